@@ -340,8 +340,9 @@ def page(arguments: argparse.Namespace) -> None:
         answered = [row for row in drawn if row["answer"] in ANSWERED]
         print(f"### Headlines of the {len(answered)} that were answered\n")
         coverage(answered)
-        print("These benches differ from what the prior expects: both directions have one ratio, so that the true contrast")
-        print("is 0, and a play varies by at most 0.02 deg. Where the prior decides, intervals are wider than they need.\n")
+        print("These benches differ from what the prior expects: both directions have one ratio, so that the true")
+        print("contrast is 0, and a play varies by at most 0.02 deg. Where the prior decides, intervals are wider than")
+        print("they need.\n")
         print("### Headlines of all that state numbers, Laplace approximations among them\n")
         coverage(drawn)
         print("### Not accepted\n")
