@@ -65,11 +65,6 @@ class Bench:
     noise_px: float
 
 
-def pair(size: tuple[int, int], vector: np.ndarray) -> Stereo:
-    """A pair of these 24 parameters, without a covariance."""
-    return Stereo(*size, *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(vector)
-
-
 def drawn_bench(seed: int) -> Bench:
     """A bench of other geometry than the table of poses: boards by distance and tilt, anywhere in both pictures."""
     rng = np.random.default_rng([seed, 45])
@@ -86,7 +81,7 @@ def drawn_bench(seed: int) -> Bench:
     turn = rotation_matrix(rng.normal(0, 0.01, 3)) @ rotation_matrix(np.array([0, toe, 0]))
     # The right camera stands to the right whatever its turn.
     shift = turn @ [-baseline, *rng.normal(0, 2, 2)]
-    true = pair(size, np.array([*cameras[0], *cameras[1], *rotation_vector(turn), *shift]))
+    true = Stereo.of_vector(np.array([*cameras[0], *cameras[1], *rotation_vector(turn), *shift]), size)
     board, count = BOARDS[int(rng.integers(len(BOARDS)))], int(rng.integers(15, 26))
     noise, width = rng.uniform(0.05, 0.3), (board.columns - 1) * board.pitch_mm
     seen: list[list[np.ndarray]] = [[], []]
@@ -120,7 +115,7 @@ def by_opencv(bench: Bench, way: str) -> tuple[Stereo, float]:
         points, *sides, *alone[0], *alone[1], size, flags=flags, criteria=ends
     )
     inner = [np.r_[m[[0, 1, 0, 1], [0, 1, 2, 2]], np.ravel(d)[:5]] for m, d in ((m1, d1), (m2, d2))]
-    return pair(size, np.concatenate([*inner, rotation_vector(r), np.ravel(t)])), float(rms)
+    return Stereo.of_vector(np.concatenate([*inner, rotation_vector(r), np.ravel(t)]), size), float(rms)
 
 
 def judged(difference: np.ndarray, covariance: np.ndarray) -> dict[str, float]:

@@ -103,7 +103,7 @@ def drawn(seed: int) -> tuple[Stereo, list[np.ndarray]]:
         inner += [focal, focal, *middle, rng.uniform(-0.3, 0.1), 0.03, *rng.normal(0, 5e-4, 2), 0.0]
     turn = rotation_matrix(np.array([0, rng.uniform(0, 0.5) * baseline / 700, 0]))
     vector = np.array([*inner, *rotation_vector(turn), *(turn @ [-baseline, 0, 0])])
-    true = Stereo(*size.tolist(), *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(vector)
+    true = Stereo.of_vector(vector, tuple(size.tolist()))
     poses: list[np.ndarray] = []
     while len(poses) < VIEWS:
         depth = focal * 8 * BOARD.pitch_mm / (size[0] * rng.uniform(0.25, 0.55))

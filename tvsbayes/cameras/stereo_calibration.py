@@ -206,13 +206,11 @@ def calibrate_stereo(
     # Pixels determine only angles: all lengths, including T, are proportional to the pitch.
     shift = adjustment.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
     pitch[21:, 21:] = np.outer(shift, shift)
-    rms, zeros = _rms(adjustment.residuals_px), np.zeros(1)
-    bare = Stereo(*size, zeros, zeros, zeros, zeros, zeros, zeros, pitch, rms)
-    bare = replace(bare, right_image_size=None if pictures is None else pictures.right_image_size)
-    stereo = bare.with_vector(adjustment.vector)
+    stereo = Stereo.of_vector(adjustment.vector, size, _rms(adjustment.residuals_px))
     errors = board_errors(adjustment, adjusted.views, board, stereo)
     covariance = errors.correlation_factor * adjustment.covariance + errors.covariance + pitch
-    stereo = replace(stereo, parameter_covariance=0.5 * (covariance + covariance.T))
+    right_size = None if pictures is None else pictures.right_image_size
+    stereo = replace(stereo, parameter_covariance=0.5 * (covariance + covariance.T), right_image_size=right_size)
     poses = [pose_of(view, board, stereo) for view in adjusted.views]
     result = StereoCalibration(
         stereo=stereo,

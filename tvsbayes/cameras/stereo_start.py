@@ -116,37 +116,35 @@ def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool
         NothingToEstimate: OpenCV finds no pair.
     """
     pairs = [k for k, view in enumerate(start.views) if view.left is not None and view.right is not None]
-    pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
-    masks = [visible_corners(start.views[k].left, start.views[k].right) for k in pairs]
-    usable = [position for position, visible in enumerate(masks) if visible.sum() >= POSE_CORNERS_MIN]
-    pairs, masks = [pairs[position] for position in usable], [masks[position] for position in usable]
+    both = {k: visible_corners(start.views[k].left, start.views[k].right) for k in _spread(pairs)}
+    both = {k: visible for k, visible in both.items() if visible.sum() >= POSE_CORNERS_MIN}
     left, right = (
-        [np.asarray(getattr(start.views[k], side)[seen], np.float32) for k, seen in zip(pairs, masks, strict=True)]
+        [np.asarray(getattr(start.views[k], side)[visible], np.float32) for k, visible in both.items()]
         for side in CAMERAS
     )
-    pair = Stereo(*size, *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(start.vector)
-    points = [board.points_mm[visible].astype(np.float32) for visible in masks]
+    pair = Stereo.of_vector(start.vector, size)
+    points = [board.points_mm[visible].astype(np.float32) for visible in both.values()]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
     try:
-        _, *intrinsics, turn, shift, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
+        _, M1, D1, M2, D2, R, T, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
             points, left, right, pair.M1, pair.D1, pair.M2, pair.D2, size, np.eye(3), np.zeros((3, 1)), flags=flags
         )
     except cv2.error as error:
         raise undetermined(f"OpenCV found no pair ({escaped(str(error.err), 100)})") from error
-    cameras = [
-        CameraStart(np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5], {}, 0.0)
-        for matrix, distortion in (intrinsics[:2], intrinsics[2:])
-    ]
-    extrinsics = rotation_vector(np.asarray(turn)), np.ravel(shift)
-    vector = np.concatenate([cameras[0].vector, cameras[1].vector, *extrinsics])
+    vector = replace(pair, M1=M1, D1=np.ravel(D1)[:5], M2=M2, D2=np.ravel(D2)[:5], R=R, T=np.ravel(T)).vector
     if not np.isfinite(vector).all():
         raise undetermined("OpenCV found no finite pair")
     calibrated = pair.with_vector(vector)
-    board_poses = {k: np.concatenate([np.ravel(t), np.ravel(s)]) for k, t, s in zip(pairs, turns, shifts, strict=True)}
+    board_poses = {k: np.concatenate([np.ravel(t), np.ravel(s)]) for k, t, s in zip(both, turns, shifts, strict=True)}
     poses = [
         board_poses[k] if k in board_poses else pose_of(view, board, calibrated) for k, view in enumerate(start.views)
     ]
     return replace(start, vector=vector, poses=np.array(poses))
+
+
+def _spread(views: Sequence[int]) -> list[int]:
+    """At most `START_VIEWS` numbers of views, spread evenly over all."""
+    return [views[k] for k in np.unique(np.linspace(0, len(views) - 1, START_VIEWS).astype(int))]
 
 
 def pairs_disagree(reason: str) -> NothingToEstimate:
@@ -172,7 +170,7 @@ def camera_start(
             "sharpness and light; take 15 to 25 views",
         )
     keys = sorted(corners)
-    chosen = [keys[k] for k in np.unique(np.linspace(0, len(keys) - 1, START_VIEWS).astype(int))]
+    chosen = _spread(keys)
     points = [board.points_mm[visible_corners(corners[k])].astype(np.float32) for k in chosen]
     pixels = [np.ascontiguousarray(corners[k][visible_corners(corners[k])], np.float32) for k in chosen]
     start = _zhang(points, pixels, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
@@ -265,8 +263,8 @@ def _relation(views: Sequence[View], board: Board, left: CameraStart, right: Cam
 
     agreed = judge(_median_pose([relative(k, 0) for k in pairs]))
     if agreed.usual_px > limit_px and len(pairs) > 2:
-        tried = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
-        best = min((judge(relative(k, t)) for k in tried for t in range(len(orders))), key=lambda r: r.usual_px)
+        tried = (judge(relative(k, order)) for k in _spread(pairs) for order in range(len(orders)))
+        best = min(tried, key=lambda r: r.usual_px)
         near = [k for k in pairs if best.misses[k] <= best.usual_px]
         agreed = min(best, judge(_median_pose([relative(k, best.orders[k]) for k in near])), key=lambda r: r.usual_px)
     return agreed

@@ -129,26 +129,36 @@ class Stereo:
         cameras = [(*M[[0, 1, 0, 1], [0, 1, 2, 2]], *D) for M, D in ((self.M1, self.D1), (self.M2, self.D2))]
         return np.array([*cameras[0], *cameras[1], *rotation_vector(self.R), *self.T])
 
-    def with_vector(self, vector: np.ndarray) -> Stereo:
-        """The same rig with other parameters; image size and covariance stay.
+    @classmethod
+    def of_vector(cls, vector: np.ndarray, size: tuple[int, int], rms_px: float = 0.0) -> Stereo:
+        """The pair with these parameters, exactly known.
 
         Args:
             vector: shape (24,), in the order of `STEREO_PARAMETER_NAMES`.
+            size: image width and height, px.
+            rms_px: rms over corners, as OpenCV defines it.
         """
         vector = np.asarray(vector, dtype=float)
 
         def matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
             return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
-        return replace(
-            self,
+        return cls(
+            *size,
             M1=matrix(*vector[0:4]),
             D1=vector[4:9].copy(),
             M2=matrix(*vector[9:13]),
             D2=vector[13:18].copy(),
             R=rotation_matrix(vector[18:21]),
             T=vector[21:24].copy(),
+            parameter_covariance=np.zeros((24, 24)),
+            rms_px=rms_px,
         )
+
+    def with_vector(self, vector: np.ndarray) -> Stereo:
+        """The same rig with other parameters (24,); image size and covariance stay."""
+        pair = Stereo.of_vector(vector, (self.image_width, self.image_height))
+        return replace(self, M1=pair.M1, D1=pair.D1, M2=pair.M2, D2=pair.D2, R=pair.R, T=pair.T)
 
 
 class WithStereo:
