@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -37,10 +36,10 @@ from tvsbayes.results.compensation_record import (
     Verification,
 )
 from tvsbayes.results.records import read_record, stored_document
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis, stops_csv
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis, stops_csv
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
-from tvsbayes.single_axis.axis_rows import DIRECTIONS, rows_of
+from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedReadings, PredictedStops, log_mean, predicted_stops
 from tvsbayes.statistics.streams import Stream, random_stream
 
@@ -69,25 +68,6 @@ BEYOND = 1.5
 """Multiple of the promise's hours or travel above which the readings get a remark that they last longer."""
 CANDIDATES, SPREAD, PLANNED_MAX = 17, 3, 40
 """For a plan: commands tried, commands always visited, largest number of stops."""
-
-
-@dataclass(frozen=True)
-class _Fresh:
-    """Fresh stops: moves, numbers of moves read, commands, sides, readings, their u; (r,) each."""
-
-    moves: tuple[AxisMove, ...]
-    read: list[int]
-    command: np.ndarray
-    side: np.ndarray
-    value: np.ndarray
-    u: np.ndarray
-
-    @classmethod
-    def of(cls, campaign: AxisCampaign) -> _Fresh:
-        """Collect the stops of a folder of fresh readings."""
-        rows = rows_of(campaign)
-        u = np.sqrt(rows.variance)
-        return cls(campaign.moves, rows.move.tolist(), rows.command, rows.side, rows.value, u)
 
 
 def _distance(off: np.ndarray, covariance: np.ndarray) -> float:
@@ -170,7 +150,8 @@ def judged(trial: Trial, seed: int) -> Judged:
     total = float(np.logaddexp.reduce(list(logs.values())))
     worlds = {name: float(np.exp(logs[name] - total)) for name in WORLDS}
     p = _p_value(promised, trial.value, trial.shift, seed)
-    verdict, needed = _verdict(worlds, p), cast(int | None, 0)
+    verdict = _verdict(worlds, p)
+    needed: int | None = 0
     if verdict == CANNOT_TELL:
         needed = needed_readings(promised, promised.pooled()[0] - without.pooled()[0], trial.noise)
     return Judged(verdict, p, worlds, needed, promised, without)
@@ -225,7 +206,7 @@ def _visit_noise(promised: PredictedStops, side: np.ndarray, u: np.ndarray) -> n
     return np.where(side > 0, ahead, np.where(side < 0, back, 0.5 * (ahead + back))) + reading
 
 
-def _remarks(made: Compensation, fresh: _Fresh, campaign: AxisCampaign) -> tuple[str, ...]:
+def _remarks(made: Compensation, fresh: AxisRows, campaign: AxisCampaign) -> tuple[str, ...]:
     """Return further remarks for the user."""
     low, high = made.range_command
     outside = int(np.sum((fresh.command < low) | (fresh.command > high)))
@@ -266,12 +247,12 @@ def verify_readings(
     if campaign.unit != made.unit:
         message = f"the fresh readings are in {campaign.unit[:20]!r}, the table is in {made.unit[:20]!r}"
         raise InputError("unit", message, remedy="give readings in the unit of the table")
-    fresh, applied = _Fresh.of(campaign), Correction.of(made)
-    aim = made.offset + made.per_command * fresh.command
+    fresh, applied = rows_of(campaign), Correction.of(made)
+    aim, u = made.offset + made.per_command * fresh.command, np.sqrt(fresh.variance)
 
     @cache
     def at(common: float, play: float) -> PredictedStops:
-        return predicted_stops(fit, applied.moved(fresh.moves, common, play), fresh.read, fresh.u, seed)
+        return predicted_stops(fit, applied.moved(campaign.moves, common, play), fresh.move.tolist(), u, seed)
 
     with Job({"worlds": 1.0}, progress) as job:
         job.begin("worlds")
@@ -282,7 +263,7 @@ def verify_readings(
             other=other_axis(fresh.command, fresh.side),
             travel=fit.rows.travel,
             shift=_shift(made, fit.rows.travel, len(fresh.value)),
-            noise=_visit_noise(at(1.0, 1.0), fresh.side, fresh.u),
+            noise=_visit_noise(at(1.0, 1.0), fresh.side, u),
         )
         judgement = judged(trial, seed)
     return Verification(
@@ -438,17 +419,17 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
 
     promised = at(1.0, 1.0)
     mean, covariance = promised.pooled()
+    shift = _shift(made, fit.rows.travel, len(mean))
     noise = np.minimum(_visit_noise(promised, run.side, u), 0.999 * np.diag(covariance))
-    common = covariance - np.diag(noise) + _shift(made, fit.rows.travel, len(mean))
     off = [at(0.0, 0.0).pooled()[0] - mean]
     play = at(1.0, 0.0).pooled()[0] - mean
-    if _distance(play, covariance + _shift(made, fit.rows.travel, len(mean))) > SEPARATE:
+    if _distance(play, covariance + shift) > SEPARATE:
         off.append(play)
     if not np.any(off[0]):
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
     # Stops over the whole range first: a fault in a part of the table shows only there.
     spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
-    chosen = discriminating_visits(off, common, noise, np.isin(run.index, spread))
+    chosen = discriminating_visits(off, covariance - np.diag(noise) + shift, noise, np.isin(run.index, spread))
     visits, reached = chosen.visits, chosen.reached
     order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
     stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)

@@ -22,6 +22,7 @@ from tvsbayes.results.compensation_record import (
     Compensation,
     Verification,
 )
+from tvsbayes.single_axis.axis_rows import DIRECTIONS
 
 if TYPE_CHECKING:
     from tvsbayes.comparison.verified_looks import AimPlan
@@ -195,8 +196,7 @@ def _verdict(verification: Verification) -> str:
 
 def verify_plan_text(plan: VerifyPlan) -> str:
     """A plan of readings that verify a table, as text."""
-    words = {1: "forward", -1: "backward"}
-    rows = [[f"{command:.10g}", words[side]] for command, side in plan.stops]
+    rows = [[f"{command:.10g}", DIRECTIONS[side]] for command, side in plan.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
     return terminal(table, f"to arrive on a side, come from at least {plan.run_up:.4g} commands away", _power(plan))
 
