@@ -170,7 +170,7 @@ def test_classic_text_has_a_row_per_direction_with_or_without_experiments():
 
 def test_demo_text_says_which_interval_holds_the_truth():
     classic = ClassicResult({"left": direction(0.0594, 0.0002), "right": None, "up": None, "down": None}, (), ())
-    truth = {"left": 0.06205, **{name: 1.0 for name, _, _ in KEY_PARAMETERS[:3]}}
+    truth = {"left": 0.06205, **dict.fromkeys(KEY_PARAMETERS[:3], 1.0)}
     text = demo_text(classic, small_summary(), truth)
     row = next(line.split() for line in text.splitlines() if line.startswith("left"))
     assert row == ["left", "0.05940(20)", "NO", "0.06210(10)", "yes", "0.062050"]

@@ -19,7 +19,7 @@ def estimate(value: float, sd: float, contraction: float | None = 0.9) -> Estima
 
 def small_summary() -> FitSummary:
     """A fit in which the pan axis never moved right and the tilt axis never moved."""
-    parameters = {name: estimate(1.0, 0.1) for name, _, _ in (*KEY_PARAMETERS, *MORE_PARAMETERS)}
+    parameters = {name: estimate(1.0, 0.1) for name in (*KEY_PARAMETERS, *MORE_PARAMETERS)}
     parameters["mirror_offset_mm"] = estimate(30.0, 5.0, 0.001)
     parameters["stop_sd_deg.up"] = Estimate(0.05, 0.0, (0.05, 0.05), 0.0, None)
     return FitSummary(

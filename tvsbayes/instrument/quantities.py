@@ -50,10 +50,14 @@ class Quantity:
         return tuple(self.name.removeprefix(self.block).split("."))[1:]
 
     @property
+    def unit_text(self) -> str:
+        """The unit beside a value; "" for a number."""
+        return "" if self.unit == "1" else self.unit
+
+    @property
     def in_words(self) -> str:
         """Words, part and unit: "laser's direction, x, deg"."""
-        unit = "" if self.unit == "1" else self.unit
-        return ", ".join(filter(None, (self.words.removeprefix("the "), " ".join(self.parts), unit)))
+        return ", ".join(filter(None, (self.words.removeprefix("the "), " ".join(self.parts), self.unit_text)))
 
     @property
     def axis(self) -> Axis | None:

@@ -10,6 +10,7 @@ from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.parameters import QUANTITIES
 from tvsbayes.report.advice import SPOTS_LISTED, factor_text, failed, noise_line, remedy, verdict_line
 from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.result_tables import (
@@ -156,8 +157,8 @@ def gear_lines(summary: FitSummary) -> list[str]:
 
 def unconverged_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
     """A fit that did not converge: its last values without uncertainty, and the causes."""
-    parameters = (row for row in PARAMETERS if row[0] in summary.parameters)
-    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in parameters]
+    quantities = (QUANTITIES[name] for name in PARAMETERS if name in summary.parameters)
+    rows = [[q.label, f"{summary.parameters[q.name].value:.4g}", q.unit_text] for q in quantities]
     table = TableView("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
     suspects = suspect_line(summary.suspect_spots) if summary.suspect_spots else None
     message = NotConverged.of(summary.problems, "").message
@@ -290,8 +291,9 @@ def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[st
     columns = ["deg/step", "classic, type A", "holds truth", "joint", "holds truth", "truth"]
     ratios = TableView("degrees of beam per motor step, value(u)", columns, rows)
     rows = []
-    for name, label, unit in (row for row in KEY_PARAMETERS if row[0] in truth):
-        e, true = summary.parameters[name], truth[name]
-        rows.append([f"{label}, {unit}", concise(e.value, e.sd), holds(e.interval95, true), f"{true:.4f}"])
+    for q in (QUANTITIES[name] for name in KEY_PARAMETERS if name in truth):
+        e, true = summary.parameters[q.name], truth[q.name]
+        cells = [concise(e.value, e.sd), holds(e.interval95, true), f"{true:.4f}"]
+        rows.append([f"{q.label}, {q.unit_text}", *cells])
     others = TableView("what the classic estimator cannot see", ["", "joint", "holds truth", "truth"], rows)
     return terminal(ratios, "", others)

@@ -5,7 +5,7 @@ Units are in captions and heads; numbers have two digits of their uncertainty (G
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,19 +24,14 @@ if TYPE_CHECKING:
     from tvsbayes.head.pointing_model import PointingModel
 
 
-def _rows(*names: str) -> tuple[tuple[str, str, str], ...]:
-    rows = (QUANTITIES[name] for name in names)
-    return tuple((quantity.name, quantity.label, "" if quantity.unit == "1" else quantity.unit) for quantity in rows)
-
-
-KEY_PARAMETERS = _rows(
+KEY_PARAMETERS = (
     *(quantity.name for quantity in HEADLINES if quantity.label and not quantity.ratio),
     *names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale"),
 )
-"""Parameters of the last table of a fit: name, label, unit."""
-HEAD_PARAMETERS = _rows(*(term.name for term in HEAD_TERMS.values()))
+"""Parameters of the last table of a fit."""
+HEAD_PARAMETERS = tuple(term.name for term in HEAD_TERMS.values())
 """The terms of a head, which follow them."""
-MORE_PARAMETERS = _rows(*names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm"))
+MORE_PARAMETERS = names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm")
 """Parameters of the table of details."""
 SHARE_SHOWN = 5e-4
 """Least share of a variance in a table: smaller shares are printed as 0.0 %."""
@@ -73,6 +68,12 @@ def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
     return [label, concise(estimate.value, estimate.sd), interval, origin]
 
 
+def _estimate_rows(estimates: Mapping[str, Estimate | None], names: Iterable[str]) -> list[list[str]]:
+    """Rows of those of the named quantities that there are."""
+    quantities = (QUANTITIES[name] for name in names if name in estimates)
+    return [estimate_row(quantity.label, estimates[quantity.name], quantity.unit_text) for quantity in quantities]
+
+
 def headline_table(summary: FitSummary) -> TableView:
     """Ratios, contrasts and key parameters of the joint estimator: the last table of a fit."""
     pose = summary.reference_pose_deg
@@ -80,18 +81,15 @@ def headline_table(summary: FitSummary) -> TableView:
     estimates |= {
         f"effective_contrast_deg_per_step.{part}": e for part, e in summary.contrasts.items() if e is not None
     }
-    rows = [estimate_row(label, estimates[name], unit) for name, label, unit in _rows(*estimates)]
-    parameters = (row for row in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if row[0] in summary.parameters)
-    rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in parameters]
+    estimates |= {n: summary.parameters[n] for n in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if n in summary.parameters}
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    return TableView(title, ESTIMATE_COLUMNS, rows)
+    return TableView(title, ESTIMATE_COLUMNS, _estimate_rows(estimates, estimates))
 
 
 def details_table(summary: FitSummary) -> TableView:
     """Pose of the positioner, and L."""
-    parameters = (row for row in MORE_PARAMETERS if row[0] in summary.parameters)
-    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in parameters]
+    rows = _estimate_rows(summary.parameters, MORE_PARAMETERS)
     return TableView("the positioner in frame S (the left camera's)", ESTIMATE_COLUMNS, rows)
 
 
@@ -112,8 +110,7 @@ def gears_table(summary: FitSummary) -> TableView | None:
     names = [name for name in GEAR_SCALES if name in summary.parameters]
     if not any(name.startswith(("transmission", "play", "harmonic")) for name in names):
         return None
-    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in _rows(*names)]
-    return TableView("gears: what repeats by position", ESTIMATE_COLUMNS, rows)
+    return TableView("gears: what repeats by position", ESTIMATE_COLUMNS, _estimate_rows(summary.parameters, names))
 
 
 WAVES = "waves, given that they are there"
