@@ -174,9 +174,11 @@ class Calibration(Shown):
         whole[..., np.arange(count, count + NOISES), np.arange(count, count + NOISES)] = [*UNIT_NOISES.values()]
         return whole
 
-    def covers(self, pan_steps: float, tilt_steps: float) -> bool:
-        """Whether these counters are within those of the campaign's looks."""
-        return not self.unseen(pan_steps, tilt_steps)
+    def covers(self, pan_steps: Number, tilt_steps: Number) -> bool | np.ndarray:
+        """Whether counters, or arrays of one shape, are within those of the campaign's looks."""
+        (pan_low, pan_high), (tilt_low, tilt_high) = self.range_steps.tolist()
+        inside = (pan_low <= pan_steps) & (pan_steps <= pan_high)
+        return inside & (tilt_low <= tilt_steps) & (tilt_steps <= tilt_high)
 
     @property
     def seen_steps(self) -> dict[Axis, list[float]]:

@@ -69,7 +69,6 @@ def cloud(
     Raises:
         InputError: a calibration without draws.
     """
-    (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     for rows in looks:
         settings = rows.settings
         linear = locate_linear(calibration, settings)
@@ -83,7 +82,7 @@ def cloud(
             lines=np.array(rows.lines)[meets],
             xyz_mm=linear.value[meets],
             covariance_mm2=linear.covariance[meets],
-            extrapolated=(pan < pan_low) | (pan > pan_high) | (tilt < tilt_low) | (tilt > tilt_high),
+            extrapolated=~np.asarray(calibration.covers(pan, tilt)),
             simple_xyz_mm={
                 name: assumed_geometry(one, pan, tilt).points(reading, calibration.azimuth).T
                 for name, one in simple.items()

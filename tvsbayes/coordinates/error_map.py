@@ -161,8 +161,6 @@ def error_map(
     geometries = {"joint": AssumedGeometry(beam, best["baseline_mm"], best["aperture_zero_deg"])}
     geometries |= {name: assumed_geometry(one, pan, tilt) for name, one in simple.items()}
     errors = {name: _errors(assumed, truth, calibration.azimuth) for name, assumed in geometries.items()}
-    (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
-    inside = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)
     shape = tuple(len(x) for x in axes)
     return ErrorMap(
         pan_steps=axes[0],
@@ -170,7 +168,7 @@ def error_map(
         range_mm=axes[2],
         rms_mm={name: part.rms_mm.reshape(shape) for name, part in errors.items()},
         bias_mm={name: part.bias_mm.reshape(*shape, 3) for name, part in errors.items()},
-        inside=inside.reshape(shape),
+        inside=np.reshape(calibration.covers(pan, tilt), shape),
         valid=np.all([part.usable for part in errors.values()], axis=0).reshape(shape),
         distance_mm={name: part.distance_mm.reshape(-1, *shape) for name, part in errors.items()},
     )
