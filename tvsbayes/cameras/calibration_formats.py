@@ -23,6 +23,7 @@ from tvsbayes.cameras.lens_models import ERROR_MAX_PX, Kind, fitted_to_five, kin
 from tvsbayes.cameras.maker_calibrations import MakersPair, makers_pair
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_bytes
+from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.stereo_pair import (
     ASSUMED_REMEDY,
     Stereo,
@@ -39,7 +40,6 @@ BASELINE_RANGE_MM = (20.0, 3000.0)
 """Distance of the cameras of one bench; outside this range the user must state the unit."""
 RMS_PX_MAX, VIEWS_MAX = 20.0, 100_000
 NO_PROVENANCE = Provenance()
-SIDE_NAMES = ("left", "right")
 KEY_FIELDS = ("M1", "D1", "M2", "D2", "R", "T")
 """Fields that `--key` can name."""
 POSE_KEYS = {"kalibr": ("T_cn_cnm1",), "orb-slam": ("Stereo.T_c1_c2",), "boofcv": ("rightToLeft",)}
@@ -203,7 +203,7 @@ class _Reader:
             raise refusal(
                 "lens-model",
                 file=", ".join(keys.file for keys in self.fields.files),
-                found=f"the model {escaped(model, 40)} of the {SIDE_NAMES[side]} camera",
+                found=f"the model {escaped(model, 40)} of the {CAMERAS[side]} camera",
                 allowed="plumb_bob, radtan, rational or equidistant",
                 remedy="calibrate the pair again with five coefficients; renaming the model makes wrong rays",
             )
@@ -249,7 +249,7 @@ class _Reader:
         elif "P" in camera and not any({"M", "fx"} & set(part) for part in self.fields.cameras):
             entry = camera["P"]
             matrix = entry.numbers.reshape(3, 4)[:, :3]
-            self.notes.append(f"{entry.place} alone: the rectified {SIDE_NAMES[side]} camera, without distortion")
+            self.notes.append(f"{entry.place} alone: the rectified {CAMERAS[side]} camera, without distortion")
         else:
             cameras = self.fields.cameras
             raise self.fields.missing([f"M{k + 1}" for k in (0, 1) if not {"M", "fx"} & set(cameras[k])])

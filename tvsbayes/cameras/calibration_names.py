@@ -329,7 +329,7 @@ class Fields:
         hits = [entry for entry in self.entries if name in (entry.path, entry.key)]
         if not hits and field == "R" and name.endswith(".T"):
             return self._stated_entry(field, name.removesuffix(".T")).transposed()
-        if len(hits) != 1 or hits[0].numbers.size not in KEY_SIZES[field[0]]:
+        if len(hits) != 1 or hits[0].numbers.size not in FIELDS[field.rstrip("12")][0]:
             paths = [entry.path for entry in self.entries]
             found = f"{len(hits)} entries of that name" if len(hits) != 1 else f"{hits[0].numbers.size} numbers"
             raise refusal(
@@ -403,7 +403,3 @@ class Fields:
                         continue
                     return value.strip().lower()
         return ""
-
-
-KEY_SIZES = {"M": (4, 9), "D": (4, 5, 8, 12, 14), "R": (3, 9), "T": (3,)}
-"""Counts of numbers that a field named by --key can have."""

@@ -20,6 +20,7 @@ import numpy as np
 
 from tvsbayes.cameras.capture import PIPELINE_FRAMES, CameraSettings, StereoImage
 from tvsbayes.errors import DeviceFault, InputError, entry_refusal, escaped, fault
+from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.rig import Rig, Setting, driver_options
 
 FETCH_S = 5.0
@@ -34,7 +35,6 @@ STEP_SHARE = 0.05
 STEPS = {"ExposureTime": 1.0, "Gain": 0.1}
 """Largest relative and absolute deviation of a value that is read back, since cameras round: in us, and in the camera's
 unit of gain, mostly dB."""
-_NAMES = ("left", "right")
 _refused = partial(entry_refusal, "cameras", "cameras")
 
 
@@ -138,7 +138,7 @@ class GenicamCamera:
     def _open(self) -> None:
         self._harvester.add_file(self._stated.producer)
         self._harvester.update()
-        for name, key in zip(_NAMES, self._stated.cameras, strict=True):
+        for name, key in zip(CAMERAS, self._stated.cameras, strict=True):
             devices = self._harvester.device_info_list
             matches = [
                 n for n, d in enumerate(devices) if key in (_text(d, "serial_number"), _text(d, "user_defined_name"))
@@ -186,7 +186,7 @@ class GenicamCamera:
     def settings(self) -> CameraSettings:
         """See `StereoCamera.settings`."""
         values = {}
-        for name, acquirer in zip(_NAMES, self._acquirers, strict=True):
+        for name, acquirer in zip(CAMERAS, self._acquirers, strict=True):
             nodes = acquirer.remote_device.node_map
             for key, node in {"exposure_us": "ExposureTime", "gain": "Gain"}.items():
                 if hasattr(nodes, node):
@@ -210,7 +210,7 @@ class GenicamCamera:
             self._expose(free)
             left, right = (
                 self._picture(name, acquirer, PIPELINE_FRAMES if free_running else 0)
-                for name, acquirer, free_running in zip(_NAMES, self._acquirers, free, strict=True)
+                for name, acquirer, free_running in zip(CAMERAS, self._acquirers, free, strict=True)
             )
         except DeviceFault:
             raise

@@ -208,11 +208,11 @@ def _pair_rows(
 
 
 def _unmatched(views: Sequence[View], ids: Sequence[int], file: str) -> InputError:
-    noun = "moves" if file == "moves.csv" else "rows with the status undetected"
+    noun, one = ("moves", "move") if file == "moves.csv" else ("rows with the status undetected", "row")
     span = f" ({min(ids)} to {max(ids)})" if ids else ""
     found = f"{len(views)} pairs of pictures for {len(ids)} {noun}{span}, and not in every name a number of one of them"
     allowed = "as many pairs as rows, or in every name the number of its row"
-    remedy = f"name them after their row (left_0012.png, right_0012.png for {noun[:-1] if len(noun) < 6 else 'row'} 12)"
+    remedy = f"name them after their row (left_0012.png, right_0012.png for {one} 12)"
     if file == "moves.csv":
         remedy += ", or list the looks in spots.csv with the status undetected and call it again"
     return refusal("pictures", file=file, found=found, allowed=allowed, remedy=remedy)

@@ -61,8 +61,8 @@ class Centre:
 
     Attributes:
         status: "ok" or a key of `REASONS`.
-        centre_px: (2,) u, v; None if refused.
-        covariance_px2: (2, 2) of the centre; None if refused.
+        centre_px: (2,) u, v, also where it was refused after the fit; None without a fit.
+        covariance_px2: (2, 2) of the centre, likewise.
         axes_px: sds of the spot's image along its long and short axis.
         clipped_share: clipped area over bright area.
         outline_px: (n, 2) outline of the bright area, for pictures; may be empty.
