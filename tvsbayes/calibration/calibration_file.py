@@ -26,7 +26,7 @@ from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, input_hashes
 from tvsbayes.instrument.mechanisms import MECHANISMS
 
@@ -409,8 +409,8 @@ def stored_calibration(campaign: Campaign) -> Calibration | None:
     return calibration if calibration.inputs_sha256 == input_hashes(campaign) else None
 
 
-def stored_ratios(campaign: Campaign) -> np.ndarray:
-    """Read draws (n, 4) of the effective ratios left, right, up, down from `results/`, deg/step.
+def stored_ratios(campaign: Campaign) -> dict[str, np.ndarray]:
+    """Read draws (n,) of the effective ratios from `results/`, deg/step, by direction.
 
     Raises:
         InputError: the draws are missing or damaged.
@@ -425,4 +425,4 @@ def stored_ratios(campaign: Campaign) -> np.ndarray:
         raise damaged_calibration(path, error) from error
     if draws.ndim != 2 or draws.shape[1] != 4 or not np.all(np.isfinite(draws)):
         raise damaged_calibration(path, ValueError("effective_deg_per_step"))
-    return draws
+    return dict(zip(DIRECTIONS, draws.T, strict=True))

@@ -220,13 +220,15 @@ def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _
         raise InputError("usage", message, allowed=allowed, remedy=remedy)
     middle = at.mean.mean(axis=0)
     off = middle - np.polyval(np.polyfit(at.command, middle, 1), at.command)
-    phase = 2 * np.pi * at.command / period
-    # The mean over periods is fitted by four harmonics.
-    waves = np.column_stack([f(k * phase) for k in range(1, 5) for f in (np.cos, np.sin)])
-    amplitudes = np.linalg.lstsq(waves, off, rcond=None)[0]
+
+    def waves(command: np.ndarray) -> np.ndarray:
+        # The mean over periods is fitted by four harmonics.
+        phase = 2 * np.pi * command / period
+        return np.column_stack([f(k * phase) for k in range(1, 5) for f in (np.cos, np.sin)])
+
+    amplitudes = np.linalg.lstsq(waves(at.command), off, rcond=None)[0]
     command = np.linspace(low, high, PERIOD_NODES)
-    again = 2 * np.pi * command / period
-    added = -np.column_stack([f(k * again) for k in range(1, 5) for f in (np.cos, np.sin)]) @ amplitudes / fitted
+    added = -waves(command) @ amplitudes / fitted
     return _Shaped(Correction(command, added, added, resolution), {"period_command": period})
 
 

@@ -16,7 +16,7 @@ from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.coordinates.error_map import ErrorMap, SimpleError, error_map, simple_error
 from tvsbayes.coordinates.simple_calibration import simple_calibrations
 from tvsbayes.estimators.four_point import ClassicResult, classic_of
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_APPROACH, Axis
+from tvsbayes.instrument.axes import AXES, HOME_APPROACH, Axis
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
 from tvsbayes.report.spot_pictures import SpotCrop, spot_crops
@@ -25,6 +25,7 @@ from tvsbayes.results.compensation_record import Verification, stored_verificati
 from tvsbayes.results.fit_record import FitEvidence, FitRecord
 from tvsbayes.results.metrology_tables import BudgetTable
 from tvsbayes.results.plan_record import PlanRecord, stored_plan
+from tvsbayes.statistics.intervals import band95
 
 MET, NOT_MET = "met", "not met"
 MET_PROBABILITY = 0.95
@@ -91,13 +92,9 @@ def gear_bands(calibration: Calibration) -> tuple[GearBand, ...]:
         nodes = calibration.gears.steps[index]
         steps = np.linspace(nodes[0], nodes[-1], BAND_POINTS)
         values_at = calibration.gears.at(columns, (steps, steps))
-        bands = []
-        for kind in (ERROR_AT, PLAY_AT):
-            values = values_at[f"{kind}.{axis}"]
-            low, high = np.quantile(values, (0.025, 0.975), axis=0)
-            bands.append(np.stack([low, values.mean(axis=0), high]))
+        error, play = (band95(values_at[f"{kind}.{axis}"]) for kind in (ERROR_AT, PLAY_AT))
         low_seen, high_seen = calibration.range_steps[index].tolist()
-        curves.append(GearBand(axis, steps, bands[0], bands[1], (low_seen, high_seen)))
+        curves.append(GearBand(axis, steps, error, play, (low_seen, high_seen)))
     return tuple(curves)
 
 
@@ -224,10 +221,10 @@ def _inflation(fit: FitRecord) -> float:
 
 def _ratio_criteria(campaign: Campaign, fit: FitRecord, limit: float) -> list[Criterion]:
     """Every effective ratio against its limit, deg/step."""
-    draws, criteria = stored_ratios(campaign), []
-    for k, direction in enumerate(DIRECTIONS):
+    criteria = []
+    for direction, draws in stored_ratios(campaign).items():
         estimate = fit.summary.effective[direction]
         if estimate is not None:
-            errors = _inflation(fit) * (draws[:, k] - estimate.value)
+            errors = _inflation(fit) * (draws - estimate.value)
             criteria.append(criterion(f"ratio {direction}", errors, limit, "deg/step"))
     return criteria

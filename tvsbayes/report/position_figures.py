@@ -12,6 +12,7 @@ import numpy as np
 
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.report.drawing import BLACK, BLUE, DIRECTION_STYLE, ORANGE, PURPLE, SKY, drawing, legend
+from tvsbayes.statistics.intervals import band95
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,12 +33,6 @@ def _banded(axes: Axes, x: np.ndarray, band: np.ndarray, name: str, light: str =
     """A curve with its 95 % band; `band` has low, mean, high, shape (3, n)."""
     axes.fill_between(x, band[0], band[2], color=light, alpha=0.4, linewidth=0, label=f"{name}, 95 %")
     axes.plot(x, band[1], color=dark, linewidth=1.2, label="its mean")
-
-
-def band_of(drawn: np.ndarray) -> np.ndarray:
-    """Low, mean and high of 95 % of draws (draws, n), shape (3, n)."""
-    low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
-    return np.stack([low, drawn.mean(axis=0), high])
 
 
 def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
@@ -78,7 +73,7 @@ def axis_errors(fit: AxisFit, commands: np.ndarray, values: np.ndarray) -> Figur
     deviations = rows.value - design @ np.linalg.lstsq(design, rows.value, rcond=None)[0]
     with drawing(3.2) as figure:
         axes = figure.add_subplot()
-        _banded(axes, commands, band_of(values), "error by position")
+        _banded(axes, commands, band95(values), "error by position")
         for side, name in ((1, "forward"), (-1, "backward"), (0, "")):
             of_side, (marker, colour) = rows.side == side, DIRECTION_STYLE[name]
             if of_side.any():
@@ -95,7 +90,7 @@ def wave(sample: WaveSample, unit: str) -> Figure:
     period_unit = "s" if sample.wave.clock == "seconds" else unit
     with drawing(2.4) as figure:
         axes = figure.add_subplot()
-        _banded(axes, turn * float(np.mean(sample.period)), band_of(sample.curve(turn)), "wave")
+        _banded(axes, turn * float(np.mean(sample.period)), band95(sample.curve(turn)), "wave")
         axes.set(xlabel=f"{period_unit}, from {sample.record.middle:.6g} on", ylabel=unit)
         legend(figure, 2)
     return figure

@@ -55,6 +55,12 @@ def interval95(draws: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def band95(draws: np.ndarray) -> np.ndarray:
+    """Compute low, mean and high of 95 % of draws (draws, n) of a curve, shape (3, n)."""
+    low, high = np.quantile(draws, (0.025, 0.975), axis=0)
+    return np.stack([low, draws.mean(axis=0), high])
+
+
 def absolute_bound95(mean: np.ndarray, sd: np.ndarray) -> float:
     """Compute the absolute value that 95 % of errors do not exceed, in a mixture of normals (n,) of equal weight."""
     from scipy.optimize import brentq
