@@ -22,13 +22,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import AXES
 
-_TABLED = {
-    "ERROR": "transmission_error_deg",
-    "ERROR_U": "u_transmission_error_deg",
-    "PLAY": "play_variation_deg",
-    "PLAY_U": "u_play_variation_deg",
-}
-"""Columns of gear errors by their names in C."""
+_TABLED = ("transmission_error_deg", "u_transmission_error_deg", "play_variation_deg", "u_play_variation_deg")
 _UNCOMMENTED = re.compile(r"[^A-Za-z0-9 .,:()+=_-]")
 """Characters not allowed in a comment of C: its end, trigraphs, backslashes, non-ASCII."""
 
@@ -86,8 +80,8 @@ def _header_gears(calibration: Calibration) -> list[str]:
     errors: Mapping[str, Mapping[str, Any]] = gear_errors(calibration)
     none: Mapping[str, Any] = {
         "steps": [0.0] * 4,
-        **{name: [0.0] * 4 for name in _TABLED.values()},
-        **{f"beyond_{_TABLED[column]}": 0.0 for column in ("ERROR_U", "PLAY_U")},
+        **{name: [0.0] * 4 for name in _TABLED},
+        **{f"beyond_{name}": 0.0 for name in _TABLED[1::2]},
     }
     for axis, (low, high) in zip(AXES, calibration.range_steps.tolist(), strict=True):
         upper, table = axis.upper(), errors.get(axis, none)
@@ -101,7 +95,7 @@ def _header_gears(calibration: Calibration) -> list[str]:
             f"#define TVS_BEYOND_{upper}_ERROR_U_DEG {_double(table['beyond_u_transmission_error_deg'])}",
             f"#define TVS_BEYOND_{upper}_PLAY_U_DEG {_double(table['beyond_u_play_variation_deg'])}",
         ]
-        for column, name in _TABLED.items():
-            listed = ",\n    ".join(", ".join(map(_double, table[name][k : k + 4])) for k in range(0, len(nodes), 4))
-            lines.append(f"static const double TVS_{column}_{upper}_DEG[] = {{\n    {listed}}};")
+        for name, values in zip(("ERROR", "ERROR_U", "PLAY", "PLAY_U"), (table[n] for n in _TABLED), strict=True):
+            listed = ",\n    ".join(", ".join(map(_double, values[k : k + 4])) for k in range(0, len(values), 4))
+            lines.append(f"static const double TVS_{name}_{upper}_DEG[] = {{\n    {listed}}};")
     return lines
