@@ -141,9 +141,9 @@ def test_steps_take_the_gears_errors_back():
 def test_error_maps_know_the_gears():
     """A rig whose gears vary errs more where no look reached."""
     one = geared(calibration(spread=0.01, noise_deg=dict.fromkeys(calibration().noise_variance, 1e-4)))
-    found = error_map(one, [-750.0, 0.0, 750.0], [0.0], [600.0], simple={}, draws=500)
-    rms = found.rms_mm["joint"][:, 0, 0]
-    assert found.inside[:, 0, 0].tolist() == [False, True, False]
+    pan = np.array([-750.0, 0.0, 750.0])
+    rms = error_map(one, pan, [0.0], [600.0], simple={}, draws=500).rms_mm["joint"][:, 0, 0]
+    np.testing.assert_array_equal(one.covers(pan, np.zeros(3)), [False, True, False])
     assert min(rms[0], rms[2]) > 2 * rms[1]
 
 

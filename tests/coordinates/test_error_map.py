@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,7 +78,7 @@ def test_a_perfect_rig_has_no_error_straight_ahead(azimuth):
 
 @pytest.mark.parametrize("azimuth", [False, True])
 @pytest.mark.parametrize("approach", [(1.0, 1.0), (-1.0, 1.0)])
-def test_bias_of_the_nominal_estimator_is_the_twins(azimuth, approach):
+def test_error_of_the_nominal_estimator_is_the_twins(azimuth, approach):
     """A rig without scatter: the whole chain in NumPy, at every pose and range, in the order of the axes."""
     one = calibration(BENT, {}, NO_NOISE_DEG, azimuth=azimuth)
     found = mapped(one, simple_calibration(), approach=approach)
@@ -98,7 +97,6 @@ def test_bias_of_the_nominal_estimator_is_the_twins(azimuth, approach):
         thought = twin_points(np.array([[0.0, 70.0, 0.0]]), d, 200.0, float(reading), azimuth)[0]
         # The nominal point may be 10 m away: bisection's 1e-13 deg times r^2 / a.
         bound = 10 * ROUNDING_MM * (1 + (np.linalg.norm(thought) / 1000.0) ** 2)
-        np.testing.assert_allclose(found.bias_mm["nominal"][i, j, k], thought - point, atol=bound)
         assert found.rms_mm["nominal"][i, j, k] == pytest.approx(np.linalg.norm(thought - point), abs=bound)
         # Every draw is the same rig.
         np.testing.assert_allclose(
@@ -112,14 +110,10 @@ def test_bias_of_the_nominal_estimator_is_the_twins(azimuth, approach):
 
 
 def test_joint_beats_nominal_on_a_biased_rig():
-    one = replace(calibration(), range_steps=np.array([[-400.0, 80.0], [-100.0, 149.0]]))
+    one = calibration()
     found = mapped(one, simple_calibration(), ranges=np.array([150.0, 200.0, 300.0, 400.0]))
     assert found.valid.all()
     assert np.all(found.rms_mm["joint"] < found.rms_mm["nominal"])
-    np.testing.assert_array_equal(found.inside[..., 0], [[True, True, False], [False, False, False]])
-    np.testing.assert_array_equal(found.inside, np.repeat(found.inside[..., :1], 4, axis=2))
-    for name in ("joint", "nominal"):
-        assert np.all(np.linalg.norm(found.bias_mm[name], axis=-1) <= found.rms_mm[name] * (1 + 1e-9))
     # The joint error is what `locate` says of a look: the trace of its covariance.
     ray = one.ray(PAN[0], TILT[1])
     point = ray.origin_mm + 300.0 * ray.direction
@@ -135,5 +129,4 @@ def test_where_nothing_can_be_located_the_map_is_empty():
     found = mapped(calibration(), simple_calibration(), ranges=np.array([200.0, 300.0, 400.0, 1e5]))
     assert not found.valid[..., 3].any() and found.valid[..., :3].all()
     assert np.isnan(found.rms_mm["joint"][..., 3]).all()
-    assert np.isnan(found.bias_mm["joint"][..., 3, :]).all()
     assert np.isfinite(found.rms_mm["nominal"][..., :3]).all()

@@ -26,8 +26,6 @@ class ErrorMap:
     Attributes:
         pan_steps, tilt_steps, range_mm: the axes; ranges along the beam.
         rms_mm: root mean square distance from the true point, by estimator.
-        bias_mm: mean error vector, by estimator, shape (pan, tilt, range, 3).
-        inside: whether counters are within those of the campaign's looks.
         valid: whether every estimator finds a point in all but `DIVERGING_SHARE` of the draws.
         distance_mm: 3D errors by estimator, arrays (draws, pan, tilt, range), infinite where there is no point.
     """
@@ -36,8 +34,6 @@ class ErrorMap:
     tilt_steps: np.ndarray
     range_mm: np.ndarray
     rms_mm: Mapping[str, np.ndarray]
-    bias_mm: Mapping[str, np.ndarray]
-    inside: np.ndarray
     valid: np.ndarray
     distance_mm: Mapping[str, np.ndarray]
 
@@ -65,7 +61,6 @@ class _Errors:
     """Errors of one estimator over the points; fields as in `ErrorMap`, `usable` as its `valid`."""
 
     rms_mm: np.ndarray
-    bias_mm: np.ndarray
     distance_mm: np.ndarray
     usable: np.ndarray
 
@@ -78,7 +73,6 @@ def _errors(assumed: AssumedGeometry, truth: _Truth, azimuth: bool) -> _Errors:
     square = np.sum(kept**2, axis=(0, 1)) / count
     return _Errors(
         rms_mm=np.where(usable, np.sqrt(square), np.nan),
-        bias_mm=np.where(usable, kept.sum(axis=1) / count, np.nan).T,
         distance_mm=np.where(meets, np.linalg.norm(error, axis=0), np.inf),
         usable=usable,
     )
@@ -167,8 +161,6 @@ def error_map(
         tilt_steps=axes[1],
         range_mm=axes[2],
         rms_mm={name: part.rms_mm.reshape(shape) for name, part in errors.items()},
-        bias_mm={name: part.bias_mm.reshape(*shape, 3) for name, part in errors.items()},
-        inside=np.reshape(calibration.covers(pan, tilt), shape),
         valid=np.all([part.usable for part in errors.values()], axis=0).reshape(shape),
         distance_mm={name: part.distance_mm.reshape(-1, *shape) for name, part in errors.items()},
     )
