@@ -178,31 +178,30 @@ class Entry:
         return rotation_matrix(rotation_vector(matrix))
 
 
-def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
-    """Finite numbers and shape of a number, of nested lists or of OpenCV's or ROS' rows, cols, data; else None."""
+def numbers_of(value: Any) -> np.ndarray | None:
+    """Finite numbers, in their shape, of a number, nested lists or OpenCV's or ROS' rows, cols, data; else None."""
     if isinstance(value, Mapping):
         rows, cols = value.get("rows", value.get("Rows")), value.get("cols", value.get("Cols"))
         data = numbers_of(value.get("data", value.get("Data")))
         if data is not None and "sizes" in value:
-            return data[0], (data[0].size,)
-        if data is None or not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != data[0].size:
-            if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
-                # BoofCV states the rotation of a pose in the same table as its shift.
-                shift, turn = numbers_of([value[axis] for axis in "xyz"]), numbers_of(value.get("rotation"))
-                if shift is None or turn is None or turn[0].size != 9:
-                    return shift
-                return np.column_stack([turn[0].reshape(3, 3), shift[0]]).ravel(), (3, 4)
-            return None
-        return data[0], (rows, cols)
+            return data.ravel()
+        if data is not None and isinstance(rows, int) and isinstance(cols, int) and rows * cols == data.size:
+            # In an untrusted file both may be negative.
+            return data.reshape(abs(rows), abs(cols))
+        if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
+            # BoofCV states the rotation of a pose in the same table as its shift.
+            shift, turn = numbers_of([value[axis] for axis in "xyz"]), numbers_of(value.get("rotation"))
+            if shift is None or turn is None or turn.size != 9:
+                return shift
+            return np.column_stack([turn.reshape(3, 3), shift.ravel()])
+        return None
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return None
     try:
         numbers = np.array(value, dtype=float)
     except (ValueError, TypeError, OverflowError):
         return None
-    if not numbers.size or not (np.abs(numbers) <= NUMBER_MAX).all():
-        return None
-    return numbers.ravel(), numbers.shape
+    return numbers if numbers.size and (np.abs(numbers) <= NUMBER_MAX).all() else None
 
 
 def entries_of(keys: Keys, file: int) -> Iterator[Entry]:
@@ -214,7 +213,7 @@ def entries_of(keys: Keys, file: int) -> Iterator[Entry]:
         if isinstance(value, str) and _letters(key) in FIELDS["width"][1].split() + FIELDS["height"][1].split():
             raise keys.refuse(key, "integer", "a whole number of px", "correct the value")
         if numbers is not None:
-            yield Entry(keys, key, *numbers, file)
+            yield Entry(keys, key, numbers.ravel(), numbers.shape, file)
         elif isinstance(value, dict):
             yield from entries_of(keys.table(key), file)
         elif isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
