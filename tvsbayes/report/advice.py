@@ -12,6 +12,7 @@ from tvsbayes.estimators.findings import Finding
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import REGISTRY, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import ASSUMED_REMEDY, Stereo
+from tvsbayes.report.document import sentence
 from tvsbayes.report.parameter_words import sentence_in_words
 from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 from tvsbayes.results.metrology_tables import BudgetTable
@@ -153,7 +154,7 @@ def next_steps(summary: FitSummary, folder: str, causes: Sequence[Finding] = ())
     if summary.estimator == "laplace":
         steps.append(f"Sample the posterior, which takes minutes: `tvsbayes fit {folder}`, then make the report again.")
     texts = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]
-    return steps + [f"{text[0].upper()}{text[1:]}." for text in map(sentence_in_words, texts)]
+    return steps + [sentence(sentence_in_words(text)) for text in texts]
 
 
 def asks_for_looks(weak: WeakDirection) -> bool:

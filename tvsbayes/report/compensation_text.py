@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.axes import SIDES
-from tvsbayes.report.document import Part, Section, terminal
+from tvsbayes.report.document import Part, Section, sentence, terminal
 from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -190,8 +190,7 @@ def _verdict(verification: Verification) -> str:
     kind = "readings" if verification.millimetres is None else "looks"
     text = f"{verification.verdict}: {verification.readings} fresh {kind}, "
     text += f"most probable: {verification.world}, p = {verification.p:.2g}."
-    promised = _promise_text(verification)
-    return f"{text} {promised[0].upper()}{promised[1:]}."
+    return f"{text} {sentence(_promise_text(verification))}"
 
 
 def verify_plan_text(plan: VerifyPlan) -> str:
