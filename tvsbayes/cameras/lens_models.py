@@ -13,7 +13,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from tvsbayes.instrument.stereo_pair import distort
+from tvsbayes.instrument.stereo_pair import distort, undistort_unchecked
 
 Kind = Literal["five", "rational", "fisheye", "inverse"]
 FIVE: tuple[str, ...] = (
@@ -66,27 +66,21 @@ def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, 
         size: width and height of the picture, px.
         kind: kind of the other model.
     """
-    grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 1, 2)
+    pixels = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 2)
+    target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     if kind == "inverse":
-        rays: np.ndarray = distort((grid.reshape(-1, 2) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], distortion)
-        reprojected: np.ndarray = grid.reshape(-1, 2)
+        rays, reprojected = distort(target, distortion), pixels
     elif kind == "fisheye":
-        rays = cv2.fisheye.undistortPoints(grid, matrix, distortion.reshape(4, 1)).reshape(-1, 2)
+        rays = cv2.fisheye.undistortPoints(pixels[:, None], matrix, distortion.reshape(4, 1)).reshape(-1, 2)
         reprojected = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, distortion.reshape(4, 1)).reshape(-1, 2)
     else:
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-        if hasattr(cv2, "undistortPointsIter"):
-            rays = cv2.undistortPointsIter(grid, matrix, distortion, None, None, criteria).reshape(-1, 2)
-        else:
-            rays = cv2.undistortPoints(grid, matrix, distortion, criteria=criteria).reshape(-1, 2)
+        rays = undistort_unchecked(pixels, matrix, distortion)
         points = np.column_stack([rays, np.ones(len(rays))])
         reprojected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
-    pixels = grid.reshape(-1, 2)
     valid = np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) < WIDEST_TAN)
     valid[valid] &= np.abs(reprojected[valid] - pixels[valid]).max(axis=1) < ERROR_MAX_PX
     if not valid.all():
         return FittedLens(np.zeros(5), np.inf)
-    target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     columns = [(distort(rays, unit) - rays).ravel() for unit in np.eye(5)]
     distortion5 = np.linalg.lstsq(np.stack(columns, axis=1), (target - rays).ravel())[0]
     errors_px = (distort(rays, distortion5) - target) * matrix[[0, 1], [0, 1]]

@@ -41,20 +41,25 @@ def undistort(pixels: np.ndarray, camera: np.ndarray, distortion: np.ndarray) ->
     The result is checked by distorting it again; NaN where it does not return to its pixel within
     `UNDISTORT_TOLERANCE_PX`. OpenCV's default of five iterations would leave tenths of a pixel.
     """
-    import cv2
-
     pixels = np.ascontiguousarray(pixels, float).reshape(-1, 2)
-    # OpenCV compares the re-distorted point in px: 1e-12 is the rounding of the coordinate.
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_ITERATIONS, 1e-12)
     coefficients = np.asarray(distortion, float).reshape(1, 5)
-    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4: undistortPoints takes no criteria in Python
-        points = cv2.undistortPointsIter(pixels[:, None], camera, coefficients, None, None, criteria)
-    else:
-        points = cv2.undistortPoints(pixels[:, None], camera, coefficients, criteria=criteria)
-    points = points.reshape(-1, 2)
+    points = undistort_unchecked(pixels, camera, coefficients)
     returned = distort(points, coefficients) @ camera[:2, :2].T + camera[:2, 2]
     converged = np.max(np.abs(returned - pixels), axis=1) <= UNDISTORT_TOLERANCE_PX
     return np.where(converged[:, None], points, np.nan)
+
+
+def undistort_unchecked(pixels: np.ndarray, camera: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Normalised coordinates (n, 2) of raw pixels (n, 2), iterated by OpenCV, for any of its pinhole models."""
+    import cv2
+
+    # OpenCV compares the re-distorted point in px: 1e-12 is the rounding of the coordinate.
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_ITERATIONS, 1e-12)
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4: undistortPoints takes no criteria in Python
+        points = cv2.undistortPointsIter(pixels[:, None], camera, distortion, None, None, criteria)
+    else:
+        points = cv2.undistortPoints(pixels[:, None], camera, distortion, criteria=criteria)
+    return points.reshape(-1, 2)
 
 
 def triangulate(stereo: Stereo, pixels: np.ndarray, focal_scale: float = 1.0) -> np.ndarray:
