@@ -144,10 +144,8 @@ def positioning(
     readings: StopReadings | None = None,
     deg_per_step: float | None = None,
     targets: Sequence[int] | None = None,
-    runs: int = RUNS,
     tests: int = SIMULATED_TESTS,
     contrast_deg_per_step: np.ndarray | None = None,
-    seed: int = 0,
 ) -> AxisPositioning:
     """Build the ISO 230-2-style table of an axis: posterior predictive, and of the campaign's own stops.
 
@@ -158,10 +156,8 @@ def positioning(
         deg_per_step: ratio of target angles to counters. None is the calibrated mean of both directions at the middle
             of the counters, as a user of the calibration would take; the design ratio gives the uncalibrated axis.
         targets: counters of the simulated tests; None spreads them over the campaign's range.
-        runs: as in `simulated_runs`, like the next three.
         tests: number of simulated tests.
-        contrast_deg_per_step: draws of the ratio contrast.
-        seed: seed of targets and stop errors.
+        contrast_deg_per_step: draws of the ratio contrast, as in `simulated_runs`.
 
     Returns:
         The table, with notes on effects that it does not cover.
@@ -173,20 +169,19 @@ def positioning(
         raise ValueError("this calibration has no draws: read it from results/draws.npz")
     low, high = calibration.range_steps[AXES.index(axis)]
     ratio = _middle_deg_per_step(calibration, axis) if deg_per_step is None else float(deg_per_step)
-    chosen = target_steps(low, high, ratio, seed) if targets is None else tuple(map(int, targets))
+    chosen = target_steps(low, high, ratio) if targets is None else tuple(map(int, targets))
     predicted, made = None, f"no prediction: the {axis} axis was never moved over a range"
     if chosen:
-        options = {"runs": runs, "tests": tests, "seed": seed}
         contrast = contrast_deg_per_step
-        cycles = simulated_runs(calibration, axis, chosen, ratio, contrast_deg_per_step=contrast, **options)
-        predicted, made = _predicted(cycles), SIMULATED.format(tests, runs, calibration.estimator)
+        cycles = simulated_runs(calibration, axis, chosen, ratio, tests=tests, contrast_deg_per_step=contrast)
+        predicted, made = _predicted(cycles), SIMULATED.format(tests, RUNS, calibration.estimator)
     wanted = targets_wanted((high - low) * ratio)
     table = AxisPositioning(
         axis=axis,
         deg_per_step=ratio,
         predicted=predicted,
         target_steps=chosen,
-        runs=runs,
+        runs=RUNS,
         estimator=calibration.estimator,
         plug_in=None,
         plug_in_steps=(),

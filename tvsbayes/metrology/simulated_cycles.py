@@ -30,7 +30,7 @@ def targets_wanted(travel_deg: float) -> int:
     return TARGETS_LONG if abs(travel_deg) > LONG_TRAVEL_DEG else TARGETS
 
 
-def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) -> tuple[int, ...]:
+def target_steps(low: float, high: float, deg_per_step: float) -> tuple[int, ...]:
     """Choose target counters over a range: a random place in each of equal cells, so that no gear tooth repeats.
 
     ISO 230-2 requires targets P_i = (i - 1) p + r with random r.
@@ -39,13 +39,12 @@ def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) ->
         low: lower end of the range, steps; both ends are turning points, not targets.
         high: upper end.
         deg_per_step: ratio, which with the range determines the number of targets.
-        seed: seed of the places.
 
     Returns:
         Ascending counters, at least two where the range has three steps; empty for a smaller range.
     """
     count = targets_wanted((high - low) * deg_per_step)
-    places = np.arange(count) + 0.5 + random_stream(seed, Stream.CYCLE_COUNTERS).uniform(-0.2, 0.2, count)
+    places = np.arange(count) + 0.5 + random_stream(0, Stream.CYCLE_COUNTERS).uniform(-0.2, 0.2, count)
     targets = sorted({round(low + (high - low) * p / count) for p in places} - {round(low), round(high)})
     return tuple(targets) if len(targets) >= TARGETS_MIN else ()
 
