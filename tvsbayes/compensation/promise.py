@@ -154,15 +154,15 @@ def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wi
     slope = float(np.polyfit(command, middle, 1)[0])
     play = float(np.mean(at.mean[1] - at.mean[0])) * float(np.sign(slope))
     factor, taken, settings = nominal / slope, 0.0, {}
-    axis = "XYZABC".index(wish.letter)
+    axis, in_force = "XYZABC".index(wish.letter), wish.in_force or 1.0
     if wish.target in ("grbl", "grblhal"):
-        settings[f"${100 + axis}"] = round(float(wish.in_force or 0.0) * factor, 3)
-        factor = settings[f"${100 + axis}"] / float(wish.in_force or 1.0)
+        settings[f"${100 + axis}"] = round(in_force * factor, 3)
+        factor = settings[f"${100 + axis}"] / in_force
     if wish.target == "grblhal" and at.both_sides:
         taken = settings[f"${160 + axis}"] = max(round(play, 3), 0.0)
     if wish.target == "klipper":
-        settings["rotation_distance"] = round(float(wish.in_force or 0.0) / factor, 6)
-        factor = float(wish.in_force or 1.0) / settings["rotation_distance"]
+        settings["rotation_distance"] = round(in_force / factor, 6)
+        factor = in_force / settings["rotation_distance"]
     if wish.target == "urdf":
         settings = {**_joint(line), "axis_backlash": play}
     half = 0.5 * taken / abs(slope)
