@@ -130,7 +130,6 @@ def error_map(
     simple: Mapping[str, SimpleCalibration],
     approach: Sides = (1.0, 1.0),
     draws: int = 500,
-    seed: int = 0,
 ) -> ErrorMap:
     """Compute expected errors of the joint calibration and of simple ones, over the draws of the calibration.
 
@@ -142,14 +141,13 @@ def error_map(
         simple: further calibrations by name, such as "nominal" and "classic", from `simple_calibration`.
         approach: sides, +1 left or up, -1 right or down.
         draws: number of drawn rigs.
-        seed: seed of their stop errors and aperture noise.
 
     Returns:
         The map; the joint calibration is "joint".
     """
     axes = [np.asarray(x, dtype=float) for x in (pan_steps, tilt_steps, range_mm)]
     pan, tilt, ranges = (x.ravel() for x in np.meshgrid(*axes, indexing="ij"))
-    truth = _truth(calibration, pan, tilt, ranges, approach, drawn(calibration, draws, seed))
+    truth = _truth(calibration, pan, tilt, ranges, approach, drawn(calibration, draws, seed=0))
     best = calibration.estimates
     beam = calibration.beam_at((pan, tilt), approach)
     geometries = {"joint": AssumedGeometry(beam, best["baseline_mm"], best["aperture_zero_deg"])}
