@@ -69,7 +69,8 @@ def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, 
     pixels = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 2)
     target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     if kind == "inverse":
-        rays, reprojected = distort(target, distortion), pixels
+        rays: np.ndarray = distort(target, distortion)
+        reprojected: np.ndarray = pixels
     elif kind == "fisheye":
         rays = cv2.fisheye.undistortPoints(pixels[:, None], matrix, distortion.reshape(4, 1)).reshape(-1, 2)
         reprojected = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, distortion.reshape(4, 1)).reshape(-1, 2)
