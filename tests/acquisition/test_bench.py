@@ -49,7 +49,8 @@ def centroids_of_the_twin(mounted_rig, truth: dict, move: int) -> np.ndarray:
     """Where the true cameras see the spot of sheet d1 after a move, without noise: (4,) px."""
     k, p = np.radians(truth["mirror_angles_deg"][move]), truth["parameters"]
     still = Instrument(mounted_rig, 7)
-    still._y, still._eta = list(np.degrees(k) - [0.0, p["tilt_zero_deg"]]), [0.0, 0.0]
+    for gear, angle_deg in zip(still._gears, np.degrees(k) - [0.0, p["tilt_zero_deg"]], strict=True):
+        gear._output_deg = angle_deg
     still.place("d1", 0)
     still.mechanics.laser_on = True
     return still.centroid_px()

@@ -151,6 +151,69 @@ class Renderer(Protocol):
         """Render both pictures; `look` numbers the look (same speckle), `frame` the exposure (new noise)."""
 
 
+class _Gear:
+    """The true gear of one axis, and where it stands: degrees of the output (formulation 3.1).
+
+    `period_deg` is the period of its first harmonics, `start_share` its first position in the play, -1/2 to 1/2.
+    """
+
+    def __init__(self, axis: str, truth: Truth, period_deg: float, start_share: float):
+        self._axis, self._p, self._period_deg = axis, truth.parameters, period_deg
+        self._errors = (truth.gear_errors or PERFECT)[axis]
+        self._backlash_deg = truth.parameters[f"backlash_deg.{axis}"]
+        # Before the play, and behind it.
+        self._driving_deg, self._output_deg = 0.0, self._backlash_deg * start_share
+        # Mean ratio x counter without lost steps: the position of repeatable errors.
+        self._place_deg = 0.0
+        self._drift_deg, self._drifted_us = 0.0, 0
+        self.stop_error_deg = 0.0
+        self.from_switch = False
+        """Whether the next motion is that from the home switch to the first row of a segment."""
+
+    def move(self, steps: int, normal: float) -> None:
+        """Apply a stretch of motion: ratio of its sense, play, a new stop error by a standard normal number."""
+        sense = SIDES[self._axis][steps > 0]
+        # The first row of a segment is at mean ratio x counters.
+        ratio = self._axis if self.from_switch else sense
+        self.from_switch = False
+        self._driving_deg += steps * self._p[f"degrees_per_step.{ratio}"]
+        self._place_deg += steps * self._p[f"degrees_per_step.{self._axis}"]
+        self._take_up()
+        self.stop_error_deg = self._p[f"stop_sd_deg.{sense}"] * normal
+
+    def set_home(self, steps: int, offset_deg: float) -> None:
+        """Set the counter at the home switch: from here on the angle is ratio x counter + offset, without drift."""
+        angle = self._p[f"degrees_per_step.{self._axis}"] * steps + offset_deg
+        self._output_deg += angle - self._driving_deg
+        self._driving_deg, self._place_deg = angle, angle - offset_deg
+        self._drift_deg, self.from_switch = 0.0, True
+        self._take_up()
+
+    def drift(self, now_us: int, normal: float) -> None:
+        """Apply the drift of the zero since the last call by a standard normal number; cameras must not call it."""
+        hours = np.array([self._drifted_us, now_us]) / (1e6 * SECONDS_PER_HOUR)
+        self._drifted_us = now_us
+        step = self._p.get(f"drift_deg_per_root_hour.{self._axis}", 0.0) * np.sqrt(hours[1] - hours[0]) * normal
+        self._drift_deg += float(step + np.diff(self._errors.warming_deg(hours))[0])
+
+    def angle_deg(self, now_us: int) -> float:
+        """Compute the angle of the output, with its errors, the drift and the creep of the zero."""
+        crept = float(zero_shift_deg(self._p, self._axis, np.array(now_us / 60e6)))
+        repeated = float(self._errors.error_deg(np.array(self._place_deg))) + self._drift_deg + crept
+        return self._output_deg + self._wobble_deg(self._output_deg, wheel=True) + repeated + self.stop_error_deg
+
+    def _take_up(self) -> None:
+        driving = self._driving_deg + self._wobble_deg(self._driving_deg, wheel=False)
+        width = self._errors.play_at(self._backlash_deg, np.array(self._place_deg))
+        self._output_deg = take_up(self._output_deg, driving, float(width))
+
+    def _wobble_deg(self, angle_deg: float, wheel: bool) -> float:
+        """Compute the transmission error of the wheel (behind the play) or of the pinion (before it)."""
+        if (self._period_deg == FULL_TURN_DEG) != wheel:
+            return 0.0
+        return float(wobble_deg(angle_deg, harmonics_deg(self._p, self._axis), self._period_deg))
+
+
 class Instrument:
     """A true rig behind a simulated device.
 
@@ -167,19 +230,15 @@ class Instrument:
         if truth.gear_errors is None:
             period_deg, stream = rig.table.harmonic_period_deg, self._stream("gears")
             truth = replace(truth, gear_errors=draw_gear_errors(truth.parameters, period_deg, stream))
-        self.truth, self._errors = truth, [(truth.gear_errors or PERFECT)[axis] for axis in AXES]
-        self.clock = VirtualClock()
+        self.truth, self.clock = truth, VirtualClock()
         self._stops, self._homes = self._stream("stops", start), self._stream("homes", start)
         self._pixels, self._drifts = self._stream("pixels", start), self._stream("drift", start)
-        self._first_home, self._from_switch = [start == 0, start == 0], [False, False]
-        p = self.truth.parameters
-        self._backlash = [p[f"backlash_deg.{axis}"] for axis in AXES]
-        self._q = [0.0, 0.0]
-        # Mean ratio x counter without lost steps: the position of repeatable errors.
-        self._place_deg = [0.0, 0.0]
-        self._drift_deg, self._drifted_us = [0.0, 0.0], [0, 0]
-        self._y = [b * self._stops.uniform(-0.5, 0.5) for b in self._backlash]
-        self._eta = [0.0, 0.0]
+        first = rig.table.first_period_deg
+        self._gears = [
+            _Gear(axis, truth, first.get(axis, FULL_TURN_DEG), self._stops.uniform(-0.5, 0.5)) for axis in AXES
+        ]
+        # Axes whose first homing is that of the campaign.
+        self._unhomed = {0, 1} if start == 0 else set[int]()
         settings = device_settings(rig.positioner)
         home = settings.get("hp", SETTINGS["hp"][2]), settings.get("ht", SETTINGS["ht"][2])
         self.mechanics = Mechanics(home_steps=home, moved=self._moved, found_home=self._found_home)
@@ -202,70 +261,31 @@ class Instrument:
         self._sheet = placed_sheet(self.rig.sheets_mm[target], draws)
 
     def _moved(self, axis: int, steps: int) -> None:
-        """Apply a stretch of motion: ratio of its sense, play, a new stop error (formulation 3.1)."""
         self.motions += 1
-        p, sense = self.truth.parameters, SIDES[AXES[axis]][steps > 0]
-        # The first row of a segment is at mean ratio x counters, however the axis came there from the switch.
-        ratio = AXES[axis] if self._from_switch[axis] else sense
-        self._from_switch[axis] = False
-        self._q[axis] += steps * p[f"degrees_per_step.{ratio}"]
-        self._place_deg[axis] += steps * p[f"degrees_per_step.{AXES[axis]}"]
-        self._drift(axis)
-        self._take_up(axis)
-        self._eta[axis] = p[f"stop_sd_deg.{sense}"] * self._stops.standard_normal()
+        gear = self._gears[axis]
+        gear.drift(self.clock.now_us, self._drifts.standard_normal())
+        gear.move(steps, self._stops.standard_normal())
 
     def _found_home(self, axis: int) -> None:
-        """Set the counters: from here on the angle is ratio x counters + home offset, 0 in the first segment."""
-        offset = 0.0 if self._first_home[axis] else HOME_SD_DEG * self._homes.standard_normal()
-        self._first_home[axis], self._from_switch[axis] = False, True
-        ratio = self.truth.parameters[f"degrees_per_step.{AXES[axis]}"]
-        angle = ratio * self.mechanics.home_steps[axis] + offset
-        self._y[axis] += angle - self._q[axis]
-        self._q[axis], self._place_deg[axis] = angle, angle - offset
-        self._drift(axis)
-        self._drift_deg[axis] = 0.0
-        self._take_up(axis)
-
-    def _take_up(self, axis: int) -> None:
-        driving = self._q[axis] + self._wobble_deg(axis, self._q[axis], wheel=False)
-        width = self._errors[axis].play_at(self._backlash[axis], np.array(self._place_deg[axis]))
-        self._y[axis] = take_up(self._y[axis], driving, float(width))
-
-    def _drift(self, axis: int) -> None:
-        """Apply the drift of the zero over the time since the last call; cameras must not call it."""
-        before_us, now_us = self._drifted_us[axis], self.clock.now_us
-        self._drifted_us[axis] = now_us
-        scale = self.truth.parameters.get(f"drift_deg_per_root_hour.{AXES[axis]}", 0.0)
-        hours = np.array([before_us, now_us]) / (1e6 * SECONDS_PER_HOUR)
-        step = scale * np.sqrt(hours[1] - hours[0]) * self._drifts.standard_normal()
-        self._drift_deg[axis] += float(step + np.diff(self._errors[axis].warming_deg(hours))[0])
-
-    def _repeated_deg(self, axis: int) -> float:
-        """Error of the output's angle at its position, with the drift and the creep of the zero."""
-        warm = np.array(self.clock.now_us / 60e6)
-        crept = float(zero_shift_deg(self.truth.parameters, AXES[axis], warm))
-        return float(self._errors[axis].error_deg(np.array(self._place_deg[axis]))) + self._drift_deg[axis] + crept
-
-    def _wobble_deg(self, axis: int, angle_deg: float, wheel: bool) -> float:
-        """Transmission error of the wheel (behind the play) or of the pinion (before it), degrees."""
-        period = self.rig.table.first_period_deg.get(AXES[axis], FULL_TURN_DEG)
-        if (period == FULL_TURN_DEG) != wheel:
-            return 0.0
-        return float(wobble_deg(angle_deg, harmonics_deg(self.truth.parameters, AXES[axis]), period))
+        """Set the counter of an axis, with a new home offset, 0 in the first segment."""
+        offset = 0.0 if axis in self._unhomed else HOME_SD_DEG * self._homes.standard_normal()
+        self._unhomed.discard(axis)
+        gear = self._gears[axis]
+        gear.drift(self.clock.now_us, self._drifts.standard_normal())
+        gear.set_home(self.mechanics.home_steps[axis], offset)
 
     def state_deg(self) -> TrueAngles:
         """Return the true angles for a row of moves.csv.
 
         Ends the motion from the home switch: the engine calls it once per motion.
         """
-        self._from_switch = [False, False]
-        return TrueAngles(self._mirror_angles_deg(), (self._eta[0], self._eta[1]))
+        for gear in self._gears:
+            gear.from_switch = False
+        pan, tilt = (gear.stop_error_deg for gear in self._gears)
+        return TrueAngles(self._mirror_angles_deg(), (pan, tilt))
 
     def _mirror_angles_deg(self) -> tuple[float, float]:
-        psi, beta = (
-            self._y[i] + self._wobble_deg(i, self._y[i], wheel=True) + self._repeated_deg(i) + self._eta[i]
-            for i in (0, 1)
-        )
+        psi, beta = (gear.angle_deg(self.clock.now_us) for gear in self._gears)
         return psi, beta + tilt_zero_deg(self.truth.parameters)
 
     def light(self) -> Light:
