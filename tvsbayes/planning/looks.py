@@ -7,7 +7,7 @@ low-rank updates score thousands of candidates. Counters in steps, angles in rad
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -21,7 +21,7 @@ from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, Spot
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, action_seconds
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.model.compiled import compiled, placed
+from tvsbayes.model.compiled import compiled, in_batches, placed
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 from tvsbayes.model.parameter_space import ParameterSpace
@@ -149,33 +149,19 @@ def arrange(looks: Looks, sheets: Sequence[str], run_up: np.ndarray, home: tuple
     return LookPlan(order, tuple(sheets[number] for number in looks.sheet[order]), via, goal, home)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """Expectation of m looks, at one point of parameter space or, with a leading axis, at several.
+class Seen(eqx.Module):
+    """Expectation of looks, at one point of parameter space or, with a leading axis, at several.
 
-    Attributes:
-        rows: as in `expectation.Expectation`, shape (m, 4, p + e + 2).
-        slope: as there, shape (m, 4, 2).
-        seen: whether a look is in both images, shape (m,).
-        mirror_angles_rad: mirror angles (pan, tilt), shape (m, 2).
+    Fields are as in `expectation.Expectation`: NumPy arrays, and JAX arrays within the compiled function.
     """
 
-    rows: np.ndarray
-    slope: np.ndarray
-    seen: np.ndarray
-    mirror_angles_rad: np.ndarray
+    rows: Float[np.ndarray, "*looks 4 columns"]
+    slope: Float[np.ndarray, "*looks 4 2"]
+    seen: Bool[np.ndarray, "*looks"]
+    mirror_angles_rad: Float[np.ndarray, "*looks 2"]
 
     def __getitem__(self, chosen: int | np.ndarray) -> Seen:
-        return Seen(*(getattr(self, part.name)[chosen] for part in fields(Seen)))
-
-
-class _PairExpectation(eqx.Module):
-    """`Seen` for pairs of an instrument and a look."""
-
-    rows: Float[Array, "pairs 4 columns"]
-    slope: Float[Array, "pairs 4 2"]
-    seen: Bool[Array, " pairs"]
-    mirror_angles_rad: Float[Array, "pairs 2"]
+        return jax.tree.map(lambda part: part[chosen], self)
 
 
 class _Pairs(eqx.Module):
@@ -207,11 +193,11 @@ class _Observer(eqx.Module):
     warm_minutes: Float[Array, ""]
 
 
-@compiled(_PairExpectation)
-def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer) -> _PairExpectation:
+@compiled(Seen)
+def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer) -> Seen:
     """Compute the expectation of every pair's look: `expect` of a plan of one look."""
 
-    def expectation_of(pair: _Pairs) -> _PairExpectation:
+    def expectation_of(pair: _Pairs) -> Seen:
         spot = SpotArrays(
             move_index=jnp.zeros(1, dtype=jnp.int32),
             pixels=jnp.zeros((1, 4)),
@@ -235,7 +221,7 @@ def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer)
         # Errors of the gears act as an offset, so their columns follow from the offset's, see `at_all`.
         no_turning = jnp.zeros((1, 2, 0))
         expectation = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], observer.image_px, no_turning)
-        return _PairExpectation(*(getattr(expectation, part.name)[0] for part in fields(_PairExpectation)))
+        return Seen(*(getattr(expectation, part.name)[0] for part in fields(Seen)))
 
     return jax.vmap(expectation_of)(pairs)
 
@@ -275,17 +261,18 @@ class LookArrays:
         image_px = largest_px(rig)
         self.observer = _Observer(None if image_px is None else placed(image_px), *settings)
 
-    def _blocks(self, z: np.ndarray, value: np.ndarray, size: int) -> list[_Pairs]:
-        """Pair every instrument (n,) with every look (m,) in blocks, the last one padded with its last pair."""
-        m, total = len(self.looks), len(z) * len(self.looks)
-        blocks = []
-        for start in range(0, total, size):
-            pair = np.minimum(np.arange(start, start + size), total - 1)
-            instrument, look = pair // m, pair % m
-            steps, side = self.looks.steps[look].astype(float), self.looks.side[look].astype(float)
-            parts = z[instrument], value[instrument], steps, side, self.depth_mm[look]
-            blocks.append(_Pairs(*map(placed, parts)))
-        return blocks
+    def _at_pairs[Result](self, function: Callable[..., Result], z: np.ndarray, value: np.ndarray, size: int) -> Result:
+        """Evaluate a compiled function for every look (m,) at every instrument (n,), with leading axes (n, m)."""
+        steps, side = self.looks.steps.astype(float), self.looks.side.astype(float)
+        shape = len(z), len(self.looks)
+
+        def block(pair: np.ndarray) -> Result:
+            instrument, look = np.unravel_index(pair, shape)
+            parts = z[instrument], value[instrument], steps[look], side[look], self.depth_mm[look]
+            return function(_Pairs(*map(placed, parts)), self.space, self.observer)
+
+        pairs = in_batches(block, np.arange(shape[0] * shape[1]), size=size)
+        return jax.tree.map(lambda part: part.reshape(*shape, *part.shape[1:]), pairs)
 
     def at_all(self, z: np.ndarray, value: np.ndarray, turning: np.ndarray | None = None) -> Seen:
         """Compute the expectation at several instruments, with a leading axis n.
@@ -296,13 +283,7 @@ class LookArrays:
             turning: derivatives by errors of their own gears, shape (n, m, 2, e); by default those of the knowledge.
         """
         turning = self.turning if turning is None else turning
-        blocks = [
-            [np.asarray(part) for part in jax.tree.leaves(_pair_expectation(block, self.space, self.observer))]
-            for block in self._blocks(z, value, self.SHOWN)
-        ]
-        shape = len(z), len(self.looks)
-        joined = (np.concatenate(parts)[: shape[0] * shape[1]] for parts in zip(*blocks, strict=True))
-        seen = Seen(*(part.reshape(*shape, *part.shape[1:]) for part in joined))
+        seen = self._at_pairs(_pair_expectation, z, value, self.SHOWN)
         if not turning.shape[-1]:
             return seen
         columns, offset = seen.rows[..., :-2], seen.rows[..., -2:]
@@ -315,10 +296,7 @@ class LookArrays:
     def in_images(self, z: np.ndarray) -> np.ndarray:
         """Whether instruments at points (n, p) see the looks in both images, shape (n, m)."""
         value = np.broadcast_to(np.asarray(self.space.value), (len(z), len(self.space.value)))
-        blocks = [
-            np.asarray(_in_images(block, self.space, self.observer)) for block in self._blocks(z, value, self.IN_IMAGES)
-        ]
-        return np.concatenate(blocks)[: len(z) * len(self.looks)].reshape(len(z), -1)
+        return np.asarray(self._at_pairs(_in_images, z, value, self.IN_IMAGES))
 
 
 CONTRAST_COLUMNS = [INDEX["ratio_contrast_deg_per_step.pan"], INDEX["ratio_contrast_deg_per_step.tilt"]]
