@@ -77,36 +77,38 @@ RECOMPUTED_AFTER = 16
 """Number of added looks after which prospects are recomputed, as rounding errors of differences accumulate."""
 
 
-@dataclass
 class Search:
     """Greedy choice and exchange of looks by low-rank updates of one covariance.
 
-    Attributes:
+    A quantity fixed by the priors has no variance and is omitted.
+
+    Args:
         rows: rows of all candidates, shape (m, 4, P); an excluded candidate has zero rows.
         precision: precision before any look, shape (P, P).
         gradient: d(quantity)/d(column), shape (q, P).
         variance: additional variance of the quantities, shape (q,).
         criterion: see `scores`.
         numbers: numbers of the candidates, ascending, shape (m,); by default their indices in `rows`.
-
-    A quantity fixed by the priors has no variance and is omitted.
     """
 
-    rows: np.ndarray
-    precision: np.ndarray
-    gradient: np.ndarray
-    variance: np.ndarray
-    criterion: str = "c"
-    numbers: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        self.covariance = covariance_of(self.precision)
+    def __init__(
+        self,
+        rows: np.ndarray,
+        precision: np.ndarray,
+        gradient: np.ndarray,
+        variance: np.ndarray,
+        criterion: str = "c",
+        numbers: np.ndarray | None = None,
+    ):
+        self.rows, self.precision, self.criterion = rows, precision, criterion
+        self.numbers = np.arange(len(rows)) if numbers is None else numbers
+        self.covariance = covariance_of(precision)
+        self.gradient, self.variance = gradient, variance
         uncertain = np.diag(self._quantities(self.covariance)) > 0
-        self.gradient, self.variance = self.gradient[uncertain], self.variance[uncertain]
+        self.gradient, self.variance = gradient[uncertain], variance[uncertain]
         self.reference = np.diag(self._quantities(self.covariance)).copy()
-        self.numbers = np.arange(len(self.rows)) if self.numbers is None else self.numbers
         # Candidates are last, as in prospects, so that large products need no copy.
-        self.columns = np.ascontiguousarray(self.rows.transpose(2, 1, 0)).reshape(self.rows.shape[2], -1)
+        self.columns = np.ascontiguousarray(rows.transpose(2, 1, 0)).reshape(rows.shape[2], -1)
 
     def _quantities(self, covariance: np.ndarray) -> np.ndarray:
         return self.gradient @ covariance @ self.gradient.T + np.diag(self.variance)
@@ -146,17 +148,15 @@ class Search:
             prospects = self._with(prospects, places[-1])
             if count_added % RECOMPUTED_AFTER == 0:
                 prospects = self._prospects(prospects.covariance)
-        return self._candidate_numbers(places)
-
-    def _candidate_numbers(self, places: Sequence[int]) -> list[int]:
-        return np.asarray(self.numbers)[list(places)].tolist()
+        return self.numbers[places].tolist()
 
     def _places(self, picks: Sequence[int]) -> list[int]:
-        return np.searchsorted(np.asarray(self.numbers), list(picks)).tolist()
+        return np.searchsorted(self.numbers, list(picks)).tolist()
 
     def among(self, allowed: np.ndarray) -> Search:
         """Restrict the search to some candidates, mask of shape (m,)."""
-        return replace(self, rows=self.rows[allowed], numbers=np.asarray(self.numbers)[allowed])
+        quantities = self.gradient, self.variance
+        return Search(self.rows[allowed], self.precision, *quantities, self.criterion, self.numbers[allowed])
 
     def _after(self, places: Sequence[int]) -> np.ndarray:
         """Compute the covariance of the columns after a design."""
@@ -179,7 +179,7 @@ class Search:
                     places[number], changed = best, True
             if not changed:
                 break
-        return self._candidate_numbers(places)
+        return self.numbers[places].tolist()
 
 
 LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
