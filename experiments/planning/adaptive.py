@@ -42,7 +42,7 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, ordered_spots, read_campaign
-from tvsbayes.instrument.plan import PlanStep, plan_seconds
+from tvsbayes.instrument.plan import PlanStep, plan_minutes
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.next_looks import Confirmation, confirmation, next_looks
 from tvsbayes.planning.target import parse_target
@@ -126,7 +126,7 @@ def adapted(seed: int, folder: Path) -> dict[str, object]:
     events = [record.event for record in journal.records]
     if last.fit is None or len(last.fit.campaign.spots) < len(campaign.spots):
         last = Last(fit(campaign))
-    told = ended(campaign, last.fit, last.sampled, truth, plan_seconds(rig, steps[: row + 1]) / 60)
+    told = ended(campaign, last.fit, last.sampled, truth, plan_minutes(rig, steps[: row + 1]))
     asked = [dict(record.data) for record in journal.records if record.event == "confirmed"]
     return {**told, "met": outcome.reason == "target met", "changes": events.count("adapted"), "confirmed": asked}
 
@@ -173,7 +173,7 @@ def fixed(seed: int, folder: Path, plan: tuple[PlanStep, ...]) -> dict[str, obje
         if met:
             break
     rows = [step.step for step in plan if step.action == "look"]
-    minutes = plan_seconds(rig, plan[: rows[sizes[end] - 1] + 1]) / 60
+    minutes = plan_minutes(rig, plan[: rows[sizes[end] - 1] + 1])
     return {**ended(first_looks(whole, sizes[end]), fits[end], sampled, truth, minutes), "met": met}
 
 

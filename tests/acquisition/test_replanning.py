@@ -19,7 +19,7 @@ from tvsbayes.acquisition.session import acquire
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.plan import plan_seconds
+from tvsbayes.instrument.plan import plan_minutes
 
 
 def ahead(sheet: str = "d2", step: int = 5, ratio: float = 1.0, accepted: bool = True):
@@ -71,7 +71,7 @@ def test_the_sampled_posterior_has_the_last_word(mounted_rig, tmp_path):
 
 
 def test_weights_that_cannot_be_used_end_no_run(mounted_rig, tmp_path):
-    minutes = plan_seconds(mounted_rig, small_plan(3)) / 60 + 2.5
+    minutes = plan_minutes(mounted_rig, small_plan(3)) + 2.5
     with Replanning(tmp_path / "c", ahead(accepted=False), 4.6e-4, minutes, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(3), estimate=estimate).engine.run()
     told = changes(tmp_path / "c", "confirmed")
@@ -123,12 +123,12 @@ def test_a_proposal_that_the_rig_cannot_run_is_not_followed(mounted_rig, tmp_pat
 def test_the_time_ends_a_run_before_it_is_over(mounted_rig, tmp_path):
     """Also one that goes on beyond the end of its plan."""
     plan = small_plan(3)
-    minutes = plan_seconds(mounted_rig, plan) / 60 + 2
+    minutes = plan_minutes(mounted_rig, plan) + 2
     with Replanning(tmp_path / "c", ahead(), 1e-9, minutes, wait=True) as estimate:
         run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate)
         assert run_.engine.run().reason == "time over"
     record = recorded(read_journal(tmp_path / "c").records)
-    done = plan_seconds(mounted_rig, run_.engine.plan[: record.next_step]) / 60
+    done = plan_minutes(mounted_rig, run_.engine.plan[: record.next_step])
     assert len(record.spots) > 12 and minutes - 0.1 < done <= minutes and record.unverified == ()
 
 

@@ -10,7 +10,7 @@ from support.coarse_planning import ROUNDING, with_priors
 from support.dozen_spots import dozen_plan
 
 from tvsbayes.instrument.parameters import INDEX, TARGETS, Prior
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep, run_plan
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.model.parameter_space import half_normal_coordinate
 from tvsbayes.planning.drawn_rigs import instruments_in
@@ -19,7 +19,6 @@ from tvsbayes.planning.expectation import (
     design_arrays,
     expect,
     information_of,
-    plan_minutes,
     prior_knowledge,
 )
 from tvsbayes.planning.looks import covariance_of
@@ -162,4 +161,4 @@ def test_minutes_of_a_plan_by_hand(mounted_rig):
     rig = replace(mounted_rig, costs_s={"move_s": 2.0, "look_s": 3.0, "placement_s": 60.0})
     steps = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "move", 50, 0)]
     steps += [PlanStep(3, "look"), PlanStep(4, "look")]
-    assert plan_minutes(steps, rig) == pytest.approx(70 / 60, rel=1e-12)
+    assert plan_minutes(rig, steps) == pytest.approx(70 / 60, rel=1e-12)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from support.coarse_planning import ROUNDING
 
+from tvsbayes.instrument.plan import plan_minutes
 from tvsbayes.planning.candidates import Positions
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of, plan_minutes
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
     LookArrays,
@@ -89,7 +90,7 @@ def test_an_arranged_plan_travels_and_costs_what_its_steps_do(knowledge, found, 
             travelled.append(far)
     assert np.array_equal(arranged.path[arranged.order], travelled)
     assert arranged.actions == Counter(step.action for step in arranged.steps)
-    assert arranged.minutes(knowledge.rig) == pytest.approx(plan_minutes(arranged.steps, knowledge.rig), rel=1e-12)
+    assert arranged.minutes(knowledge.rig) == pytest.approx(plan_minutes(knowledge.rig, arranged.steps), rel=1e-12)
 
 
 def test_looks_taken_again_count_as_often_as_they_are_taken():

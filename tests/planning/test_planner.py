@@ -13,10 +13,10 @@ from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, read_plan, write_plan
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, plan_minutes, read_plan, write_plan
 from tvsbayes.instrument.protocols import paper_protocol
 from tvsbayes.instrument.stops import FEW_STOPS
-from tvsbayes.planning.expectation import information_of, plan_minutes, prior_knowledge
+from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.looks import Looks
 from tvsbayes.planning.plan_check import JUDGING
 from tvsbayes.planning.planner import CHOOSING, COUNTING, EXCHANGING, LOOKING, few_looks, plan_from
@@ -60,7 +60,7 @@ def test_the_plan_runs_through_the_twin(result, mounted_rig, tmp_path):
     steps = read_plan(tmp_path / "plan.csv")
     assert steps == result.steps
     assert sum(s.action == "look" for s in steps) == result.looks == 4 * result.experiments
-    assert result.minutes == pytest.approx(plan_minutes(steps, mounted_rig))
+    assert result.minutes == pytest.approx(plan_minutes(mounted_rig, steps))
     run = simulate(mounted_rig, steps, 3)
     assert sum(s.status == "ok" for s in run.campaign.spots) >= 0.9 * result.looks
 

@@ -14,7 +14,7 @@ from tvsbayes.cli.main import run
 from tvsbayes.comparison.watched_looks import CHANGES, POWER_MIN, WatchedLooks, null_distribution, powers
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.instrument.plan import plan_seconds, read_plan
+from tvsbayes.instrument.plan import plan_minutes, read_plan
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.planning import watch_plan as plans
@@ -126,7 +126,7 @@ def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch
     jsonschema.validate(document, json.loads((ROOT / "data/schemas/watch-plan-1.schema.json").read_text()))
     steps = read_plan(out)
     assert document["plan"] == str(out) and sum(step.action == "look" for step in steps) == document["looks"]
-    assert plan_seconds(rig, steps) / 60 == pytest.approx(document["minutes"], abs=1e-9)
+    assert plan_minutes(rig, steps) == pytest.approx(document["minutes"], abs=1e-9)
     assert run(["plan", "mine", "--watch"]) == 0
     assert asked[0][0].costs_s == rig.costs_s and asked[1][0] is None
     assert [named["minutes"] for _, named in asked] == [3, 10]

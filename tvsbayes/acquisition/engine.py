@@ -33,7 +33,7 @@ from tvsbayes.acquisition.running_estimate import Aim, RunningEstimate
 from tvsbayes.errors import InputError, TvsError, fault
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import UNDETECTED, Spot, pixels_of
-from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
+from tvsbayes.instrument.plan import PlanStep, plan_minutes, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import triangulate
 
@@ -197,7 +197,7 @@ class Acquisition:
 
     def _minutes(self, row: int) -> float:
         """Duration of the plan up to a row, by `[costs]`."""
-        return plan_seconds(self.rig, self.plan[:row]) / 60
+        return plan_minutes(self.rig, self.plan[:row])
 
     def _adapt(self, row: int, proposal: Proposal | None) -> None:
         """Replaces the remaining looks by proposed ones; the journal records the change before it takes effect."""

@@ -22,7 +22,7 @@ from tvsbayes.acquisition.run_identity import check_same, identity, setup_change
 from tvsbayes.acquisition.running_estimate import EstimateOptions, RunningEstimate
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.campaign import NAME_ACQUIRED
-from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
+from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.positioner.emulated_board import EmulatedBoard
@@ -117,7 +117,7 @@ def _running(
     """The running estimate of a run, None without one."""
     target = None if estimate is None else estimate.target_u_deg_per_step
     if adapt is not None and target is not None:
-        minutes = plan_seconds(rig, plan) / 60 if adapt.minutes is None else adapt.minutes
+        minutes = plan_minutes(rig, plan) if adapt.minutes is None else adapt.minutes
         return Replanning(folder, adapt.ahead, target, minutes, wait=simulate)
     if estimate is None or not estimate.holds(simulate):
         return None

@@ -227,10 +227,10 @@ def _live_page(port: int | None, no_browser: bool) -> Iterator[LiveRun | None]:
 def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
     """Print the steps of a run and its duration."""
     from tvsbayes.acquisition.replanning import check_plan
-    from tvsbayes.instrument.plan import outline, plan_seconds
+    from tvsbayes.instrument.plan import outline, plan_minutes
 
     check_plan(rig, plan)
-    lines, minutes = outline(rig, plan), plan_seconds(rig, plan) / 60
+    lines, minutes = outline(rig, plan), plan_minutes(rig, plan)
     text = "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"])
     finish({"steps": lines, "minutes": minutes}, text, as_json)
 

@@ -161,6 +161,11 @@ def plan_seconds(rig: Rig, plan: Iterable[PlanStep]) -> float:
     return action_seconds(rig, Counter(step.action for step in plan))
 
 
+def plan_minutes(rig: Rig, plan: Iterable[PlanStep]) -> float:
+    """Duration of a plan by `[costs]`, minutes."""
+    return plan_seconds(rig, plan) / 60
+
+
 @dataclass(frozen=True)
 class PlannedLook:
     """A look of a plan: its step, the number of the preceding move, and the number of the observed placement."""

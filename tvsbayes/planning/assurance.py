@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.estimators.likelihood import RATIO_COLUMNS
 from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.model.gear_kriging import scales_at
@@ -101,10 +101,8 @@ def instrument_gears(knowledge: Knowledge, physical: np.ndarray) -> GearPlaces:
     gears = knowledge.gears
     if knowledge.after_data or not gears.size:
         return gears
-    ratio = np.radians([physical[INDEX[f"degrees_per_step.{axis}"]] for axis in AXES])
-    return replace(
-        gears, ratio_rad_per_step=ratio, scales=scales_at(physical, np.asarray(knowledge.space.harmonic_period_deg))
-    )
+    scales = scales_at(physical, np.asarray(knowledge.space.harmonic_period_deg))
+    return replace(gears, ratio_rad_per_step=np.radians(physical[RATIO_COLUMNS]), scales=scales)
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,8 @@ class _VisibleInstruments:
         rows: numbers of the n instruments that see any look and reach the target's point.
         instruments: these.
         seen: expectations, shapes (n, looks, ...).
-        gradient: gradient of the target, shape (n, q, p + e); for lines by place, to be summed, (n, c + 1, q, p + e).
+        gradient: gradient of the target by parts, to be summed by weights, shape (n, parts, q, p + e); for lines a part
+            for each place and one for none, else a single part.
         own_variance: additional variance of the target, shape (n, q).
     """
 
@@ -202,9 +201,9 @@ class Assurance:
                 continue
             rows.append(row)
         visible, count = np.array(rows, dtype=int), len(self.target.indices)
-        parts = (knowledge.gears.size // 2 + 1,) if self._of_lines else ()
-        gradient = np.array([s.gradient for s in sensitivities]).reshape(len(rows), *parts, count, knowledge.size)
-        own_variance = np.array([s.own_variance for s in sensitivities]).reshape(len(rows), *parts, count)
+        shape = len(rows), knowledge.gears.size // 2 + 1 if self._of_lines else 1, count
+        gradient = np.array([s.gradient for s in sensitivities]).reshape(*shape, knowledge.size)
+        own_variance = np.array([s.own_variance for s in sensitivities]).reshape(shape).sum(axis=1)
         return _VisibleInstruments(first + visible, block[visible], expectation[visible], gradient, own_variance)
 
     def _target_at(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
@@ -234,12 +233,13 @@ class Assurance:
 
     def _sensitivity_of(self, scene: _VisibleInstruments, picks: np.ndarray) -> Sensitivity:
         """Compute the sensitivity of the target for a design: ratios along the lines through the visible looks."""
-        if not self._of_lines:
-            return Sensitivity(scene.gradient, {"at the point": scene.own_variance})
         gears, rows = self.family.knowledge.gears, list(self.target.indices)
-        times_seen = scene.seen.seen * np.bincount(picks, minlength=len(self.looks))
-        weights = gears.weights(gears.line_through(self.looks.steps, times_seen))[:, rows]
-        return Sensitivity(np.einsum("nqi,niqp->nqp", weights, scene.gradient))
+        weights = np.ones((len(scene.rows), len(rows), 1))
+        if self._of_lines:
+            times_seen = scene.seen.seen * np.bincount(picks, minlength=len(self.looks))
+            weights = gears.weights(gears.line_through(self.looks.steps, times_seen))[:, rows]
+        gradient = np.einsum("nqi,niqp->nqp", weights, scene.gradient)
+        return Sensitivity(gradient, {"at the point": scene.own_variance})
 
     def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
         """Whiten looks (n, m) again with the noise scales of other coordinates (n, p) and the same scatter of looks.

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tvsbayes.errors import InputError
+from tvsbayes.estimators.likelihood import RATIO_COLUMNS
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX
@@ -106,13 +107,17 @@ class Positions:
         return arrays.in_images(points).mean(axis=0)
 
 
+def have_room(steps: np.ndarray, side: np.ndarray, limits: np.ndarray, run_up: np.ndarray) -> np.ndarray:
+    """Whether looks (..., 2) and the starts of their run-ups from a side are inside the limits (2, 2), shape (...)."""
+    end_points = np.stack([steps, steps - side * run_up])
+    return np.all((end_points >= limits[:, 0]) & (end_points <= limits[:, 1]), axis=(0, -1))
+
+
 def from_all_sides(positions: Positions, limits: np.ndarray, run_up: np.ndarray) -> Looks:
     """Build looks at positions from all four sides whose run-up is inside the limits (2, 2)."""
     parts = []
     for side in itertools.product((1, -1), repeat=2):
-        start = positions.steps - np.array(side) * run_up
-        end_points = np.stack([positions.steps, start])
-        inside = np.all((end_points >= limits[:, 0]) & (end_points <= limits[:, 1]), axis=(0, 2))
+        inside = have_room(positions.steps, np.array(side), limits, run_up)
         sides = np.tile(np.array(side), (int(inside.sum()), 1))
         parts.append(Looks(positions.steps[inside], sides, positions.sheet[inside]))
     return Looks(*(np.concatenate([getattr(some, part.name) for some in parts]) for part in fields(Looks)))
@@ -202,8 +207,7 @@ def candidates(knowledge: Knowledge) -> Candidates:
         raise InputError(
             "no-sheet", "the rig has no sheets to look at", file="rig.toml", column="sheets", remedy=remedy
         )
-    physical = np.asarray(physical_at(knowledge.z, knowledge.space).value)
-    ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
+    ratio = np.asarray(physical_at(knowledge.z, knowledge.space).value)[RATIO_COLUMNS]
     widest: Mapping[str, tuple[int, int]] = UNSTATED_STEPS
     if rig.table.mechanism.sightings:
         # Without pictures the range is that of candidates.

@@ -31,14 +31,15 @@ from tvsbayes.estimators.campaign_arrays import (
 )
 from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.kalman_filter import filter_rows, kalman_update, no_belief
+from tvsbayes.estimators.likelihood import RATIO_COLUMNS
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
-from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
+from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.mirrors import Ray
-from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import CREEP_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary
-from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
+from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
@@ -110,8 +111,7 @@ class Knowledge:
         """
         if not self.gears_vary:
             return self
-        physical = np.asarray(physical_at(self.z, self.space).value)
-        ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
+        ratio = np.asarray(physical_at(self.z, self.space).value)[RATIO_COLUMNS]
         return self.with_places(regular_places(reached, ratio, expected_scales(self.z, self.space, self.after_data)))
 
     def with_places(self, gears: GearPlaces) -> Knowledge:
@@ -156,7 +156,7 @@ def fit_places(result: JointFit) -> GearPlaces:
     places = result.seen_line.places
     valid = np.asarray(places.valid)
     steps, on_tilt, share = (np.asarray(a)[valid] for a in (places.steps, places.on_tilt, result.seen_line.share))
-    ratio = np.asarray(result.mode.physical)[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
+    ratio = np.asarray(result.mode.physical)[RATIO_COLUMNS]
     return GearPlaces(steps, on_tilt, np.radians(ratio), expected_scales(result.z, result.space, True), share)
 
 
@@ -311,22 +311,6 @@ def largest_px(rig: Rig) -> np.ndarray | None:
     return np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
 
 
-def expected_information(
-    arrays: CampaignArrays,
-    depth_mm: np.ndarray,
-    rig: Rig,
-    z: np.ndarray,
-    space: ParameterSpace,
-    turning: np.ndarray,
-) -> Expectation:
-    """Compute `expect` without padding, as NumPy arrays."""
-    count = len(depth_mm)
-    depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
-    turns = padded(turning, len(arrays.spots.valid))
-    views = expect(z, space, arrays, depths, largest_px(rig), turns)
-    return jax.tree.map(lambda x: np.asarray(x)[:count], views)
-
-
 @dataclass(frozen=True)
 class PlanInformation:
     """Expected information of a plan.
@@ -353,19 +337,6 @@ class PlanInformation:
         return {move for move, seen in zip(self.look_moves, self.expectation.seen, strict=True) if seen}
 
 
-def plan_minutes(steps: Sequence[PlanStep], rig: Rig) -> float:
-    """Compute the duration of a plan by `[costs]`, minutes."""
-    return plan_seconds(rig, steps) / 60
-
-
-def _logged_plan(steps: Sequence[PlanStep], rig: Rig) -> PlanLog:
-    log = run_plan(steps, rig)
-    if not log.looks:
-        remedy = "add `look` steps to the plan"
-        raise InputError("no-look", "the plan looks at nothing", file="plan.csv", column="action", remedy=remedy)
-    return log
-
-
 def information_of(
     steps: Sequence[PlanStep],
     knowledge: Knowledge,
@@ -387,13 +358,19 @@ def information_of(
         InputError: the plan has no look or places an unknown sheet.
     """
     rig = knowledge.rig
-    log = _logged_plan(steps, rig)
+    log = run_plan(steps, rig)
+    if not log.looks:
+        remedy = "add `look` steps to the plan"
+        raise InputError("no-look", "the plan looks at nothing", file="plan.csv", column="action", remedy=remedy)
     look_moves = tuple(look.move for look in log.looks)
     depth = np.array([rig.depths_mm[log.targets[look.placement]] for look in log.looks])
     arrays = design_arrays(log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture)
-    turning = knowledge.gears.turning_after(log.moves, look_moves)
-    views = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space, turning)
+    size = len(arrays.spots.valid)
+    turning = padded(knowledge.gears.turning_after(log.moves, look_moves), size)
+    point = knowledge.z if z is None else z, space or knowledge.space
+    views = expect(*point, arrays, padded(depth, size, depth[-1]), largest_px(rig), turning)
+    views = jax.tree.map(lambda part: np.asarray(part)[: len(depth)], views)
     rows = np.asarray(views.rows)[..., : knowledge.size].reshape(-1, knowledge.size)
     seen = np.asarray(views.seen) if views.seen.any() else np.ones(len(depth), dtype=bool)
     pose = np.asarray(views.mirror_angles_rad)[seen].mean(axis=0)
-    return PlanInformation(rows.T @ rows, views, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)
+    return PlanInformation(rows.T @ rows, views, tuple(log.moves), look_moves, plan_minutes(rig, steps), pose)

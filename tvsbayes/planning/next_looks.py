@@ -16,7 +16,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.conditions import powered_on_s, warm_minutes
-from tvsbayes.instrument.plan import PlanStep, plan_seconds, step_json
+from tvsbayes.instrument.plan import PlanStep, plan_minutes, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.expectation import knowledge_of
 from tvsbayes.planning.planner import design_problem
@@ -126,7 +126,7 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
 
     def minutes(choice: Choice) -> float:
         steps = choice.design.steps_onwards
-        return plan_seconds(rig, steps[1:] if choice.design.sheet[0] == sheet else steps) / 60
+        return plan_minutes(rig, steps[1:] if choice.design.sheet[0] == sheet else steps)
 
     choices = _choices(problem, count, (last.pan_steps, last.tilt_steps))
     best = max(choices, key=lambda choice: (problem.now - choice.value) / max(minutes(choice), 1e-9))

@@ -33,15 +33,16 @@ from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Look, ordered_spots, pixels_of
 from tvsbayes.instrument.homing import homed
-from tvsbayes.instrument.parameters import INDEX, NAMES
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_seconds, run_plan
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import COSTS_S, Rig
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import rests_of
-from tvsbayes.model.parameter_space import physical_at
-from tvsbayes.planning.candidates import BACKLASH_COLUMNS, run_up_steps
+from tvsbayes.model.parameter_space import STOP_COLUMNS, physical_at
+from tvsbayes.planning.candidates import BACKLASH_COLUMNS, have_room, run_up_steps
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2
-from tvsbayes.planning.looks import run_up_start
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, run_up_start
+from tvsbayes.planning.search import smallest_design
 from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
 from tvsbayes.statistics.streams import Stream, random_stream
 
@@ -159,18 +160,15 @@ class WatchDesigns:
     def _reachable(self, candidate: Candidate) -> bool:
         if candidate.target not in self.rig.depths_mm:
             return False
-        start = np.array(candidate.steps) - np.array(candidate.side) * self._run_up
-        end_points = np.stack([np.array(candidate.steps), start])
-        return bool(np.all((end_points >= self._limits[:, 0]) & (end_points <= self._limits[:, 1])))
+        steps, side = np.array(candidate.steps), np.array(candidate.side)
+        return bool(have_room(steps, side, self._limits, self._run_up))
 
     def _prepare(self, linear: LinearSpots, first: int, places: list[int]) -> None:
         """Compute the information of the first session and of every candidate (its row), stop errors integrated out."""
-        errors = linear.places.shape[2]
-        self.parameters = len(NAMES)
         spelled = linear.spelled_out(linear.places)
-        shifts = columns_of(self.changes)[-1].stop
+        shifts = slice(len(NAMES), len(NAMES) + columns_of(self.changes)[-1].stop)
         fisher = stop_information(rows_of(spelled, slice(first))).fisher
-        keep = np.r_[: self.parameters, self.parameters + shifts : self.parameters + shifts + errors]
+        keep = np.r_[: shifts.start, shifts.stop : shifts.stop + linear.places.shape[2]]
         self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
         whitened = []
         for candidate, row in zip(self.candidates, places, strict=True):
@@ -179,13 +177,12 @@ class WatchDesigns:
             columns = spelled.jacobian[row]
             fitted = columns[:, keep].copy()
             # The path since homing is short in these plans: only the first session informs on the contrast.
-            fitted[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
-            joined = np.concatenate([fitted, columns[:, self.parameters : self.parameters + shifts], slope], axis=1)
+            fitted[:, CONTRAST_COLUMNS] = 0.0
+            joined = np.concatenate([fitted, columns[:, shifts], slope], axis=1)
             root = np.linalg.cholesky(np.eye(4) + slope @ np.diag(variance) @ slope.T)
             whitened.append(np.linalg.solve(root, joined))
         rows = np.array(whitened)
         self.each = np.einsum("mia,mib->mab", rows, rows)
-        self.shifts = shifts
         generator = random_stream(self.seed, Stream.WATCHED_CHANGES)
         self._directions = []
         for change in self.changes:
@@ -194,8 +191,8 @@ class WatchDesigns:
 
     def _stop_variance(self, candidate: Candidate) -> np.ndarray:
         physical = physical_at(self.z, self.fit.space).value
-        names = ("left" if candidate.side[0] > 0 else "right", "up" if candidate.side[1] > 0 else "down")
-        return np.radians([physical[INDEX[f"stop_sd_deg.{name}"]] for name in names]) ** 2
+        columns = [STOP_COLUMNS[axis, int(side > 0)] for axis, side in enumerate(candidate.side)]
+        return np.radians([physical[column] for column in columns]) ** 2
 
     def information(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
         """Compute the information on the changes by a pattern with so many homings on every sheet, shape (q, q).
@@ -266,7 +263,7 @@ class WatchDesigns:
 
     def minutes(self, pattern: Pattern, homings: int) -> float:
         """Compute the duration by `[costs]`, minutes."""
-        return plan_seconds(self.rig, self.steps(pattern, homings)) / 60
+        return plan_minutes(self.rig, self.steps(pattern, homings))
 
     def judged(self, pattern: Pattern, homings: int) -> list[float]:
         """Compute powers of the plan by its own moves, at the limit of all tests together."""
@@ -285,7 +282,7 @@ MINUTES = 10.0
 """Default limit of the duration of a plan, minutes."""
 HOMINGS_MAX = 3000
 """Largest number of homings on a sheet that is stated as needed."""
-HOMING_COUNTS = np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int))
+HOMING_COUNTS: tuple[int, ...] = tuple(np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int)).tolist())
 """Trial numbers of homings, before bisection between two of them."""
 CORRECTIONS = 4
 """Largest number of increases by a tenth where the plan's own moves have less power than independent stops."""
@@ -310,32 +307,21 @@ class _Trial:
 
     def allowed(self, minutes: float) -> np.ndarray:
         """Mark the `HOMING_COUNTS` within a budget."""
-        looks = HOMING_COUNTS * self.pattern.size
-        minutes_needed = np.array([self.minutes(int(homings)) for homings in HOMING_COUNTS])
-        return (minutes_needed <= minutes) & (looks <= LOOKS_MAX) & (looks >= LOOKS_MIN)
+        return np.array([self.minutes(n) <= minutes and LOOKS_MIN <= self.looks(n) <= LOOKS_MAX for n in HOMING_COUNTS])
+
+    def first_enough(self, mask: np.ndarray) -> int | None:
+        """Find the first of `HOMING_COUNTS` with enough power for the changes of a mask; return its index."""
+        enough = np.all(self.powers[:, mask] >= POWER_MIN, axis=1)
+        return int(np.argmax(enough)) if enough.any() else None
 
 
 def _trials(designs: WatchDesigns) -> list[_Trial]:
     trials = []
     for pattern in designs.patterns():
-        powers = np.array([designs.powers(pattern, float(homings)) for homings in HOMING_COUNTS])
+        powers = np.array([designs.powers(pattern, homings) for homings in HOMING_COUNTS])
         once, twice = (designs.minutes(pattern, homings) for homings in (1, 2))
         trials.append(_Trial(pattern, powers, once, twice - once))
     return trials
-
-
-def _smallest(designs: WatchDesigns, trial: _Trial, mask: np.ndarray) -> int | None:
-    """Find the least number of homings at which a pattern detects the changes of a mask with enough power."""
-    sufficient = np.flatnonzero(np.all(trial.powers[:, mask] >= POWER_MIN, axis=1))
-    if not sufficient.size:
-        return None
-    rung = int(sufficient[0])
-    low, high = (int(HOMING_COUNTS[rung - 1]) if rung else 0), int(HOMING_COUNTS[rung])
-    while high - low > 1:
-        middle = (low + high) // 2
-        enough = np.all(designs.powers(trial.pattern, float(middle))[mask] >= POWER_MIN)
-        low, high = (low, middle) if enough else (middle, high)
-    return max(high, -(-LOOKS_MIN // trial.pattern.size))
 
 
 @dataclass(frozen=True)
@@ -354,24 +340,29 @@ class _Need:
         return self.trial.minutes(self.homings)
 
 
+def _need(designs: WatchDesigns, trial: _Trial, first: int, mask: np.ndarray) -> _Need:
+    """Find the fewest homings that are enough, up to the trial count of index `first`, the first that is."""
+
+    def enough(homings: int) -> bool:
+        return bool(np.all(designs.powers(trial.pattern, homings)[mask] >= POWER_MIN))
+
+    homings = smallest_design(enough, HOMING_COUNTS[max(first - 1, 0) : first + 1])
+    assert homings is not None, "the first sufficient count is enough"
+    return _Need(trial, max(homings, -(-LOOKS_MIN // trial.pattern.size)))
+
+
 def _fewest(designs: WatchDesigns, trials: list[_Trial], mask: np.ndarray, minutes: float = np.inf) -> _Need | None:
     """Find the fewest looks that detect the changes of a mask; among equal numbers the least time."""
     # Patterns are first ranked by trial counts: values in between cost a bisection for each.
     ranked = sorted(
-        (trial.looks(int(HOMING_COUNTS[rung])), number)
+        (trial.looks(HOMING_COUNTS[first]), number, first)
         for number, trial in enumerate(trials)
-        if (rung := int(np.argmax(np.all(trial.powers[:, mask] >= POWER_MIN, axis=1)))) or _meets_at_first(trial, mask)
+        if (first := trial.first_enough(mask)) is not None
     )
-    needs = []
-    for _, number in ranked[:12]:
-        homings = _smallest(designs, trials[number], mask)
-        if homings is not None and trials[number].minutes(homings) <= minutes:
-            needs.append(_Need(trials[number], homings))
-    return min(needs, key=lambda need: (need.looks, need.minutes), default=None)
-
-
-def _meets_at_first(trial: _Trial, mask: np.ndarray) -> bool:
-    return bool(np.all(trial.powers[0, mask] >= POWER_MIN))
+    needs = (_need(designs, trials[number], first, mask) for _, number, first in ranked[:12])
+    return min(
+        (need for need in needs if need.minutes <= minutes), key=lambda need: (need.looks, need.minutes), default=None
+    )
 
 
 def _noticeable(trials: list[_Trial], minutes: float) -> np.ndarray:
@@ -389,7 +380,7 @@ def _noticeable(trials: list[_Trial], minutes: float) -> np.ndarray:
 def _most_powerful(trials: list[_Trial], minutes: float) -> _Need:
     """Find the pattern with the largest total power, where no change can be detected with enough power."""
     by_power = [
-        (float(trial.powers[rung].sum()), number, int(HOMING_COUNTS[rung]))
+        (float(trial.powers[rung].sum()), number, HOMING_COUNTS[rung])
         for number, trial in enumerate(trials)
         for rung in np.flatnonzero(trial.allowed(minutes))
     ]
@@ -461,7 +452,7 @@ def _looks_to_add(designs: WatchDesigns, trials: list[_Trial]) -> list[int | Non
     fewest: list[int | None] = [None] * len(designs.changes)
     for trial in trials:
         for homings in HOMING_COUNTS:
-            looks, enough = trial.looks(int(homings)), designs.powers(trial.pattern, float(homings), True) >= POWER_MIN
+            looks, enough = trial.looks(homings), designs.powers(trial.pattern, homings, True) >= POWER_MIN
             fewest = [
                 min(looks, best or looks) if met else best for best, met in zip(fewest, enough.tolist(), strict=True)
             ]
