@@ -166,11 +166,9 @@ def spread(estimates: Estimates) -> np.ndarray:
 
 def laplace_estimates(result: JointFit) -> Estimates:
     """Return estimates by the mode and the draws of the Laplace approximation."""
-    mode, draws = (
-        _headline_draws(jax.tree.map(lambda part: np.asarray(part)[None], result.mode)),
-        _headline_draws(result.draws),
-    )
-    return Estimates(result.z, result.covariance, mode[0], draws, np.full(len(draws), 1 / len(draws)))
+    [mode] = _headline_draws(jax.tree.map(lambda part: np.asarray(part)[None], result.mode))
+    draws = _headline_draws(result.draws)
+    return Estimates(result.z, result.covariance, mode, draws, np.full(len(draws), 1 / len(draws)))
 
 
 def sampled_estimates(posterior: Posterior) -> Estimates:

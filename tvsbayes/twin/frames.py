@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from os import cpu_count
 from pathlib import Path
@@ -20,7 +19,7 @@ from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 from tvsbayes.progress import Job, Show
 from tvsbayes.twin.board_pictures import Board, BoardPose, board_poses, render_board
-from tvsbayes.twin.physics import CameraPair, cameras_of
+from tvsbayes.twin.physics import CameraPair, Light, cameras_of
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign
 from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
 
@@ -115,14 +114,16 @@ def _render(
     folder: Path, simulated: SimulatedCampaign, seed: int, poses: list[BoardPose], progress: Show | None
 ) -> int:
     """Write the pictures of `write_frames`, for boards at these poses."""
-    visible, board = cameras_of(simulated.truth.stereo_pair), Board()
+    visible = cameras_of(simulated.truth.stereo_pair)
     make_folder(folder / "frames")
     if poses:
         make_folder(folder / "boards")
     infrared = cameras_of(simulated.truth.stereo_pair, simulated.truth.parameters["focal_scale"])
-    looks, boards = _Looks(folder, simulated, infrared, seed), _Boards(folder, board, poses, visible, seed)
-    jobs = [partial(boards.write, number) for number in range(len(poses))]
-    jobs += [partial(looks.write, row) for row in range(len(simulated.campaign.spots))]
+    jobs = [partial(_write_board, folder, visible, pose, number, seed) for number, pose in enumerate(poses)]
+    jobs += [
+        partial(_write_look, folder, infrared, simulated.light.of(row), spot.spot, seed)
+        for row, spot in enumerate(simulated.campaign.spots)
+    ]
     # NumPy's generators, OpenCV and file writing release Python's lock, so threads suffice.
     pool = ThreadPoolExecutor(min(WORKERS_MAX, cpu_count() or 1))
     try:
@@ -134,43 +135,22 @@ def _render(
     return 2 * len(jobs)
 
 
-@dataclass(frozen=True)
-class _Looks:
-    """Pictures of the looks of a campaign."""
-
-    folder: Path
-    simulated: SimulatedCampaign
-    cameras: CameraPair
-    seed: int
-
-    def write(self, row: int) -> None:
-        """Write both pictures of a row of spots.csv."""
-        number = self.simulated.campaign.spots[row].spot
-        paths = [self.folder / frame_name(number, camera) for camera in CAMERAS]
-        if all(path.is_file() for path in paths):
-            return
-        made = render_spots(self.cameras, self.simulated.light.of(row), Scene(), Sensor(), self.seed, number)
-        for path, picture in zip(paths, (made.left, made.right), strict=True):
-            _write(path, picture)
+def _write_look(folder: Path, cameras: CameraPair, light: Light, number: int, seed: int) -> None:
+    """Write both pictures of a look, if they do not exist."""
+    paths = [folder / frame_name(number, camera) for camera in CAMERAS]
+    if all(path.is_file() for path in paths):
+        return
+    made = render_spots(cameras, light, Scene(), Sensor(), seed, number)
+    for path, picture in zip(paths, (made.left, made.right), strict=True):
+        _write(path, picture)
 
 
-@dataclass(frozen=True)
-class _Boards:
-    """Pictures of a board in its poses."""
-
-    folder: Path
-    board: Board
-    poses: list[BoardPose]
-    cameras: CameraPair
-    seed: int
-
-    def write(self, number: int) -> None:
-        """Write both pictures of a pose."""
-        for side, (name, camera) in enumerate(zip(CAMERAS, (self.cameras.left, self.cameras.right), strict=True)):
-            path = self.folder / "boards" / f"{name}{number + 1:02d}.png"
-            if not path.is_file():
-                picture = render_board(camera, self.poses[number], self.board, Sensor(), (self.seed, number, side))
-                _write(path, picture)
+def _write_board(folder: Path, cameras: CameraPair, pose: BoardPose, number: int, seed: int) -> None:
+    """Write both pictures of a board in a pose, if they do not exist."""
+    for side, (name, camera) in enumerate(zip(CAMERAS, (cameras.left, cameras.right), strict=True)):
+        path = folder / "boards" / f"{name}{number + 1:02d}.png"
+        if not path.is_file():
+            _write(path, render_board(camera, pose, Board(), Sensor(), (seed, number, side)))
 
 
 def _write(path: Path, picture: np.ndarray) -> None:

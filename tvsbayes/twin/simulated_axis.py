@@ -21,6 +21,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, 
 from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors, kind_of
 from tvsbayes.single_axis.waves import SECOND, WANDER, WavePeriods
 from tvsbayes.twin.gear_errors import kelvin_of, zero_shift
+from tvsbayes.twin.physics import take_up
 
 READING_SHARE = 5e-5
 """Stated u of simulated readings as a share of the travel, where nothing else is known."""
@@ -78,6 +79,10 @@ class AxisTruth:
     error: np.ndarray
     play_variation: np.ndarray
     waves: tuple[TrueWave, ...] = ()
+
+    def wave(self, of: str, x: float) -> float:
+        """Evaluate the sum of the waves of a variable, see `TrueWave.of`."""
+        return sum(wave.at(x) for wave in self.waves if wave.of == of)
 
     def as_json(self) -> dict[str, object]:
         """Return the content of `truth.json`."""
@@ -198,7 +203,7 @@ def _encoder_reads(truth: AxisTruth, stand: float) -> float:
     """Compute the encoder's reading of a position; its waves are functions of the reading."""
     value = stand
     for _ in range(20):
-        value = stand + sum(wave.at(value) for wave in truth.waves if wave.of == "encoder")
+        value = stand + truth.wave("encoder", value)
     return value
 
 
@@ -206,7 +211,7 @@ def _time_shift(truth: AxisTruth, warm_s: float, kelvin: float, time_s: float) -
     """Compute the shift of the zero by creep, temperature and waves of time."""
     true = truth.parameters
     shift = zero_shift(true["creep"], true["creep_minutes"], warm_s / 60.0, true["thermal_per_K"], kelvin)
-    return float(shift) + sum(wave.at(time_s) for wave in truth.waves if wave.of == "seconds")
+    return float(shift) + truth.wave("seconds", time_s)
 
 
 def stops_of(
@@ -233,7 +238,7 @@ def stops_of(
         else:
             step = move.command - last.command
             wheel += (ratio + 0.5 * contrast * np.sign(step)) * step
-            stand = min(max(stand, wheel - 0.5 * backlash), wheel + 0.5 * backlash)
+            stand = take_up(stand, wheel, backlash)
             side = int(np.sign(step)) or side
             hours = (move.time_s - last.time_s) / 3600.0
             zero += true["drift_per_root_hour"] * np.sqrt(hours) * float(rng.standard_normal())
@@ -244,7 +249,7 @@ def stops_of(
         place = int(np.searchsorted(truth.command, move.command))
         share = 2 * (stand - wheel) / backlash if backlash else -side * np.sign(ratio)
         stops[row] = stand + truth.error[place] + 0.5 * share * truth.play_variation[place] + zero + stop
-        stops[row] += sum(wave.at(abs(ratio) * move.command) for wave in truth.waves if wave.of == "position")
+        stops[row] += truth.wave("position", abs(ratio) * move.command)
         stops[row] += _time_shift(truth, move.time_s - since, kelvin[row], move.time_s)
         last = move
     return stops
@@ -264,9 +269,7 @@ def drive_of(
         keep = 0.0 if last is None else math.exp(-gap / true["seeing_s"])
         seeing = keep * seeing + true["seeing_scale"] * math.sqrt(1.0 - keep**2) * float(rng.standard_normal())
         positions[k] = true["per_command"] * command + zero + _time_shift(truth, time_s - move.time_s, 0.0, time_s)
-        positions[k] += sum(
-            wave.at(abs(true["per_command"]) * command) for wave in truth.waves if wave.of == "position"
-        )
+        positions[k] += truth.wave("position", abs(true["per_command"]) * command)
         positions[k] += seeing * true["reading_u"]
         last = time_s
     return positions
@@ -298,8 +301,7 @@ def simulate_axis(template: AxisCampaign, moves: Sequence[AxisMove] | None = Non
     truth = draw_axis(
         commands, template.stated, per_command, travel, rng, template.periods, (moves[0].time_s, moves[-1].time_s)
     )
-    stated = [r.u for r in template.readings if r.u > 0]
-    u = float(np.median(stated)) if stated else READING_SHARE * travel
+    u = _reading_u(template, travel)
     stops = stops_of(truth, moves, rng, template.powered_on_s)
     readings: list[Reading] = []
     for move, stand in zip(moves, stops, strict=True):
@@ -325,8 +327,7 @@ def _simulated_drive(template: AxisCampaign, rate: float, seed: int, rng: np.ran
     truth = draw_axis(
         [move.command], template.stated, per_command, travel, rng, template.periods, (float(times[0]), float(times[-1]))
     )
-    stated = [r.u for r in template.readings if r.u > 0]
-    u = float(np.median(stated)) if stated else READING_SHARE * travel
+    u = _reading_u(template, travel)
     truth.parameters["reading_u"] = u
     stands = drive_of(truth, move, rate, times, rng)
     noise = truth.parameters["reading_scale"] * u * rng.standard_normal(len(times))
@@ -334,6 +335,12 @@ def _simulated_drive(template: AxisCampaign, rate: float, seed: int, rng: np.ran
     readings = tuple(Reading(k, 0, v, u, "ok", float(t)) for k, (v, t) in enumerate(zip(values, times, strict=True)))
     header = {**template.header, "synthetic": True, "seed": seed}
     return SimulatedAxis(replace(template, moves=(move,), readings=readings, header=header, path=None), truth)
+
+
+def _reading_u(template: AxisCampaign, travel: float) -> float:
+    """Return the u of simulated readings: the median of those stated."""
+    stated = [r.u for r in template.readings if r.u > 0]
+    return float(np.median(stated)) if stated else READING_SHARE * travel
 
 
 def _per_command(template: AxisCampaign) -> float:

@@ -7,7 +7,7 @@ drift, the other axis at its mean. The estimators have their own formulas.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -15,14 +15,10 @@ from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.twin.gear_errors import GearErrors
 from tvsbayes.twin.head_physics import tilt_zero_deg
-from tvsbayes.twin.physics import effective_mirror_offset_mm, harmonics_deg, mirror_chain, wobble_deg
+from tvsbayes.twin.physics import harmonics_deg, mirror_chain, wobble_deg
 
 SLOPE_STEP_RAD = 1e-5
 """Step of central differences of the mirrors: truncation 1e-10, rounding 1e-11."""
-AT_POSE: dict[str, Callable[[Mapping[str, float], tuple[float, float]], float]] = {
-    "effective_mirror_offset_mm": effective_mirror_offset_mm,
-}
-"""Formulas of true headlines of parameters and a pose (psi, beta), deg, by public name."""
 
 
 def looks_steps(campaign: Campaign) -> np.ndarray:

@@ -29,8 +29,8 @@ from tvsbayes.instrument.parameters import (
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, stereo_parameters
 from tvsbayes.twin.gear_errors import PERFECT, AxisErrors, GearErrors, Tabulated, draw_gear_errors
-from tvsbayes.twin.physics import local_deg_per_step
-from tvsbayes.twin.true_headlines import AT_POSE, effective_deg_per_step
+from tvsbayes.twin.physics import effective_mirror_offset_mm, local_deg_per_step
+from tvsbayes.twin.true_headlines import effective_deg_per_step
 
 TRUTH_FORMAT = "tvsbayes-truth/1"
 Pair = tuple[float, float]
@@ -46,7 +46,7 @@ class GearErrorTable(TypedDict):
 
 
 class TruthDocument(TypedDict):
-    """Content of truth.json; see `Truth`. Quantities of `AT_POSE` are added by their names."""
+    """Content of truth.json; see `Truth`."""
 
     format: str
     note: str
@@ -61,6 +61,7 @@ class TruthDocument(TypedDict):
     gear_error: NotRequired[dict[str, GearErrorTable]]
     effective_deg_per_step: NotRequired[dict[str, float]]
     local_deg_per_step: NotRequired[dict[str, float]]
+    effective_mirror_offset_mm: NotRequired[float]
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class Truth(WithStereo):
             **self.parameters,
             **{f"effective_deg_per_step.{direction}": value for direction, value in ratio.items()},
             **{f"effective_contrast_deg_per_step.{axis}": value for axis, value in contrast.items()},
-            **{name: formula(self.parameters, pose_deg) for name, formula in AT_POSE.items()},
+            "effective_mirror_offset_mm": effective_mirror_offset_mm(self.parameters, pose_deg),
         }
 
     def as_json(self, campaign: Campaign) -> TruthDocument:
@@ -141,8 +142,8 @@ class Truth(WithStereo):
         if self.reference_pose_deg is not None:
             document["local_deg_per_step"] = local_deg_per_step(self.parameters, self.reference_pose_deg)
             if not mechanism.terms:
-                at_pose = {name: formula(self.parameters, self.reference_pose_deg) for name, formula in AT_POSE.items()}
-                document = cast("TruthDocument", document | at_pose)
+                offset_mm = effective_mirror_offset_mm(self.parameters, self.reference_pose_deg)
+                document["effective_mirror_offset_mm"] = offset_mm
         return document
 
     def _gear_error(self, axis: str, campaign: Campaign) -> GearErrorTable:
