@@ -38,6 +38,11 @@ def test_a_terminal_gets_sentences_folded_between_words_and_tables_as_they_are(m
     assert styled(told, Terminal(True)) == (
         'fault    port: no such port as this;\n         write port = "..." there'
     ), "a sentence behind cells goes on below itself"
+    monkeypatch.setenv("COLUMNS", "60")
+    values = f"{'azimuth_deg':15}{'azimuth_deg':15}{'deg':9}61.352086886..., 61.065125695..., -46.2548"
+    folded = styled(values, Terminal(True)).split("\n")
+    assert [line.strip() for line in folded[1:]] == ["61.065125695...,", "-46.2548"], "as does a list of values"
+    assert {len(line) - len(line.lstrip()) for line in folded[1:]} == {39}
 
 
 def test_a_terminal_gets_verdicts_in_colour_line_by_line(monkeypatch):

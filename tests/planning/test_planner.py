@@ -86,7 +86,7 @@ def test_the_document_has_the_contracts_keys(result):
 
 def test_the_text_names_the_plan_and_what_was_not_reached(result):
     text = plan_text(result)
-    assert f"the plan: {result.looks} looks in" in text
+    assert f"the plan: {result.looks} looks in" in text and "few may leave a direction without a stop" in text
     last = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
     assert f"for a chance of 95 %: not reached with up to {last} looks" in plan_text(replace(result, n95=None))
 

@@ -1,15 +1,35 @@
-"""What `locate --cloud` says of its uncertainties."""
+"""What `locate` says of its points, and `locate --cloud` of its uncertainties."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tvsbayes.coordinates.cloud import LawChecked
 from tvsbayes.coordinates.cloud_files import CloudFile
-from tvsbayes.report.command_text import cloud_text
+from tvsbayes.report.command_text import cloud_text, locations_text
+
+
+@pytest.mark.parametrize("aperture_read", [False, True])
+def test_points_say_where_their_distance_is_a_statement(aperture_read):
+    located = SimpleNamespace(
+        refused=[None],
+        covariance_mm2=np.eye(3)[None],
+        xyz_mm=np.array([[751.0, 173.0, 7.7]]),
+        u95_mm=np.ones((1, 3)),
+        digits_held=np.ones((1, 3)),
+        law_off_mm=np.zeros(1),
+        extrapolated=[False],
+        unseen=[""],
+        draws=1000,
+        estimator="posterior",
+    )
+    text = " ".join(locations_text(located, aperture_read).split())
+    assert "751.0(1.0)" in text
+    assert ("no aperture readings: distances rest on baseline" in text) is not aperture_read
 
 
 @pytest.mark.parametrize("held, points, said", ((25, 156, "do not rely on the sds"), (149, 156, "may be relied on")))

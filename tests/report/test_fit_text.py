@@ -15,7 +15,7 @@ from tvsbayes.report.fit_text import FINE_DEG, classic_text, demo_text, fit_text
 from tvsbayes.report.result_tables import KEY_PARAMETERS
 from tvsbayes.report.scanner_document import verdict_of
 from tvsbayes.results.convergence import Importance, MonteCarloError, NamedValue, Sampling
-from tvsbayes.results.estimates import FitSummary, Validation, ValidationTest
+from tvsbayes.results.estimates import FitSummary, Validation, ValidationTest, WeakDirection
 
 
 def test_a_fit_astray_shows_no_results():
@@ -57,6 +57,22 @@ def test_fit_text_shows_what_the_reader_must_know():
     # A flood of ids helps nobody.
     assert "spots that disagree with all others: 0, 1, 2" in text
     assert ", 19 and 10 more; look at them" in text
+
+
+def test_scales_known_only_in_their_sum_are_not_set_by_the_data():
+    """The line says what the word of the table means; it is no further weak direction."""
+    text = "only the sum of the variances of stop scatter left and look scatter pan is known (correlation -0.84)"
+    summary = small_summary()
+    known = WeakDirection(text, {"stop_sd_deg.left": 1.0, "look_scatter_deg.pan": -0.84})
+    shared = structs.replace(summary, weak_directions=(*summary.weak_directions, known))
+    for details in (False, True):
+        lines = fit_text(shared, details).splitlines()
+        origin = {line.split("  ")[0]: line.split(" ")[-1] for line in lines}
+        assert lines.count(f"set by sum: {text}") == 1
+        assert origin["stop scatter left, deg"] == origin["look scatter pan, deg"] == "sum"
+        assert origin["stop scatter right, deg"] == origin["noise / stated"] == "data"
+        assert not any(line.startswith("weak") and text in line for line in lines)
+    assert "1 weak direction," in fit_text(shared) and "sum" not in fit_text(summary)
 
 
 def test_an_encoder_says_what_a_degree_does():

@@ -92,6 +92,40 @@ def test_a_table_wider_than_a_terminal_is_printed_in_parts_below_each_other():
     assert max(map(len, lines)) <= 80
 
 
+LONG_LABELS = TableView(
+    "title",
+    ["quantity", "value(u)", "95 % interval", "set by"],
+    [["scatter of stops", "0.0052(16)", "[0.0016, 0.0084]", "data"], ["never moved", "", "", ""]],
+)
+
+
+def test_a_row_too_long_for_its_label_takes_two_lines(monkeypatch):
+    """Where columns do not split evenly: a last column alone, far below, is hard to read beside its row."""
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    for columns in ("40", "48"):
+        monkeypatch.setenv("COLUMNS", columns)
+        assert LONG_LABELS.text().splitlines() == [
+            "title",
+            "quantity",
+            "    value(u)     95 % interval  set by",
+            "scatter of stops",
+            "  0.0052(16)  [0.0016, 0.0084]    data",
+            "never moved",
+        ]
+    for columns in ("56", "200"):
+        monkeypatch.setenv("COLUMNS", columns)
+        assert LONG_LABELS.text().splitlines()[2].endswith("data") and len(LONG_LABELS.text().splitlines()) == 4
+
+
+def test_a_narrow_terminal_splits_a_table_that_fits_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    table = TableView("a caption of more than forty columns of text", ["", "a", "b"], [["row", "1" * 30, "2" * 30]])
+    assert len(table.text().splitlines()) == 3, "a file or a pipe has no columns"
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    lines = table.text().splitlines()
+    assert len(lines) == 6 and max(map(len, lines)) <= 40
+
+
 def test_tables_are_plain_text_whatever_the_terminal_says(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "20")

@@ -63,7 +63,7 @@ def calibration_of_draws(
         normal = generator.standard_normal(len(physical))
         return (normal - normal.mean()) / normal.std()
 
-    if not any(spot.aperture_deg is not None for spot in campaign.spots if spot.status == "ok"):
+    if not campaign.aperture_read:
         for name in RECEIVER_NAMES:
             prior, off = campaign.rig.priors[name], standard()
             log = prior.distribution == "log-normal"

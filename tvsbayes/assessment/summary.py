@@ -19,6 +19,7 @@ from tvsbayes.assessment.weaknesses import (
     moved_directions,
     poorly_known_stops,
     prior_conflicts,
+    sum_directions,
     weak_directions,
 )
 from tvsbayes.estimators.campaign_arrays import components
@@ -294,7 +295,10 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         jacobian=((a, b), (c, d)),
         parameters=parameters,
         noise=fit_noise(fit.chi2, observations - determined, parameters),
-        weak_directions=weak_directions(fit, moved),
+        weak_directions=(
+            *weak_directions(fit, moved),
+            *sum_directions(fit.free, np.asarray(source.draws.physical), source.weights),
+        ),
         leverage=leverage(fit, moved),
         classic_predicted=_classic_predicted(source),
         excluded_spots=fit.excluded_spots,

@@ -13,11 +13,19 @@ from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.linear_spots import standard_deviations_without
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import HEADLINES, INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.instrument.parameters import (
+    HEADLINES,
+    INDEX,
+    NAMES,
+    NOISE_NAMES,
+    QUANTITIES,
+    STEREO_PARAMETER_NAMES,
+    names_of,
+)
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
 from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, rests_of, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
-from tvsbayes.results.estimates import CONFLICT_LIMIT, Leverage, WeakDirection, conflict_sentence
+from tvsbayes.results.estimates import CONFLICT_LIMIT, ONLY_SUMS, Leverage, WeakDirection, conflict_sentence
 
 LEVERAGE_LIMIT = 2.0
 """A stop is named if a headline's sd would grow by more than this factor without it (formulation 4.2)."""
@@ -101,6 +109,38 @@ def _scatter_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
         "variance, the priors its division; look twice at some stops"
     )
     return WeakDirection(text, {look: 1.0, **dict.fromkeys(stops, -1.0)})
+
+
+def sum_directions(free: np.ndarray, physical: np.ndarray, weights: np.ndarray) -> tuple[WeakDirection, ...]:
+    """Name the scales of noise of which the data determine only sums of variances; none or one direction.
+
+    A scale is one of them if its rank correlations with the others explain most of its variance.
+
+    Args:
+        free: whether a parameter is estimated, shape (p,).
+        physical: draws of the parameters, shape (n, p).
+        weights: their weights, shape (n,).
+    """
+    scales = [name for name in names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale") if free[INDEX[name]]]
+    scales = [name for name in scales if np.ptp(physical[:, INDEX[name]]) > 0]
+    if len(scales) < 2:
+        return ()
+    ranks = np.argsort(np.argsort(physical[:, [INDEX[name] for name in scales]], axis=0), axis=0)
+    covariance = np.cov(ranks, rowvar=False, aweights=weights)
+    correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    own_share = 1 / np.diag(np.linalg.inv(correlation))
+    shared = np.flatnonzero(own_share < WEAK_VARIANCE).tolist()
+    found = sorted({*shared, *(int(np.argmin(correlation[k])) for k in shared)})
+    if not found:
+        return ()
+    labels, least = [QUANTITIES[scales[k]].label for k in found], correlation[np.ix_(found, found)].min()
+    listed = f"{', '.join(labels[:-1])} and {labels[-1]}"
+    plural, verb, them = ("", "is", "it") if len(found) == 2 else ("s", "are", "them")
+    text = f"{ONLY_SUMS}{plural} of the variances of {listed} {verb} known (correlation {least:+.2f}): "
+    text += f"the priors divide {them}"
+    if any(scales[k].startswith("stop_sd_deg") for k in found):
+        text += "; look twice at some stops"
+    return (WeakDirection(text, {scales[k]: float(correlation[found[0], k]) for k in found}),)
 
 
 SHIFTS = {

@@ -24,7 +24,7 @@ COLOUR_STARTS = (
 """Colours, with the first words of lines in that colour."""
 CELL_GAP = "  "
 """Separator of cells, which never separates words of a sentence."""
-LAST_CELL_MIN = 24
+LAST_CELL_MIN = 16
 """Least width of the last cell for which it is wrapped below itself."""
 BOLD_STARTS = ("error:", "verdict:", "next:", "VALIDATION FAILED", "MOVED (p ", "CANNOT TELL (p ", "OK (p ")
 

@@ -99,8 +99,9 @@ def locate(
 
     look = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
     sides_of(look[-1])
+    measured = read_campaign(campaign)
     with waiting() as progress:
-        calibration = StoredOrFitted(read_campaign(campaign), report_line, progress).calibration
+        calibration = StoredOrFitted(measured, report_line, progress).calibration
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
@@ -109,7 +110,7 @@ def locate(
     if located.refused[0] is not None:
         raise located.refused[0]
     document = {"estimator": located.estimator, "draws": located.draws, **located.as_json(0)}
-    text = locations_text(located)
+    text = locations_text(located, measured.aperture_read)
     if budget:
         from tvsbayes.metrology.look_budget import budget as point_budget
 
@@ -126,8 +127,9 @@ def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool
 
     points = read_looks(file)
     looks = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
+    measured = read_campaign(campaign)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
-        calibration = StoredOrFitted(read_campaign(campaign), report_line, job.part(FITTING)).calibration
+        calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
         from tvsbayes.coordinates.location import locate as locate_points
         from tvsbayes.report.command_text import locations_text
 
@@ -135,7 +137,7 @@ def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool
         located = locate_points(calibration, *looks, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [located.as_json(k) for k in range(len(located.refused))]
     document = {"estimator": located.estimator, "draws": located.draws, "points": entries}
-    finish(document, locations_text(located), as_json)
+    finish(document, locations_text(located, measured.aperture_read), as_json)
 
 
 def _write_cloud(campaign: Path, file: Path, out: Path, draws: int, seed: int, as_json: bool) -> None:

@@ -293,6 +293,11 @@ class Campaign(Shown, WithStereo):
         return self.points_mm[[spot.status == "ok" for spot in self.spots]]
 
     @property
+    def aperture_read(self) -> bool:
+        """Whether any usable look has a reading of the aperture."""
+        return any(look.status == "ok" and look.aperture_deg is not None for look in self.spots)
+
+    @property
     def looks_table(self) -> CsvKind[Any]:
         """The kind of file that holds its looks."""
         return SIGHTINGS if self.rig.mechanism.sightings else SPOTS

@@ -15,7 +15,7 @@ from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.parameter_words import made_by, name_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
-from tvsbayes.report.tables import COLUMNS, TableView, two_digits
+from tvsbayes.report.tables import TableView, text_width, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
 from tvsbayes.statistics.chances import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
 
@@ -120,6 +120,10 @@ LAW = (
     "an end of its 95 % interval differs"
 )
 """Note below a table of points."""
+STATED_APERTURE = (
+    "the campaign has no aperture readings: distances rest on baseline, emission angle at pan 0 and the aperture's "
+    "zero as stated"
+)
 
 
 def plan_text(result: PlanResult) -> str:
@@ -136,6 +140,7 @@ def plan_text(result: PlanResult) -> str:
     symbol = result.target.text.partition("(")[0]
     lines.append(f"{symbol} in {unit}, medians over {result.draws} drawn instruments;")
     lines.append("chance of success (assurance): that the fit of such a campaign reports the target as met")
+    lines.append("a row takes the first looks of the longest plan: few may leave a direction without a stop")
     looks_max = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
         count = f"not reached with up to {looks_max} looks" if n is None else f"{LOOKS_PER_EXPERIMENT * n} looks"
@@ -264,8 +269,8 @@ def detection_text(detection: Detection) -> str:
     return terminal(table, f"method {detection.method}; {sd}noise: {noise}", *lines)
 
 
-def locations_text(locations: Locations) -> str:
-    """Points with their uncertainty."""
+def locations_text(locations: Locations, aperture_read: bool) -> str:
+    """Points with their uncertainty; `aperture_read`: whether the campaign has readings of the aperture."""
     rows: list[list[str]] = []
     for index, error in enumerate(locations.refused):
         if error is not None:
@@ -287,7 +292,8 @@ def locations_text(locations: Locations) -> str:
     notes = [extrapolated_text(words) for words in list(counters)[:UNSEEN_SHOWN]]
     if len(counters) > UNSEEN_SHOWN:
         notes.append(f"and {len(counters) - UNSEEN_SHOWN} more counters that no look reached")
-    return terminal(table, *textwrap.wrap(LAW, COLUMNS), *notes)
+    stated = [] if aperture_read else textwrap.wrap(STATED_APERTURE, text_width())
+    return terminal(table, *textwrap.wrap(LAW, text_width()), *stated, *notes)
 
 
 LAW_SHARE = 0.95

@@ -63,6 +63,7 @@ def fit_text(
     if summary.few_stops:
         lines.append(few_stops_line(summary.few_stops, summary.estimator))
     lines += homing_lines(summary)
+    lines += [f"set by sum: {weak.text}" for weak in summary.weak_directions if weak.of_sums]
     lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
     if summary.excluded_spots:
         lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
@@ -95,7 +96,7 @@ def encoder_line(summary: FitSummary) -> str | None:
 def more_line(summary: FitSummary) -> str:
     """Further contents of --details and the report; "" where there are none."""
     counts = {
-        "weak direction": len(summary.weak_directions),
+        "weak direction": sum(not weak.of_sums for weak in summary.weak_directions),
         "stop that decides a result": len(summary.leverage),
         "prior that matters": len({entry.parameter for entry in summary.prior_sensitivity}),
     }
@@ -133,7 +134,8 @@ def detail_lines(summary: FitSummary) -> list[Part]:
             f"prior: with {word} the u of {entry.parameter}, {entry.quantity} moves {entry.shift_sd:+.2f} sd and its "
             f"sd changes by a factor {entry.sd_ratio:.2f}"
         )
-    lines += [f"weak (set by the priors, not by the data): {weak.text}" for weak in summary.weak_directions]
+    weak_texts = [weak.text for weak in summary.weak_directions if not weak.of_sums]
+    lines += [f"weak (set by the priors, not by the data): {text}" for text in weak_texts]
     lines += [f"depends on one stop: {entry.text}" for entry in summary.leverage]
     return lines
 

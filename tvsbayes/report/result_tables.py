@@ -84,7 +84,10 @@ def headline_table(summary: FitSummary) -> TableView:
     estimates |= {n: summary.parameters[n] for n in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if n in summary.parameters}
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    return TableView(title, ESTIMATE_COLUMNS, _estimate_rows(estimates, estimates))
+    in_sums = {name for weak in summary.weak_directions if weak.of_sums for name in weak.loadings}
+    rows = _estimate_rows(estimates, estimates)
+    rows = [[*row[:-1], "sum"] if name in in_sums else row for name, row in zip(estimates, rows, strict=True)]
+    return TableView(title, ESTIMATE_COLUMNS, rows)
 
 
 def details_table(summary: FitSummary) -> TableView:

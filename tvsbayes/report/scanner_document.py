@@ -28,7 +28,7 @@ from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.page import numbered
 from tvsbayes.report.parameter_words import cause_in_words, sentence_in_words
 from tvsbayes.report.tables import TableView, chance_text, interval_text, two_digits
-from tvsbayes.report.uncertainty_sections import uncertainty_sections
+from tvsbayes.report.uncertainty_sections import NO_APERTURE, uncertainty_sections
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
@@ -195,10 +195,11 @@ def point_errors(e: Evidence) -> list[Number]:
 
 
 def error_sources(e: Evidence) -> list[str]:
-    """Causes of the joint calibration's error, and of the larger error of the last simple calibration."""
+    """What errors in mm rest on; causes of the joint calibration's error, and of the last simple calibration's."""
     order = np.argsort(-e.budget.share)[:CAUSES_LISTED]
     causes = ", ".join(f"{cause_in_words(e.budget.causes[k])} {100 * e.budget.share[k]:.0f} %" for k in order)
-    sentences = [f"Causes of the remaining error of the joint one, as shares of the variance: {causes}."]
+    sentences = [] if e.campaign.aperture_read else [NO_APERTURE]
+    sentences += [f"Causes of the remaining error of the joint one, as shares of the variance: {causes}."]
     for name, error in list(e.simple_errors.items())[-1:]:
         sentences.append(
             f"Error of {name} there: its beam points {error.azimuth_deg:+.2f} deg in azimuth and "

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import shutil
+import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +19,13 @@ from rich.text import Text
 from tvsbayes.display import concise
 
 COLUMNS, GAP = 80, 2
-"""Width of a terminal; gap between two columns of a table."""
+"""Width of a text; gap between two columns of a table."""
+
+
+def text_width() -> int:
+    """Columns of the terminal behind stdout, at most `COLUMNS`; `COLUMNS` for files and pipes."""
+    is_terminal = sys.stdout is not None and sys.stdout.isatty()
+    return min(COLUMNS, shutil.get_terminal_size().columns) if is_terminal else COLUMNS
 
 
 def two_digits(value: float) -> str:
@@ -72,21 +80,42 @@ class TableView:
         return not self.columns
 
     def text(self) -> str:
-        """The table without lines, for terminals and files; too wide a table is split into parts below each other."""
-        title = textwrap.wrap(self.caption, COLUMNS, break_long_words=False, break_on_hyphens=False)
-        return "\n".join([*title, *(self._part(columns) for columns in self._parts())])
+        """The table without lines, for terminals and files.
 
-    def _parts(self) -> list[list[int]]:
-        """Columns of every part: the first column and as many others as fit, about equally many in each part."""
+        A table wider than `text_width` is split into parts of equally many columns below each other. Where columns do
+        not split evenly, each row takes two lines, the first for its header.
+        """
+        room, widths = text_width(), self._widths()
+        title = textwrap.wrap(self.caption, room, break_long_words=False, break_on_hyphens=False)
+        parts = self._parts(widths, room)
+        is_uneven = len(parts) > 1 and (len(parts[0]) == 2 or len(parts[0]) != len(parts[-1]))
+        if is_uneven and sum(widths[1:]) <= room:
+            return "\n".join([*title, *self._two_line_rows()])
+        return "\n".join([*title, *(self._part(columns) for columns in parts)])
+
+    def _widths(self) -> list[int]:
+        """Widths of all columns, each with a gap."""
         cells = [self.columns, *self.rows]
-        others = max(1, *map(len, cells)) - 1
-        width = [max((cell_len(row[k]) for row in cells if k < len(row)), default=0) + GAP for k in range(others + 1)]
+        columns = range(max(1, *map(len, cells)))
+        return [max((cell_len(row[k]) for row in cells if k < len(row)), default=0) + GAP for k in columns]
+
+    def _two_line_rows(self) -> list[str]:
+        """Lines: the first cell of each row, and its other cells, indented, below it."""
+        firsts = [*([] if self.pairs else [self.columns[0]]), *(row[0] for row in self.rows)]
+        others = self._part(range(1, len(self._widths()))).split("\n")
+        pairs = zip(firsts, others, strict=True)
+        return [line for first, rest in pairs for line in (first, " " * GAP + rest) if line.strip()]
+
+    @staticmethod
+    def _parts(width: Sequence[int], room: int) -> list[list[int]]:
+        """Columns of every part: the first column and as many others as fit, about equally many in each part."""
+        others = len(width) - 1
 
         def parts(size: int) -> list[list[int]]:
             return [[0, *range(k, min(k + size, others + 1))] for k in range(1, others + 1, size)] or [[0]]
 
         def fits(size: int) -> bool:
-            return all(sum(width[k] for k in part) - GAP <= COLUMNS for part in parts(size))
+            return all(sum(width[k] for k in part) - GAP <= room for part in parts(size))
 
         widest = next((size for size in range(others, 1, -1) if fits(size)), 1)
         balanced = math.ceil(others / len(parts(widest))) or 1

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 OTHERS = f"others, each below {100 * SMALLEST_SHARE:g} %"
 """Row of all inputs of a budget without their own row."""
+NO_APERTURE = (
+    "The campaign has no aperture readings: baseline, emission angle at pan 0 and the aperture's zero are as stated "
+    "for every calibration. The errors in mm hold if the statement does, and calibrations differ by the beam alone."
+)
 END_SHIFT = 0.1
 """Least difference of an end of the linear interval for a note, over U; a quantile of 1000 draws scatters by half."""
 
@@ -61,6 +65,8 @@ def maps_section(e: Evidence) -> Section:
         "Nominal and classic users are given a baseline shortened by the mirror offset and moved by half of it; noise "
         "of one look is included for all."
     ]
+    if not e.campaign.aperture_read:
+        text.append(NO_APERTURE)
     worse = np.flatnonzero(at_middle["joint"] >= at_middle["nominal"])
     if len(worse):
         text.append(_no_better(e, [f"{e.maps.range_mm[k]:g}" for k in worse]))
@@ -75,8 +81,6 @@ def _no_better(e: Evidence, ranges_mm: Sequence[str]) -> str:
         f": {share_in_words(e.budget.causes[largest])} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
     )
     text += f" at {e.range_mm:g} mm"
-    if not any(spot.aperture_deg is not None for spot in e.campaign.spots):
-        text += "; the campaign has no aperture readings, which determine the range of a point"
     return f"{text}."
 
 

@@ -93,11 +93,20 @@ class Estimate(ClosedRecord, frozen=True):
         return self.contraction is not None and self.contraction >= CONTRACTION_LIMIT
 
 
+ONLY_SUMS = "only the sum"
+"""Beginning of the text of a weak direction between scales of noise."""
+
+
 class WeakDirection(ClosedRecord, frozen=True):
     """A combination of parameters that the data do not constrain beyond the prior; loadings are in prior sds."""
 
     text: str
     loadings: dict[str, float]
+
+    @property
+    def of_sums(self) -> bool:
+        """Whether it names scales of noise of which the data determine only sums of variances."""
+        return self.text.startswith(ONLY_SUMS)
 
 
 class Leverage(ClosedRecord, frozen=True):

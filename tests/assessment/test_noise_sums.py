@@ -1,0 +1,65 @@
+"""Scales of noise of which the data know only sums of variances are named, others are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tvsbayes.assessment.weaknesses import sum_directions
+from tvsbayes.instrument.parameters import INDEX, NAMES
+
+DRAWS = 4000
+FREE, EVEN = np.ones(len(NAMES), dtype=bool), np.full(DRAWS, 1 / DRAWS)
+LEFT, LOOK, NOISE = "stop_sd_deg.left", "look_scatter_deg.pan", "pixel_scale"
+
+
+def independent() -> np.ndarray:
+    """Draws of all parameters that know nothing of each other, shape (DRAWS, p)."""
+    return np.random.default_rng(5).lognormal(0.0, 0.3, (DRAWS, len(NAMES)))
+
+
+def known_sum_of(*parts: str) -> np.ndarray:
+    """The same, with the sum of the squares of `parts` known to 5 %, and anything of its division."""
+    draws, rng = independent(), np.random.default_rng(6)
+    total = 1 + 0.05 * rng.standard_normal((DRAWS, 1))
+    draws[:, [INDEX[name] for name in parts]] = np.sqrt(total * rng.dirichlet(np.ones(len(parts)), DRAWS))
+    return draws
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        ((LEFT, LOOK), "only the sum of the variances of stop scatter left and look scatter pan is known ("),
+        (
+            (LEFT, LOOK, NOISE),
+            "the sums of the variances of stop scatter left, look scatter pan and noise / stated are",
+        ),
+    ],
+)
+def test_what_is_known_in_a_sum_alone_is_named(parts, told):
+    """Two parts of a known sum correlate with -1, three with -0.5: together the others explain each."""
+    (found,) = sum_directions(FREE, known_sum_of(*parts), EVEN)
+    assert found.of_sums and told in found.text and found.text.endswith("; look twice at some stops")
+    assert found.loadings.pop(LEFT) == pytest.approx(1.0)
+    assert set(found.loadings) == {*parts} - {LEFT} and all(-1 <= value < -0.4 for value in found.loadings.values())
+
+
+def test_noise_and_looks_without_stops_ask_for_no_second_look():
+    (found,) = sum_directions(FREE, known_sum_of(LOOK, NOISE), EVEN)
+    assert "look scatter pan and noise / stated is known" in found.text and "look twice" not in found.text
+
+
+def test_what_is_told_apart_or_fixed_is_not_named():
+    assert sum_directions(FREE, independent(), EVEN) == ()
+    assert sum_directions(~FREE, independent(), EVEN) == ()
+    shared, fixed = known_sum_of(LEFT, LOOK), FREE.copy()
+    fixed[INDEX[LOOK]] = False
+    assert sum_directions(fixed, shared, EVEN) == ()
+    shared[:, INDEX[LOOK]] = 0.01
+    assert sum_directions(FREE, shared, EVEN) == ()
+
+
+def test_draws_count_with_their_weights():
+    mixed, weights = np.concatenate([known_sum_of(LEFT, LOOK), independent()]), np.repeat([1 / DRAWS, 0.0], DRAWS)
+    assert sum_directions(FREE, mixed, weights)
+    assert sum_directions(FREE, mixed, weights[::-1]) == ()
