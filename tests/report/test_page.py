@@ -44,9 +44,8 @@ from tvsbayes.report.parameter_words import (
     share_in_words,
     source_in_words,
 )
-from tvsbayes.report.scanner_document import _cells, answer_table, report_document
+from tvsbayes.report.scanner_document import NO_APERTURE, _cells, answer_table, report_document
 from tvsbayes.report.tables import TableView, chance_text
-from tvsbayes.report.uncertainty_sections import NO_APERTURE
 
 BYTES_MAX = 3_000_000
 
@@ -150,20 +149,19 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence, no_pictures
 def test_millimetres_without_aperture_readings_say_what_they_rest_on(evidence, no_pictures):
     """All calibrations share what is stated of the aperture: they are compared by their beams alone."""
 
-    def texts(e) -> list[str]:
-        page = report_html(e)
-        return [" ".join(" ".join(Nodes(part).text).split()) for part in (page, page.split(b"<main>")[1])]
+    def text(e) -> str:
+        return " ".join(" ".join(Nodes(report_html(e)).text).split())
 
-    assert [text.count(NO_APERTURE) for text in texts(evidence)] == [2, 1], "on the first page, and below the table"
+    assert text(evidence).count(NO_APERTURE) == 1
     first, *others = evidence.campaign.spots
     read = replace(evidence.campaign, spots=(replace(first, aperture_deg=70.0), *others))
-    assert not any(NO_APERTURE in text for text in texts(replace(evidence, campaign=read)))
+    assert NO_APERTURE not in text(replace(evidence, campaign=read))
 
 
 def test_a_long_cell_wraps_and_is_not_cut(evidence, no_pictures):
     """The versions of a dozen programs are wider than any screen."""
-    (versions,) = re.findall(r'<td class="long">([^<]*)</td>', report_html(evidence).decode())
-    assert "numpy" in versions and "tvsbayes" in versions
+    long = re.findall(r'<td class="long">([^<]*)</td>', report_html(evidence).decode())
+    assert any("numpy" in cell and "jax" in cell for cell in long)
     assert "td.long { white-space: normal;" in (shipped_data() / "report" / "report.css").read_text(encoding="utf-8")
 
 

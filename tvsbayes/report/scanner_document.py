@@ -28,7 +28,7 @@ from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.page import numbered
 from tvsbayes.report.parameter_words import cause_in_words, sentence_in_words
 from tvsbayes.report.tables import TableView, chance_text, interval_text, two_digits
-from tvsbayes.report.uncertainty_sections import NO_APERTURE, uncertainty_sections
+from tvsbayes.report.uncertainty_sections import uncertainty_sections
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
@@ -37,6 +37,10 @@ ASYMMETRY_MAX = 1.5
 """Largest ratio of the distances of an interval's ends from the value for which half the interval is stated as U."""
 CAUSES_LISTED = 3
 """Number of listed causes of a point's uncertainty; the section on budgets has all."""
+NO_APERTURE = (
+    "The campaign has no aperture readings: baseline, emission angle at pan 0 and the aperture's zero are as stated "
+    "for every calibration. The errors in mm hold if the statement does, and calibrations differ by the beam alone."
+)
 
 
 def report_document(e: Evidence, issue: Issue | None = None) -> Document:

@@ -30,10 +30,6 @@ if TYPE_CHECKING:
 
 OTHERS = f"others, each below {100 * SMALLEST_SHARE:g} %"
 """Row of all inputs of a budget without their own row."""
-NO_APERTURE = (
-    "The campaign has no aperture readings: baseline, emission angle at pan 0 and the aperture's zero are as stated "
-    "for every calibration. The errors in mm hold if the statement does, and calibrations differ by the beam alone."
-)
 END_SHIFT = 0.1
 """Least difference of an end of the linear interval for a note, over U; a quantile of 1000 draws scatters by half."""
 
@@ -65,8 +61,6 @@ def maps_section(e: Evidence) -> Section:
         "Nominal and classic users are given a baseline shortened by the mirror offset and moved by half of it; noise "
         "of one look is included for all."
     ]
-    if not e.campaign.aperture_read:
-        text.append(NO_APERTURE)
     worse = np.flatnonzero(at_middle["joint"] >= at_middle["nominal"])
     if len(worse):
         text.append(_no_better(e, [f"{e.maps.range_mm[k]:g}" for k in worse]))
