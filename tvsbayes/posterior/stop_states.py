@@ -107,7 +107,9 @@ class Elimination:
         rest |= dict(zip(zip(rows.tolist(), columns.tolist(), strict=True), scaled, strict=True))
         pivot, below = np.empty_like(sd), []
         for i, after in enumerate(later):
-            pivot[:, i] = np.sqrt(diagonal[:, i])
+            # Rounding makes it negative at scales so large that a draw has no density: NaN says so.
+            with np.errstate(invalid="ignore"):
+                pivot[:, i] = np.sqrt(diagonal[:, i])
             column = np.stack([rest[i, j] / pivot[:, i] for j in after], axis=1) if after else np.empty((len(sd), 0))
             below.append(column)
             for a, j in enumerate(after):
