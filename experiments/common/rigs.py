@@ -9,7 +9,7 @@ import numpy as np
 
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, Spot, read_campaign
-from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES
+from tvsbayes.instrument.parameters import CREEP_NAMES, LOOK_SCATTER_NAMES
 from tvsbayes.instrument.plan import PlanStep, read_plan
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign
@@ -78,6 +78,12 @@ def dense_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
         for look in range(30):
             orders += [("move", PAN_SWEEP[look % len(PAN_SWEEP)], TILT_STEPS[look % len(TILT_STEPS)]), ("look",)]
     return numbered(orders)
+
+
+def creeping_rig() -> Rig:
+    """The drawn rig, whose zeros creep too."""
+    rig = drawn_rig()
+    return replace(rig, truth={name: prior for name, prior in rig.truth.items() if name not in CREEP_NAMES})
 
 
 def drawn_truth(rig: Rig, seed: int) -> Truth:

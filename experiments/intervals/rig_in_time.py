@@ -18,11 +18,11 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.drawn_instruments import USABLE, scored, tables
-from experiments.common.rigs import drawn_rig, shipped_plan
+from experiments.common.rigs import creeping_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.assessment.gear_waves import gear_periods
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.parameters import CREEP_NAMES, RIG_PRIORS, names_of
+from tvsbayes.instrument.parameters import RIG_PRIORS, names_of
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.statistics.chances import binomial_bounds
@@ -38,14 +38,13 @@ SURE = 0.95
 
 def moving_rig(periodic: bool) -> Rig:
     """Priors and truths of a rig: the mounted one, whose zeros move in time, with periods or without."""
-    rig = drawn_rig()
-    truth = {name: p for name, p in rig.truth.items() if name not in CREEP_NAMES}
+    rig = creeping_rig()
     if not periodic:
-        return replace(rig, truth=truth)
+        return rig
     priors = {name: prior for name, prior in rig.table.priors.items() if name not in PERIODIC_NAMES}
     table = replace(rig.table, priors=priors, harmonic_period_deg={axis: (PERIOD_DEG,) for axis in AXES})
     wave = "harmonic_amplitude_deg.pan.1"
-    return replace(rig, table=table, truth={**truth, wave: RIG_PRIORS[wave]})
+    return replace(rig, table=table, truth={**rig.truth, wave: RIG_PRIORS[wave]})
 
 
 def temperature_degC(time_s: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ from experiments.common.command_line import act, study_parser
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import physical_of
 from experiments.common.headlines import SHRINK
-from experiments.common.rigs import dense_plan, drawn_rig, small_plan, unseen
+from experiments.common.rigs import creeping_rig, dense_plan, small_plan, unseen
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.uniformity import ALPHA, BAND_SAMPLES, DRAWS, FAULT_SIMULATIONS, Band, pit_values
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
@@ -90,7 +90,7 @@ def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
     """Simulate, fit, sample, rank; whatever fails is recorded as a failure."""
     tier, variant, seed = task
     use_compilation_cache()
-    simulated = simulate(drawn_rig(), small_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
+    simulated = simulate(creeping_rig(), small_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
     row: dict[str, object] = {"tier": tier, "variant": variant, "seed": seed, "converged": False, "problems": []}
     row["unseen"] = unseen(simulated.campaign)
     start = time.process_time()
