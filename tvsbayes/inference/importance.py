@@ -253,7 +253,7 @@ class Weighing:
             log_evidence=self.log_evidence,
             log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
             invalid_evaluations=self.pool.invalid,
-            answer="accepted" if not missing else best_answer(pareto, heaviest, self.monte_carlo_error),
+            answer=answer_of(missing, pareto, heaviest, self.monte_carlo_error),
         )
 
     @property
@@ -300,8 +300,12 @@ def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, Mon
     return (*missing, *uncertain(errors))
 
 
-def best_answer(pareto: float, heaviest: float, errors: Mapping[str, MonteCarloError]) -> AnswerKind:
-    """Choose the answer of draws that are not accepted, by the arguments of `lacking`."""
+def answer_of(
+    missing: tuple[str, ...], pareto: float, heaviest: float, errors: Mapping[str, MonteCarloError]
+) -> AnswerKind:
+    """Choose the answer that draws allow: `missing` is what `lacking` says of the other arguments."""
+    if not missing:
+        return "accepted"
     known = all(error.roughly_known for error in errors.values())
     return "rough" if pareto < ROUGH_K_MAX and heaviest <= ROUGH_HEAVIEST_MAX and known else "laplace"
 

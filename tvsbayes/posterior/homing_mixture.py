@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.importance import K_MAX, ROUND, ImportanceRun, Pool, Weighing, best_answer, lacking
+from tvsbayes.inference.importance import K_MAX, ROUND, ImportanceRun, Pool, Weighing, answer_of, lacking
 from tvsbayes.inference.summaries import monte_carlo_errors
 from tvsbayes.instrument.homing import prior_chance
 from tvsbayes.posterior.draws import Posterior
@@ -69,7 +69,7 @@ class WayDraws:
     @property
     def reliable(self) -> bool:
         """Whether the tail of the weights determines means."""
-        return self.weighed.importance.pareto_k < K_MAX
+        return self.weighed.smoothed.pareto_k < K_MAX
 
     @property
     def log_evidence(self) -> float:
@@ -176,9 +176,14 @@ class Mixture:
         return lacking(self.pareto_k, self.heaviest, sum(map(len, self._weights)), self.errors)
 
     @property
+    def worst(self) -> str:
+        """Return the headline with the largest error."""
+        return max(self.errors, key=lambda name: self.errors[name].rounds_factor)
+
+    @property
     def shares_of_error(self) -> np.ndarray:
-        """Compute the share of each way in the squared error of the headline known worst, shape (ways,)."""
-        name = max(self.errors, key=lambda each: self.errors[each].rounds_factor)
+        """Compute the share of each way in the squared error of the worst headline, shape (ways,)."""
+        name = self.worst
         error, column = self.errors[name], self.names.index(name)
         worst = int(np.argmax([error.mean / MEAN_ERROR_MAX, *(each / END_ERROR_MAX for each in error.interval95)]))
         squares = []
@@ -192,7 +197,11 @@ class Mixture:
         return np.array(squares) / np.sum(squares)
 
     def improved(self) -> Mixture | None:
-        """Draw more where it lowers the error most; None where the draws suffice or no rounds are left."""
+        """Draw more where it helps most; None where the draws suffice or no rounds are left."""
+        return self._with_reliable_weights() or (self._with_smaller_error() if self.missing else None)
+
+    def _with_reliable_weights(self) -> Mixture | None:
+        """Draw otherwise under the first way whose weights are unreliable."""
         first = self.ways[0]
         for place, way in enumerate(self.ways[1:], 1):
             if way.reliable:
@@ -203,9 +212,12 @@ class Mixture:
                 return self._with(place, self._alone(way, place), ALONE_ROUNDS)
             if not way.shared and self.probabilities[place] >= WORTH_RELIABLE_WEIGHTS and self.left >= way.rounds:
                 return self._with(place, way.refitted, way.rounds)
-        if not self.missing:
-            return None
-        factor, shares = max(error.rounds_factor for error in self.errors.values()), self.shares_of_error
+        return None
+
+    def _with_smaller_error(self) -> Mixture | None:
+        """Draw more under the way that lowers the largest error most for its cost."""
+        first = self.ways[0]
+        factor, shares = self.errors[self.worst].rounds_factor, self.shares_of_error
         cost = np.array([SHARED_COST if way.shared and way.rounds < first.rounds else 1.0 for way in self.ways])
         for place in np.argsort(-shares / cost).tolist():
             if shares[place] < WORTH_DRAWING:
@@ -231,6 +243,7 @@ class Mixture:
         """Draw from another way of homing itself, by its own map and the proposal fitted for the most probable way."""
         first = self.ways[0]
         target = Target(way.target.fit, transport_beside(way.target.fit, first.target.path))
+        # Another seed: the same numbers in the proposal of the first way would tie the draws of both.
         empty = WayDraws(target, Pool.empty(first.pool.proposals[-1]), way.seed + 1000 * place)
         return empty.extended(ALONE_ROUNDS, first.pool)
 
@@ -245,7 +258,7 @@ class Mixture:
             missing=self.missing,
             pareto_k=self.pareto_k,
             heaviest_share=self.heaviest,
-            answer="accepted" if not self.missing else best_answer(self.pareto_k, self.heaviest, self.errors),
+            answer=answer_of(self.missing, self.pareto_k, self.heaviest, self.errors),
         )
         convergence = replace(diagnosis, importance=importance, monte_carlo_error=self.errors)
         return replace(mixed(parts, self.probabilities), convergence=convergence, seconds=seconds)
