@@ -33,7 +33,7 @@ from tvsbayes.acquisition.running_estimate import Aim, RunningEstimate
 from tvsbayes.errors import InputError, TvsError, fault
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import UNDETECTED, Spot, pixels_of
-from tvsbayes.instrument.plan import PlanStep, plan_minutes, plan_seconds, run_plan
+from tvsbayes.instrument.plan import PlanStep, continued, plan_minutes, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import triangulate
 
@@ -203,7 +203,7 @@ class Acquisition:
         """Replaces the remaining looks by proposed ones; the journal records the change before it takes effect."""
         if proposal is None:
             return
-        steps = proposal.continued(row, self._log.recorder.state.target)
+        steps = continued(proposal.steps, row, self._log.recorder.state.target)
         try:
             check_plan(self.rig, steps)
         except InputError as error:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -80,11 +80,6 @@ class Proposal:
     now: float
     looks: int
     why: str
-
-    def continued(self, row: int, sheet: str) -> tuple[PlanStep, ...]:
-        """The steps as rows of a plan from `row` on, with `sheet` already in place."""
-        steps = self.steps[1:] if self.steps[0].target == sheet else self.steps
-        return tuple(replace(step, step=row + number) for number, step in enumerate(steps))
 
 
 @dataclass(frozen=True)

@@ -237,6 +237,12 @@ def run_plan(
     return log
 
 
+def continued(steps: Sequence[PlanStep], row: int, sheet: str) -> tuple[PlanStep, ...]:
+    """Steps as rows of a plan from `row` on, without a first placement of the sheet that is in place."""
+    in_place = bool(steps) and steps[0].action == "place" and steps[0].target == sheet
+    return tuple(replace(step, step=row + number) for number, step in enumerate(steps[in_place:]))
+
+
 def outline(rig: Rig, plan: Sequence[PlanStep]) -> list[str]:
     """The steps of a run in words: the listing of `--dry-run`."""
     lines, counters = [], (0, 0)

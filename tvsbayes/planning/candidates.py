@@ -49,6 +49,11 @@ class Candidates:
     notes: tuple[str, ...]
 
 
+def sheet_choices[Sheet](sheets: Sequence[Sheet], most: int) -> list[tuple[Sheet, ...]]:
+    """List all choices of one sheet up to `most`."""
+    return [choice for size in range(1, most + 1) for choice in itertools.combinations(sheets, size)]
+
+
 BACKLASH_COLUMNS = [INDEX[f"backlash_deg.{axis}"] for axis in AXES]
 RUN_UP_STOPS = 4.0
 """Sds of a stop added to the play: the stop before the run-up deviates by more once in 30 000 runs."""

@@ -164,19 +164,15 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
 
 def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
     """Choose four looks on every sheet from all candidates and from those a full turn away, by gain per minute."""
-    search, candidates, rig, now = problem.search(), problem.candidates, problem.knowledge.rig, problem.now
-    batches = []
-    for number in range(len(problem.knowledge.sheets)):
-        for turned in (False, True):
-            allowed = (candidates.looks.sheet == number) & (candidates.turned | (not turned))
-            if not allowed.any():
-                continue
-            best = problem.choose(search, allowed, LOOKS_PER_EXPERIMENT)
-            steps, minutes, gain = best.design.steps, best.design.minutes(rig), max(now - best.value, 0.0)
-            text = f"{'a full turn of pan away, ' if turned else ''}{describe_looks(rig, steps)}"
-            batches.append(Batch(steps, minutes, gain, gain / max(minutes, 1e-9), text))
-    unique = {batch.actions: batch for batch in batches}.values()
-    return tuple(sorted(unique, key=lambda b: -b.gain_per_minute)[:NEXT_LISTED])
+    candidates, rig = problem.candidates, problem.knowledge.rig
+    sheets = [candidates.looks.sheet == number for number in range(len(problem.knowledge.sheets))]
+    subsets = [subset for sheet in sheets for subset in (sheet, sheet & candidates.turned)]
+    batches = {}
+    for best in problem.choices(LOOKS_PER_EXPERIMENT, subsets):
+        away = "a full turn of pan away, " if candidates.turned[best.picks].all() else ""
+        text = f"{away}{describe_looks(rig, best.steps)}"
+        batches[best.steps] = Batch(best.steps, best.minutes, best.gain, best.gain_per_minute, text)
+    return tuple(sorted(batches.values(), key=lambda batch: -batch.gain_per_minute)[:NEXT_LISTED])
 
 
 def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch], after_data: bool) -> Advice:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,11 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.conditions import powered_on_s, warm_minutes
-from tvsbayes.instrument.plan import PlanStep, plan_minutes, step_json
+from tvsbayes.instrument.plan import PlanLog, PlanStep, step_json
 from tvsbayes.instrument.rig import Rig
+from tvsbayes.planning.candidates import sheet_choices
 from tvsbayes.planning.expectation import knowledge_of
 from tvsbayes.planning.planner import design_problem
-from tvsbayes.planning.search import Choice, DesignProblem
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.results.tiers import IMPORTANCE
@@ -122,42 +121,26 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
     problem = design_problem(knowledge, target, fit.reference_pose_rad, False)
     # The segment continues: no new home offset, and the expectation of the looks includes the creep so far.
     problem = replace(problem, knowledge=replace(problem.knowledge, after_data=False), warming=False)
-    last, sheet = fit.campaign.moves[-1], ordered_spots(fit.campaign)[-1].target
-
-    def minutes(choice: Choice) -> float:
-        steps = choice.design.steps_onwards
-        return plan_minutes(rig, steps[1:] if choice.design.sheet[0] == sheet else steps)
-
-    choices = _choices(problem, count, (last.pan_steps, last.tilt_steps))
-    best = max(choices, key=lambda choice: (problem.now - choice.value) / max(minutes(choice), 1e-9))
+    session = PlanLog(list(fit.campaign.moves), targets=[ordered_spots(fit.campaign)[-1].target])
+    sheet_of_look, sheets = problem.candidates.looks.sheet, range(len(problem.knowledge.sheets))
+    subsets = [np.isin(sheet_of_look, choice) for choice in sheet_choices(sheets, 2)]
+    best = max(problem.choices(count, subsets, session), key=lambda choice: choice.gain_per_minute)
     sds = np.asarray(fit.draws.effective_deg_per_step).std(axis=0)
     confirmation_result = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
+    order = best.design.order
     places, quantity = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
     return NextLooks(
         target=target,
-        steps=best.design.steps_onwards,
-        minutes=minutes(best),
+        steps=best.steps,
+        minutes=best.minutes,
         now=problem.now,
         expected=best.value,
-        after_each=_after_each(problem, best),
+        after_each=tuple(problem.value(best.picks, best.design, order[: n + 1]) for n in range(len(order))),
         deg_per_step=dict(zip(DIRECTIONS, map(float, np.asarray(fit.mode.effective_deg_per_step)), strict=True)),
         u_deg_per_step=dict(zip(DIRECTIONS, map(float, sds), strict=True)),
         why=(
             f"{count} looks at {places} lower {quantity} most per minute: from {problem.now:.3g} to {best.value:.3g} "
-            f"{target.unit} in {minutes(best):.1f} minutes"
+            f"{target.unit} in {best.minutes:.1f} minutes"
         ),
         confirmed=confirmation_result,
     )
-
-
-def _choices(problem: DesignProblem, count: int, start: tuple[int, int]) -> list[Choice]:
-    """Choose the best looks on every sheet and on every pair of sheets."""
-    search, sheet_of_look = problem.search(), problem.candidates.looks.sheet
-    subsets = [s for size in (1, 2) for s in combinations(range(len(problem.knowledge.sheets)), size)]
-    masks = (np.isin(sheet_of_look, subset) for subset in subsets)
-    return [problem.choose(search, allowed, count, start) for allowed in masks if allowed.any()]
-
-
-def _after_each(problem: DesignProblem, best: Choice) -> tuple[float, ...]:
-    order = best.design.order
-    return tuple(problem.value(best.picks, best.design, order[:done]) for done in range(1, len(order) + 1))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX, TARGET_ROWS
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, too_few_counters
-from tvsbayes.instrument.plan import PlanStep, describe_looks, run_plan, step_json
+from tvsbayes.instrument.plan import PlanStep, continued, describe_looks, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.planning.candidates import Candidates, candidates
@@ -169,10 +169,7 @@ def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = F
 def appended(steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, run_up: np.ndarray) -> tuple[PlanStep, ...]:
     """Write looks as steps after a plan: without homing, with a placement only where another sheet is needed."""
     end = run_plan(steps, knowledge.rig)
-    addition = [s for s in arrange(looks, knowledge.sheets, run_up, end.at).steps if s.action != "home"]
-    if addition and addition[0].action == "place" and addition[0].target == end.sheet:
-        addition = addition[1:]
-    return tuple(replace(s, step=len(steps) + k) for k, s in enumerate(addition))
+    return continued(arrange(looks, knowledge.sheets, run_up, end.at).steps_onwards, len(steps), end.sheet)
 
 
 @dataclass(frozen=True)

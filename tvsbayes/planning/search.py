@@ -7,17 +7,16 @@ for the home offset of (pan, tilt) after an earlier campaign.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 
 from tvsbayes.instrument.parameters import TARGET_ROWS
-from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanLog, PlanStep, continued, plan_minutes
 from tvsbayes.planning.assurance import Assurance, Family
-from tvsbayes.planning.candidates import Candidates
+from tvsbayes.planning.candidates import Candidates, sheet_choices
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookPlan, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
@@ -223,23 +222,33 @@ SUBSETS_MAX = 40
 
 def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
     """List choices of sheets: all subsets of one to three, the farthest apart first."""
-    subsets = [s for size in (1, 2, 3) for s in combinations(range(count), size)]
-    return sorted(subsets, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
+    return sorted(sheet_choices(range(count), 3), key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The looks chosen by a search.
+    """A few looks chosen together, and their worth.
 
     Attributes:
         picks: numbers of the candidates, shape (k,).
         design: their plan.
-        value: value of the target after it, in the target's unit.
+        steps: its steps: from a homing on, or as they continue a session.
+        minutes: duration by `[costs]`, without the placement of a sheet in place.
+        value: value of the target after them, in the target's unit.
+        gain: its reduction.
     """
 
     picks: np.ndarray
     design: LookPlan
+    steps: tuple[PlanStep, ...]
+    minutes: float
     value: float
+    gain: float
+
+    @property
+    def gain_per_minute(self) -> float:
+        """Return the reduction of the target a minute."""
+        return self.gain / max(self.minutes, 1e-9)
 
 
 @dataclass(frozen=True)
@@ -287,24 +296,32 @@ class DesignProblem:
         precision = self.knowledge.precision + self.information(picks, design, taken)
         return self.at_centre.value(covariance_of(precision), self.target.factor)
 
-    def choose(self, search: Search, allowed: np.ndarray, count: int, start: tuple[int, int] | None = None) -> Choice:
-        """Choose the best looks among some candidates.
+    def choices(self, count: int, subsets: Iterable[np.ndarray], session: PlanLog | None = None) -> list[Choice]:
+        """Choose the best looks in each subset of the candidates.
 
         Args:
-            search: search for the target.
-            allowed: mask of candidates, shape (m,); at least one.
             count: number of looks.
-            start: present counters; None for a plan that begins with a homing.
+            subsets: masks of candidates, shape (m,) each; those without a candidate are omitted.
+            session: the session that the looks continue; None for plans that begin with a homing.
         """
-        picks = np.array(search.among(allowed).greedy(count))
-        looks = self.candidates.looks[picks]
-        design = arrange(looks, self.knowledge.sheets, self.candidates.run_up, start or (0, 0))
-        if start is not None:
+        search = self.search()
+        picks = (np.array(search.among(subset).greedy(count)) for subset in subsets if subset.any())
+        return [self._choice(each, session) for each in picks]
+
+    def _choice(self, picks: np.ndarray, session: PlanLog | None) -> Choice:
+        looks, rig, run_up = self.candidates.looks[picks], self.knowledge.rig, self.candidates.run_up
+        design = arrange(looks, self.knowledge.sheets, run_up, session.at if session else (0, 0))
+        if session is None:
+            steps, minutes = design.steps, design.minutes(rig)
+        else:
             # The first look gets a run-up, since the counters at the start of the looks are unknown.
             via = design.via.copy()
-            via[0] = design.goal[0] - looks.side[design.order[0]] * self.candidates.run_up
+            via[0] = design.goal[0] - looks.side[design.order[0]] * run_up
             design = replace(design, via=via)
-        return Choice(picks, design, self.value(picks, design))
+            steps = design.steps_onwards
+            minutes = plan_minutes(rig, continued(steps, 0, session.sheet))
+        value = self.value(picks, design)
+        return Choice(picks, design, steps, minutes, value, max(self.now - value, 0.0))
 
 
 def _of_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
