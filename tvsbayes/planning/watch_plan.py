@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 
@@ -39,7 +38,7 @@ from tvsbayes.instrument.rig import COSTS_S, Rig
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import STOP_COLUMNS, physical_at
-from tvsbayes.planning.candidates import BACKLASH_COLUMNS, have_room, run_up_steps
+from tvsbayes.planning.candidates import BACKLASH_COLUMNS, counter_range, have_room, run_up_steps, sheet_choices
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, run_up_start
 from tvsbayes.planning.search import smallest_design
@@ -153,9 +152,9 @@ class WatchDesigns:
     @cached_property
     def _limits(self) -> np.ndarray:
         """Return the lowest and highest counter of (pan, tilt): the rig's, else those of the campaign; (2, 2)."""
-        reached = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
-        known = self.rig.limits.within({axis: (min(reach), max(reach)) for axis, reach in reached.items()})
-        return np.array([known[axis] for axis in AXES])
+        counters = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
+        reached: dict[str, tuple[int, int]] = {axis: (min(of_axis), max(of_axis)) for axis, of_axis in counters.items()}
+        return counter_range(self.rig.limits, reached).limits
 
     def _reachable(self, candidate: Candidate) -> bool:
         if candidate.target not in self.rig.depths_mm:
@@ -237,8 +236,8 @@ class WatchDesigns:
     def patterns(self) -> list[Pattern]:
         """Build patterns for every choice of sheets, grown for few homings and for many."""
         names = list(dict.fromkeys(candidate.target for candidate in self.candidates))
-        choices = [(name,) for name in names] + list(combinations(names, 2))
-        grown = [pattern for sheets in choices for homings in (1.0, 8.0) for pattern in self.grown(sheets, homings)]
+        scopes = [(sheets, homings) for sheets in sheet_choices(names, 2) for homings in (1.0, 8.0)]
+        grown = [pattern for sheets, homings in scopes for pattern in self.grown(sheets, homings)]
         return list({tuple(pattern.looks.items()): pattern for pattern in grown}.values())
 
     def steps(self, pattern: Pattern, homings: int) -> tuple[PlanStep, ...]:
