@@ -11,12 +11,12 @@ import pytest
 from support.axes import campaign, drawn, runs
 
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.single_axis.axis_campaign import Reading, read_axis
+from tvsbayes.single_axis.axis_campaign import AxisStop, Reading, read_axis
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.axis_rows import reversal_of, rows_of
-from tvsbayes.single_axis.next_stops import NextStop, _with_stop, plan_next
+from tvsbayes.single_axis.axis_rows import SIDES, reversal_of, rows_of
+from tvsbayes.single_axis.next_stops import NextStop, _run_up_start, _with_stop, plan_next
 from tvsbayes.twin.simulated_axis import draw_axis, simulate_axis
 
 
@@ -97,7 +97,8 @@ def test_a_last_reading_of_no_use_takes_nothing_from_the_gains(turned):
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 def test_a_stop_to_be_read_moves_neither_line_nor_reversal(turned, direction):
     rows = rows_of(turned)
-    more = rows_of(_with_stop(turned, rows, 45.0, direction, 60.0)[0])
+    via = _run_up_start(turned.moves, 45.0, SIDES[direction])
+    more = rows_of(_with_stop(turned, rows, AxisStop(via, 45.0, direction), 60.0))
     assert len(more.value) == len(rows.value) + 1
     # Least squares of a point on the line, by another factorisation.
     np.testing.assert_allclose([*more.line, reversal_of(more)[0]], [*rows.line, reversal_of(rows)[0]], atol=1e-9)

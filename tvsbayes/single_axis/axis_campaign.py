@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import escaped, refusal
@@ -406,12 +406,16 @@ def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
     return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
 
 
-def stops_csv(stops: Iterable[tuple[float | None, float, str]]) -> bytes:
-    """`plan.csv` of an axis: step, command, direction, read (1 or 0).
+class AxisStop(NamedTuple):
+    """A stop of a plan: the command visited before, or None; the command; its direction of approach."""
 
-    Args:
-        stops: the command visited before, or None; the command; its direction of approach.
-    """
+    via: float | None
+    command: float
+    direction: str
+
+
+def stops_csv(stops: Iterable[AxisStop]) -> bytes:
+    """`plan.csv` of an axis: step, command, direction, read (1 or 0)."""
     rows: list[tuple[int, float, str, int]] = []
     for via, command, direction in stops:
         if via is not None:

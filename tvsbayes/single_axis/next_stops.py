@@ -6,6 +6,8 @@ covariances. The variance due to unknown scales stays constant: the plan begins 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -13,15 +15,15 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.progress import Job, Show
+from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.records import plain
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, stops_csv
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, AxisStop, Reading, stops_csv
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 from tvsbayes.single_axis.axis_record import deviation_functionals
-from tvsbayes.single_axis.axis_rows import AxisRows, reversal_of, rows_of
+from tvsbayes.single_axis.axis_rows import SIDES, AxisRows, reversal_of, rows_of
 
 TARGETS = (*(name for name, quantity in AXIS_QUANTITIES.items() if quantity.target), "position")
 """Targets of a plan; "position" is the mean uncertainty of the error by position over the range."""
@@ -92,7 +94,7 @@ class AxisPlan(Shown):
 
     def plan_bytes(self) -> bytes:
         """`plan.csv`: step, command, direction, read (1 or 0)."""
-        return stops_csv((stop.via, stop.command, stop.direction) for stop in self.next)
+        return stops_csv(AxisStop(stop.via, stop.command, stop.direction) for stop in self.next)
 
 
 def _move_seconds(campaign: AxisCampaign) -> float:
@@ -101,28 +103,29 @@ def _move_seconds(campaign: AxisCampaign) -> float:
     return float(np.median(gaps)) if gaps else MOVE_S
 
 
-def _with_stop(
-    campaign: AxisCampaign, rows: AxisRows, command: float, direction: str, seconds: float
-) -> tuple[AxisCampaign, float | None]:
-    """The campaign with one more stop, reached in this direction, and the command visited before it, or None.
+def _run_up_start(moves: Sequence[AxisMove], command: float, side: int) -> float | None:
+    """The command to visit first, so that the last move to `command` is towards `side`; None where it is already."""
+    if side * (command - moves[-1].command) > 0:
+        return None
+    commands = np.array([move.command for move in moves])
+    via = command - side * RUN_UP_SHARE * float(np.ptp(commands))
+    return float(np.round(via)) if np.all(commands == np.round(commands)) else via
+
+
+def _with_stop(campaign: AxisCampaign, rows: AxisRows, stop: AxisStop, seconds: float) -> AxisCampaign:
+    """The campaign with one more stop.
 
     Its reading lies on the line with a reversal through the `rows`, and so does not change the line.
     """
     moves, last = list(campaign.moves), campaign.moves[-1]
-    commands = [m.command for m in campaign.moves]
-    sign = 1 if direction == "forward" else -1
-    via = None
-    if sign * (command - last.command) <= 0:
-        via = command - sign * RUN_UP_SHARE * (max(commands) - min(commands))
-        via = float(np.round(via)) if np.all(np.array(commands) == np.round(commands)) else via
-        moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, via))
-    moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
+    for command in (stop.command,) if stop.via is None else (stop.via, stop.command):
+        moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
     offset, slope = rows.line
-    value = offset + slope * command - 0.5 * float(np.sign(slope)) * sign * reversal_of(rows)[0]
+    value = offset + slope * stop.command - 0.5 * float(np.sign(slope)) * SIDES[stop.direction] * reversal_of(rows)[0]
     u = float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
     number = max(r.reading for r in campaign.readings) + 1
     reading = Reading(number, len(moves) - 1, value, u)
-    return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading)), via
+    return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading))
 
 
 def _functionals(fit: AxisFit, target: str, places: np.ndarray) -> np.ndarray:
@@ -134,23 +137,18 @@ def _functionals(fit: AxisFit, target: str, places: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Variance:
-    """Variance of a target, unit^2, by the law of total variance over draws of the scales.
-
-    Attributes:
-        given: mean of its variances given the scales.
-        between: variance of its means.
-    """
+    """Variance of a target, unit^2: mean of its variances given the scales, and variance between their means."""
 
     given: float
     between: float
 
 
-def _variance(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> _Variance:
-    """The variance with the rows of a campaign, at draws w (n, d)."""
+def _variance(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray) -> _Variance:
+    """The variance with the rows of a campaign, at the draws of the fit."""
     rows = replace(rows_of(campaign), line=fit.rows.line)
     model = AxisModel.of(rows, fit.model.priors, places, fit.model.coordinates.waves)
     model = replace(model, coordinates=fit.model.coordinates)
-    mean, sd = model.linear(w).of(_functionals(replace(fit, rows=rows, model=model, w=w), target, places))
+    mean, sd = model.linear(fit.w).of(_functionals(replace(fit, rows=rows, model=model), target, places))
     return _Variance(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
 
 
@@ -160,6 +158,85 @@ def _with_linear_play(fit: AxisFit) -> AxisFit:
     remaining = tuple(name for name in names if name != "backlash")
     model = replace(fit.model, coordinates=replace(fit.model.coordinates, names=remaining))
     return replace(fit, model=model, w=np.delete(fit.w, names.index("backlash"), axis=1))
+
+
+@dataclass(frozen=True)
+class _Aim:
+    """A target, and its u after more stops.
+
+    Attributes:
+        fit: fit of the present readings with few draws of the scales.
+        target: name in `TARGETS`.
+        places: commands of the candidates, shape (n,).
+        now: present variance at all draws.
+        given: mean of the present variances given the scales, at the few draws.
+    """
+
+    fit: AxisFit
+    target: str
+    places: np.ndarray
+    now: _Variance
+    given: float
+
+    @classmethod
+    def of(cls, fit: AxisFit, target: str, places: np.ndarray) -> _Aim:
+        """The target with the readings of a fit.
+
+        Raises:
+            NothingToEstimate: the target is fixed.
+        """
+        now = _variance(fit, fit.campaign, target, places)
+        if target == "backlash" and fit.model.play_is_sampled:
+            # A sampled play has no variance given the scales: that of a linear play replaces it.
+            now, fit = _Variance(now.given + now.between, 0.0), _with_linear_play(fit)
+        few = replace(fit, w=fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)])
+        given = _variance(few, fit.campaign, target, places).given
+        if not given:
+            remedy = f"state {target} in [axis] with u above 0, or name another target"
+            raise NothingToEstimate("held", f"{target} is held at its value: no reading changes it", remedy=remedy)
+        return cls(few, target, places, now, given)
+
+    @property
+    def u_now(self) -> float:
+        """Present u."""
+        return float(np.sqrt(self.now.between + self.now.given))
+
+    def u(self, campaign: AxisCampaign) -> float:
+        """The u with the readings of a campaign."""
+        # With few draws the ratio of variances is more accurate than the variance.
+        given = _variance(self.fit, campaign, self.target, self.places).given
+        return float(np.sqrt(self.now.between + self.now.given * given / self.given))
+
+
+@dataclass(frozen=True)
+class _Session:
+    """Readings with planned ones.
+
+    Attributes:
+        campaign: all readings.
+        u: u of the target by them, unit.
+        minutes: time of the planned stops.
+        stops: these, in order.
+    """
+
+    campaign: AxisCampaign
+    u: float
+    minutes: float = 0.0
+    stops: tuple[NextStop, ...] = ()
+
+    def choices(self, aim: _Aim, move_s: float, minutes: float, advance: Advance) -> Iterator[_Session]:
+        """The session with one more stop: at every place from both sides, within the commands and the time."""
+        for k, command in enumerate(aim.places.tolist()):
+            advance(k / len(aim.places))
+            for direction in ("forward", "backward"):
+                via = _run_up_start(self.campaign.moves, command, SIDES[direction])
+                stop_minutes = (1 + (via is not None)) * move_s / 60.0
+                within = via is None or aim.places[0] <= via <= aim.places[-1]
+                if within and self.minutes + stop_minutes <= minutes:
+                    after = _with_stop(self.campaign, aim.fit.rows, AxisStop(via, command, direction), move_s)
+                    u = aim.u(after)
+                    stop = NextStop(command, direction, via, u, self.u - u, (self.u - u) / stop_minutes)
+                    yield _Session(after, u, self.minutes + stop_minutes, (*self.stops, stop))
 
 
 def plan_next(
@@ -194,49 +271,20 @@ def plan_next(
         allowed = ", ".join(TARGETS)
         raise InputError("target", f"--target {target[:60]!r}", allowed=allowed, remedy="name one of them")
     commands = np.array([m.command for m in fit.campaign.moves])
-    low, high = float(commands.min()), float(commands.max())
-    grid = np.unique(np.concatenate([np.linspace(low, high, CANDIDATES), [fit.rows.command.min()]]))
+    grid = np.unique(np.r_[np.linspace(commands.min(), commands.max(), CANDIDATES), fit.rows.command.min()])
     if np.all(commands == np.round(commands)):
         grid = np.unique(np.round(grid))
-    w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
-    seconds = _move_seconds(fit.campaign)
-    campaign, chosen, minutes_used = fit.campaign, [], 0.0
-    start = _variance(fit, campaign, target, grid, fit.w)
-    if target == "backlash" and fit.model.play_is_sampled:
-        # A sampled play has no variance given the scales: that of a linear play replaces it.
-        start, fit = _Variance(start.given + start.between, 0.0), _with_linear_play(fit)
-        w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
-    few = _variance(fit, campaign, target, grid, w)
-    if not few.given:
-        remedy = f"state {target} in [axis] with u above 0, or name another target"
-        raise NothingToEstimate("held", f"{target} is held at its value: no reading changes it", remedy=remedy)
+    aim, move_s = _Aim.of(fit, target, grid), _move_seconds(fit.campaign)
+    session, longest = _Session(fit.campaign, aim.u_now), math.inf if minutes is None else minutes
 
-    def u_of(after: AxisCampaign) -> float:
-        # With few draws the ratio of variances is more accurate than the variance.
-        return float(np.sqrt(start.between + start.given * _variance(fit, after, target, grid, w).given / few.given))
+    def advance(share: float) -> None:
+        job.at((len(session.stops) + share) / count)
 
-    u_now = now = float(np.sqrt(start.between + start.given))
     with Job({"choosing stops": 1.0}, progress) as job:
-        for number in range(count):
-            best: tuple[float, NextStop, AxisCampaign] | None = None
-            for k, command in enumerate(grid):
-                job.at((number + k / len(grid)) / count)
-                for direction in ("forward", "backward"):
-                    after, via = _with_stop(campaign, fit.rows, float(command), direction, seconds)
-                    if via is not None and not low <= via <= high:
-                        continue
-                    stop_minutes = (1 + (via is not None)) * seconds / 60.0
-                    if minutes is not None and minutes_used + stop_minutes > minutes:
-                        continue
-                    u = u_of(after)
-                    rate = (now - u) / stop_minutes
-                    if best is None or rate > best[0]:
-                        stop = NextStop(float(command), direction, via, u, now - u, rate)
-                        best = rate, stop, after
+        for _ in range(count):
+            choices = session.choices(aim, move_s, longest, advance)
+            best = max(choices, key=lambda choice: choice.stops[-1].gain_per_minute, default=None)
             if best is None:
                 break
-            _, stop, campaign = best
-            chosen.append(stop)
-            minutes_used += (1 + (stop.via is not None)) * seconds / 60.0
-            now = stop.u
-    return AxisPlan(target, u_now, tuple(chosen), minutes_used)
+            session = best
+    return AxisPlan(target, aim.u_now, session.stops, session.minutes)
