@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -272,18 +273,27 @@ def verify_looks(
     )
 
 
+class AimedStop(NamedTuple):
+    """A look to make: its counters, and the sides (1 or -1) from which they are reached."""
+
+    pan: int
+    tilt: int
+    pan_side: int
+    tilt_side: int
+
+
 @dataclass(frozen=True)
 class AimPlan:
     """Looks to make with the calibration in force, in this order.
 
     Attributes:
-        stops: counters of pan and tilt, and the sides (1 or -1) from which they are reached, of each look.
+        stops: the looks.
         run_up: run-up of pan and tilt before a counter, steps.
         enough: whether they discriminate the hypotheses in 95 of 100 cases, by the more informative axis.
         distance: distance of the nearest two hypotheses, standard deviations.
     """
 
-    stops: tuple[tuple[int, int, int, int], ...]
+    stops: tuple[AimedStop, ...]
     run_up: tuple[int, int]
     enough: bool
     distance: float
@@ -311,7 +321,7 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
     count = max(LOOKS_MIN, *(len(axis.stops) for axis in axes))
     # The axis that needs fewer stops repeats them: every look measures both axes.
     pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)
-    stops = tuple((p, t, ps, ts) for (p, ps), (t, ts) in zip(pan, tilt, strict=True))
+    stops = tuple(AimedStop(p, t, ps, ts) for (p, ps), (t, ts) in zip(pan, tilt, strict=True))
     reached = max(axis.reached for axis in axes)
     return AimPlan(stops, (run_up[0], run_up[1]), reached >= IDENTIFIED, float(np.sqrt(reached)))
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from tvsbayes.results.compensation_record import (
     Verification,
 )
 from tvsbayes.results.records import read_record, stored_document
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis, stops_csv
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisStop, axis_hashes, read_axis, stops_csv
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, rows_of
@@ -337,29 +338,39 @@ def verify_axis(
         return verify_readings(results.fit, table, new, seed=seed, progress=job.part("verification"))
 
 
+class VerifyStop(NamedTuple):
+    """A stop to read: its command, and the side of arrival, 1 or -1."""
+
+    command: float
+    side: int
+
+
 @dataclass(frozen=True)
 class VerifyPlan:
     """Stops to read with the table in force, in this order.
 
     Attributes:
-        stops: command and side, 1 or -1, of each stop.
+        stops: the stops.
         run_up: distance by which the axis moves beyond a command before it returns to it.
         enough: whether they discriminate the hypotheses in 95 of 100 cases.
         distance: distance of the nearest two hypotheses, standard deviations.
     """
 
-    stops: tuple[tuple[float, int], ...]
+    stops: tuple[VerifyStop, ...]
     run_up: float
     enough: bool
     distance: float
 
     def plan_bytes(self) -> bytes:
         """Return `plan.csv`: step, command, direction, read (1 or 0)."""
-        before = [side * math.inf for _, side in self.stops[:1]] + [command for command, _ in self.stops]
-        return stops_csv(
-            (command - side * self.run_up if side * (command - at) < self.run_up else None, command, DIRECTIONS[side])
-            for at, (command, side) in zip(before, self.stops, strict=False)
-        )
+        at, planned = math.nan, []
+        for command, side in self.stops:
+            # The first stop gets a run-up, wherever the axis is.
+            arrives = side * (command - at) >= self.run_up
+            via = None if arrives else command - side * self.run_up
+            planned.append(AxisStop(via, command, DIRECTIONS[side]))
+            at = command
+        return stops_csv(planned)
 
 
 def _separation(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:
@@ -432,5 +443,5 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
     chosen = discriminating_visits(off, covariance - np.diag(noise) + shift, noise, np.isin(run.index, spread))
     visits, reached = chosen.visits, chosen.reached
     order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
-    stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)
+    stops = tuple(VerifyStop(float(nodes[run.index[k]]), int(run.side[k])) for k in order)
     return VerifyPlan(stops, run_up, reached >= IDENTIFIED, float(np.sqrt(reached)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -107,11 +108,20 @@ def _refusal(calibration: Calibration, settings: Settings, row: int) -> InputErr
     return calibration.refusal(pan, tilt, float(settings.aperture_deg[row]), (pan_side, tilt_side))
 
 
+class SampledLook(NamedTuple):
+    """A look of a sample: absolute counters, reading, and directions of the last moves of (pan, tilt)."""
+
+    pan_steps: float
+    tilt_steps: float
+    aperture_deg: float
+    approach: tuple[str, str]
+
+
 class EvenSample:
     """At most `CHECKED_MAX` looks, evenly spread over a stream of unknown length, which is passed through `of`."""
 
     def __init__(self) -> None:
-        self.looks: list[tuple[float, float, float, tuple[str, str]]] = []
+        self.looks: list[SampledLook] = []
         self._stride, self._passed = 1, 0
 
     def of(self, blocks: Iterable[LookRows]) -> Iterator[LookRows]:
@@ -120,7 +130,8 @@ class EvenSample:
             for k in range(-self._passed % self._stride, len(rows.lines), self._stride):
                 if (self._passed + k) % self._stride:
                     continue
-                self.looks.append((rows.pan_steps[k], rows.tilt_steps[k], rows.aperture_deg[k], rows.approach[k]))
+                settings = rows.pan_steps[k], rows.tilt_steps[k], rows.aperture_deg[k]
+                self.looks.append(SampledLook(*settings, rows.approach[k]))
                 if len(self.looks) > CHECKED_MAX:
                     self.looks = self.looks[::2]
                     self._stride *= 2
