@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,9 @@ from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experim
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, RIG_NAMES, names_of
+from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.target import Target
@@ -41,6 +44,53 @@ class ClassicForecast:
 CLASSIC_DRAWS = 100
 
 
+@dataclass(frozen=True)
+class _Experiments:
+    """One experiment of each of `DIRECTIONS` on a drawn instrument, without noise; arrays over these.
+
+    Attributes:
+        campaign: campaign of the experiments.
+        pixels: centroids, shape (4, 4, 4), as in `Selection`; so are `steps` and `axis`.
+        true_ratio: local ratios at the mean pose of the looks, deg/step.
+        stop_variance: variances of the stops, deg^2.
+        look_variance: variances of the scatter of looks, deg^2.
+        spot_sd_px: noise of a pixel coordinate, shape (1,).
+    """
+
+    campaign: Campaign
+    pixels: np.ndarray
+    steps: np.ndarray
+    axis: np.ndarray
+    true_ratio: np.ndarray
+    stop_variance: np.ndarray
+    look_variance: np.ndarray
+    spot_sd_px: np.ndarray
+
+
+def _simulated_experiments(rig: Rig, plan: Sequence[PlanStep], physical: np.ndarray) -> _Experiments | None:
+    """Simulate a plan of two experiments in each direction; None where a direction has no second one."""
+    parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
+    noise_free = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
+    stereo = rig.stereo_pair.with_vector(physical[len(RIG_NAMES) :])
+    simulated = simulate(rig, plan, 0, Truth(with_derived({**parameters, **noise_free}), stereo))
+    selection, pose = select_experiments(simulated.campaign), simulated.truth.reference_pose_deg
+    # The second experiment of each direction starts like all later ones, unlike the first.
+    second = np.flatnonzero(selection.experiments % 2 == 1)
+    if len(second) < len(DIRECTIONS) or pose is None:
+        return None
+    true_ratio = local_deg_per_step(with_derived(parameters), pose)
+    return _Experiments(
+        campaign=simulated.campaign,
+        pixels=selection.pixels[second],
+        steps=selection.steps[second],
+        axis=selection.axis[second],
+        true_ratio=np.array([true_ratio[d] for d in DIRECTIONS]),
+        stop_variance=np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS]),
+        look_variance=np.repeat([parameters[name] ** 2 for name in LOOK_SCATTER_NAMES], 2),
+        spot_sd_px=np.array([rig.spot_sd_px * parameters["pixel_scale"]]),
+    )
+
+
 def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicForecast | None:
     """Simulate the paper's experiments on drawn instruments without noise; None with fewer than two sheets.
 
@@ -52,41 +102,28 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         return None
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
+    each = (_simulated_experiments(rig, plan, physical) for physical in instruments.physical[:CLASSIC_DRAWS])
+    drawn = [experiments for experiments in each if experiments is not None]
+    if not drawn:
+        return None
+
+    def of_all(name: str) -> np.ndarray:
+        return np.array([getattr(experiments, name) for experiments in drawn])
+
     near_mm, far_mm = rig.sheets_mm[near], rig.sheets_mm[far]
     # Error of a beam through two spots with angle errors e1, e2: (far e2 - near e1) / (far - near).
     factor = (near_mm**2 + far_mm**2) / (far_mm - near_mm) ** 2
-    pixels, steps, axes, local, stops, looks, spot_sds = [], [], [], [], [], [], []
-    campaign = None
-    for physical in instruments.physical[:CLASSIC_DRAWS]:
-        parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
-        noise_free = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
-        stereo = rig.stereo_pair.with_vector(physical[len(RIG_NAMES) :])
-        simulated = simulate(rig, plan, 0, Truth(with_derived({**parameters, **noise_free}), stereo))
-        selection = select_experiments(simulated.campaign)
-        # The second experiment of each direction starts like all later ones, unlike the first.
-        second_experiments = np.flatnonzero(selection.experiments % 2 == 1)
-        pose = simulated.truth.reference_pose_deg
-        if len(second_experiments) < len(DIRECTIONS) or pose is None:
-            continue
-        pixels.append(selection.pixels[second_experiments])
-        steps.append(selection.steps[second_experiments])
-        axes.append(selection.axis[second_experiments])
-        true_ratio = local_deg_per_step(with_derived(parameters), pose)
-        local.append([true_ratio[d] for d in DIRECTIONS])
-        stops.append([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
-        looks.append(np.repeat([parameters[name] ** 2 for name in LOOK_SCATTER_NAMES], 2))
-        spot_sds.append([rig.spot_sd_px * parameters["pixel_scale"]])
-        campaign = simulated.campaign if campaign is None else campaign
-    if campaign is None:
-        return None
-    slopes = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo_pair)
+    steps, true_ratio, stops = of_all("steps"), of_all("true_ratio"), of_all("stop_variance")
+    slopes = ratio_slopes(of_all("pixels"), steps.ravel(), of_all("axis").ravel(), rig.stereo_pair)
     ratio = slopes.ratio.reshape(-1, len(DIRECTIONS))
     by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
-    stop_variance = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * factor * np.array(looks)
-    variance = by_pixel * np.array(spot_sds) ** 2 + stop_variance * (ratio / np.array(local) / np.array(steps)) ** 2
+    # An experiment begins at a stop of the opposite direction.
+    stop_variance = stops + stops[:, [1, 0, 3, 2]] + 2 * factor * of_all("look_variance")
+    variance = by_pixel * of_all("spot_sd_px") ** 2 + stop_variance * (ratio / true_ratio / steps) ** 2
     # Draws with a direction without experiments were skipped before.
-    stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(campaign).directions.values() if r is not None])
-    return ClassicForecast(np.sqrt(variance), ratio - np.array(local), stereo_u)
+    directions = classic(drawn[0].campaign).directions.values()
+    stereo_u = np.array([r.u_stereo_deg_per_step for r in directions if r is not None])
+    return ClassicForecast(np.sqrt(variance), ratio - true_ratio, stereo_u)
 
 
 def classic_count(sd: float, half_width: float) -> int:
