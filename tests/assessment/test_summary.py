@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from tvsbayes.assessment.summary import CLASSIC_DRAWS, _classic_predicted, summarise, worth_sampling
-from tvsbayes.assessment.weaknesses import weak_directions
 from tvsbayes.estimators.four_point import classic, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import Alternative, fit
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import (
     CREEP_NAMES,
@@ -29,7 +27,6 @@ from tvsbayes.instrument.parameters import (
 )
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
-from tvsbayes.instrument.stops import rests_of
 from tvsbayes.pipeline import unusable
 from tvsbayes.report.fit_text import fit_text
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, FitSummary
@@ -127,20 +124,6 @@ def test_one_step_count_is_named_as_a_weak_direction(summary):
     pan = next(t for t in texts if t.startswith("pan ratio and pan backlash move together"))
     # The tilt phase parks the pan axis at 100 once: nearly, not only.
     assert "nearly every leg has |N| = 200 and reverses; add N = 100 or a cleared approach" in pan
-
-
-def test_scatters_that_no_second_look_tells_apart_are_named(fitted):
-    """In the paper's protocol a tilt stop is looked at again while pan moves, and so is a pan stop."""
-    told = "every stop of the {} axis was looked at once"
-    texts = [weak.text for weak in weak_directions(fitted, set(DIRECTIONS))]
-    assert not any(told.format(axis) in text for text in texts for axis in AXES)
-    rests, kept = rests_of(fitted.campaign.moves, "pan"), {}
-    for spot in ordered_spots(fitted.campaign):
-        kept.setdefault(rests[spot.move], spot)
-    once = replace(fitted, campaign=replace(fitted.campaign, spots=tuple(kept.values())))
-    found = {weak.text: weak.loadings for weak in weak_directions(once, set(DIRECTIONS))}
-    loadings = next(own for text, own in found.items() if text.startswith(told.format("pan")))
-    assert loadings == {"look_scatter_deg.pan": 1.0, "stop_sd_deg.left": -1.0, "stop_sd_deg.right": -1.0}
 
 
 @pytest.mark.thorough

@@ -5,8 +5,6 @@ Directions and gradients are in the coordinates, each in sds of its prior, of th
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit, with_places
@@ -23,9 +21,9 @@ from tvsbayes.instrument.parameters import (
     names_of,
 )
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
-from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, rests_of, separation
+from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
-from tvsbayes.results.estimates import CONFLICT_LIMIT, ONLY_SUMS, Leverage, WeakDirection, conflict_sentence
+from tvsbayes.results.estimates import CONFLICT_LIMIT, Leverage, WeakDirection, conflict_sentence
 
 LEVERAGE_LIMIT = 2.0
 """A stop is named if a headline's sd would grow by more than this factor without it (formulation 4.2)."""
@@ -94,23 +92,6 @@ def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
     return WeakDirection(too_few_counters(axis, counters, telling), names)
 
 
-def _scatter_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
-    """Return scatter of stops and of looks of an axis, if no stop has a second look to separate them."""
-    look, *stops = f"look_scatter_deg.{axis}", *(f"stop_sd_deg.{direction}" for direction in SENSES[axis])
-    stops = [name for name in stops if fit.free[INDEX[name]]]
-    if not fit.free[INDEX[look]] or not stops:
-        return None
-    rests = rests_of(fit.campaign.moves, axis)
-    looks = Counter(rests[s.move] for s in ordered_spots(fit.campaign) if s.spot not in fit.excluded_spots)
-    if max(looks.values(), default=1) > 1:
-        return None
-    text = (
-        f"every stop of the {axis} axis was looked at once: the data determine only the sum of stop and look "
-        "variance, the priors its division; look twice at some stops"
-    )
-    return WeakDirection(text, {look: 1.0, **dict.fromkeys(stops, -1.0)})
-
-
 def sum_directions(free: np.ndarray, physical: np.ndarray, weights: np.ndarray) -> tuple[WeakDirection, ...]:
     """Name the scales of noise of which the data determine only sums of variances; none or one direction.
 
@@ -136,7 +117,7 @@ def sum_directions(free: np.ndarray, physical: np.ndarray, weights: np.ndarray) 
     labels, least = [QUANTITIES[scales[k]].label for k in found], correlation[np.ix_(found, found)].min()
     listed = f"{', '.join(labels[:-1])} and {labels[-1]}"
     plural, verb, them = ("", "is", "it") if len(found) == 2 else ("s", "are", "them")
-    text = f"{ONLY_SUMS}{plural} of the variances of {listed} {verb} known (correlation {least:+.2f}): "
+    text = f"only the sum{plural} of the variances of {listed} {verb} known (correlation {least:+.2f}): "
     text += f"the priors divide {them}"
     if any(scales[k].startswith("stop_sd_deg") for k in found):
         text += "; look twice at some stops"
@@ -188,8 +169,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
             directions.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
             continue
         weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
-        of_axis = _counters_direction(fit, axis), _scatter_direction(fit, axis)
-        directions += [one for one in (weak, *of_axis, *_shift_directions(fit, axis)) if one is not None]
+        of_axis = weak, _counters_direction(fit, axis), *_shift_directions(fit, axis)
+        directions += [one for one in of_axis if one is not None]
     noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES, *names_of("creep_minutes")}
     rows = np.array([i for i, name in enumerate(fit.names) if fit.free[i] and name not in noise])
     if rows.size == 0:

@@ -16,6 +16,7 @@ from msgspec import UNSET, Meta, UnsetType
 from tvsbayes.display import Shown, View
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.homing import ANYWHERE
+from tvsbayes.instrument.parameters import NOISE_NAMES
 from tvsbayes.results.convergence import MonteCarloError, Sampling
 from tvsbayes.results.records import (
     AllDirections,
@@ -93,10 +94,6 @@ class Estimate(ClosedRecord, frozen=True):
         return self.contraction is not None and self.contraction >= CONTRACTION_LIMIT
 
 
-ONLY_SUMS = "only the sum"
-"""Beginning of the text of a weak direction between scales of noise."""
-
-
 class WeakDirection(ClosedRecord, frozen=True):
     """A combination of parameters that the data do not constrain beyond the prior; loadings are in prior sds."""
 
@@ -106,7 +103,7 @@ class WeakDirection(ClosedRecord, frozen=True):
     @property
     def of_sums(self) -> bool:
         """Whether it names scales of noise of which the data determine only sums of variances."""
-        return self.text.startswith(ONLY_SUMS)
+        return self.loadings.keys() <= set(NOISE_NAMES)
 
 
 class Leverage(ClosedRecord, frozen=True):
