@@ -283,6 +283,8 @@ HOMINGS_MAX = 3000
 """Largest number of homings on a sheet that is stated as needed."""
 HOMING_COUNTS: tuple[int, ...] = tuple(np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int)).tolist())
 """Trial numbers of homings, before bisection between two of them."""
+BISECTED_MAX = 12
+"""Largest number of patterns for which the fewest homings are found."""
 CORRECTIONS = 4
 """Largest number of increases by a tenth where the plan's own moves have less power than independent stops."""
 
@@ -291,6 +293,7 @@ CORRECTIONS = 4
 class _Trial:
     """A pattern with its powers at `HOMING_COUNTS`, shape (counts, changes), and its duration."""
 
+    designs: WatchDesigns
     pattern: Pattern
     powers: np.ndarray
     first_minutes: float
@@ -308,10 +311,10 @@ class _Trial:
         """Mark the `HOMING_COUNTS` within a budget."""
         return np.array([self.minutes(n) <= minutes and LOOKS_MIN <= self.looks(n) <= LOOKS_MAX for n in HOMING_COUNTS])
 
-    def first_enough(self, mask: np.ndarray) -> int | None:
-        """Find the first of `HOMING_COUNTS` with enough power for the changes of a mask; return its index."""
+    def first_need(self, mask: np.ndarray) -> _Need | None:
+        """Find the first of `HOMING_COUNTS` with enough power for the changes of a mask."""
         enough = np.all(self.powers[:, mask] >= POWER_MIN, axis=1)
-        return int(np.argmax(enough)) if enough.any() else None
+        return _Need(self, HOMING_COUNTS[int(np.argmax(enough))]) if enough.any() else None
 
 
 def _trials(designs: WatchDesigns) -> list[_Trial]:
@@ -319,13 +322,13 @@ def _trials(designs: WatchDesigns) -> list[_Trial]:
     for pattern in designs.patterns():
         powers = np.array([designs.powers(pattern, homings) for homings in HOMING_COUNTS])
         once, twice = (designs.minutes(pattern, homings) for homings in (1, 2))
-        trials.append(_Trial(pattern, powers, once, twice - once))
+        trials.append(_Trial(designs, pattern, powers, once, twice - once))
     return trials
 
 
 @dataclass(frozen=True)
 class _Need:
-    """A pattern with the fewest looks for a purpose."""
+    """A pattern with a number of homings on every sheet."""
 
     trial: _Trial
     homings: int
@@ -335,45 +338,42 @@ class _Need:
         return self.trial.looks(self.homings)
 
     @property
+    def all_homings(self) -> int:
+        return self.homings * len(self.trial.pattern.looks)
+
+    @property
     def minutes(self) -> float:
         return self.trial.minutes(self.homings)
 
+    @cached_property
+    def judged(self) -> list[float]:
+        """Compute powers by the plan's own moves."""
+        return self.trial.designs.judged(self.trial.pattern, self.homings)
 
-def _need(designs: WatchDesigns, trial: _Trial, first: int, mask: np.ndarray) -> _Need:
-    """Find the fewest homings that are enough, up to the trial count of index `first`, the first that is."""
+    def fewest(self, mask: np.ndarray) -> _Need:
+        """Find the fewest homings that are enough for the changes of a mask, as the first of the trial counts is."""
 
-    def enough(homings: int) -> bool:
-        return bool(np.all(designs.powers(trial.pattern, homings)[mask] >= POWER_MIN))
+        def enough(homings: int) -> bool:
+            return bool(np.all(self.trial.designs.powers(self.trial.pattern, homings)[mask] >= POWER_MIN))
 
-    homings = smallest_design(enough, HOMING_COUNTS[max(first - 1, 0) : first + 1])
-    assert homings is not None, "the first sufficient count is enough"
-    return _Need(trial, max(homings, -(-LOOKS_MIN // trial.pattern.size)))
+        homings = smallest_design(enough, [n for n in HOMING_COUNTS if n <= self.homings][-2:])
+        assert homings is not None, "the first sufficient count is enough"
+        return replace(self, homings=max(homings, -(-LOOKS_MIN // self.trial.pattern.size)))
 
 
-def _fewest(designs: WatchDesigns, trials: list[_Trial], mask: np.ndarray, minutes: float = np.inf) -> _Need | None:
+def _fewest(trials: list[_Trial], mask: np.ndarray, minutes: float = np.inf) -> _Need | None:
     """Find the fewest looks that detect the changes of a mask; among equal numbers the least time."""
     # Patterns are first ranked by trial counts: values in between cost a bisection for each.
-    ranked = sorted(
-        (trial.looks(HOMING_COUNTS[first]), number, first)
-        for number, trial in enumerate(trials)
-        if (first := trial.first_enough(mask)) is not None
-    )
-    needs = (_need(designs, trials[number], first, mask) for _, number, first in ranked[:12])
-    return min(
-        (need for need in needs if need.minutes <= minutes), key=lambda need: (need.looks, need.minutes), default=None
-    )
+    first_needs = [need for trial in trials if (need := trial.first_need(mask)) is not None]
+    needs = [need.fewest(mask) for need in sorted(first_needs, key=lambda need: need.looks)[:BISECTED_MAX]]
+    within = (need for need in needs if need.minutes <= minutes)
+    return min(within, key=lambda need: (need.looks, need.minutes), default=None)
 
 
 def _noticeable(trials: list[_Trial], minutes: float) -> np.ndarray:
     """Find the largest set of changes that a plan within the budget detects, as a mask."""
-    best, best_key = np.zeros(trials[0].powers.shape[1], dtype=bool), (-1, -1.0)
-    for trial in trials:
-        for row in trial.powers[trial.allowed(minutes)]:
-            noticed = row >= POWER_MIN
-            key = int(noticed.sum()), float(np.sum(row))
-            if key > best_key:
-                best, best_key = noticed, key
-    return best
+    rows = [row for trial in trials for row in trial.powers[trial.allowed(minutes)]]
+    return np.asarray(max(rows, key=lambda row: (np.sum(row >= POWER_MIN), np.sum(row))) >= POWER_MIN)
 
 
 def _most_powerful(trials: list[_Trial], minutes: float) -> _Need:
@@ -414,15 +414,14 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
             remedy="allow more minutes, or lower [costs] if the machine is faster",
         )
     noticed = _noticeable(trials, minutes)
-    need = (_fewest(designs, trials, noticed, minutes) if noticed.any() else None) or _most_powerful(trials, minutes)
-    homings, judged = _corrected(designs, need, noticed, minutes)
-    pattern = need.trial.pattern
-    changes = _changes(designs, trials, judged)
+    need = (_fewest(trials, noticed, minutes) if noticed.any() else None) or _most_powerful(trials, minutes)
+    need = _corrected(need, noticed, minutes)
+    changes = _changes(need, trials)
     return WatchPlan(
-        steps=designs.steps(pattern, homings),
-        looks=need.trial.looks(homings),
-        homings=homings * len(pattern.looks),
-        minutes=designs.minutes(pattern, homings),
+        steps=designs.steps(need.trial.pattern, need.homings),
+        looks=need.looks,
+        homings=need.all_homings,
+        minutes=designs.minutes(need.trial.pattern, need.homings),
         minutes_allowed=minutes,
         power_wanted=POWER_MIN,
         false_alarm_rate=FALSE_ALARM_RATE,
@@ -431,27 +430,24 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
     )
 
 
-def _changes(designs: WatchDesigns, trials: list[_Trial], judged: list[float]) -> tuple[PlannedChange, ...]:
-    """Compute the plan's power for every change, and the looks needed for each change alone."""
-    needs = [_fewest(designs, trials, mask) for mask in np.eye(len(designs.changes), dtype=bool)]
-    additions = _looks_to_add(designs, trials) if None in needs else [None] * len(needs)
+def _changes(plan: _Need, trials: list[_Trial]) -> tuple[PlannedChange, ...]:
+    """Describe every change by the plan's power for it and the looks needed for it alone."""
+    tested = plan.trial.designs.changes
+    needs = [_fewest(trials, mask) for mask in np.eye(len(tested), dtype=bool)]
+    additions = _looks_to_add(trials) if None in needs else [None] * len(needs)
     changes = []
-    for change, power, need, looks_to_add in zip(designs.changes, judged, needs, additions, strict=True):
-        description = change.what, change.size, change.unit, power
-        if need is None:
-            changes.append(PlannedChange(*description, None, None, None, looks_to_add))
-        else:
-            homings = need.homings * len(need.trial.pattern.looks)
-            changes.append(PlannedChange(*description, need.looks, homings, need.minutes, None))
+    for change, power, need, looks_to_add in zip(tested, plan.judged, needs, additions, strict=True):
+        sizes = (None, None, None, looks_to_add) if need is None else (need.looks, need.all_homings, need.minutes, None)
+        changes.append(PlannedChange(change.what, change.size, change.unit, power, *sizes))
     return tuple(changes)
 
 
-def _looks_to_add(designs: WatchDesigns, trials: list[_Trial]) -> list[int | None]:
+def _looks_to_add(trials: list[_Trial]) -> list[int | None]:
     """Compute additional looks of the campaign and of every watch to detect each change, to the next trial count."""
-    fewest: list[int | None] = [None] * len(designs.changes)
+    fewest: list[int | None] = [None] * trials[0].powers.shape[1]
     for trial in trials:
         for homings in HOMING_COUNTS:
-            looks, enough = trial.looks(homings), designs.powers(trial.pattern, homings, True) >= POWER_MIN
+            looks, enough = trial.looks(homings), trial.designs.powers(trial.pattern, homings, True) >= POWER_MIN
             fewest = [
                 min(looks, best or looks) if met else best for best, met in zip(fewest, enough.tolist(), strict=True)
             ]
@@ -460,14 +456,12 @@ def _looks_to_add(designs: WatchDesigns, trials: list[_Trial]) -> list[int | Non
     return fewest
 
 
-def _corrected(designs: WatchDesigns, need: _Need, noticed: np.ndarray, minutes: float) -> tuple[int, list[float]]:
-    """Compute powers by the plan's own moves, with more homings where shared stops reduce the power."""
-    homings = need.homings
-    judged = designs.judged(need.trial.pattern, homings)
+def _corrected(need: _Need, noticed: np.ndarray, minutes: float) -> _Need:
+    """Add homings where shared stops reduce the power for the changes of a mask."""
     for _ in range(CORRECTIONS):
-        increased = homings + -(-homings // 10)
-        enough = np.all(np.array(judged)[noticed] >= POWER_MIN)
-        if enough or need.trial.minutes(increased) > minutes or need.trial.looks(increased) > LOOKS_MAX:
+        more = replace(need, homings=need.homings + -(-need.homings // 10))
+        enough = np.all(np.array(need.judged)[noticed] >= POWER_MIN)
+        if enough or more.minutes > minutes or more.looks > LOOKS_MAX:
             break
-        homings, judged = increased, designs.judged(need.trial.pattern, increased)
-    return homings, judged
+        need = more
+    return need
