@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,6 @@ from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experim
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, RIG_NAMES, names_of
-from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.drawn_rigs import Instruments
@@ -46,15 +44,14 @@ CLASSIC_DRAWS = 100
 
 @dataclass(frozen=True)
 class _Experiments:
-    """One experiment of each of `DIRECTIONS` on a drawn instrument, without noise; arrays over these.
+    """The second experiment in each of `DIRECTIONS` on a drawn instrument without noise; arrays over these four.
 
     Attributes:
-        campaign: campaign of the experiments.
-        pixels: centroids, shape (4, 4, 4), as in `Selection`; so are `steps` and `axis`.
+        campaign: campaign of all experiments.
+        pixels, steps, axis: as in `Selection`.
         true_ratio: local ratios at the mean pose of the looks, deg/step.
-        stop_variance: variances of the stops, deg^2.
-        look_variance: variances of the scatter of looks, deg^2.
-        spot_sd_px: noise of a pixel coordinate, shape (1,).
+        angle_variance: variance of the angle between spots by stops and scatter of looks, deg^2.
+        spot_sd_px: noise of a pixel coordinate.
     """
 
     campaign: Campaign
@@ -62,32 +59,37 @@ class _Experiments:
     steps: np.ndarray
     axis: np.ndarray
     true_ratio: np.ndarray
-    stop_variance: np.ndarray
-    look_variance: np.ndarray
-    spot_sd_px: np.ndarray
+    angle_variance: np.ndarray
+    spot_sd_px: float
 
 
-def _simulated_experiments(rig: Rig, plan: Sequence[PlanStep], physical: np.ndarray) -> _Experiments | None:
-    """Simulate a plan of two experiments in each direction; None where a direction has no second one."""
+def _experiments(rig: Rig, sheets: tuple[str, str], physical: np.ndarray) -> _Experiments | None:
+    """Simulate two of the paper's experiments in each direction; None where a direction lacks the second."""
     parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
     noise_free = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
     stereo = rig.stereo_pair.with_vector(physical[len(RIG_NAMES) :])
-    simulated = simulate(rig, plan, 0, Truth(with_derived({**parameters, **noise_free}), stereo))
+    truth = Truth(with_derived({**parameters, **noise_free}), stereo)
+    simulated = simulate(rig, four_point_protocol(2, targets=sheets), 0, truth)
     selection, pose = select_experiments(simulated.campaign), simulated.truth.reference_pose_deg
     # The second experiment of each direction starts like all later ones, unlike the first.
     second = np.flatnonzero(selection.experiments % 2 == 1)
     if len(second) < len(DIRECTIONS) or pose is None:
         return None
     true_ratio = local_deg_per_step(with_derived(parameters), pose)
+    near_mm, far_mm = (rig.sheets_mm[sheet] for sheet in sheets)
+    # Error of a beam through two spots with angle errors e1, e2: (far e2 - near e1) / (far - near).
+    factor = (near_mm**2 + far_mm**2) / (far_mm - near_mm) ** 2
+    stops = np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
+    scatter = np.repeat([parameters[name] ** 2 for name in LOOK_SCATTER_NAMES], 2)
     return _Experiments(
         campaign=simulated.campaign,
         pixels=selection.pixels[second],
         steps=selection.steps[second],
         axis=selection.axis[second],
         true_ratio=np.array([true_ratio[d] for d in DIRECTIONS]),
-        stop_variance=np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS]),
-        look_variance=np.repeat([parameters[name] ** 2 for name in LOOK_SCATTER_NAMES], 2),
-        spot_sd_px=np.array([rig.spot_sd_px * parameters["pixel_scale"]]),
+        # An experiment begins at a stop of the opposite direction.
+        angle_variance=stops + stops[[1, 0, 3, 2]] + 2 * factor * scatter,
+        spot_sd_px=rig.spot_sd_px * parameters["pixel_scale"],
     )
 
 
@@ -100,28 +102,22 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     rig = knowledge.rig
     if len(rig.sheets_mm) < 2:
         return None
-    near, far = knowledge.sheets[0], knowledge.sheets[1]
-    plan = four_point_protocol(2, targets=(near, far))
-    each = (_simulated_experiments(rig, plan, physical) for physical in instruments.physical[:CLASSIC_DRAWS])
-    drawn = [experiments for experiments in each if experiments is not None]
-    if not drawn:
+    sheets = knowledge.sheets[0], knowledge.sheets[1]
+    drawn = [_experiments(rig, sheets, physical) for physical in instruments.physical[:CLASSIC_DRAWS]]
+    complete = [experiments for experiments in drawn if experiments is not None]
+    if not complete:
         return None
 
     def of_all(name: str) -> np.ndarray:
-        return np.array([getattr(experiments, name) for experiments in drawn])
+        return np.array([getattr(experiments, name) for experiments in complete])
 
-    near_mm, far_mm = rig.sheets_mm[near], rig.sheets_mm[far]
-    # Error of a beam through two spots with angle errors e1, e2: (far e2 - near e1) / (far - near).
-    factor = (near_mm**2 + far_mm**2) / (far_mm - near_mm) ** 2
-    steps, true_ratio, stops = of_all("steps"), of_all("true_ratio"), of_all("stop_variance")
+    steps, true_ratio = of_all("steps"), of_all("true_ratio")
     slopes = ratio_slopes(of_all("pixels"), steps.ravel(), of_all("axis").ravel(), rig.stereo_pair)
-    ratio = slopes.ratio.reshape(-1, len(DIRECTIONS))
-    by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
-    # An experiment begins at a stop of the opposite direction.
-    stop_variance = stops + stops[:, [1, 0, 3, 2]] + 2 * factor * of_all("look_variance")
-    variance = by_pixel * of_all("spot_sd_px") ** 2 + stop_variance * (ratio / true_ratio / steps) ** 2
-    # Draws with a direction without experiments were skipped before.
-    directions = classic(drawn[0].campaign).directions.values()
+    ratio = slopes.ratio.reshape(steps.shape)
+    by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(steps.shape)
+    variance = by_pixel * of_all("spot_sd_px")[:, None] ** 2
+    variance += of_all("angle_variance") * (ratio / true_ratio / steps) ** 2
+    directions = classic(complete[0].campaign).directions.values()
     stereo_u = np.array([r.u_stereo_deg_per_step for r in directions if r is not None])
     return ClassicForecast(np.sqrt(variance), ratio - true_ratio, stereo_u)
 
