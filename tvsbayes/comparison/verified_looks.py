@@ -23,6 +23,7 @@ from tvsbayes.compensation.verification import (
     IDENTIFIED,
     SEPARATE,
     Trial,
+    VerifyStop,
     discriminating_visits,
     judged,
     other_axis,
@@ -32,6 +33,7 @@ from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
+from tvsbayes.inference.stored_posterior import answer_of
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
@@ -80,8 +82,7 @@ def accepted_calibration(campaign: Campaign) -> Calibration:
             file="results/fit.json",
             remedy="run `tvsbayes fit`, aim by `tvsbayes steps-for` or the header, and look there",
         )
-    old = "accepted" if document.values.get("estimator") == "posterior" else "laplace"
-    refuse_answer(str(document.values.get("answer") or old), SURER)
+    refuse_answer(answer_of(document), SURER)
     return calibration
 
 
@@ -321,7 +322,7 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
     count = max(LOOKS_MIN, *(len(axis.stops) for axis in axes))
     # The axis that needs fewer stops repeats them: every look measures both axes.
     pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)
-    stops = tuple(AimedStop(p, t, ps, ts) for (p, ps), (t, ts) in zip(pan, tilt, strict=True))
+    stops = tuple(AimedStop(int(p.command), int(t.command), p.side, t.side) for p, t in zip(pan, tilt, strict=True))
     reached = max(axis.reached for axis in axes)
     return AimPlan(stops, (run_up[0], run_up[1]), reached >= IDENTIFIED, float(np.sqrt(reached)))
 
@@ -330,7 +331,7 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
 class _AxisStops:
     """Counters and sides of one axis, and the squared distance of the nearest hypothesis by these stops."""
 
-    stops: list[tuple[int, int]]
+    stops: list[VerifyStop]
     reached: float
 
 
@@ -358,7 +359,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
     visits = discriminating_visits(worlds, common, noise, np.repeat(spread, 2))
     chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(visits.visits[i]))]
-    return _AxisStops([(int(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
+    return _AxisStops([VerifyStop(float(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
 
 
 def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.ndarray:

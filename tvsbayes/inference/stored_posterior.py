@@ -107,7 +107,7 @@ def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosteri
     if not FORMAT.fullmatch(kind):
         remedy = "read it with the tvsbayes that wrote it, or fit again" if OLDER.fullmatch(kind) else AGAIN
         raise keys.refuse("format", "format", "a fit of version 1, such as tvsbayes-fit/1", remedy)
-    answer = _answer(keys)
+    answer = answer_of(keys)
     if answer != "accepted" and not anyway:
         what = "a rough answer" if answer == "rough" else "the Laplace approximation at the mode, no sample"
         message = f"results/fit.json: the fit is {what}: its intervals are not accepted"
@@ -116,8 +116,8 @@ def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosteri
     return _merged(_draws(place / "draws.npz"), answer)
 
 
-def _answer(keys: Keys) -> AnswerKind:
-    """Return the answer that the draws represent.
+def answer_of(keys: Keys) -> AnswerKind:
+    """Return the answer of a fit by its `fit.json`.
 
     Raises:
         NotConverged: the fit found no mode that explains the data.
