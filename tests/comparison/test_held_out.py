@@ -25,7 +25,7 @@ pytestmark = pytest.mark.thorough
 
 def test_a_refit_that_failed_judges_nobody(mixed_fit, monkeypatch):
     lost = replace(mixed_fit, converged=False, problems=("it went astray",))
-    monkeypatch.setattr("tvsbayes.comparison.held_out.refit", lambda *_: lost)
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: lost)
     held = hold_out(mixed_fit)
     assert held.verdict == CANNOT_TELL and "went astray" in held.reason
 
@@ -105,10 +105,10 @@ def test_experiments_beyond_the_lens_model_neither_teach_nor_are_asked():
 
 
 def test_a_fold_without_a_fit_decides_nothing(mixed_fit, monkeypatch):
-    def lost(*_arguments):
+    def lost(*_arguments, **_choices):
         raise NotConverged("diverged", "NOT CONVERGED: the fit ran away")
 
-    monkeypatch.setattr("tvsbayes.comparison.held_out.refit", lost)
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lost)
     held = hold_out(mixed_fit)
     assert held.verdict == CANNOT_TELL and "the fit ran away" in held.reason and not held.predictions
 

@@ -12,8 +12,9 @@ from scipy import stats
 from support.coarse_planning import with_priors
 from support.waits import check_forward, doings
 
-from tvsbayes.comparison.held_positions import _of_all_looks, hold_out_positions, predicted_positions
+from tvsbayes.comparison.held_positions import LeftOut, hold_out_positions, predicted_positions
 from tvsbayes.errors import NothingToEstimate
+from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots
@@ -87,16 +88,17 @@ def test_looks_left_out_teach_nothing_of_themselves(worn, whole):
     rests = rests_of(campaign.moves, "pan")
     out = np.array([rests[spot.move].steps == PAN[2] for spot in spots])
     sign = np.array([rests[spot.move].sign for spot in spots])
-    plain = predicted_positions(whole, whole, 0, PAN[2], out, sign)
+    left_out = LeftOut("pan", PAN[2], out, sign)
+    plain = predicted_positions(whole, whole, left_out)
     slope = np.asarray(whole.linearised.slope)[..., 0]
     moved = eqx.tree_at(
         lambda lin: lin.residual,
-        _of_all_looks(whole, whole),
+        linearised_at(whole.z, whole.space, whole.arrays),
         np.asarray(whole.linearised.residual) + np.where(out[:, None], slope * np.radians(1.0), 0.0),
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.comparison.held_positions._of_all_looks", lambda *_: moved)
-        other = predicted_positions(whole, whole, 0, PAN[2], out, sign)
+        patch.setattr("tvsbayes.comparison.held_positions.linearised_at", lambda *_: moved)
+        other = predicted_positions(whole, whole, left_out)
     for before, after in zip(plain, other, strict=True):
         assert after.mean - before.mean == pytest.approx(1.0, rel=1e-6)
         assert after.predicted == pytest.approx(before.predicted, abs=1e-6) and after.u == pytest.approx(before.u)

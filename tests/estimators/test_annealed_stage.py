@@ -11,7 +11,7 @@ from support.dense_likelihood import angle_covariances, physical, residual_covar
 from support.dozen_algebra import NOISE, found_at
 from support.varying_gears import perfect_gears
 
-from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.campaign import ordered_spots
@@ -62,10 +62,9 @@ def test_reduced_residuals_have_length_slope_and_curvature_of_all(dozen, found):
     np.testing.assert_allclose(root.T @ root, curvature, atol=ALGEBRA * np.abs(curvature).max())
 
 
-def test_a_stage_without_a_step_is_the_linearisation(dozen, found):
-    """Of gears that repeat no error, for which fits compile the stage: they leave residuals and derivatives alone."""
+def test_gears_that_repeat_no_error_leave_residuals_and_derivatives_alone(dozen, found):
     arrays = campaign_arrays(dozen.campaign, perfect_gears(dozen.campaign.rig))
-    stayed = stage(found.z, dozen.space, arrays, Fixed(NOISE, found.z, np.array(1.0)), NO_STEP)
+    stayed = linearised_at(found.z, dozen.space, arrays)
     assert np.array_equal(stayed.z, found.z)
     for name in ("residual", "slope", "residual_jacobian", "predicted_jacobian", "stop_variance"):
         expected = getattr(found.reduced.also, name)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.dense_spots import dense_covariance
-from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.noise_scales import ScalesAlone, noise_draws
 from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, names_of
@@ -20,9 +20,8 @@ SCATTER = [INDEX[name] for name in LOOK_SCATTER_NAMES]
 
 def dense_density(fit, z: np.ndarray) -> float:
     """Log density of the looks at noise scales, up to a constant: one Gaussian of all their residuals."""
-    count, fixed = len(fit.linearised.residual), Fixed(fit.held, z, np.array(1.0))
-    lin = stage(z, fit.space, fit.arrays, fixed, NO_STEP)
-    own = np.where(fit.held, 0.0, -np.asarray(lin.residual_jacobian))
+    count, lin = len(fit.linearised.residual), linearised_at(z, fit.space, fit.arrays)
+    own = lin.by_coordinates(fit.held)
     spots = linear_spots(lin, fit.arrays, own)
     columns = own.reshape(4 * count, -1)
     residual = spots.residual.ravel() + columns @ np.where(fit.held, 0.0, z)

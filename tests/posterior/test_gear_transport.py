@@ -16,13 +16,13 @@ from support.dense_likelihood import angle_covariances, drawn_at_every_move, res
 from support.small_posterior import ROUNDING, play_priors
 from support.varying_gears import PERIODS_DEG, coordinates_with, varying_gears
 
-from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, campaign_arrays
-from tvsbayes.estimators.linear_spots import Linearised, linear_spots, stop_information
+from tvsbayes.estimators.annealed_stage import linearised_at
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
+from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, names_of
-from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, free_mask, parameter_space, physical_at
+from tvsbayes.model.parameter_space import coordinates_of, free_mask, parameter_space, physical_at
 from tvsbayes.posterior.transport import SCALE_NAMES, WALK_INFORMATION, Transport, transport
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -42,12 +42,6 @@ FLOOR = 1e-8
 """Of a centred map, in y: Gauss and Newton take differences of residuals of 1e4 units of noise."""
 
 
-def linearised(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> Linearised:
-    """The campaign at z, nothing held."""
-    with jax.enable_x64(True):
-        return stage(z, space, arrays, Fixed(np.zeros(len(NAMES), bool), z, np.array(1.0)), NO_STEP)
-
-
 def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str, ...], redraw: bool) -> SimpleNamespace:
     """What the map reads of a fit, at values; `redraw`: every look has stop errors of its own."""
     table = varying_gears(campaign.rig)
@@ -58,7 +52,7 @@ def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str,
             arrays = drawn_at_every_move(campaign, arrays)
         z = coordinates_of(space, physical_at(dozen.z, dozen.space).value)
         z = coordinates_with(space, z, values)
-        lin = linearised(z, space, arrays)
+        lin = linearised_at(z, space, arrays)
         information = stop_information(linear_spots(lin, arrays, -np.asarray(lin.residual_jacobian)))
     free = free_mask(space, has_aperture=True)
     free[[INDEX[name] for name in held]] = False
@@ -120,7 +114,7 @@ def dense_density(fitted: SimpleNamespace, path: Transport, z: np.ndarray) -> tu
     if fitted.free[INDEX["creep_minutes"]]:
         # The model itself at another time constant.
         only = np.where(np.arange(len(NAMES)) == INDEX["creep_minutes"], z, fitted.z)
-        at = linearised(only, fitted.space, fitted.arrays)
+        at = linearised_at(only, fitted.space, fitted.arrays)
     pixels = values["pixel_scale"] / mode["pixel_scale"]
     others = path.free[path.noise :]
     wide = path.root[path.noise :, path.noise :]

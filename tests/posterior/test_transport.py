@@ -26,7 +26,7 @@ from support.two_parameters import (
     route,
 )
 
-from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
@@ -176,7 +176,7 @@ def test_the_precision_at_other_noise_scales_is_the_smoothers():
     for w in np.random.default_rng(12).normal(size=(4, path.noise)):
         z = path.from_whitened(np.concatenate([w, np.zeros(len(others))])[None])[0]
         with jax.enable_x64(True):
-            lin = stage(z, fitted.space, fitted.arrays, Fixed(fitted.held, z, np.array(1.0)), NO_STEP)
+            lin = linearised_at(z, fitted.space, fitted.arrays)
         spots = linear_spots(lin, fitted.arrays, -np.asarray(lin.residual_jacobian))
         fisher = stop_information(spots).fisher[np.ix_(others, others)]
         expected = wide.T @ (np.diag(play_priors(path)[0]) + fisher) @ wide

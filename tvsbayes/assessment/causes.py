@@ -60,9 +60,7 @@ def _noise_of(fit: JointFit, readings: bool) -> str:
 
 def _split_information(fit: JointFit) -> _SplitInformation:
     readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
-    linear = linear_spots(
-        fit.linearised, fit.arrays, np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
-    )
+    linear = linear_spots(fit.linearised, fit.arrays, fit.linearised.by_coordinates(fit.held))
     information = stop_information(linear.spelled_out(linear.places))
     gain = np.concatenate([group.jacobian for group in information.groups])
     noise, places = gain.T @ gain, linear.places.shape[2] // 2

@@ -61,7 +61,7 @@ def _left_to_stops(fit: JointFit) -> np.ndarray:
     stop. With u = C^-1 r of all spots, unit noise has the conditional mean u, and the error of a stop its variance
     times the projection of u. The other effects need not be computed one by one.
     """
-    left = np.concatenate([group.residual for group in fit.information.groups]).reshape(-1, 4)
+    left = fit.information.residual.reshape(-1, 4)
     slope, spots = np.asarray(fit.linearised.slope), ordered_spots(fit.campaign)
     projected = np.einsum("nia,ni->na", slope, left)
     for index, axis in enumerate(AXES):

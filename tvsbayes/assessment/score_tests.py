@@ -230,13 +230,12 @@ class _Asked:
 
 
 def _ask(fit: JointFit, defects: Sequence[_Defect]) -> _Asked:
-    columns_of_fit = np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
+    columns_of_fit = fit.linearised.by_coordinates(fit.held)
     columns_of_all = np.concatenate(
         [columns_of_fit, *(columns for defect in defects for columns in defect.columns)], axis=2
     )
     information = stop_information(linear_spots(fit.linearised, fit.arrays, columns_of_all))
-    errors = np.concatenate([group.residual for group in information.groups])
-    score = columns_of_all.reshape(-1, columns_of_all.shape[2]).T @ errors
+    score = information.score(columns_of_all)
     p = columns_of_fit.shape[2]
     fisher, cross = information.fisher[:p, :p], information.fisher[:p, p:]
     values, vectors = np.linalg.eigh(fisher)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tvsbayes.comparison.gap import camera_u
-from tvsbayes.errors import TvsError
+from tvsbayes.errors import NotConverged, TvsError
 from tvsbayes.estimators.four_point import Selection, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
@@ -160,14 +160,11 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
             predicted = predict_classic(angle, selection, out)
             if not predicted:
                 continue
-            left_out = frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel())
-            without = f"without the experiments {name}"
+            left_out = {campaign.spots[r].spot for r in selection.spot_rows[out].ravel()}
             try:
-                taught = refit(fit_of_all, left_out, job.part(name))
-            except TvsError as error:
-                return undecided(f"{without} there is no fit: {error.message}")
-            if not taught.converged:
-                return undecided(f"{without} the fit does not converge: {'; '.join(taught.problems)}")
+                taught = refit(fit_of_all, left_out, f"the experiments {name}", job.part(name))
+            except NotConverged as error:
+                return undecided(error.message)
             by_model = predict_joint(taught, selection, out, random_stream(seed, Stream.HELD_OUT, index))
             for e, joint in by_model.items():
                 if e in predicted:
@@ -178,18 +175,32 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
     return judge(by, predictions, lengths, unseen)
 
 
-def refit(fit_of_all: JointFit, without: frozenset[int], progress: Show | None = None) -> JointFit:
+def refit(fit_of_all: JointFit, out: set[int], what: str, progress: Show | None) -> JointFit:
     """Refit the same model without some spots; harmonics, contrasts and backlash are free as in the fit of all.
 
     Spots that a robust fit excluded stay excluded. Those that it kept have full weight, since their weights depended on
     the spots now left out.
-    """
-    from tvsbayes.estimators.joint_fit import fit, priors_used
 
-    rig, space = fit_of_all.campaign.rig, fit_of_all.space
-    priors = priors_used(rig.priors, np.asarray(space.value), np.asarray(space.u))
-    reduced = replace(fit_of_all.campaign, rig=replace(rig, priors=priors))
-    return fit(reduced, without=without | set(fit_of_all.excluded_spots), progress=progress)
+    Args:
+        fit_of_all: the fit of all spots.
+        out: ids of the spots left out.
+        what: what they are, in words.
+        progress: called with the share that is done.
+
+    Raises:
+        NotConverged: there is no converged fit without them.
+    """
+    from tvsbayes.estimators.joint_fit import fit
+
+    reduced = replace(fit_of_all.campaign, rig=fit_of_all.table)
+    try:
+        fitted = fit(reduced, without=out | set(fit_of_all.excluded_spots), progress=progress)
+    except TvsError as error:
+        raise NotConverged(error.code, f"without {what} there is no fit: {error.message}") from error
+    if not fitted.converged:
+        problems = "; ".join(fitted.problems)
+        raise NotConverged("not-converged", f"without {what} the fit does not converge: {problems}")
+    return fitted
 
 
 class ClassicAngle(NamedTuple):

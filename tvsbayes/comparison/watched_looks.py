@@ -13,9 +13,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.campaign_arrays import in_sight
-from tvsbayes.estimators.joint_fit import JointFit, priors_used
+from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
@@ -164,14 +164,6 @@ class DrawnDepartures:
     weights: np.ndarray
 
 
-@dataclass(frozen=True)
-class Shift:
-    """Sizes of changes by generalised least squares: values (n,) and their covariance (n, n)."""
-
-    value: np.ndarray
-    covariance: np.ndarray
-
-
 def _directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute eigenvalues of the scaled information not explained by old parameters, and unscaled vectors."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
@@ -209,13 +201,12 @@ class _ScoreInformation:
     def of(cls, spots: LinearSpots, prior: np.ndarray) -> _ScoreInformation:
         """Eliminate the first columns, coordinates with prior N(0, 1) that are at `prior`, shape (p,)."""
         information, count = stop_information(spots), len(prior)
-        errors = np.concatenate([group.residual for group in information.groups])
-        score = spots.jacobian.reshape(len(errors), -1).T @ errors
+        score = information.score(spots.jacobian)
         gradient, cross = score[:count] - prior, information.fisher[:count, count:]
         precision = information.fisher[:count, :count] + np.eye(count)
         left = np.linalg.solve(precision, np.column_stack([gradient, cross]))
         return cls(
-            chi2=float(spots.residual.ravel() @ errors - gradient @ left[:, 0]),
+            chi2=float(spots.residual.ravel() @ information.residual - gradient @ left[:, 0]),
             score=score[count:] - cross.T @ left[:, 0],
             information=information.fisher[count:, count:] - cross.T @ left[:, 1:],
         )
@@ -229,17 +220,14 @@ class WatchedLooks:
         self.fit, self.first = fit, len(ordered_spots(campaign))
         joined = after_each_other(campaign, homed(looks, fit.sides))
         used = np.append(fit.arrays.used, in_sight(joined)[self.first :])
-        table = replace(
-            campaign.rig,
-            priors=priors_used(campaign.rig.priors, np.asarray(fit.space.value), np.asarray(fit.space.u)),
-        )
-        self.problem = Problem(joined, table, used, np.asarray(fit.arrays.spots.weight)[: self.first])
+        self.problem = Problem(joined, fit.table, used, np.asarray(fit.arrays.spots.weight)[: self.first])
         later = self.problem.spots[self.first :]
         self.looks = int(used[self.first :].sum())
         readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
-        self.changes = changes_of(table.mechanism)
+        mechanism = fit.space.mechanism
+        self.changes = changes_of(mechanism)
         # Four pixels give three residuals after elimination of the range; a sighting gives two angles.
-        self.dof = 2 * self.looks if table.mechanism.sightings else 3 * self.looks + readings
+        self.dof = 2 * self.looks if mechanism.sightings else 3 * self.looks + readings
 
     def departure(self, z: np.ndarray, *, angles: bool = False) -> Departure:
         """Compute the departure of the looks from the first session, both linearised at z, at its noise scales.
@@ -264,30 +252,21 @@ class WatchedLooks:
             stereo_mean=placed(at.value[rig:]),
             stereo_root=placed(np.eye(len(NAMES) - rig)),
         )
-        still = np.zeros(len(NAMES))
-        fixed = Fixed(np.zeros(len(NAMES), dtype=bool), still, np.array(1.0))
-        staged = stage(still, plain, self.problem.arrays, fixed, NO_STEP)
-        physical = -np.asarray(staged.residual_jacobian)
+        lin = linearised_at(np.zeros(len(NAMES)), plain, self.problem.arrays)
+        physical = -np.asarray(lin.residual_jacobian)
         slope = np.where(self.problem.held, 0.0, physical @ at.slope)
         if angles:
-            shifts = self._of_angles(np.asarray(staged.slope))
+            shifts = np.radians(1.0) * lin.by_angles(self.usable)
         else:
             shifted = [COORDINATES[name] for change in self.changes for name in change.names]
             shifts = physical[:, :, shifted] * self._unit_sizes(at.value)
             shifts[: self.first] = 0.0
-        return linear_spots(staged, self.problem.arrays, np.concatenate([slope, shifts], axis=2))
+        return linear_spots(lin, self.problem.arrays, np.concatenate([slope, shifts], axis=2))
 
     @property
     def usable(self) -> np.ndarray:
         """Return indices of the usable new looks in the linearised campaign, shape (looks,)."""
         return self.first + np.flatnonzero(self.problem.arrays.used[self.first :])
-
-    def _of_angles(self, slope: np.ndarray) -> np.ndarray:
-        """Build columns for the mirror angles of every usable new look, pan and tilt in turn, per degree."""
-        columns = np.zeros((*slope.shape[:2], 2 * self.looks))
-        for k, place in enumerate(self.usable):
-            columns[place, :, 2 * k : 2 * k + 2] = np.radians(1.0) * slope[place]
-        return columns
 
     def _unit_sizes(self, value: np.ndarray) -> np.ndarray:
         """Return physical values of a shift by one unit of the changes, shape (q,)."""
@@ -400,13 +379,13 @@ def _moved(departures: DrawnDepartures, limit: float) -> tuple[MovedPart, ...]:
         return ()
     rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
     covariance = _inverse(departures.centre.information[np.ix_(rows, rows)])
-    shift = Shift(covariance @ departures.centre.score[rows], covariance)
+    sizes, us = covariance @ departures.centre.score[rows], np.sqrt(np.diag(covariance))
     named = [(part, change.unit) for change in departures.centre.changes for part in change.parts]
     parts: list[MovedPart] = []
     start = 0
     for columns in known:
         rows_of_change = slice(start, start := start + columns.stop - columns.start)
-        value, u = shift.value[rows_of_change], np.sqrt(np.diag(shift.covariance)[rows_of_change])
+        value, u = sizes[rows_of_change], us[rows_of_change]
         ratio = np.abs(value) / u
         significant = [k for k in np.argsort(-ratio).tolist() if ratio[k] > TOLD_U] or [int(np.argmax(ratio))]
         parts += [

@@ -30,8 +30,6 @@ STAGE_STEPS = 12
 level of the noise. Newton steps on the full density find the mode."""
 PART = 128
 """Spots linearised in one call; a larger campaign takes more calls."""
-NO_STEP = 1e300
-"""Tolerance that the start meets: the stage then linearises there only."""
 
 
 class Fixed(eqx.Module):
@@ -114,11 +112,13 @@ def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
     return LinearResidual(value, np.concatenate([root[free:, free:].T, np.zeros((1, z.size))]), lin)
 
 
+def linearised_at(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> Linearised:
+    """Linearise a campaign at coordinates z (p,), as NumPy arrays, without padding."""
+    return linear_campaign(z, space, arrays, Fixed(np.zeros(z.size, dtype=bool), z, np.array(1.0))).also
+
+
 def stage(
     z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays, fixed: Fixed, tolerance: float = STAGE_TOLERANCE
 ) -> Linearised:
-    """Fit geometry and stereo for given noise scales from z; return the campaign linearised there.
-
-    The tolerance `NO_STEP` linearises at z.
-    """
+    """Fit geometry and stereo for given noise scales from z; return the campaign linearised there."""
     return descend(lambda at: linear_campaign(at, space, arrays, fixed), z, tolerance, STAGE_STEPS).also

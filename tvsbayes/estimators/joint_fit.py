@@ -26,8 +26,9 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES, Prior
+from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES
 from tvsbayes.instrument.places import line_share, seen_places
+from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
@@ -149,6 +150,11 @@ class JointFit(Shown):
     def names(self) -> tuple[str, ...]:
         """Return the public names of the coordinates and of the columns of `draws.physical`."""
         return self.space.mechanism.names
+
+    @property
+    def table(self) -> RigTable:
+        """Return the rig of the campaign with the priors of the fit, which its options may have changed."""
+        return table_used(self.campaign.rig, np.asarray(self.space.value), np.asarray(self.space.u))
 
     @property
     def held(self) -> np.ndarray:
@@ -337,12 +343,10 @@ def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " 
     return used
 
 
-def priors_used(stated: Mapping[str, Prior], value: np.ndarray, u: np.ndarray) -> dict[str, Prior]:
-    """Return the priors of a fit, which its options may have changed; columns are in the order of `stated`."""
-    return {
-        name: replace(prior, value=float(value[column]), u=float(u[column]))
-        for column, (name, prior) in enumerate(stated.items())
-    }
+def table_used(rig: RigTable, value: np.ndarray, u: np.ndarray) -> RigTable:
+    """Return a rig with these values and u of its priors, in their order."""
+    changed = zip(rig.priors.items(), value.tolist(), u.tolist(), strict=True)
+    return replace(rig, priors={name: replace(prior, value=v, u=w) for (name, prior), v, w in changed})
 
 
 def restored(campaign: Campaign, stored: StoredMode) -> JointFit | None:
@@ -358,7 +362,7 @@ def restored(campaign: Campaign, stored: StoredMode) -> JointFit | None:
     """
     if stored.names != campaign.rig.mechanism.names or stored.prior.shape[1] != len(RIG_NAMES):
         return None
-    table = replace(campaign.rig, priors=priors_used(campaign.rig.priors, *stored.prior))
+    table = table_used(campaign.rig, *stored.prior)
     with jax.enable_x64(True):
         sides: dict[str, str] = {axis: side for axis, side in zip(AXES, stored.sides, strict=True) if side}
         problem = Problem(homed(campaign, sides), table, stored.valid > 0, stored.weight)

@@ -31,14 +31,12 @@ from tvsbayes.estimators.kalman_filter import (
 )
 from tvsbayes.estimators.looks import WINDOW, Looks, looks_at, spot_angles
 from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToStates, noise_scales, spot_residuals
-from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import BlockRoot, place_blocks
 from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, no_moves
-from tvsbayes.model.parameter_space import Model, ParameterSpace
+from tvsbayes.model.parameter_space import RATIO_COLUMNS, Model, ParameterSpace
 
-RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 POINTS_TOGETHER = 256
 """Points whose errors at places are eliminated together: many, since NumPy's calls cost more than small matrices; few
 enough for their memory."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import equinox as eqx
 import jax
@@ -74,6 +75,18 @@ class Linearised(LinearLooks):
     def place_load(self) -> Float[Array | np.ndarray, "spots 4 errors"]:
         """Compute d(predicted)/d(errors at places), these in units in which they are N(0, 1) a priori."""
         return self.place_columns @ self.place_root
+
+    def by_coordinates(self, held: np.ndarray) -> np.ndarray:
+        """Return d(predicted)/d(coordinates), 0 for those held (p,), shape (spots, 4, p)."""
+        return np.where(held, 0.0, -np.asarray(self.residual_jacobian))
+
+    def by_angles(self, rows: np.ndarray) -> np.ndarray:
+        """Return d(predicted)/d(mirror angles) of some spots (k,), pan and tilt in turn, shape (spots, 4, 2 k)."""
+        slope = np.asarray(self.slope)
+        columns = np.zeros((*slope.shape[:2], 2 * len(rows)))
+        for k, row in enumerate(rows.tolist()):
+            columns[row, :, 2 * k : 2 * k + 2] = slope[row]
+        return columns
 
     def spot_deviations(self) -> SpotDeviations:
         """Fit both angles to the whitened residuals of each spot; covariance 0 where a spot determines neither."""
@@ -207,6 +220,15 @@ class StopInformation:
     place_mean: np.ndarray
     place_slope: np.ndarray
     place_covariance: np.ndarray
+
+    @cached_property
+    def residual(self) -> np.ndarray:
+        """Return C^-1 r of all spots, shape (4 n,)."""
+        return np.concatenate([group.residual for group in self.groups])
+
+    def score(self, jacobian: np.ndarray) -> np.ndarray:
+        """Compute J^T C^-1 r, shape (q,), by d(prediction)/d(quantities) of all spots, shape (n, 4, q)."""
+        return jacobian.reshape(len(self.residual), -1).T @ self.residual
 
 
 def _group_rows(spots: LinearSpots) -> list[slice]:

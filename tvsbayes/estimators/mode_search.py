@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import optimize
 
-from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, linear_part, stage
+from tvsbayes.estimators.annealed_stage import Fixed, linear_part, linearised_at, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays, components
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import (
@@ -26,17 +26,16 @@ from tvsbayes.estimators.linear_spots import (
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.conditions import unseen_shifts
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE_NAMES, names_of
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import Places, place_root
-from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space, physical_at
+from tvsbayes.model.parameter_space import RATIO_COLUMNS, ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
 from tvsbayes.statistics.chances import chi2_quantile
-from tvsbayes.statistics.least_squares import Mode, neighbouring_mode, newton_mode
+from tvsbayes.statistics.least_squares import Mode, Objective, neighbouring_mode, newton_mode
 
-RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Successive factors on the noise of pixels and readings: plain Levenberg-Marquardt from the nominal rig ends in a
 wrong minimum when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
@@ -106,6 +105,13 @@ def held_by(free: Bool[np.ndarray, " parameters"]) -> Bool[np.ndarray, " paramet
     return np.isin(NAMES, NOISE_NAMES) | ~free
 
 
+def _curvatures(objective: Objective, z: np.ndarray, columns: np.ndarray, step: float) -> np.ndarray:
+    """Compute second differences of an objective at z (p,) along some coordinates (k,), shape (k,)."""
+    steps = step * np.eye(len(z))[columns]
+    centre, *nudged = objective(np.concatenate([z[None], z + steps, z - steps]))
+    return (np.sum(np.reshape(nudged, (2, -1)), axis=0) - 2 * centre) / step**2
+
+
 class Problem:
     """One campaign with its priors, as arguments of the compiled functions.
 
@@ -150,12 +156,7 @@ class Problem:
 
     def least_squares(self, z: np.ndarray, inflation: float) -> np.ndarray:
         """Fit geometry and stereo for given noise scales."""
-        return np.array(self.stage(z, inflation, STAGE_TOLERANCE).z)
-
-    def stage(self, z: np.ndarray, inflation: float, tolerance: float) -> Linearised:
-        """Run a least-squares stage from z; return the campaign linearised at its end."""
-        fixed = Fixed(self.held, z, np.array(inflation))
-        return stage(z, self.space, self.arrays, fixed, tolerance)
+        return np.array(stage(z, self.space, self.arrays, Fixed(self.held, z, np.array(inflation))).z)
 
     def negative_log_density(self, z: np.ndarray) -> np.ndarray:
         """Evaluate many points (n, p); infinite where the model has no value."""
@@ -207,8 +208,7 @@ class Problem:
         if not len(places.steps):
             return Room(self.space, np.zeros((len(NAMES), len(NAMES))), places.steps, places)
         lin = self.linearised(z)
-        jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
-        linear = linear_spots(lin, self.arrays, jacobian)
+        linear = linear_spots(lin, self.arrays, lin.by_coordinates(self.held))
         information = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
         ratio = np.radians(physical_at(z, self.space).value[RATIO_COLUMNS])
         return Room(self.space, information.fisher, places.steps * ratio[places.on_tilt.astype(int)], places)
@@ -243,12 +243,11 @@ class Problem:
 
     def linearised(self, z: np.ndarray) -> Linearised:
         """Linearise the campaign at a point, without padding."""
-        return self.stage(z, 1.0, NO_STEP)
+        return linearised_at(z, self.space, self.arrays)
 
     def information(self, lin: Linearised) -> StopInformation:
         """Compute the stops' information on geometry and stereo at fixed noise scales."""
-        jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
-        return stop_information(linear_spots(lin, self.arrays, jacobian))
+        return stop_information(linear_spots(lin, self.arrays, lin.by_coordinates(self.held)))
 
     def mode(self, z: np.ndarray) -> Mode:
         """Find the mode by Newton steps from z at fixed scales of repeating errors, and the variance of these scales.
@@ -259,12 +258,9 @@ class Problem:
         repeated = np.flatnonzero(self.repeated)
         if not repeated.size:
             return optimum
-        room, steps = self.room(optimum.z), SCALE_STEP * np.eye(len(NAMES))[repeated]
-        points = np.concatenate([optimum.z[None], optimum.z + steps, optimum.z - steps])
-        centre, *nudged = self.negative_log_density(points) - room(points)
-        both = np.sum(np.reshape(nudged, (2, -1)), axis=0)
-        covariance = optimum.covariance.copy()
-        covariance[repeated, repeated] = 1 / np.clip((both - 2 * centre) / SCALE_STEP**2, 1.0, None)
+        room, covariance = self.room(optimum.z), optimum.covariance.copy()
+        bent = _curvatures(lambda z: self.negative_log_density(z) - room(z), optimum.z, repeated, SCALE_STEP)
+        covariance[repeated, repeated] = 1 / np.clip(bent, 1.0, None)
         return replace(optimum, covariance=covariance)
 
     def mode_beside(self, known: Mode) -> Mode:
@@ -282,10 +278,8 @@ class Problem:
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Compute the information on the coordinates: Fisher's, and for the noise by differences."""
         value = self.information(self.linearised(z)).fisher + np.eye(len(NAMES))
-        steps = NOISE_STEP * np.eye(len(NAMES))[self.noise]
-        centre, *nudged = self.negative_log_density(np.concatenate([z[None], z + steps, z - steps]))
-        both = np.sum(np.reshape(nudged, (2, -1)), axis=0)
-        value[self.noise, self.noise] = np.maximum(1.0, (both - 2 * centre) / NOISE_STEP**2)
+        bent = _curvatures(self.negative_log_density, z, self.noise, NOISE_STEP)
+        value[self.noise, self.noise] = np.maximum(1.0, bent)
         return value
 
     def reweighted(self, z: np.ndarray) -> float:

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE_NAMES
-from tvsbayes.model.parameter_space import ParameterSpace
 
 STEP = 0.05
 """Step of central differences, in sds of the Laplace approximation; the weights correct for larger curvature."""
@@ -51,24 +50,21 @@ class ScalesAlone:
     def __init__(self, fit: JointFit):
         self.fit = fit
         self.columns = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & fit.free)
-        self._space: ParameterSpace = fit.space
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """Evaluate at points (n, p) that differ in their noise scales, shape (n,)."""
-        arrays, still = self.fit.arrays, no_draw(len(z), self.fit.arrays)
-        joint = evaluate(z, still, self._space, arrays).log_density
+        arrays = self.fit.arrays
+        joint = evaluate(z, no_draw(len(z), arrays), self.fit.space, arrays).log_density
         log_density = joint + np.array([self._room(point) for point in z])
         return np.where(np.isfinite(log_density), log_density, -np.inf)
 
     def _room(self, z: np.ndarray) -> float:
         """Compute the log density's increase at z by integrating out geometry and cameras."""
-        arrays = self.fit.arrays
-        lin = stage(z, self._space, arrays, Fixed(self.fit.held, z, np.array(1.0)), NO_STEP)
-        jacobian = np.where(self.fit.held, 0.0, -np.asarray(lin.residual_jacobian))
-        spots = linear_spots(lin, arrays, jacobian)
-        information = stop_information(spots)
-        errors = np.concatenate([group.residual for group in information.groups])
-        slope = jacobian.reshape(len(errors), -1).T @ errors - np.where(self.fit.held, 0.0, z)
+        arrays, held = self.fit.arrays, self.fit.held
+        lin = linearised_at(z, self.fit.space, arrays)
+        jacobian = lin.by_coordinates(held)
+        information = stop_information(linear_spots(lin, arrays, jacobian))
+        slope = information.score(jacobian) - np.where(held, 0.0, z)
         precision = information.fisher + np.eye(len(z))
         return float(0.5 * slope @ np.linalg.solve(precision, slope) - 0.5 * np.linalg.slogdet(precision)[1])
 

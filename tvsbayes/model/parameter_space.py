@@ -230,8 +230,11 @@ def scale_of(mechanism: Mechanism) -> np.ndarray:
 
 STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
 """Coordinates of the stop sds by axis and side, (right, left) and (down, up): shape (2, 2)."""
-SCATTER_COLUMNS = np.array([INDEX[name] for name in LOOK_SCATTER_NAMES])
-"""Coordinates of the looks' scatter by axis."""
+SCATTER_COLUMNS, RATIO_COLUMNS, DRIFT_COLUMNS = (
+    np.array([INDEX[name] for name in names])
+    for names in (LOOK_SCATTER_NAMES, BLOCKS["degrees_per_step"], BLOCKS["drift_deg_per_root_hour"])
+)
+"""Coordinates of the looks' scatter, of the mean ratios and of the zeros' drift by axis."""
 
 
 def _camera_columns(*parts: str) -> slice | np.ndarray:

@@ -12,11 +12,10 @@ from functools import lru_cache
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.likelihood import RATIO_COLUMNS
 from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.parameter_space import SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
+from tvsbayes.model.parameter_space import RATIO_COLUMNS, SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, Knowledge

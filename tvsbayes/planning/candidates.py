@@ -10,13 +10,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.likelihood import RATIO_COLUMNS
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.instrument.protocols import UNSTATED_STEPS
-from tvsbayes.model.parameter_space import physical_at
+from tvsbayes.model.parameter_space import RATIO_COLUMNS, physical_at
 from tvsbayes.planning.drawn_rigs import draws_of
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import LookArrays, Looks

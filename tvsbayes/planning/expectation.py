@@ -31,7 +31,6 @@ from tvsbayes.estimators.campaign_arrays import (
 )
 from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.kalman_filter import filter_rows, kalman_update, no_belief
-from tvsbayes.estimators.likelihood import RATIO_COLUMNS
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
 from tvsbayes.instrument.axes import HOME_SD_DEG
@@ -45,7 +44,7 @@ from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import MoveArrays, mirror_angles, trace
-from tvsbayes.model.parameter_space import Model, ParameterSpace, parameter_space, physical_at
+from tvsbayes.model.parameter_space import RATIO_COLUMNS, Model, ParameterSpace, parameter_space, physical_at
 from tvsbayes.planning.gear_places import (
     NO_PLACES,
     FittedErrors,

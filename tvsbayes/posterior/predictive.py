@@ -22,16 +22,15 @@ from tvsbayes.estimators.likelihood import filter_input
 from tvsbayes.estimators.looks import WINDOW, observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
-from tvsbayes.instrument.parameters import INDEX, names_of
+from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.compiled import compiled, in_batches
-from tvsbayes.model.parameter_space import SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
+from tvsbayes.model.parameter_space import DRIFT_COLUMNS, SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.statistics.streams import Stream, random_stream
 
 if TYPE_CHECKING:
     import xarray as xr
 
-DRIFT_COLUMNS = [INDEX[name] for name in names_of("drift_deg_per_root_hour")]
 PREDICTED_DRAWS = 8
 """Draws of each chain for which looks are predicted again."""
 RANK_TOLERANCE = 1e-12
