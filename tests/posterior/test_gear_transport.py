@@ -22,7 +22,7 @@ from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, names_of
-from tvsbayes.model.parameter_space import coordinates_of, free_mask, parameter_space, physical_at
+from tvsbayes.model.parameter_space import DRIFT_COLUMNS, coordinates_of, free_mask, parameter_space, physical_at
 from tvsbayes.posterior.transport import SCALE_NAMES, WALK_INFORMATION, Transport, transport
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -184,7 +184,9 @@ def test_a_drift_takes_from_the_map_what_it_takes_from_the_dense_campaign(dozen,
     fitted = fit_of(dozen, dozen.campaign, VALUES | dict.fromkeys(LOOK_SCATTER_NAMES, 0.0) | drift, held, redraw=False)
     path = transport(fitted)
     dense, _ = dense_density(fitted, path, fitted.z)
-    paths = (path, replace(path, drift_scale=np.zeros(2)))
+    without = path.physical.copy()
+    without[DRIFT_COLUMNS] = 0.0
+    paths = (path, replace(path, physical=without))
     factors = [each.conditional(np.zeros((1, path.noise))).own[0] for each in paths]
     drifting, still = ((factor @ factor.T)[::-1, ::-1] for factor in factors)
     assert np.abs(drifting - dense).max() < share * np.abs(still - dense).max()

@@ -14,7 +14,7 @@ from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
 from tvsbayes.posterior.linear_campaign import LinearCampaign
 from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.stop_states import StopStates
-from tvsbayes.posterior.transport import GEAR_SCALES, Transport, curvatures
+from tvsbayes.posterior.transport import Transport, curvatures
 
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
 STRETCH = 0.3
@@ -39,32 +39,35 @@ def linear_campaign(along: np.ndarray, prior: np.ndarray, noise: int) -> LinearC
     return LinearCampaign(np.zeros(ROWS), seen, no_states(), *of_states, np.zeros((ROWS, 0)), prior, looks)
 
 
+class Scaled(Transport):
+    """A map whose noise coordinate, where it has one, scales the datum as one of all pixels does."""
+
+    @property
+    def pixels(self) -> np.ndarray:
+        """1 at that coordinate."""
+        return np.ones(self.noise)
+
+
 def route() -> Transport:
     """The map z_1 = w_1, z_2 = w_2 exp(0.3 w_1) at two of the parameters.
 
     The first scales the noise of the one datum that knows the second, which has no prior.
     """
-    return Transport(
+    return Scaled(
         mode=np.zeros(len(NAMES)),
+        physical=np.zeros(len(NAMES)),
         free=np.array([BACKLASH, RATIO]),
         root=np.eye(2),
         noise=1,
         narrow=0,
         slope=np.array([[STRETCH]]),
         half=np.zeros(1, bool),
-        pixels=np.ones(1),
-        scatter=np.zeros((2, 1)),
         linear=linear_campaign(np.ones(1), np.zeros((1, 1)), 1),
         residuals=lambda z: np.zeros((len(z), ROWS)),
         bend=np.zeros((1, 0, 0)),
         place_angle_rad=np.zeros(0),
         place_on_tilt=np.zeros(0, bool),
         drift_axis=np.zeros((0, 2)),
-        drift_scale=np.zeros(2),
-        drift_noise=np.zeros((2, 1)),
-        gear_scale=np.zeros(len(GEAR_SCALES)),
-        gear_noise=np.zeros((len(GEAR_SCALES), 1)),
-        creep_noise=np.zeros(1),
         period_deg=np.zeros((2, PERIODS_MAX)),
     )
 
@@ -98,14 +101,9 @@ def ridge() -> Transport:
         narrow=1,
         slope=np.zeros((0, 0)),
         half=np.zeros(0, bool),
-        pixels=np.zeros(0),
-        scatter=np.zeros((2, 0)),
         linear=linear_campaign(np.array([0.0, sd / NARROW_SD]), np.diag([1.0, sd**2]), 0),
         residuals=ridge_residual,
         bend=np.zeros((2, 1, 1)),
-        drift_noise=np.zeros((2, 0)),
-        gear_noise=np.zeros((len(GEAR_SCALES), 0)),
-        creep_noise=np.zeros(0),
     )
     return replace(straight, bend=curvatures(straight)[:, 1:, 1:])
 

@@ -26,7 +26,9 @@ from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import BlockRoot, place_blocks
 from tvsbayes.model.parameter_space import (
+    DRIFT_COLUMNS,
     FARTHEST_SD,
+    RATIO_COLUMNS,
     SCATTER_COLUMNS,
     STOP_COLUMNS,
     half_normal,
@@ -46,7 +48,6 @@ GEAR_SCALES = np.array(
     ]
 )
 """Coordinates on which the covariance of the errors at places depends."""
-DRIFT_COLUMNS = np.array([INDEX[name] for name in names_of("drift_deg_per_root_hour")])
 CREEP_COLUMNS = np.array([INDEX[name] for name in names_of("creep_deg")])
 WALK_STEPS = 128
 """Largest number of steps of a drift between two homings; it is linear within each."""
@@ -123,6 +124,7 @@ class Transport:
 
     Attributes:
         mode: z at w = 0, shape (p,).
+        physical: values of the parameters there, in the units of their names, shape (p,).
         free: sampled columns of z, (d,): noise scales, then all others, the widest conditional sd first.
         root: lower-triangular factor of their covariance in that order, separately for noise coordinates and others,
             whose mean at other scales follows from the residuals, shape (d, d).
@@ -131,8 +133,6 @@ class Transport:
         slope: derivative of ln of the noise scales by w of the noise coordinates, shape (q, q); of half-normal scales,
             whose logarithm is not linear, the step of z instead.
         half: which noise scales are half-normal, shape (q,).
-        pixels: 1 at the noise coordinate that scales all pixels, shape (q,).
-        scatter: 1 at the noise coordinates that are the scatter of looks (pan, tilt), shape (2, q).
         linear: the campaign linearised at the mode.
         residuals: residuals of the model, for centring.
         bend: change of the slopes of the narrow coordinates with all others, `turn` = 1 + bend' y, shape (g, narrow,
@@ -140,34 +140,23 @@ class Transport:
         place_angle_rad, place_on_tilt: places, as arguments of `gear_processes.place_blocks`; their transmission errors
             and plays are the first of the e errors, followed by the terms of the drifts.
         drift_axis: 1 at the axis (pan, tilt) whose drift is the sd of each of those terms, shape (terms, 2).
-        drift_scale: sd of the drifts at the mode, rad h^(-1/2), shape (2,).
-        drift_noise: 1 at the noise coordinate of each of them, shape (2, q).
-        gear_scale: values of `GEAR_SCALES` at the mode, in the units of their names, shape (12,).
-        gear_noise: 1 at the noise coordinate of each of them, shape (12, q).
-        creep_noise: 1 at the noise coordinate that is the time constant of a creep, shape (q,).
         period_deg: periods of the gears' errors, shape (2, 3).
     """
 
     mode: np.ndarray
+    physical: np.ndarray
     free: np.ndarray
     root: np.ndarray
     noise: int
     narrow: int
     slope: np.ndarray
     half: np.ndarray
-    pixels: np.ndarray
-    scatter: np.ndarray
     linear: LinearCampaign
     residuals: Residuals
     bend: np.ndarray
     place_angle_rad: np.ndarray
     place_on_tilt: np.ndarray
     drift_axis: np.ndarray
-    drift_scale: np.ndarray
-    drift_noise: np.ndarray
-    gear_scale: np.ndarray
-    gear_noise: np.ndarray
-    creep_noise: np.ndarray
     period_deg: np.ndarray
 
     @property
@@ -187,6 +176,20 @@ class Transport:
         They are wide: where several of them are far out together, the proposal fits the target badly.
         """
         return np.isin(np.array(NAMES)[self.free], OPTICS_NAMES)
+
+    def noise_of(self, *columns: int) -> np.ndarray:
+        """Mark with 1 the noise coordinate that is each of some columns (k,) of z, shape (k, q)."""
+        return (np.array(columns)[:, None] == self.free[: self.noise]).astype(float)
+
+    @cached_property
+    def pixels(self) -> np.ndarray:
+        """Mark with 1 the noise coordinate that scales all pixels, shape (q,)."""
+        return self.noise_of(INDEX["pixel_scale"])[0]
+
+    @cached_property
+    def creep_noise(self) -> np.ndarray:
+        """Mark with 1 the noise coordinate that is the time constant of a creep, shape (q,)."""
+        return self.noise_of(INDEX["creep_minutes"])[0]
 
     @cached_property
     def plays(self) -> tuple[int, ...]:
@@ -239,10 +242,10 @@ class Transport:
     def _place_roots(self, log_scale: np.ndarray) -> BlockRoot:
         """Compute factors of the covariance of errors at places, then of drift terms, at ln of noise scales (n, q)."""
         values = np.zeros((len(log_scale), len(NAMES)))
-        values[:, GEAR_SCALES] = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
+        values[:, GEAR_SCALES] = self.physical[GEAR_SCALES] * np.exp(log_scale @ self.noise_of(*GEAR_SCALES).T)
         scales, valid = scales_at(values, self.period_deg), np.ones(len(self.place_on_tilt), dtype=bool)
         errors = place_blocks(scales, self.place_angle_rad, self.place_on_tilt, valid)
-        drift = self.drift_scale * np.exp(log_scale @ self.drift_noise.T)
+        drift = np.radians(self.physical[DRIFT_COLUMNS]) * np.exp(log_scale @ self.noise_of(*DRIFT_COLUMNS).T)
         terms = (drift @ self.drift_axis.T)[..., None] * np.eye(len(self.drift_axis))
         return BlockRoot((*errors.blocks, terms))
 
@@ -256,7 +259,7 @@ class Transport:
         weight = np.exp(-2 * log_scale @ self.pixels)
         places, count = linear.places.shape[1], linear.columns.shape[1]
         later = None if linear.creep is None else linear.creep.later(log_scale @ self.creep_noise)
-        inner = linear.looks.inner(weight[:, None] * np.exp(2 * log_scale @ self.scatter.T))
+        inner = linear.looks.inner(weight[:, None] * np.exp(2 * log_scale @ self.noise_of(*SCATTER_COLUMNS).T))
         products = linear.at(inner, later)
         variance = linear.constant + np.exp(2 * log_scale) @ linear.by_noise.T
         elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance), products.of_states)
@@ -511,7 +514,7 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
         wide: lower triangular factor of their covariance, shape (g, g).
     """
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
-    names = np.array(NAMES)
+    names, physical = np.array(NAMES), np.asarray(fit.mode.physical)
     free = np.flatnonzero(fit.free)
     scales = np.isin(names[free], SCALE_NAMES)
     # The scatter of looks comes first: given it, the other scales are nearly independent.
@@ -525,7 +528,7 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     present = np.flatnonzero(places.valid)
     columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, 2 * len(places.steps))
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
-    ratio = np.radians([fit.mode.physical[INDEX[name]] for name in names_of("degrees_per_step")])
+    ratio = np.radians(physical[RATIO_COLUMNS])
     spots = len(linear.residual)
 
     def misfit(z: np.ndarray) -> np.ndarray:
@@ -536,14 +539,13 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
         precision[place] = HalfNormal(float(fit.z[others[place]])).precision
     return Transport(
         mode=fit.z,
+        physical=physical,
         free=np.concatenate([noise, others]),
         root=linalg.block_diag(of_noise, wide),
         noise=len(noise),
         narrow=0,
         slope=np.where(half, 1.0, np.asarray(fit.space.u)[noise])[:, None] * of_noise,
         half=half,
-        pixels=(noise == INDEX["pixel_scale"]).astype(float),
-        scatter=(SCATTER_COLUMNS[:, None] == noise).astype(float),
         linear=LinearCampaign(
             residual=linear.residual.ravel(),
             along=(linear.jacobian[..., others] @ wide).reshape(4 * spots, -1),
@@ -563,10 +565,5 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
         place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[present],
         place_on_tilt=np.asarray(places.on_tilt)[present],
         drift_axis=drifts.axis,
-        drift_scale=np.radians(np.asarray(fit.mode.physical)[DRIFT_COLUMNS]),
-        drift_noise=(DRIFT_COLUMNS[:, None] == noise).astype(float),
-        gear_scale=np.asarray(fit.mode.physical)[GEAR_SCALES],
-        gear_noise=(GEAR_SCALES[:, None] == noise).astype(float),
-        creep_noise=(noise == INDEX["creep_minutes"]).astype(float),
         period_deg=np.asarray(fit.space.harmonic_period_deg),
     )
