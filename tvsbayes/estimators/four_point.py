@@ -59,6 +59,10 @@ class SkippedExperiment:
     reason: str
 
 
+class _Unusable(Exception):
+    """Why an experiment cannot be used, in words."""
+
+
 @dataclass(frozen=True)
 class Selection:
     """The complete experiments of a campaign, as arrays over e experiments.
@@ -221,21 +225,19 @@ def select_experiments(campaign: Campaign) -> Selection:
     kept: list[tuple[int, list[int], str, int]] = []
     skipped: list[SkippedExperiment] = []
     for number in sorted(rows):
-        by_point, reason = _by_point(spots, rows[number])
-        if reason is None:
-            at = [moves[spots[row].move] for row in by_point]
-            axis, steps, reason = _commanded(at)
-        if reason is None:
-            kept.append((number, by_point, axis, steps))
-        else:
-            skipped.append(SkippedExperiment(number, reason))
-    spot_rows = np.array([k[1] for k in kept], dtype=int).reshape(-1, 4)
+        try:
+            by_point = _by_point(spots, rows[number])
+            kept.append((number, by_point, *_commanded([moves[spots[row].move] for row in by_point])))
+        except _Unusable as reason:
+            skipped.append(SkippedExperiment(number, str(reason)))
+    numbers, four_rows, axes, steps = zip(*kept, strict=True) if kept else 4 * ((),)
+    spot_rows = np.array(four_rows, dtype=int).reshape(-1, 4)
     return Selection(
-        experiments=np.array([k[0] for k in kept], dtype=int),
+        experiments=np.array(numbers, dtype=int),
         spot_rows=spot_rows,
         pixels=pixels_of(spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
-        steps=np.array([k[3] for k in kept], dtype=int),
-        axis=np.array([k[2] for k in kept], dtype="U4"),
+        steps=np.array(steps, dtype=int),
+        axis=np.array(axes, dtype="U4"),
         skipped=tuple(skipped),
     )
 
@@ -247,8 +249,8 @@ def experiment_rows(campaign: Campaign, selection: Selection) -> np.ndarray:
     return np.array(rows, dtype=int).reshape(-1, 4)
 
 
-def _by_point(spots: Sequence[Spot], rows: list[int]) -> tuple[list[int], str | None]:
-    """Find the rows of points 1 to 4 in order, or the reason why there are not exactly four."""
+def _by_point(spots: Sequence[Spot], rows: list[int]) -> list[int]:
+    """Find the rows of points 1 to 4 in order; raise `_Unusable` where there are not exactly four."""
     by_point: dict[int | None, list[int]] = {}
     for row in rows:
         by_point.setdefault(spots[row].point, []).append(row)
@@ -256,31 +258,31 @@ def _by_point(spots: Sequence[Spot], rows: list[int]) -> tuple[list[int], str | 
     for point in (1, 2, 3, 4):
         members = by_point.get(point, [])
         if not members:
-            return [], f"point {point} is missing"
+            raise _Unusable(f"point {point} is missing")
         ok = [row for row in members if spots[row].status == "ok"]
         if not ok:
-            return [], f"point {point} is not usable: status {spots[members[0]].status}"
+            raise _Unusable(f"point {point} is not usable: status {spots[members[0]].status}")
         if len(ok) > 1:
-            return [], f"point {point} is present {len(ok)} times"
+            raise _Unusable(f"point {point} is present {len(ok)} times")
         ordered.append(ok[0])
-    return ordered, None
+    return ordered
 
 
-def _commanded(at: list[Move]) -> tuple[str, int, str | None]:
-    """Find the moved axis and signed N of the moves of points 1 to 4, or the reason why there is none."""
+def _commanded(at: list[Move]) -> tuple[str, int]:
+    """Find the moved axis and signed N of the moves of points 1 to 4; raise `_Unusable` where there is none."""
     one, two, three, four = ((m.segment, m.pan_steps, m.tilt_steps) for m in at)
     if len({m.segment for m in at}) > 1:
-        return "", 0, "the positioner was homed within the experiment"
+        raise _Unusable("the positioner was homed within the experiment")
     if one != two:
-        return "", 0, "points 1 and 2 were seen at different counters"
+        raise _Unusable("points 1 and 2 were seen at different counters")
     if three != four:
-        return "", 0, "points 3 and 4 were seen at different counters"
+        raise _Unusable("points 3 and 4 were seen at different counters")
     pan, tilt = three[1] - two[1], three[2] - two[2]
     if pan and tilt:
-        return "", 0, f"both axes moved between points 2 and 3 (pan {pan:+d}, tilt {tilt:+d} steps)"
+        raise _Unusable(f"both axes moved between points 2 and 3 (pan {pan:+d}, tilt {tilt:+d} steps)")
     if not pan and not tilt:
-        return "", 0, "no axis moved between points 2 and 3"
-    return ("pan", pan, None) if pan else ("tilt", tilt, None)
+        raise _Unusable("no axis moved between points 2 and 3")
+    return ("pan", pan) if pan else ("tilt", tilt)
 
 
 def classic(campaign: Campaign) -> ClassicResult:
