@@ -193,20 +193,35 @@ class AxisModel:
         names = [name for name, is_recorded in there.items() if is_recorded]
         return tuple(name for name in names if not self.priors[name].u == 0 == self.priors[name].value)
 
+    @cached_property
+    def layout(self) -> dict[str, slice]:
+        """Columns by what they are; those of the processes are in the order of the places."""
+        places = len(self.places.command)
+        sizes = {"line": LINE_TERMS, "homed": len(self.homed), "unknown": len(self.unknown_segments)}
+        sizes |= {"shifts": len(self.shifts), "waves": COLUMNS * len(self.coordinates.waves)}
+        sizes |= {"error": places, "play": places}
+        ends = np.cumsum(list(sizes.values())).tolist()
+        return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+
     @property
-    def waves_begin(self) -> int:
-        """First column of the waves: `COLUMNS` of each."""
-        return LINE_TERMS + len(self.homed) + len(self.unknown_segments) + len(self.shifts)
+    def shift_columns(self) -> dict[str, int]:
+        """Column of each of `shifts`."""
+        return {name: k for k, name in enumerate(self.shifts, start=self.layout["shifts"].start)}
+
+    def of_wave(self, k: int) -> slice:
+        """Columns of wave k."""
+        first = self.layout["waves"].start + COLUMNS * k
+        return slice(first, first + COLUMNS)
 
     @property
     def processes(self) -> int:
         """First column of the error by position; that of the play follows it."""
-        return self.waves_begin + COLUMNS * len(self.coordinates.waves)
+        return self.layout["error"].start
 
     @property
     def columns(self) -> int:
         """Number of linear quantities."""
-        return self.processes + 2 * len(self.places.command)
+        return self.layout["play"].stop
 
     @cached_property
     def _weights(self) -> np.ndarray:
@@ -223,21 +238,21 @@ class AxisModel:
         clocks = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
         return clocks[wave.clock]
 
+    def clock_of_rows(self, wave: Wave) -> np.ndarray:
+        """`clock` of the rows, shape (rows,)."""
+        return self.clock(wave, self.rows.command, self.rows.time_s, self.rows.value)
+
     def record(self, wave: Wave) -> WaveRecord:
         """Range of the rows on the clock of a wave."""
-        rows = self.rows
-        return WaveRecord.of(self.clock(wave, rows.command, rows.time_s, rows.value))
+        return WaveRecord.of(self.clock_of_rows(wave))
 
-    def _wave_columns(self, w: np.ndarray) -> Iterator[np.ndarray]:
-        """Columns (n or 1, rows, `COLUMNS`) of every wave at coordinates (n, d)."""
+    def wave_columns(self, wave: Wave, period: np.ndarray) -> np.ndarray:
+        """Columns (n, rows, `COLUMNS`) of a wave at periods (n,), averaged as the rows are."""
         rows = self.rows
-        speed = abs(rows.line[1] * (rows.rate or 0.0))
-        for wave, draws in zip(self.coordinates.waves, self.coordinates.wave_draws(w), strict=True):
-            width = rows.width_s * (1.0 if wave.clock == "seconds" else speed)
-            x = self.clock(wave, rows.command, rows.time_s, rows.value)
-            yield wave_columns(x, draws.period, WaveRecord.of(x), width)
+        speed = 1.0 if wave.clock == "seconds" else abs(rows.line[1] * (rows.rate or 0.0))
+        return wave_columns(self.clock_of_rows(wave), period, self.record(wave), rows.width_s * speed)
 
-    def _shift_columns(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def _shifts_of_rows(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Columns (n or 1, rows) of the shifts of the zero in time."""
         columns = {}
         if "creep" in self.shifts:
@@ -251,7 +266,8 @@ class AxisModel:
     def _columns(self, w: np.ndarray, values: Mapping[str, np.ndarray], extra: np.ndarray | None) -> np.ndarray:
         """Readings minus the prior means, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
         rows, backlash = self.rows, values["backlash"]
-        shifts, waves = self._shift_columns(values), list(self._wave_columns(w))
+        drawn = zip(self.coordinates.waves, self.coordinates.wave_draws(w), strict=True)
+        waves, shifts = [self.wave_columns(wave, draws.period) for wave, draws in drawn], self._shifts_of_rows(values)
         play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
         spread = play.spread if self.play_is_sampled else self._unknown_spread
         # Equal columns are computed once for all draws.
@@ -264,37 +280,32 @@ class AxisModel:
         filled[:, :, 0] = rows.value - level - self.priors["per_command"].value * anchor
         filled[:, :, 0] -= 0.5 * self.priors["ratio_contrast"].value * play.path
         filled[:, :, 0] -= 0.5 * play.side * backlash[:blocks, None]
-        filled[:, :, 1 + OFFSET], filled[:, :, 1 + SLOPE], filled[:, :, 1 + CONTRAST] = 1.0, anchor, 0.5 * play.path
-        filled[:, :, 1 + BACKLASH] = 0.5 * play.side
-        for k, segment in enumerate(self.homed):
-            filled[:, :, 1 + LINE_TERMS + k] = rows.segment == segment
-        for k, segment in enumerate(self.unknown_segments):
-            filled[:, :, 1 + LINE_TERMS + len(self.homed) + k] = spread * (rows.segment == segment)
-        first_shift = 1 + LINE_TERMS + len(self.homed) + len(self.unknown_segments)
-        for k, (name, column) in enumerate(shifts.items(), start=first_shift):
+        columns = filled[:, :, 1:]
+        columns[..., OFFSET], columns[..., SLOPE], columns[..., CONTRAST] = 1.0, anchor, 0.5 * play.path
+        columns[..., BACKLASH] = 0.5 * play.side
+        columns[..., self.layout["homed"]] = rows.segment[:, None] == self.homed
+        columns[..., self.layout["unknown"]] = spread[..., None] * np.equal.outer(rows.segment, self.unknown_segments)
+        for name, column in shifts.items():
             filled[:, :, 0] -= self.priors[name].value * column
-            filled[:, :, k] = column
-        for k, columns in enumerate(waves):
-            first = 1 + self.waves_begin + COLUMNS * k
-            filled[:, :, first : first + COLUMNS] = columns
-        start, count = 1 + self.processes, len(self.places.command)
-        filled[:, :, start : start + count] = self._weights
-        filled[:, :, start + count : start + 2 * count] = 0.5 * play.share[:, :, None] * self._weights
+            columns[..., self.shift_columns[name]] = column
+        for k, wave in enumerate(waves):
+            columns[..., self.of_wave(k)] = wave
+        columns[..., self.layout["error"]] = self._weights
+        columns[..., self.layout["play"]] = 0.5 * play.share[:, :, None] * self._weights
         if extra is not None:
-            filled[:, :, 1 + self.columns :] = extra
+            columns[..., self.columns :] = extra
         return filled
 
     def _scatter(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Variances of stop errors (in motion: of seeing) and of readings, each (n, rows)."""
         rows = self.rows
+        reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
         if rows.in_motion:
             seeing = (values["seeing_scale"] * rows.reading_u) ** 2
-            stop = seeing[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None])
-            return stop, np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
+            return seeing[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None]), reading
         forward = 0.5 * (1.0 + rows.side)
         stop = np.outer(values["stop_sd.forward"] ** 2, forward)
         stop += np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
-        reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
         if not self.places.exact:
             reading += self._between_nodes(values)[:, None]
         return stop, reading
@@ -334,34 +345,28 @@ class AxisModel:
         It is a Cholesky factor with places in order. With `reorder`, places with influence on rows precede the others
         and do not depend on the coordinates of these.
         """
-        count, n = len(self.places.command), len(values["backlash"])
-        factor = np.zeros((n, self.columns, self.columns))
-        slope = abs(self.rows.line[1])
-        factor[:, OFFSET, OFFSET] = OFFSET_TRAVELS * self.rows.travel
-        factor[:, SLOPE, SLOPE] = self.priors["per_command"].u
-        factor[:, CONTRAST, CONTRAST] = self.priors["ratio_contrast"].u
-        factor[:, BACKLASH, BACKLASH] = 0.0 if self.play_is_sampled else self.priors["backlash"].u
-        homes = LINE_TERMS + np.arange(len(self.homed))
-        factor[:, homes, homes] = values["home_sd"][:, None]
-        unknown = LINE_TERMS + len(self.homed) + np.arange(len(self.unknown_segments))
-        # The sd of a uniform distribution from -1 to 1.
-        factor[:, unknown, unknown] = np.sqrt(1 / 3)
-        for k, name in enumerate(self.shifts, start=LINE_TERMS + len(self.homed) + len(self.unknown_segments)):
-            factor[:, k, k] = self.priors[name].u
+        sd = np.zeros((len(values["backlash"]), self.columns))
+        sd[:, OFFSET] = OFFSET_TRAVELS * self.rows.travel
+        sd[:, SLOPE], sd[:, CONTRAST] = self.priors["per_command"].u, self.priors["ratio_contrast"].u
+        sd[:, BACKLASH] = 0.0 if self.play_is_sampled else self.priors["backlash"].u
+        sd[:, self.layout["homed"]] = values["home_sd"][:, None]
+        # That of a uniform distribution from -1 to 1.
+        sd[:, self.layout["unknown"]] = np.sqrt(1 / 3)
+        for name, column in self.shift_columns.items():
+            sd[:, column] = self.priors[name].u
         for k, scale in enumerate(scales):
-            of_wave = self.waves_begin + COLUMNS * k + np.arange(COLUMNS)
-            factor[:, of_wave, of_wave] = np.outer(scale, SHARES)
-        distance = slope * (self.places.command[:, None] - self.places.command)
+            sd[:, self.of_wave(k)] = np.outer(scale, SHARES)
+        factor = sd[:, None] * np.eye(self.columns)
+        distance = abs(self.rows.line[1]) * (self.places.command[:, None] - self.places.command)
         length = values["transmission_error_length"][:, None, None]
-        covariance = matern52(distance[None], length) + JITTER * np.eye(count)
+        covariance = matern52(distance[None], length) + JITTER * np.eye(len(distance))
         if reorder:
             first = np.argsort(~np.any(self._weights != 0, axis=0), kind="stable")
             root = np.empty_like(covariance)
             root[:, first[:, None], first] = np.linalg.cholesky(covariance[:, first[:, None], first])
         else:
             root = np.linalg.cholesky(covariance)
-        error = slice(self.processes, self.processes + count)
-        play = slice(self.processes + count, self.columns)
+        error, play = self.layout["error"], self.layout["play"]
         factor[:, error, error] = values["transmission_error"][:, None, None] * root
         factor[:, play, play] = values["play_variation"][:, None, None] * root
         return factor
@@ -427,8 +432,8 @@ class AxisModel:
         means[:, SLOPE] = self.priors["per_command"].value
         means[:, CONTRAST] = self.priors["ratio_contrast"].value
         means[:, BACKLASH] = self.coordinates.values(w)["backlash"]
-        for k, name in enumerate(self.shifts, start=LINE_TERMS + len(self.homed) + len(self.unknown_segments)):
-            means[:, k] = self.priors[name].value
+        for name, column in self.shift_columns.items():
+            means[:, column] = self.priors[name].value
         return means
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
@@ -471,8 +476,7 @@ class AxisModel:
         for part, block in self._blocks(w, informed=len(others) > 0):
             reduced = replace(block, factor=block.factor[:, informed[:, None], informed]) if len(others) else block
             information, right_side = _information(reduced, 0)
-            _, scaled, scale = _equilibrated(information)
-            inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+            inverse = _inverse(information)
             loading = block.factor[:, :, informed] if len(others) else block.factor
             means[part] = np.einsum("nij,njk,nk->ni", loading, inverse, right_side, optimize=True)
             covariances[part] = loading @ inverse @ np.swapaxes(loading, 1, 2)
@@ -500,8 +504,7 @@ class AxisModel:
         means, covariances = np.empty((len(w), len(rows))), np.empty((len(w), len(rows), len(rows)))
         for part, block in self._blocks(w, extra):
             information, right_side = _information(block, len(rows))
-            _, scaled, scale = _equilibrated(information)
-            inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+            inverse = _inverse(information)
             expected = np.einsum("nij,nj->ni", inverse, right_side)
             means[part] = self.rows.value[rows] - expected[:, self.columns :]
             covariances[part] = inverse[:, self.columns :, self.columns :]
@@ -517,7 +520,7 @@ class AxisModel:
     def shift(self, name: str) -> np.ndarray:
         """A functional (columns,) of one of `shifts`."""
         functional = np.zeros(self.columns)
-        functional[LINE_TERMS + len(self.homed) + len(self.unknown_segments) + self.shifts.index(name)] = 1.0
+        functional[self.shift_columns[name]] = 1.0
         return functional
 
     @property
@@ -534,7 +537,7 @@ class AxisModel:
             ValueError: a period is unknown, and no draws are given.
         """
         functionals = np.zeros((len(command), self.columns))
-        functionals[:, self.processes : self.processes + len(self.places.command)] = self.places.weights(command)
+        functionals[:, self.layout["error"]] = self.places.weights(command)
         by_draw = self.repeats_by_draw
         if by_draw and w is None:
             raise ValueError("draws are needed where a period is not known")
@@ -542,9 +545,8 @@ class AxisModel:
         functionals = np.repeat(functionals[None], 1 if w is None or not by_draw else len(w), axis=0)
         for k, (wave, draw) in enumerate(zip(self.coordinates.waves, draws, strict=True)):
             if wave.clock == "position":
-                first = self.waves_begin + COLUMNS * k
                 x = self.clock(wave, command, command, command)
-                functionals[:, :, first : first + COLUMNS] = wave_columns(x, draw.period, self.record(wave))
+                functionals[:, :, self.of_wave(k)] = wave_columns(x, draw.period, self.record(wave))
         return functionals if by_draw else functionals[0]
 
 
@@ -576,6 +578,12 @@ def _equilibrated(information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
     scaled = information / (scale[:, :, None] * scale[:, None, :])
     return np.linalg.cholesky(scaled), scaled, scale
+
+
+def _inverse(information: np.ndarray) -> np.ndarray:
+    """Inverse of the matrix, by its scaled one."""
+    _, scaled, scale = _equilibrated(information)
+    return np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
 
 
 def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:

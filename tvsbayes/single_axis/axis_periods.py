@@ -108,9 +108,8 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
     for k, wave in enumerate(model.coordinates.waves):
         probability = float(np.mean(model.coordinates.wave_draws(fit.w)[k].scale > 0))
         w, linear = _with_wave(fit, k, rng)
-        first_column = model.waves_begin + COLUMNS * k
         functionals = np.concatenate([np.zeros((COLUMNS, model.columns)), model.line_terms(per_command=1.0)[None]])
-        functionals[range(COLUMNS), range(first_column, first_column + COLUMNS)] = 1.0
+        functionals[:COLUMNS, model.of_wave(k)] = np.eye(COLUMNS)
         draws = linear.drawn(functionals, rng)
         coefficients, ratio = draws[:, :COLUMNS], draws[:, COLUMNS] / fit.rows.line[1]
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()

@@ -26,10 +26,8 @@ from tvsbayes.single_axis.waves import (
     TabulatedDensity,
     Wave,
     WavePeriods,
-    WaveRecord,
     absent_coord,
     log_scale_prior,
-    wave_columns,
 )
 
 PER_RESOLUTION = 8
@@ -83,19 +81,17 @@ def _whitened_model(model: AxisModel, w: np.ndarray) -> _WhitenedModel:
 
 def _log_evidence(state: _WhitenedModel, wave: Wave, log_period: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Log Bayes factors (p, scales) of a wave against none, at logs of periods (p,) and scales (scales,)."""
-    model, rows = state.model, state.model.rows
-    x = model.clock(wave, rows.command, rows.time_s, rows.value)
-    width = rows.width_s * (1.0 if wave.clock == "seconds" else abs(rows.line[1] * (rows.rate or 0.0)))
+    model, rows = state.model, len(state.base)
     evidence = np.empty((len(log_period), len(scales)))
     for start in range(0, len(log_period), AT_ONCE):
         block = slice(start, start + AT_ONCE)
-        columns = wave_columns(x, np.exp(log_period[block]), WaveRecord.of(x), width) * np.array(SHARES)
+        columns = model.wave_columns(wave, np.exp(log_period[block])) * np.array(SHARES)
         count = len(columns)
-        flat = np.moveaxis(columns, 0, 1).reshape(len(x), -1)
+        flat = np.moveaxis(columns, 0, 1).reshape(rows, -1)
         white = model.whitened_extra(state.w, flat)
         cross = white.T @ state.base[:, 1:]
         right_side = (white.T @ state.base[:, 0] - cross @ state.inverse @ state.towards).reshape(count, COLUMNS)
-        wave_block = white.reshape(len(x), count, COLUMNS)
+        wave_block = white.reshape(rows, count, COLUMNS)
         cross = cross.reshape(count, COLUMNS, -1)
         information = np.einsum("rpi,rpj->pij", wave_block, wave_block, optimize=True)
         information -= cross @ state.inverse @ np.swapaxes(cross, 1, 2)
@@ -117,8 +113,7 @@ class _SearchResult:
 
 def _search(state: _WhitenedModel, wave: Wave, others: Sequence[Wave] = ()) -> _SearchResult:
     """Search one wave with all others as in `state`; its period must be resolved from those of `others`."""
-    rows = state.model.rows
-    span = float(np.ptp(state.model.clock(wave, rows.command, rows.time_s, rows.value)))
+    span = float(np.ptp(state.model.clock_of_rows(wave)))
     low, high = (np.log(end * wave.unit) for end in SCALE_RANGE)
     log_scale = np.linspace(low, high, SCALES)
     prior = log_scale_prior(log_scale, wave.unit)
