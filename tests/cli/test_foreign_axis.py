@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import openpyxl
 import pytest
 from support.commands import assert_error
 
@@ -132,6 +133,19 @@ def test_what_would_be_a_wrong_answer_in_silence(ask, tmp_path, name):
     code, document = ask("import", file, "--axis", "--to", out, "--yes")
     reading = read_axis(out).readings[-1]
     assert code == 0 and any(said in text for text in document["assumed"]) and (reading.value, reading.u) == last
+
+
+def test_a_workbook_needs_no_format(ask, tmp_path):
+    """Its bytes contain what ends a message of Klipper's logger."""
+    file, out, book = tmp_path / "dial.xlsx", tmp_path / "out", openpyxl.Workbook()
+    book.active.append(["Position (mm)", "Forward (mm)", "Backward (mm)"])
+    for position in range(0, 50, 10):
+        book.active.append([position, 1.001 * position, 1.001 * position + PLAY])
+    book.save(file)
+    code, document = ask("import", file, "--axis", "--to", out, "--yes")
+    assert (code, document["readings"]) == (0, 10)
+    found = classic_axis(rows_of(read_axis(out)))
+    assert found.per_command == pytest.approx(1.001, abs=1e-6) and abs(found.backlash) == pytest.approx(PLAY, abs=1e-6)
 
 
 def test_deviations_on_demand(ask, tmp_path):
