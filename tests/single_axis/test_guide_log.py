@@ -27,7 +27,7 @@ Frame,Time,mount,dx,dy,RARawDistance,DECRawDistance,RAGuideDistance,DECGuideDist
 
 
 def motion_of(time_s: float) -> float:
-    """Of the axis that nobody corrects, arcsec."""
+    """Of the star before an axis that nobody corrects, arcsec of the axis, positive to the west: the axis lags."""
     return 8.0 * math.sin(2 * math.pi * time_s / 480.0) + 0.01 * time_s
 
 
@@ -49,10 +49,10 @@ def night(frames: int = 300, events: dict[int, list[str]] | None = None, pulse_r
 
 
 def motions(found):
-    """Measured less driven angle of the readings that are ok, arcsec, and their times."""
+    """Driven angle less the axis' of the readings that are ok, arcsec, and their times."""
     ok = [reading for reading in found.readings if reading.status == "ok"]
     times = np.array([reading.time_s for reading in ok])
-    return times, np.array([reading.value for reading in ok]) - SIDEREAL_ARCSEC_PER_S * times
+    return times, SIDEREAL_ARCSEC_PER_S * times - np.array([reading.value for reading in ok])
 
 
 # Raw distances are written to 1e-4 px, values to 1e-4 arcsec; what is summed are pulses, whole ms and exact.

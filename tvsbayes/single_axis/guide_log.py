@@ -2,7 +2,8 @@
 
 A run lies between "Guiding Begins" and "Guiding Ends". Distances are pixels on the sky, durations ms, times s since the
 beginning of the run. A pulse acts after its frame: the star's uncorrected motion is the raw distance plus the pulses of
-all previous frames. Angles of the axis, arcsec: those on the sky over cos(declination). No JAX.
+all previous frames. A star ahead of the mount means that the axis lags: its angle is the drive's less the motion. Angles
+of the axis, arcsec: those on the sky over cos(declination). No JAX.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ PRIORS = {"per_command": (1.0, 1e-3), "transmission_error": (0.0, 10.0)}
 of worms are some arcsec to some tens of arcsec."""
 ASSUMED = (
     "a pulse acts after its frame: motion = raw distance + W - E pulses of the frames before",
-    "sign: positive where the star runs ahead of the mount, so that the axis lags and W pulses answer",
+    "sign: a star ahead of the mount, which W pulses answer, is an axis that lags: angle = drive - motion",
 )
 ASSUMPTIONS = {
     "declination_deg": "declination of the star",
@@ -302,7 +303,7 @@ def _logged_pulse(known: Mapping[str, float], x_rate: float, cosine: float, assu
 
 
 def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> ForeignReadings:
-    """A run as moves and readings: the drive's angle plus the star's uncorrected motion, both in arcsec of the axis.
+    """A run as moves and readings: the drive's angle less the star's uncorrected motion, both in arcsec of the axis.
 
     Args:
         run: a run of the log.
@@ -325,7 +326,7 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
                 moves.append(AxisMove(len(moves), len(moves), time_s, command, "forward"))
                 pulse_sum, needs_move = 0.0, False
             motion = raw * scale.pixel_arcsec / scale.cos_declination + pulse_sum
-            value = scale.drive_arcsec_per_s * time_s + motion
+            value = scale.drive_arcsec_per_s * time_s - motion
         frames.append((time_s, len(moves) - 1, value, status))
         pulse_sum += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
     used = sum(value is not None for _, _, value, _ in frames)
