@@ -2,8 +2,8 @@
 
 A run lies between "Guiding Begins" and "Guiding Ends". Distances are pixels on the sky, durations ms, times s since the
 beginning of the run. A pulse acts after its frame: the star's uncorrected motion is the raw distance plus the pulses of
-all previous frames. A star ahead of the mount means that the axis lags: its angle is the drive's less the motion. Angles
-of the axis, arcsec: those on the sky over cos(declination). No JAX.
+all previous frames. Where the star is ahead of the mount, the axis lags: its angle is the drive's less the motion.
+Angles of the axis, arcsec: those on the sky over cos(declination). No JAX.
 """
 
 from __future__ import annotations
