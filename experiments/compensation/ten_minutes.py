@@ -133,9 +133,14 @@ tvsbayes compensate mount --to pec -o worm.csv
 ```
 
 The table holds the strongest wave and those of a half, a third ... an eighth of its period, over one period in the
-middle of the log; `--period` takes another. Its phase counts from command 0 of `moves.csv`: shift it to the index of
-the worm. The promise is of errors off the drive's own line within a period of its slowest wave; walk and creep of the
-zero are in it. `verify` needs stops: of a mount log again with the table in force, and `fit` says which wave is left.
+middle of the log; `--period` takes another. `compensate` says its period in seconds and its size, peak to peak. What it
+adds turns the axis ahead, in arcsec. Its phase counts from command 0, which is the beginning of a guide log: shift it to
+the index of the worm. The promise is of errors off the drive's own line within a period of its slowest wave; walk and
+creep of the zero are in it.
+
+Did it get better? `verify` needs stops, which a drive does not make. Log again with the table in force, and import that
+log into another folder: `fit` says which waves are left. With `periods = [478.7]`, the table's period in seconds, in
+place of `period_between` in its `campaign.toml`, the amplitude of that wave is given even where there is none.
 """
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import FORMATS, Origin, Wish
 from tvsbayes.compensation.promise import compensation_of
+from tvsbayes.compensation.verification import refuse_drive
 from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.report.compensation_text import compensation_text
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.waves import WavePeriods
@@ -81,3 +84,16 @@ def test_the_file_repeats_and_says_how_to_see_what_is_left():
     # 300 readings of u 0.3 know a wave to 0.3 sqrt(2 / 300) = 0.024 in each of four columns; 0.3 is 6 of their sums.
     np.testing.assert_allclose(rows[:, 1], expected, atol=0.3)
     assert "run tvsbayes fit" in text and "homing" not in text
+    assert ", 200 s; phase 0 at command 0, 0 s after the log begins" in text and text.count("promise, ") == 1
+
+
+def test_the_text_says_the_size_of_what_repeats_and_what_shows_the_rest():
+    """A drive has no sides and no stops: neither a row for each nor a verification by them."""
+    made = compensation_of(results(), Wish("pec"))
+    text = compensation_text(made)
+    size = float(re.search(r"3000 commands, 200 s: (\S+) arcsec peak to peak", text)[1])
+    assert size == pytest.approx(np.ptp(wave(np.linspace(0, WORM_S, 1000))), abs=0.3)
+    assert "backward" not in text and text.count("while it drives") == 2
+    with pytest.raises(NothingToEstimate, match="not verified by stops") as refused:
+        refuse_drive(made)
+    assert "`periods = [200]`" in refused.value.remedy

@@ -12,6 +12,7 @@ from support.compensated import driven, fresh, results, table, to_and_fro, true_
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import plan_verification, stored_compensation, verify_axis, verify_readings
 from tvsbayes.errors import InputError
+from tvsbayes.report.compensation_text import verification_text
 from tvsbayes.results.compensation_record import (
     APPLIED,
     BROKEN,
@@ -53,6 +54,19 @@ def test_sizes_are_those_of_the_readings():
     assert found.after.rms == pytest.approx(np.sqrt(np.mean(errors**2)))
     assert found.after.worst == pytest.approx(np.max(np.abs(errors)))
     assert found.before.rms > 5 * found.after.rms and found.promised95 < 0.1 and found.readings == 12
+
+
+def test_with_one_homing_errors_are_given_without_their_shift_too():
+    """The prior of the next homing dominates all others then; the zero of a dial gauge is set anew as well."""
+    new = fresh(3)
+    assert verify_readings(results().fit, table(), new).shift_free is None
+    shifted = replace(new, readings=tuple(replace(reading, value=reading.value + 0.05) for reading in new.readings))
+    found = verify_readings(results().fit, structs.replace(table(), homings=1), shifted)
+    aim = table().offset + np.array([new.moves[r.move].command for r in new.readings])
+    left, promised = found.shift_free
+    assert left.rms == pytest.approx(np.std([r.value for r in new.readings] - aim)) and left.rms < 0.5 * found.after.rms
+    assert promised < found.promised95
+    assert "but for one shift common to all" in verification_text(found)
 
 
 def test_another_axis_is_none_of_the_worlds():

@@ -225,7 +225,7 @@ def _verify_scanner(
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
     """`plan FOLDER --verify`: plan the fewest readings that verify a table."""
-    from tvsbayes.compensation.verification import plan_verification, stored_compensation
+    from tvsbayes.compensation.verification import plan_verification, refuse_drive, stored_compensation
     from tvsbayes.report.compensation_text import verify_plan_text
     from tvsbayes.results.records import plain
     from tvsbayes.single_axis.axis_campaign import read_axis
@@ -239,6 +239,7 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
         return
     data = read_axis(folder)
     compensation = stored_compensation(data)
+    refuse_drive(compensation)
     with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed)
         job.begin("choosing stops")

@@ -56,9 +56,11 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
         f"aim: reading = {number(made.offset)} + {number(made.per_command)} x command",
         "sense: what is added to a command is (aim - reading expected) / (reading per command)",
     ]
-    for side, left in made.promise.items():
+    for side, left in made.sides.items():
         before = f"{left.without95:.3g} without"
-        lines.append(f"promise, arriving {side}: 95 % of errors at most {left.error95:.3g} {unit} ({before})")
+        lines.append(f"promise, {side}: 95 % of errors at most {left.error95:.3g} {unit} ({before})")
+        if made.shift_matters and left.shift_free95 is not None:
+            lines[-1] += f"; but for one shift common to all at most {left.shift_free95:.3g}"
     if made.in_motion:
         lines.append(f"within {number(made.travel_command, 6)} commands, off the drive's own line, but for one shift")
     else:
@@ -212,7 +214,11 @@ def _pec(made: Compensation, origin: Origin) -> str:
     phase = np.arange(PHASES) / PHASES
     at = low + (phase * period - low) % period
     added = Correction.of(made).sent(at, np.zeros(PHASES)) - at
-    lines = [f"# period: {number(period)} commands; phase 0 at command 0; add is in commands", "phase,add"]
+    seconds, zero_s = made.settings.get("period_s"), made.settings.get("phase_0_s", 0.0)
+    in_time = "" if seconds is None else f", {number(seconds, 6)} s"
+    at_time = "" if seconds is None else f", {number(round(zero_s, 1), 6)} s after the log begins"
+    lines = [f"# period: {number(period)} commands{in_time}; phase 0 at command 0{at_time}; add is in commands"]
+    lines += ["phase,add"]
     lines += [f"{number(float(p), 6)},{number(float(a), 7)}" for p, a in zip(phase, added, strict=True)]
     return "\n".join([*_commented(made, origin), *lines, ""])
 

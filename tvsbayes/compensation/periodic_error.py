@@ -169,10 +169,18 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
         travel_command=span,
         homings=len(np.unique(rows.segment)),
         table=tuple(TableRow(*map(float, row)) for row in zip(*columns, strict=True)),
-        settings={"period_command": period},
+        settings={"period_command": period, **_seconds(rows, period)},
         promise={"forward": promise, "backward": promise},
         unsaid=form.unsaid,
     )
+
+
+def _seconds(rows: AxisRows, period: float) -> dict[str, float]:
+    """Compute the period in seconds, and the time of command 0 on the clock of the campaign, from the rate."""
+    if not rows.rate:
+        return {}
+    command, time_s = float(rows.command[0]), float(rows.time_s[0])
+    return {"period_s": period / abs(rows.rate), "phase_0_s": time_s - command / rows.rate}
 
 
 def _promise(before: np.ndarray, after: np.ndarray, drift: np.ndarray, reading: np.ndarray) -> SidePromise:

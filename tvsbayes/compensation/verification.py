@@ -267,17 +267,21 @@ def verify_readings(
             noise=_visit_noise(at(1.0, 1.0), fresh.side, u),
         )
         judgement = judged(trial, seed)
+    stops, shift_free = np.arange(len(aim)), None
+    if made.shift_matters:
+        shift_free = (size_of(fresh.value - aim, True), bound_of(judgement.promised, aim, stops, True))
     return Verification(
         verdict=judgement.verdict,
         p=judgement.p,
         worlds=judgement.worlds,
         before=size_of(judgement.without.pooled()[0] - aim, made.zero_free),
         after=size_of(fresh.value - aim, made.zero_free),
-        promised95=bound_of(judgement.promised, aim, np.arange(len(aim)), made.zero_free),
+        promised95=bound_of(judgement.promised, aim, stops, made.zero_free),
         readings=len(fresh.value),
         unit=campaign.unit,
         needed=judgement.needed,
         remarks=_remarks(made, fresh, campaign),
+        shift_free=shift_free,
     )
 
 
@@ -327,11 +331,12 @@ def verify_axis(
     Raises:
         InputError: a folder cannot be used, or there is no table.
         NotConverged: the fit is not accepted.
-        NothingToEstimate: there are too few fresh readings.
+        NothingToEstimate: there are too few fresh readings, or the table is that of a drive at constant rate.
     """
     known = folder if isinstance(folder, AxisCampaign) else read_axis(folder)
     new = fresh if isinstance(fresh, AxisCampaign) else read_axis(fresh)
     table = stored_compensation(known) if made is None else made
+    refuse_drive(table)
     with Job({"fit": 1.0, "verification": 1.0}, progress) as job:
         results = results_for(known, progress=job.part("fit"), seed=seed)
         refuse_answer(results.summary.answer)
@@ -407,6 +412,25 @@ def discriminating_visits(
         visits[best] += 1
         reached = each[best]
     return DiscriminatingVisits(visits, reached)
+
+
+def refuse_drive(made: Compensation) -> None:
+    """Refuse the table of a drive at constant rate, whose readings contain no stops.
+
+    Raises:
+        NothingToEstimate: it is one; with what shows the remaining error instead.
+    """
+    if not made.in_motion:
+        return
+    period = made.settings.get("period_s")
+    key = f"; `periods = [{period:.6g}]` for `period_between` in its campaign.toml asks for it alone" if period else ""
+    raise NothingToEstimate(
+        "in-motion",
+        "a table of a drive at constant rate is not verified by stops: the drive makes none",
+        allowed="tables of axes that stop",
+        remedy="log again with the table in force, import and `tvsbayes fit` the log: what is left is the wave of the "
+        f"table's period{key}",
+    )
 
 
 def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:

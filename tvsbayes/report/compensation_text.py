@@ -9,7 +9,7 @@ from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.axes import SIDES
 from tvsbayes.report.document import Part, Section, sentence, terminal
-from tvsbayes.report.tables import TableView, two_digits
+from tvsbayes.report.tables import TableView, three_digits, two_digits
 from tvsbayes.results.compensation_record import (
     APPLIED,
     BROKEN,
@@ -55,16 +55,22 @@ HELPS = {
     "readings": "the readings themselves; a better reference",
 }
 """Remedies by the largest cause of the remaining error."""
+DRIVE_HELPS = {
+    "format": "waves of other periods, which a table of one period does not hold",
+    "drift": "the walk of the zero; guide",
+}
+"""The same for a drive at constant rate, where they differ."""
 
 
 def promise_table(result: Compensation) -> TableView:
     """Remaining error by side, and the error that each cause alone would leave."""
     rows = []
-    for side, remainder in result.promise.items():
+    for side, remainder in result.sides.items():
         causes = [two_digits(remainder.causes[cause]) for cause in CAUSES]
-        rows.append([side, two_digits(remainder.without95), two_digits(remainder.error95), *causes])
+        sizes = [two_digits(remainder.without95), two_digits(remainder.error95)]
+        rows.append([side.removeprefix("arriving "), *sizes, *causes])
     caption = f"95 % of errors are at most, {escaped(result.unit)}; each cause alone"
-    return TableView(caption, ["arriving", "without", "after applying", *CAUSES], rows)
+    return TableView(caption, ["" if result.in_motion else "arriving", "without", "after applying", *CAUSES], rows)
 
 
 def sizes_table(verification: Verification) -> TableView:
@@ -77,6 +83,9 @@ def sizes_table(verification: Verification) -> TableView:
         ],
         ["after (read)", two_digits(verification.after.rms), two_digits(verification.after.worst)],
     ]
+    if verification.shift_free is not None:
+        left, _ = verification.shift_free
+        rows.append(["after, but for one shift common to all", two_digits(left.rms), two_digits(left.worst)])
     columns = ["", "RMS", "worst"]
     if (points := verification.millimetres) is not None:
         columns += [f"RMS at {points.distance_mm:.10g} mm, mm", "worst, mm"]
@@ -89,9 +98,10 @@ def sizes_table(verification: Verification) -> TableView:
 def _promise_text(verification: Verification) -> str:
     mm = verification.millimetres
     points = "" if mm is None else f", of points at {mm.distance_mm:.10g} mm {two_digits(mm.promised95)} mm"
-    return (
-        f"promised: 95 % of errors at most {two_digits(verification.promised95)} {escaped(verification.unit)}{points}"
-    )
+    unit, shift_free = escaped(verification.unit), ""
+    if verification.shift_free is not None:
+        shift_free = f"; but for one shift common to all at most {two_digits(verification.shift_free[1])} {unit}"
+    return f"promised: 95 % of errors at most {two_digits(verification.promised95)} {unit}{points}{shift_free}"
 
 
 def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
@@ -106,7 +116,7 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
         promise_table(result),
         "",
         *_validity(result),
-        f"largest remaining error: {HELPS[largest]}",
+        f"largest remaining error: {DRIVE_HELPS.get(largest, HELPS[largest]) if result.in_motion else HELPS[largest]}",
         *(f"the format: {text}" for text in result.unsaid),
     ]
     if result.homings == 1 and not result.in_motion:
@@ -114,7 +124,7 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
         bounds = [
             f"{side} {two_digits(p.shift_free95)}" for side, p in result.promise.items() if p.shift_free95 is not None
         ]
-        if bounds and not result.zero_free:
+        if bounds and result.shift_matters:
             lines.append(f"but for one shift common to all, as within one homing, at most: {', '.join(bounds)} {unit}")
     lines.append(f"nothing is applied yet; apply it once, in one place, then {result.shown_by}")
     return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
@@ -123,8 +133,14 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
 def _validity(result: Compensation) -> list[str]:
     """Validity of the promise, in words."""
     if result.in_motion:
-        travel = f"{result.travel_command:.6g}"
-        return [f"the promise holds within {travel} commands, off the drive's own line, but for one shift"]
+        travel, added = f"{result.travel_command:.6g}", [row.add_forward for row in result.table]
+        size = three_digits(abs(result.per_command) * (max(added) - min(added)))
+        seconds = f", {result.settings['period_s']:.5g} s" if "period_s" in result.settings else ""
+        return [
+            f"the promise holds within {travel} commands, off the drive's own line, but for one shift",
+            f"the error that repeats every {result.settings['period_command']:.6g} commands{seconds}: {size} "
+            f"{escaped(result.unit)} peak to peak",
+        ]
     return [
         f"the promise holds between these commands, within {two_digits(result.hours)} h and "
         f"{result.travel_command:.4g} commands of travel since homing",

@@ -135,6 +135,18 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
         return self.reversal_command == 0 and "period_command" in self.settings
 
     @property
+    def sides(self) -> dict[str, SidePromise]:
+        """The promise by kind of motion, in words: by side of arrival, of a drive once."""
+        if self.in_motion:
+            return {"while it drives": self.promise["forward"]}
+        return {f"arriving {side}": promise for side, promise in self.promise.items()}
+
+    @property
+    def shift_matters(self) -> bool:
+        """Whether the prior alone determines the scatter of homings, so that errors within one homing are smaller."""
+        return self.homings == 1 and not self.in_motion and not self.zero_free
+
+    @property
     def shown_by(self) -> str:
         """The readings that test whether the promise is kept."""
         if self.in_motion:
@@ -182,10 +194,12 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
         promised95: 95 % of errors of these stops are at most this size, by the promise.
         readings: number used; for a scanner looks, each of which shows both axes.
         millimetres: the same for points; only for a scanner.
-        unit: unit of errors; with `needed`, `remarks` and `looks` not part of the document.
+        unit: unit of errors; it and what follows are not part of the document.
         needed: readings needed for a verdict; None where no number suffices, 0 where these do.
         remarks: further remarks, in sentences.
         looks: whether these are looks of two axes aimed by a calibration.
+        shift_free: errors of the fresh readings less their mean, and the promise for these, 95 %; None where the
+            scatter of homings was read.
     """
 
     verdict: Verdict
@@ -200,7 +214,8 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
     needed: int | None = 0
     remarks: tuple[str, ...] = ()
     looks: bool = False
-    beside: ClassVar = ("unit", "needed", "remarks", "looks")
+    shift_free: tuple[ErrorSize, float] | None = None
+    beside: ClassVar = ("unit", "needed", "remarks", "looks", "shift_free")
 
     def as_json(self) -> dict[str, Any]:
         """The document; an axis has no points."""
