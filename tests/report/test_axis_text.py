@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from msgspec import structs
 from support.axes import drawn, runs
 
 from tvsbayes.report.axis_document import (
+    axis_document,
     axis_fit_text,
     axis_plan_text,
     deviation_table,
     for_firmware,
     worst_place,
 )
+from tvsbayes.report.document import Issue
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
-from tvsbayes.single_axis.axis_record import PositionDeviation, summarise_axis
+from tvsbayes.single_axis.axis_record import PositionDeviation, results_for, summarise_axis
 from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
+from tvsbayes.single_axis.waves import WavePeriods
 
 
 @pytest.mark.parametrize(("after", "said"), [(0.99, True), (0.96, True), (0.94, False), (0.3, False)])
@@ -96,3 +101,21 @@ def test_numbers_that_must_not_be_used_are_not_offered_to_firmware(clean):
     assert first.startswith("for your firmware, from ") and "largest at command" in second
     broken = axis_fit_text(structs.replace(clean, converged=False, sampling={}, problems=("no mode",)))
     assert "for your firmware" not in broken and "largest at command" not in broken
+
+
+def test_a_drive_has_neither_play_nor_directions_nor_stops_to_read():
+    """Numbers and advice that only an axis with stops can have are left out."""
+    rate, time_s = 15.0, 5.0 * np.arange(200)
+    value = rate * time_s + 4.0 * np.sin(2 * np.pi * time_s / 200.0) + 0.3 * np.random.default_rng(1).normal(size=200)
+    readings = tuple(
+        Reading(k, 0, float(v), 0.3, time_s=float(t)) for k, (v, t) in enumerate(zip(value, time_s, strict=True))
+    )
+    asked = WavePeriods(stated=(200.0,), in_seconds=True)
+    campaign = AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, {}, {"rate": rate}, asked)
+    results = results_for(campaign)
+    document = axis_document(results, Issue.today())
+    text = axis_fit_text(results.summary)
+    assert not document.numbers and "compensate AXIS --to pec" in document.steps[0]
+    assert "What repeats by position" not in [section.title for section in document.sections]
+    assert "backward" not in text and "play" not in text and "a wave of" in text
+    assert document.picture is not None and "every 200 s" in document.picture.caption

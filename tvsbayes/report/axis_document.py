@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tvsbayes.compensation.periodic_error import LIKELY as TABLE_LIKELY
 from tvsbayes.compensation.verification import compensation_in
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped, typed
@@ -74,6 +75,15 @@ METHOD = (
 )
 
 
+STOPS_ALONE = ("backlash", "ratio_contrast", "offset")
+"""Parameters that a drive at constant rate does not show: it has one direction and no zero of its own."""
+
+
+def is_drive(summary: AxisSummary) -> bool:
+    """Whether the readings are of a drive at constant rate."""
+    return "seeing_s" in summary.parameters
+
+
 def _row(name: str, estimate: Estimate) -> list[str]:
     return [name, concise(estimate.value, estimate.sd), interval_text(*estimate.interval95, estimate.sd)]
 
@@ -91,20 +101,26 @@ def ratio_table(summary: AxisSummary) -> TableView:
     """Unit per command by direction: of the gears, of the line through the readings, and from the classic estimate."""
     unit = escaped(summary.unit)
     low, high = summary.range_command
-    rows = [_row(f"gears, {side}", e) for side, e in summary.per_command.items()]
-    rows += [
-        _row(f"line from {low:.10g} to {high:.10g}, {side}", e) for side, e in summary.effective_per_command.items()
-    ]
+    sides = ("forward",) if is_drive(summary) else tuple(summary.per_command)
+    rows = [_row(_of_side("gears", side, sides), summary.per_command[side]) for side in sides]
+    line = f"line from {low:.10g} to {high:.10g}"
+    rows += [_row(_of_side(line, side, sides), summary.effective_per_command[side]) for side in sides]
     classic = summary.classic
     rows.append(["classic: least-squares line", concise(classic.per_command, classic.u_per_command), ""])
     return TableView(f"{unit} per command, value(u)", ["", "value(u)", "95 % interval"], rows)
 
 
+def _of_side(label: str, side: str, sides: Sequence[str]) -> str:
+    """A label with its direction, where there are two."""
+    return f"{label}, {side}" if len(sides) > 1 else label
+
+
 def parameter_table(summary: AxisSummary) -> TableView:
     """All parameters but the ratio."""
     rows, labels = [], {name: quantity.label for name, quantity in AXIS_QUANTITIES.items()}
+    left_out = {"per_command", *(STOPS_ALONE if is_drive(summary) else ())}
     for name, estimate in summary.parameters.items():
-        if name != "per_command":
+        if name not in left_out:
             share = "" if estimate.contraction is None else f"{100 * max(estimate.contraction, 0.0):.0f} %"
             rows.append([labels.get(name, name), *_row(name, estimate)[1:], share])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: set by the readings, 0 %: set by the prior"
@@ -131,7 +147,7 @@ def for_firmware(summary: AxisSummary) -> str:
 def result_lines(summary: AxisSummary) -> list[str]:
     """Main results of a converged fit: numbers for firmware, the worst position, waves; for a drive only waves."""
     waves = [*_waves(summary.periods, summary, summary.periods_in), *_waves(summary.encoder_periods, summary, "")]
-    if "seeing_s" in summary.parameters:
+    if is_drive(summary):
         return waves
     return [for_firmware(summary), *([worst_place(summary)] if summary.deviations else []), *waves]
 
@@ -293,16 +309,15 @@ def axis_plan_text(plan: AxisPlan, unit: str) -> str:
 
 def _wave_figures(fit: AxisFit) -> list[FigureView]:
     """Figures of probable waves."""
-    alt, end = "A wave over one period as a curve with a band.", "over one period, both harmonics, with its 95 % band."
-    return [
-        FigureView(
-            wave(sample, fit.campaign.unit),
-            alt,
-            f"Wave of the {'encoder' if sample.wave.clock == 'encoder' else 'gear'} {end}",
-        )
-        for sample in wave_samples(fit)
-        if sample.probability > LIKELY
-    ]
+    alt, unit = "A wave over one period as a curve with a band.", escaped(fit.campaign.unit)
+    figures = []
+    for sample in wave_samples(fit):
+        if sample.probability > LIKELY:
+            period = f"{float(np.mean(sample.period)):.4g} {'s' if sample.wave.clock == 'seconds' else unit}"
+            name = "encoder" if sample.wave.clock == "encoder" else "gear"
+            caption = f"Wave of the {name} every {period}: one period, both harmonics, with its 95 % band."
+            figures.append(FigureView(wave(sample, fit.campaign.unit), alt, caption))
+    return figures
 
 
 def curve_commands(low: float, high: float) -> np.ndarray:
@@ -336,12 +351,21 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
         compensation_sections = [compensation_section(compensation, verification)]
     return [
         Section("Result", result_texts, tables=parameters, figures=figures, opened=True),
-        Section("What repeats by position", tables=deviations),
+        *([] if is_drive(summary) else [Section("What repeats by position", tables=deviations)]),
         *compensation_sections,
         Section("What the readings do not determine", items=summary.weak_directions or ["No remarks."]),
         Section("Classic", [line], tables=[iso230_table(classic, unit)]),
         Section("Method", METHOD),
     ]
+
+
+def _steps(summary: AxisSummary, folder: str) -> list[str]:
+    """What to do next, in sentences."""
+    if not is_drive(summary):
+        return [f"`tvsbayes plan --given {folder}` says which stops to read next."]
+    if any(wave.probability >= TABLE_LIKELY for wave in summary.periods):
+        return [f"`tvsbayes compensate {folder} --to pec -o worm.csv` writes the table of the strongest wave's period."]
+    return ["Log a longer run: of N periods, noise leaves about period / (2 N) times noise over amplitude."]
 
 
 def axis_document(results: AxisResults, issue: Issue) -> Document:
@@ -359,10 +383,10 @@ def axis_document(results: AxisResults, issue: Issue) -> Document:
             name=title_of(header, fit.campaign.path),
             about=about_table(header, str(header.get("created") or ""), issue),
             verdict=Verdict(verdict, "cannot-tell" if summary.explained else "not-met"),
-            numbers=[Number("play", concise(play.value, play.sd), summary.unit)],
+            numbers=[] if is_drive(summary) else [Number("play", concise(play.value, play.sd), summary.unit)],
             answer=period_table(summary) or ratio_table(summary),
             picture=figures[0] if figures else None,
-            steps=[f"`tvsbayes plan --given {folder}` says which stops to read next."],
+            steps=_steps(summary, folder),
             traceable="The readings are taken as stated.",
             warnings=[*summary.problems, *summary.warnings, *_lines("Prior conflict", summary.prior_conflicts)],
             versions=origin["versions"],
