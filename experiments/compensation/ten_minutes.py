@@ -134,9 +134,9 @@ tvsbayes compensate mount --to pec -o worm.csv
 
 The table holds the strongest wave and those of a half, a third ... an eighth of its period, over one period in the
 middle of the log; `--period` takes another. `compensate` says its period in seconds and its size, peak to peak. What it
-adds turns the axis ahead, in arcsec. Its phase counts from command 0, which is the beginning of a guide log: shift it to
-the index of the worm. The promise is of errors off the drive's own line within a period of its slowest wave; walk and
-creep of the zero are in it.
+adds turns the axis ahead, in arcsec. Its phase counts from command 0, which is the beginning of a guide log: shift it
+to the index of the worm. The promise is of errors off the drive's own line within a period of its slowest wave; walk
+and creep of the zero are in it.
 
 Did it get better? `verify` needs stops, which a drive does not make. Log again with the table in force, and import that
 log into another folder: `fit` says which waves are left. With `periods = [478.7]`, the table's period in seconds, in
