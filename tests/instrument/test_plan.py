@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep, read_plan, run_plan, write_plan
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, continued, read_plan, run_plan, write_plan
 
 PLAN = (
     PlanStep(0, "home", 0, 0),
@@ -90,3 +90,12 @@ def test_a_plan_that_is_built_orders_no_move_twice():
         *(("home", 0, 0), ("move", 10, 0), ("move", 10, -45), ("move", 10, -5))
     ]
     assert plan.at == (10, -5)
+
+
+def test_a_plan_goes_on_without_the_sheet_that_is_in_place():
+    looks = PlanStep(1, "move", 10, 0), PlanStep(2, "look")
+    steps = (PlanStep(0, "place", target="d1"), *looks)
+    assert continued(steps, 7, "d1") == (PlanStep(7, "move", 10, 0), PlanStep(8, "look"))
+    assert [(step.step, step.action) for step in continued(steps, 7, "d2")] == [(7, "place"), (8, "move"), (9, "look")]
+    # A head places nothing: its first step is a move.
+    assert continued(looks, 1, "") == looks and continued((), 1, "") == ()
