@@ -6,9 +6,10 @@ Expected information at the most probable instrument. deg/step; counters in step
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 
 from experiments.common.rigs import numbered
 from tvsbayes.instrument.plan import PlanStep
@@ -92,7 +93,7 @@ def searched_family(knowledge: Knowledge, found: Candidates | None = None, scope
     """The planner's order of looks for the worst effective ratio, however small."""
     found = candidates(knowledge) if found is None else found
     seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
-    target = replace(parse_target(DEFAULT_TARGET), limit=UNREACHED)
+    target = structs.replace(parse_target(DEFAULT_TARGET), limit=UNREACHED)
     pose = seen.mirror_angles_rad.mean(axis=0)
     centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
     return design_family(DesignProblem(knowledge, found, seen, target, centre), scope)

@@ -106,9 +106,10 @@ def ended(
     places = [DIRECTIONS.index(d) for d in moved]
     errors = np.array([value[k] - true[d] for k, d in zip(places, moved, strict=True)])
     told["laplace"] = {"u": float(sd.max()), "z": (errors / sd[places]).tolist()}
-    held = [sampled.interval95[d][0] <= true[d] <= sampled.interval95[d][1] for d in moved]
-    z = [(sampled.deg_per_step[d] - true[d]) / sampled.u_deg_per_step[d] for d in moved]
-    u = max(sampled.u_deg_per_step.values())
+    ratios = sampled.effective_deg_per_step
+    held = [ratios[d].interval95[0] <= true[d] <= ratios[d].interval95[1] for d in moved]
+    z = [(ratios[d].value - true[d]) / ratios[d].sd for d in moved]
+    u = max(ratio.sd for ratio in ratios.values())
     told["importance"] = {"u": u, "z": z, "held": held, "accepted": sampled.accepted}
     return told
 
@@ -167,7 +168,7 @@ def fixed(seed: int, folder: Path, plan: tuple[PlanStep, ...]) -> dict[str, obje
         except NotConverged:
             # So few looks that their posterior has no finite density about its mode: as good as no fit.
             continue
-        after = max(sampled.u_deg_per_step.values())
+        after = max(ratio.sd for ratio in sampled.effective_deg_per_step.values())
         ratio = max(1.0, after / before) if sampled.accepted else ratio
         met = sampled.accepted and after <= TARGET
         if met:

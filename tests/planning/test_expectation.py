@@ -33,9 +33,7 @@ def u_of(steps, knowledge, z=None) -> np.ndarray:
     """U of every headline after a plan, at the pose of its own looks."""
     information = information_of(steps, knowledge)
     at = [
-        sensitivity(
-            Target("", q, 1.0, 1.0, ""), knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad
-        )
+        sensitivity(Target("", q, 1.0, ""), knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad)
         for q in TARGETS
     ]
     covariance = covariance_of(knowledge.precision + information.fisher)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.coarse_planning import with_priors
 
 from tvsbayes.instrument.axes import HOME_APPROACH
@@ -20,6 +21,7 @@ from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, s
 from tvsbayes.planning.looks import LookArrays, arrange, information_of_looks
 from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, Sensitivity, Target, parse_target, sensitivity
+from tvsbayes.results.plan_record import steps_of
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -44,13 +46,14 @@ def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
     turned = [batch for batch in batches if batch.text.startswith("a full turn of pan away, ")]
     assert turned and len(turned) < len(batches)
     for batch in batches:
-        log = run_plan(batch.actions, wide, HOME_APPROACH)
+        steps = steps_of(batch.actions)
+        log = run_plan(steps, wide, HOME_APPROACH)
         pan = [log.moves[look.move].pan_steps for look in log.looks]
         assert len(pan) == LOOKS_PER_EXPERIMENT
         assert min(pan) > 3000 or batch not in turned
         # The text names the looks' own counters.
-        assert all(f"({steps}, " in batch.text for steps in pan)
-        judged = planner.baseline_of("", information_of(batch.actions, known), known, target, pose)
+        assert all(f"({counter}, " in batch.text for counter in pan)
+        judged = planner.baseline_of("", information_of(steps, known), known, target, pose)
         assert batch.gain == pytest.approx(now - judged.joint, rel=1e-6)
         assert batch.minutes == judged.minutes and batch.gain_per_minute == batch.gain / batch.minutes
 
@@ -80,7 +83,7 @@ def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
         shown = LookArrays(looks, known, False).at(known.z, known.space)
         path = np.zeros((len(once), 2))
         information = information_of_looks(shown, once, path, known.space, False)
-        target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
+        target = structs.replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
         at = sensitivity(target, known.z, known.space, known.rig.table, shown.mirror_angles_rad.mean(axis=0))
         return limit_of(known, information, at, target)
 
@@ -129,7 +132,7 @@ def test_when_to_stop():
     assert not stop_now(1e-4, target, open_end, (good,), False).now, "nothing was measured yet"
     assert not stop_now(3e-4, target, open_end, (good,), True).now
     assert stop_now(3e-4, target, open_end, (poor,), True).now
-    floor = replace(open_end, floor=2.5e-4, reachable=False)
+    floor = structs.replace(open_end, floor=2.5e-4, reachable=False)
     assert stop_now(3e-4, target, floor, (good,), True).now
     assert "floor" in stop_now(3e-4, target, floor, (good,), False).reason
 
@@ -168,7 +171,7 @@ def test_after_data_priors_and_campaign_are_one_share(knowledge):
 
 
 def target_of(limit: float) -> Target:
-    return Target("", "left", 1.0, limit, "deg/step")
+    return Target("", "left", limit, "deg/step")
 
 
 def test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high(knowledge):
@@ -203,7 +206,7 @@ def test_measuring_stops_below_a_thousandth_of_the_value_a_minute(gain_per_minut
     """The rule that is printed: less than 0.1 % of what is known now, with and without data."""
     now, target = 3e-4, parse_target("u(left) <= 2e-4 deg/step")
     best = Batch((), 2.0, 2 * gain_per_minute * now, gain_per_minute * now, "")
-    idle = replace(best, gain_per_minute=0.0)
+    idle = structs.replace(best, gain_per_minute=0.0)
     for after_data in (False, True):
         advice = stop_now(now, target, Limit(1e-5, "focal scale", {}, True, None), (best, idle), after_data)
         assert advice.now is stop

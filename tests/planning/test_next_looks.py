@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,11 +20,11 @@ from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.next_looks import Confirmation, next_looks
 from tvsbayes.planning.target import parse_target, sensitivity
 from tvsbayes.posterior.draws import Draws
+from tvsbayes.results.estimates import Measured
+from tvsbayes.results.plan_record import steps_of
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
-SAMPLED = Confirmation(
-    False, *(dict.fromkeys(DIRECTIONS, each) for each in (0.06, 3e-4)), dict.fromkeys(DIRECTIONS, (0.0594, 0.0606))
-)
+SAMPLED = Confirmation("importance", False, dict.fromkeys(DIRECTIONS, Measured(0.06, 3e-4, (0.0594, 0.0606))))
 TARGET = parse_target("u(worst) <= 1e-4 deg/step")
 
 
@@ -54,12 +53,16 @@ def found(begun_fit, mounted_rig):
 def whole_plan(rig, found) -> tuple[PlanStep, ...]:
     """The plan so far with the proposal behind it."""
     before = begun(rig, 12)
-    return (*before, *(replace(step, step=len(before) + n) for n, step in enumerate(found.steps)))
+    return (*before, *steps_of(found.steps, len(before)))
+
+
+def laplace_sds(found) -> list[float]:
+    return [ratio.sd for ratio in found.effective_deg_per_step.values()]
 
 
 def test_what_is_promised_is_the_information_of_the_whole_run(found, mounted_rig, begun_fit):
     """The plan so far and the proposal through the filter, move by move, at the point that the fit believes in."""
-    assert found.now == pytest.approx(max(found.u_deg_per_step.values()), rel=0.1)
+    assert found.now == pytest.approx(max(laplace_sds(found)), rel=0.1)
     assert found.expected == found.after_each[-1] < 0.7 * found.now
     assert np.all(np.diff([found.now, *found.after_each]) < 1e-12)
     after = knowledge_of(begun_fit, mounted_rig)
@@ -108,15 +111,16 @@ def test_the_posterior_confirms_where_it_is_asked_to(begun_fit, mounted_rig, fou
         return SimpleNamespace(converged=True, propagate=propagate)
 
     monkeypatch.setattr("tvsbayes.planning.next_looks.sample", sample)
-    worst = max(found.u_deg_per_step.values())
+    worst = max(laplace_sds(found))
     assert found.confirmed is None
     assert next_looks(begun_fit, mounted_rig, TARGET, 2, confirm_below=0.99 * worst).confirmed is None and not asked
     confirmed = next_looks(begun_fit, mounted_rig, TARGET, 2, confirm_below=1.01 * worst).confirmed
     assert confirmed.accepted and asked == ["importance"]
-    for direction, u in found.u_deg_per_step.items():
-        assert confirmed.u_deg_per_step[direction] == pytest.approx(1.5 * u)
-        low, high = confirmed.interval95[direction]
-        assert high - low == pytest.approx(6 * u) and low < found.deg_per_step[direction] < high
+    for direction, ratio in found.effective_deg_per_step.items():
+        sampled = confirmed.effective_deg_per_step[direction]
+        assert sampled.sd == pytest.approx(1.5 * ratio.sd)
+        low, high = sampled.interval95
+        assert high - low == pytest.approx(6 * ratio.sd) and low < ratio.value < high
 
 
 def test_the_command_prints_them(begun_fit, mounted_rig, tmp_path, monkeypatch, capsys):

@@ -11,7 +11,7 @@ from support.coarse_planning import with_priors
 from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
+from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, SENSES
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.plan import PlanStep, describe_looks, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, paper_protocol
@@ -19,6 +19,7 @@ from tvsbayes.instrument.stops import INSEPARABLE, inseparable, separation
 from tvsbayes.planning.expectation import prior_knowledge
 from tvsbayes.planning.looks import Looks
 from tvsbayes.planning.plan_check import CURING, JUDGING, appended, beyond_limits, check_plan, judge
+from tvsbayes.results.plan_record import steps_of
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -62,8 +63,9 @@ def test_the_papers_protocol_leaves_ratio_and_backlash_together_and_is_cured(mou
     assert {fault.axis for fault in check.faults} == {"pan", "tilt"}
     for fault in check.faults:
         assert "add N = 100 or a cleared approach" in fault.text
-        assert fault.addition and fault.after < 0.9 * fault.before
-        again = check_plan(mounted_rig, (*steps, *fault.addition))
+        before = max(check.expected[direction] for direction in SENSES[fault.axis])
+        assert fault.addition and fault.u_deg_per_step < 0.9 * before
+        again = check_plan(mounted_rig, (*steps, *steps_of(fault.addition, len(steps))))
         assert fault.axis not in {f.axis for f in again.faults}
     json.dumps(check.as_json(), allow_nan=False)
 

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.coarse_planning import with_priors
 from support.waits import check_forward, doings
 
@@ -88,7 +89,7 @@ def test_the_text_names_the_plan_and_what_was_not_reached(result):
     text = plan_text(result)
     assert f"the plan: {result.looks} looks in" in text and "few may leave a direction without a stop" in text
     last = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
-    assert f"for a chance of 95 %: not reached with up to {last} looks" in plan_text(replace(result, n95=None))
+    assert f"for a chance of 95 %: not reached with up to {last} looks" in plan_text(structs.replace(result, n95=None))
 
 
 def test_gain_per_minute_falls_in_order(result):
@@ -117,7 +118,7 @@ def test_after_data_the_next_session_starts_from_what_is_known(knowledge):
     assert result.minutes <= 6.0
     assert "the campaign and its priors" in result.shares
     assert result.steps[0].action == "home"
-    enough = plan_from(known, replace(target, limit=1.0), None, taught.pose_rad, scope=scope, draws=20, seed=2)
+    enough = plan_from(known, structs.replace(target, limit=1.0), None, taught.pose_rad, scope=scope, draws=20, seed=2)
     assert enough.stop.now and enough.met and enough.steps == ()
     assert enough.assurance is None and "nothing is left to do" in plan_text(enough)
 

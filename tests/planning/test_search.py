@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.coarse_planning import ROUNDING
 
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
@@ -111,7 +112,7 @@ def refine(knowledge, found, seen):
     """(first choice, limit, minutes) -> reported values of that choice, and what became of it."""
 
     def run(picks, limit, minutes=None):
-        target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
+        target = structs.replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
         family = Family(knowledge, found, np.asarray(picks), False)
         pose = seen.mirror_angles_rad.mean(axis=0)
         at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 
 
 def test_targets_are_read():
-    assert parse_target("u(left) <= 2e-4 deg/step") == Target("u(left) <= 2e-4 deg/step", "left", 1.0, 2e-4, "deg/step")
+    assert parse_target("u(left) <= 2e-4 deg/step") == Target("u(left) <= 2e-4 deg/step", "left", 2e-4, "deg/step")
     point = parse_target("  U95(x)  at 1000, 0,-2.5 mm <= 60 mm ")
     assert (point.quantity, point.point_mm, point.limit) == ("x", (1000.0, 0.0, -2.5), 60.0)
     assert point.factor == pytest.approx(1.96, abs=1e-3)

@@ -23,7 +23,7 @@ from tvsbayes.report.figures import (
     trajectories,
 )
 from tvsbayes.report.fit_sections import residuals_section
-from tvsbayes.results.estimates import Cause, CauseGroup, CurvePoint, Curves, RatioAt
+from tvsbayes.results.estimates import Cause, CauseGroup, CurvePoint, Curves, Measured
 
 
 def test_the_papers_figures_for_any_campaign(evidence):
@@ -94,7 +94,7 @@ def test_a_prompt_completes_figures_alone():
 
 def test_no_text_of_the_ratios_is_cut_or_lies_on_the_points(evidence):
     """Labels end inside of the figure; legends stand beside the axes."""
-    at = RatioAt(0.062, 1e-4, (0.0618, 0.0622))
+    at = Measured(0.062, 1e-4, (0.0618, 0.0622))
     places = (0.0, 5.0, 9.0)
     along = {a: tuple(CurvePoint(x, x, **dict.fromkeys(pair, at)) for x in places) for a, pair in SENSES.items()}
     curves = ratio_curves(Curves(along, {}))

@@ -24,6 +24,7 @@ TWIN = shipped_data() / "twins" / "paper_twin"
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 BATCH = {"text": "sheet d9, <b>four</b> looks", "minutes": 2.5, "gain": 1.2e-5, "gain_per_minute": 4.8e-6}
+BATCH["actions"] = [{"action": "place", "target": "d9"}, {"action": "look"}]
 
 
 PLANNED = {

@@ -21,9 +21,10 @@ from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
-from tvsbayes.instrument.plan import PlanStep, step_json
+from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
+from tvsbayes.results.plan_record import actions_of
 
 NEXT_SHARE, NEXT_LEAST, NEXT_MOST = 0.3, 8, 80
 """Looks of a proposal: a share of the looks so far, which suffices until the next fit, with its minimum and maximum.
@@ -200,9 +201,9 @@ def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> 
     """The event of a change of plan: from which row on, the steps, and why each look was chosen."""
     looks = iter(proposal.after_each)
     u_before, entries = proposal.now, []
-    for step in steps:
-        entry = step_json(step)
-        if step.action == "look":
+    for action in actions_of(steps):
+        entry = action.as_json()
+        if action.action == "look":
             u_after = next(looks)
             # The gain of this look, given the looks before it.
             entry |= {"u_before_deg_per_step": u_before, "u_after_deg_per_step": u_after}

@@ -13,13 +13,14 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from tvsbayes.display import concise
+from tvsbayes.results.estimates import Uncertain
 
 FIRST_LOOKS = 12
 """Three experiments of four points: fewer looks determine almost nothing."""
@@ -42,6 +43,11 @@ class Estimate:
     deg_per_step: dict[str, float]
     u_deg_per_step: dict[str, float]
     tier: str = "laplace"
+
+    @classmethod
+    def of(cls, looks: int, ratios: Mapping[str, Uncertain], tier: str = "laplace") -> Estimate:
+        """The estimate with these ratios by direction."""
+        return cls(looks, {d: r.value for d, r in ratios.items()}, {d: r.sd for d, r in ratios.items()}, tier)
 
     @property
     def text(self) -> str:

@@ -40,7 +40,7 @@ from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior, derived_names
 from tvsbayes.posterior.predictive import ideal_pixels
-from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt, fit_noise
+from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, Measured, fit_noise
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_quantiles
 
@@ -220,7 +220,7 @@ def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint
         pan, tilt = pose.tolist()
         estimates = posterior.local_deg_per_step(pan, tilt)
         ratios = {
-            direction: RatioAt(
+            direction: Measured(
                 float(estimates.mean[k]), float(estimates.sd[k]), tuple(estimates.interval95[:, k].tolist())
             )
             for k, direction in enumerate(DIRECTIONS)

@@ -166,8 +166,7 @@ def laplace_estimate(folder: Path, looks: int) -> Estimate:
     error = unusable(summary)
     if error is not None:
         raise error
-    known = {direction: e for direction, e in summary.effective.items() if e is not None}
-    return Estimate(looks, {d: e.value for d, e in known.items()}, {d: e.sd for d, e in known.items()})
+    return Estimate.of(looks, {direction: e for direction, e in summary.effective.items() if e is not None})
 
 
 def propose_looks(rig: Path, folder: Path, looks: int, target_u: float, count: int, confirm_below: float) -> Ahead:
@@ -193,13 +192,14 @@ def proposal_of(chosen: NextLooks, looks: int) -> Ahead:
     """Estimates and proposal of next looks for a run, after a number of looks."""
     from tvsbayes.acquisition.replanning import Ahead, Proposal
     from tvsbayes.acquisition.running_estimate import Estimate
+    from tvsbayes.results.plan_record import steps_of
 
-    proposal = Proposal(chosen.steps, chosen.after_each, chosen.now, looks, chosen.why)
-    laplace, sampled_check = Estimate(looks, chosen.deg_per_step, chosen.u_deg_per_step), chosen.confirmed
-    if sampled_check is None:
+    proposal = Proposal(steps_of(chosen.steps), chosen.after_each, chosen.now, looks, chosen.why)
+    laplace, confirmed = Estimate.of(looks, chosen.effective_deg_per_step), chosen.confirmed
+    if confirmed is None:
         return Ahead(laplace, proposal)
-    sampled = Estimate(looks, sampled_check.deg_per_step, sampled_check.u_deg_per_step, "importance")
-    return Ahead(laplace, proposal, sampled, sampled_check.accepted)
+    sampled = Estimate.of(looks, confirmed.effective_deg_per_step, confirmed.tier)
+    return Ahead(laplace, proposal, sampled, confirmed.accepted)
 
 
 @contextmanager

@@ -340,11 +340,12 @@ def _next_looks(
 
         looks = next_looks(fitted, rig, target, count, confirm_below=confirm)
     from tvsbayes.instrument.plan import outline
+    from tvsbayes.results.plan_record import steps_of
 
-    lines = [looks.why, *outline(rig, looks.steps)]
+    lines = [looks.why, *outline(rig, steps_of(looks.steps))]
     if looks.confirmed is not None:
         state = "" if looks.confirmed.accepted else ", whose weights must not be used"
-        values = ", ".join(f"{d} {u:.2e}" for d, u in looks.confirmed.u_deg_per_step.items())
+        values = ", ".join(f"{d} {ratio.sd:.2e}" for d, ratio in looks.confirmed.effective_deg_per_step.items())
         lines.append(f"u by importance sampling{state}, deg/step: {values}")
     finish(looks.as_json(), "\n".join(lines), as_json)
 

@@ -271,9 +271,3 @@ def describe_looks(rig: Rig, steps: Sequence[PlanStep], previous: Sequence[PlanS
         directions = ", ".join(direction_of(axis, stop.sign) for axis, stop in zip(AXES, stops, strict=True))
         phrases.append(f"({stops[0].steps}, {stops[1].steps}) by {directions}")
     return f"{log.sheet}: ".removeprefix(": ") + "; ".join(phrases)
-
-
-def step_json(step: PlanStep) -> dict[str, object]:
-    """The entry of a plan's action in a document."""
-    filled = {"pan_steps": step.pan_steps, "tilt_steps": step.tilt_steps, "target": step.target or None}
-    return {"action": step.action, **{k: v for k, v in filled.items() if v is not None}}

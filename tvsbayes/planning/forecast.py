@@ -18,6 +18,7 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.target import Target
+from tvsbayes.results.records import Record
 from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
 from tvsbayes.twin.physics import local_deg_per_step
 from tvsbayes.twin.simulated_campaign import simulate
@@ -136,8 +137,7 @@ def classic_count(sd: float, half_width: float) -> int:
     return n
 
 
-@dataclass(frozen=True)
-class ClassicAnswer:
+class ClassicAnswer(Record, frozen=True):
     """The four-point method's own number of experiments: n = (t s / E)^2 in every direction.
 
     Attributes:

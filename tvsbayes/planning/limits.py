@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,11 +15,11 @@ from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import GEARS_AT_POINT, Sensitivity, Target
-from tvsbayes.results.plan_record import Advice, Batch
+from tvsbayes.results.plan_record import Advice, Batch, actions_of
+from tvsbayes.results.records import Record
 
 
-@dataclass(frozen=True)
-class Limit:
+class Limit(Record, frozen=True):
     """The uncertainty of the target that remains after very many looks.
 
     Attributes:
@@ -171,7 +170,7 @@ def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
     for best in problem.choices(LOOKS_PER_EXPERIMENT, subsets):
         away = "a full turn of pan away, " if candidates.turned[best.picks].all() else ""
         text = f"{away}{describe_looks(rig, best.steps)}"
-        batches[best.steps] = Batch(best.steps, best.minutes, best.gain, best.gain_per_minute, text)
+        batches[best.steps] = Batch(actions_of(best.steps), best.minutes, best.gain, best.gain_per_minute, text)
     return tuple(sorted(batches.values(), key=lambda batch: -batch.gain_per_minute)[:NEXT_LISTED])
 
 

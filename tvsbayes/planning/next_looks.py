@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,89 +14,64 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.conditions import powered_on_s, warm_minutes
-from tvsbayes.instrument.plan import PlanLog, PlanStep, step_json
+from tvsbayes.instrument.plan import PlanLog
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.candidates import sheet_choices
 from tvsbayes.planning.expectation import knowledge_of
 from tvsbayes.planning.planner import design_problem
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
+from tvsbayes.results.estimates import Measured, Uncertain
+from tvsbayes.results.plan_record import Action, actions_of
+from tvsbayes.results.records import Record, Tier
 from tvsbayes.results.tiers import IMPORTANCE
 
 
-@dataclass(frozen=True)
-class Confirmation:
-    """Effective ratios by importance sampling, by direction, deg/step.
+class Confirmation(Record, frozen=True):
+    """Effective ratios by a sampled posterior.
 
     Attributes:
-        accepted: whether the weights may be used.
-        deg_per_step, u_deg_per_step: means and sds.
-        interval95: low and high ends.
+        tier: what made its draws.
+        accepted: whether they may be used.
+        effective_deg_per_step: by direction.
     """
 
+    tier: Tier
     accepted: bool
-    deg_per_step: dict[str, float]
-    u_deg_per_step: dict[str, float]
-    interval95: dict[str, tuple[float, float]]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return this part of the document of `plan --given --next`."""
-        ratios = {
-            d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d], "interval95": list(self.interval95[d])}
-            for d in DIRECTIONS
-        }
-        return {"tier": IMPORTANCE, "accepted": self.accepted, "effective_deg_per_step": ratios}
+    effective_deg_per_step: dict[str, Measured]
 
 
-@dataclass(frozen=True)
-class NextLooks:
+class NextLooks(Record, frozen=True):
     """A few looks that continue a campaign.
 
     Attributes:
         target: target of the looks.
-        steps: placements, moves and looks; the first is a placement.
-        minutes: duration by `[costs]`, without that placement where its sheet is placed already.
         now: the target's value by the campaign; `expected`: after the looks.
+        minutes: duration by `[costs]`, without the first placement where its sheet is placed already.
+        steps: placements, moves and looks; the first is a placement.
         after_each: the target's value after each look, in their order.
-        deg_per_step, u_deg_per_step: effective ratios of the fit by direction, and their Laplace sds.
+        effective_deg_per_step: effective ratios of the fit by direction, with their Laplace sds.
         why: reason of the choice, in words.
         confirmed: the ratios by the sampled posterior, where requested.
     """
 
     target: Target
-    steps: tuple[PlanStep, ...]
-    minutes: float
     now: float
     expected: float
+    minutes: float
+    steps: tuple[Action, ...]
     after_each: tuple[float, ...]
-    deg_per_step: dict[str, float]
-    u_deg_per_step: dict[str, float]
+    effective_deg_per_step: dict[str, Uncertain]
     why: str
     confirmed: Confirmation | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the document of `plan --given --next`."""
-        ratios = {d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d]} for d in DIRECTIONS}
-        return {
-            "target": self.target.as_json(),
-            "now": self.now,
-            "expected": self.expected,
-            "minutes": self.minutes,
-            "steps": [step_json(step) for step in self.steps],
-            "after_each": list(self.after_each),
-            "effective_deg_per_step": ratios,
-            "why": self.why,
-            "confirmed": None if self.confirmed is None else self.confirmed.as_json(),
-        }
 
 
 def confirmation(fit: JointFit) -> Confirmation:
     """Estimate the effective ratios of a converged fit by importance sampling; Laplace sds may be too small."""
     posterior = sample(fit, IMPORTANCE)
     stats = posterior.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
-    ends = [(low, high) for low, high in stats.interval95.T.tolist()]
-    by_direction = (dict(zip(DIRECTIONS, row, strict=True)) for row in (stats.mean.tolist(), stats.sd.tolist(), ends))
-    return Confirmation(posterior.converged, *by_direction)
+    ratios = map(Measured, stats.mean.tolist(), stats.sd.tolist(), map(tuple, stats.interval95.T.tolist()))
+    return Confirmation(IMPORTANCE, posterior.converged, dict(zip(DIRECTIONS, ratios, strict=True)))
 
 
 def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_below: float | None = None) -> NextLooks:
@@ -129,15 +103,15 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
     confirmation_result = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
     order = best.design.order
     places, quantity = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
+    ratios = map(Uncertain, np.asarray(fit.mode.effective_deg_per_step).tolist(), sds.tolist())
     return NextLooks(
         target=target,
-        steps=best.steps,
-        minutes=best.minutes,
         now=problem.now,
         expected=best.value,
+        minutes=best.minutes,
+        steps=actions_of(best.steps),
         after_each=tuple(problem.value(best.picks, best.design, order[: n + 1]) for n in range(len(order))),
-        deg_per_step=dict(zip(DIRECTIONS, map(float, np.asarray(fit.mode.effective_deg_per_step)), strict=True)),
-        u_deg_per_step=dict(zip(DIRECTIONS, map(float, sds), strict=True)),
+        effective_deg_per_step=dict(zip(DIRECTIONS, ratios, strict=True)),
         why=(
             f"{count} looks at {places} lower {quantity} most per minute: from {problem.now:.3g} to {best.value:.3g} "
             f"{target.unit} in {best.minutes:.1f} minutes"

@@ -18,7 +18,7 @@ from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX, TARGET_ROWS
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, too_few_counters
-from tvsbayes.instrument.plan import PlanStep, continued, describe_looks, run_plan, step_json
+from tvsbayes.instrument.plan import PlanStep, continued, describe_looks, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.planning.candidates import Candidates, candidates
@@ -33,6 +33,8 @@ from tvsbayes.planning.looks import LookArrays, Looks, arrange, covariance_of
 from tvsbayes.planning.search import Search
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
+from tvsbayes.results.plan_record import Action, actions_of
+from tvsbayes.results.records import Record
 
 CURE_LOOKS = 24
 """Largest number of looks in an addition."""
@@ -46,26 +48,23 @@ def judging_seconds() -> float:
     return JUDGED_SECONDS + expect.wait(EXPECT_COMPILED_SECONDS)
 
 
-@dataclass(frozen=True)
-class PlanFault:
+class PlanFault(Record, frozen=True):
     """A quantity that a plan does not determine, and the smallest addition that determines it.
 
     Attributes:
         axis: pan or tilt.
         text: the fault in words.
-        addition: steps to append to the plan, empty where none was found.
-        before, after: u of the worst effective ratio of the axis without and with it, deg/step.
+        addition: actions to append to the plan, empty where none was found.
+        u_deg_per_step: u of the worst effective ratio of the axis with them; None without.
     """
 
     axis: Axis
     text: str
-    addition: tuple[PlanStep, ...]
-    before: float
-    after: float | None
+    addition: tuple[Action, ...] = ()
+    u_deg_per_step: float | None = None
 
 
-@dataclass(frozen=True)
-class PlanCheck:
+class PlanCheck(Record, frozen=True, tag_field="kind", tag="rig with plan"):
     """Result of `check RIG PLAN`.
 
     Attributes:
@@ -84,16 +83,6 @@ class PlanCheck:
     contraction: dict[str, float | None]
     faults: tuple[PlanFault, ...]
     warnings: tuple[str, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """Return the document of `check --json` for a rig with a plan."""
-        names = ("looks", "seen", "minutes", "expected", "contraction")
-        faults = [
-            {"axis": f.axis, "text": f.text, "addition": [step_json(s) for s in f.addition], "u_deg_per_step": f.after}
-            for f in self.faults
-        ]
-        values = {name: getattr(self, name) for name in names}
-        return {"kind": "rig with plan", **values, "faults": faults, "warnings": list(self.warnings)}
 
 
 @dataclass(frozen=True)
@@ -216,16 +205,14 @@ def _fault(
     """Build a fault with its smallest addition, if there are candidates."""
     before = plan.u(axis)
     if possible is None:
-        return PlanFault(axis, text, (), before, None)
+        return PlanFault(axis, text)
     cure = _cure(steps, knowledge, possible, axis, plan)
     if cure is None:
-        return PlanFault(
-            axis, f"{text}; up to {CURE_LOOKS} more looks do not change that on this rig", (), before, None
-        )
+        return PlanFault(axis, f"{text}; up to {CURE_LOOKS} more looks do not change that on this rig")
     looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
     looks_text = f"{looks} more look{'s' * (looks != 1)}, {describe_looks(knowledge.rig, cure.addition, steps)}"
     text += f"; smallest addition: {looks_text}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
-    return PlanFault(axis, text, cure.addition, before, after)
+    return PlanFault(axis, text, actions_of(cure.addition), after)
 
 
 def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanStep, step_json
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
@@ -46,29 +46,29 @@ from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.plan_record import Advice, Batch
+from tvsbayes.results.records import Record
 from tvsbayes.statistics.chances import ASSURED, share_error
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
 
 
-@dataclass(frozen=True)
-class CurvePoint:
+class CurvePoint(Record, frozen=True):
     """Results of up to n experiments: medians over draws of the instrument, in the target's unit.
 
-    `classic` is None where the four-point method does not estimate the quantity or n is too small for it.
+    `classic` is None where the four-point method does not estimate the quantity or n is too small for it, `joint` where
+    most instruments see no look.
     """
 
     experiments: int
     minutes: float
     classic: float | None
-    joint: float
+    joint: float | None
     assurance: float
     assurance_se: float
 
 
-@dataclass(frozen=True)
-class Baseline:
+class Baseline(Record, frozen=True):
     """A known protocol, or the planned one, evaluated in the same way at the most probable instrument."""
 
     name: str
@@ -78,21 +78,17 @@ class Baseline:
     joint: float
 
 
-@dataclass(frozen=True, repr=False)
-class PlanResult(Shown):
+class PlanResult(Shown, Record, frozen=True, kw_only=True, rename={"limit": "limited_by", "shares": "variance_shares"}):
     """A plan with its curve and advice.
 
     Attributes:
         target: target of the plan.
-        steps: the recommended plan; empty where the target is met already.
         experiments, looks, minutes: its size.
         expected: the target's value after it at the most probable instrument; `now`: before it.
         assurance, assurance_se: probability that its fit reports the target as met, and its Monte Carlo error; None
             where the target is met already.
         curve: results by number of experiments.
         n80, n95: experiments for which the assurance is 80 % and 95 %, None if none.
-        limit: floor of the target.
-        shares: shares of the variance of the target after the plan, by cause.
         baselines: the plan and other protocols.
         next: possible next experiments, best first.
         stop: the stopping rule applied now.
@@ -100,10 +96,12 @@ class PlanResult(Shown):
         met: the target is met already, or the plan meets it with an assurance of 80 %.
         notes: sentences on excluded looks and the reasons.
         draws, seed, criterion: settings of the computation.
+        limit: floor of the target.
+        shares: shares of the variance of the target after the plan, by cause.
+        steps: the recommended plan, empty where the target is met already; not part of the document.
     """
 
     target: Target
-    steps: tuple[PlanStep, ...]
     experiments: int
     looks: int
     minutes: float
@@ -114,8 +112,6 @@ class PlanResult(Shown):
     curve: tuple[CurvePoint, ...]
     n80: int | None
     n95: int | None
-    limit: Limit
-    shares: dict[str, float]
     baselines: tuple[Baseline, ...]
     next: tuple[Batch, ...]
     stop: Advice
@@ -125,6 +121,10 @@ class PlanResult(Shown):
     draws: int
     seed: int
     criterion: str
+    limit: Limit
+    shares: dict[str, float]
+    steps: tuple[PlanStep, ...]
+    beside: ClassVar = ("steps",)
 
     def shown(self) -> View:
         """Show the curve by number of looks."""
@@ -132,27 +132,6 @@ class PlanResult(Shown):
         columns = ("looks", "minutes", "classic", "joint", "chance of success")
         rows = [(LOOKS_PER_EXPERIMENT * p.experiments, p.minutes, p.classic, p.joint, p.assurance) for p in self.curve]
         return View(f"PlanResult for {self.target.text}: {size}", columns, rows)
-
-    def as_json(self) -> dict[str, object]:
-        """Return the document of `plan --json`."""
-
-        def plain(value: object) -> object:
-            if isinstance(value, float):
-                return value if math.isfinite(value) else None
-            if isinstance(value, PlanStep):
-                return step_json(value)
-            if isinstance(value, Target):
-                return value.as_json()
-            if isinstance(value, tuple | list):
-                return [plain(v) for v in value]
-            if isinstance(value, dict):
-                return {k: plain(v) for k, v in value.items()}
-            return plain(vars(value)) if hasattr(value, "__dataclass_fields__") else value
-
-        document = {key: plain(value) for key, value in vars(self).items() if key not in ("steps", "limit", "shares")}
-        document["limited_by"] = plain(self.limit)
-        document["variance_shares"] = plain(self.shares)
-        return document
 
 
 PLAN_DRAWS = 200
@@ -240,7 +219,8 @@ def _curve(
         best_value = min(best_value, float(np.median(reported)))
         best_share = max(best_share, float(np.mean(reported <= target.limit)))
         classic_value = value_of_classic(forecast, target, n)
-        rows.append(CurvePoint(n, durations[n], classic_value, best_value, best_share, share_error(best_share, draws)))
+        joint = best_value if math.isfinite(best_value) else None
+        rows.append(CurvePoint(n, durations[n], classic_value, joint, best_share, share_error(best_share, draws)))
     return tuple(rows)
 
 

@@ -21,6 +21,7 @@ from tvsbayes.instrument.protocols import RUN_UP_STEPS
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces
+from tvsbayes.results.records import Record
 from tvsbayes.statistics.intervals import NORMAL_95
 
 UNITS = {
@@ -32,25 +33,29 @@ DEFAULT_TARGET = "u(worst) <= 2e-4 deg/step"
 """The limit is 0.3 % of the paper's ratios: above the floor by stereo and a focal scale known to 0.2 %."""
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(Record, frozen=True, rename={"point_mm": "at_mm"}):
     """The target of a measurement: an uncertainty with a limit.
 
     Attributes:
         text: as written.
         quantity: one of `UNITS`.
-        factor: 1 for u, 1.96 for U95.
         limit: limit in the unit.
         unit: deg/step, deg or mm.
         point_mm: point of a target coordinate, frame T.
+        expanded95: whether the uncertainty is U95, not u.
     """
 
     text: str
     quantity: str
-    factor: float
     limit: float
     unit: str
     point_mm: tuple[float, float, float] | None = None
+    expanded95: bool = False
+
+    @property
+    def factor(self) -> float:
+        """Return the ratio to u: 1 for u, 1.96 for U95."""
+        return NORMAL_95 if self.expanded95 else 1.0
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -63,18 +68,6 @@ class Target:
     def of_ratios(self) -> bool:
         """Whether the target is an effective ratio, which the four-point method estimates too."""
         return self.quantity == "worst" or self.quantity in DIRECTIONS
-
-    def as_json(self) -> dict[str, object]:
-        """Return this part of the documents of `plan` and `study`."""
-        point = None if self.point_mm is None else list(self.point_mm)
-        return {
-            "text": self.text,
-            "quantity": self.quantity,
-            "limit": self.limit,
-            "unit": self.unit,
-            "at_mm": point,
-            "expanded95": self.factor != 1.0,
-        }
 
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -128,7 +121,7 @@ def parse_target(text: str) -> Target:
         point = x, y, z
     if point is not None and max(map(abs, point)) > LARGEST_NUMBER:
         raise refuse("the point is too far away", f"state its coordinates within {LARGEST_NUMBER:g} mm")
-    return Target(" ".join(text.split()), name, 1.0 if match["kind"] == "u" else NORMAL_95, limit, unit, point)
+    return Target(" ".join(text.split()), name, limit, unit, point, match["kind"] == "U95")
 
 
 @dataclass(frozen=True)

@@ -132,9 +132,9 @@ def plan_text(result: PlanResult) -> str:
     lines = [f"target: {result.target.text}; now {result.now:.3g} {unit}", ""]
     lines.append("looks  minutes     classic       joint  chance of success")
     for p in _curve_shown(result):
-        classic_value = "-" if p.classic is None else f"{p.classic:.3g}"
+        classic_value, joint = ("-" if value is None else f"{value:.3g}" for value in (p.classic, p.joint))
         lines.append(
-            f"{LOOKS_PER_EXPERIMENT * p.experiments:5d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
+            f"{LOOKS_PER_EXPERIMENT * p.experiments:5d}  {p.minutes:7.1f}  {classic_value:>10}  {joint:>10}  "
             f"{100 * p.assurance:6.0f} +- {100 * p.assurance_se:.1f} %"
         )
     symbol = result.target.text.partition("(")[0]

@@ -66,7 +66,24 @@ ALWAYS_ESTIMATED = (
 """Parameters that every `fit.json` contains."""
 
 
-class Estimate(ClosedRecord, frozen=True):
+class Uncertain(Record, frozen=True):
+    """A quantity with its standard uncertainty."""
+
+    value: float
+    sd: NotNegative
+
+
+class Measured(Uncertain, frozen=True):
+    """Summary of a quantity's draws.
+
+    Attributes:
+        value, sd, interval95: mean, standard uncertainty, central interval.
+    """
+
+    interval95: tuple[float, float]
+
+
+class Estimate(Measured, frozen=True, forbid_unknown_fields=True):
     """One estimated quantity.
 
     Attributes:
@@ -78,9 +95,6 @@ class Estimate(ClosedRecord, frozen=True):
         rhat, ess_bulk, ess_tail: diagnosis of a sampler; None where none ran.
     """
 
-    value: float
-    sd: NotNegative
-    interval95: tuple[float, float]
     prior_sd: NotNegative | None
     contraction: Contraction | None
     rhat: float | None = None
@@ -178,26 +192,18 @@ class Validation(ClosedRecord, frozen=True):
         return f"{self.inflation:.2f}" != "1.00"
 
 
-class RatioAt(ClosedRecord, frozen=True):
-    """A local ratio at one pose, deg/step: mean, standard deviation, equal-tailed 95 % interval."""
-
-    value: float
-    sd: NotNegative
-    interval95: tuple[float, float]
-
-
 class CurvePoint(ClosedRecord, frozen=True):
-    """Local ratios at one pose of the mirrors; directions without moves are left out."""
+    """Local ratios at one pose of the mirrors, deg/step; directions without moves are left out."""
 
     pan_deg: float
     tilt_deg: float
-    left: RatioAt | UnsetType = UNSET
-    right: RatioAt | UnsetType = UNSET
-    up: RatioAt | UnsetType = UNSET
-    down: RatioAt | UnsetType = UNSET
+    left: Measured | UnsetType = UNSET
+    right: Measured | UnsetType = UNSET
+    up: Measured | UnsetType = UNSET
+    down: Measured | UnsetType = UNSET
 
     @property
-    def ratios(self) -> dict[str, RatioAt]:
+    def ratios(self) -> dict[str, Measured]:
         """Local ratios of the directions with moves."""
         values = {direction: getattr(self, direction) for direction in DIRECTIONS}
         return {direction: ratio for direction, ratio in values.items() if ratio is not UNSET}
@@ -222,18 +228,6 @@ class Curves(ClosedRecord, frozen=True, rename={"ratios": "effective_deg_per_ste
 
     ratios: BothAxes[tuple[CurvePoint, ...]]
     lost_motion: ByDirection[tuple[LostMotion, ...]]
-
-
-class Measured(Record, frozen=True):
-    """Summary of a quantity's draws.
-
-    Attributes:
-        value, sd, interval95: mean, standard uncertainty, central interval.
-    """
-
-    value: float
-    sd: NotNegative
-    interval95: tuple[float, float]
 
 
 class PeriodEstimate(Record, frozen=True):

@@ -5,10 +5,11 @@ Values and gains in the unit of the target, times in minutes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from typing import Literal
 
-from tvsbayes.files.documents import Keys
+from msgspec import structs
+
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.results.records import Record, read_record, stored_document
@@ -16,19 +17,36 @@ from tvsbayes.results.records import Record, read_record, stored_document
 PLAN_FORMAT = "tvsbayes-plan/1"
 
 
-@dataclass(frozen=True)
-class Batch:
-    """A possible next experiment: four looks at one sheet and their expected gain; read back without its actions."""
+class Action(Record, frozen=True, omit_defaults=True):
+    """An action of a plan, with the counters and the sheet that it names."""
 
-    actions: tuple[PlanStep, ...]
+    action: Literal["home", "place", "move", "look"]
+    pan_steps: int | None = None
+    tilt_steps: int | None = None
+    target: str = ""
+
+
+def actions_of(steps: Iterable[PlanStep]) -> tuple[Action, ...]:
+    """The actions of a plan."""
+    return tuple(Action(step.action, step.pan_steps, step.tilt_steps, step.target) for step in steps)
+
+
+def steps_of(actions: Iterable[Action], first: int = 0) -> tuple[PlanStep, ...]:
+    """Actions as steps of a plan, numbered from `first`."""
+    return tuple(PlanStep(number, *structs.astuple(action)) for number, action in enumerate(actions, first))
+
+
+class Batch(Record, frozen=True):
+    """A possible next experiment: four looks at one sheet and their expected gain."""
+
+    actions: tuple[Action, ...]
     minutes: float
     gain: float
     gain_per_minute: float
     text: str
 
 
-@dataclass(frozen=True)
-class Advice:
+class Advice(Record, frozen=True):
     """Whether to stop measuring, with the rule."""
 
     now: bool
@@ -81,11 +99,5 @@ def stored_plan(campaign: Campaign, inputs: Mapping[str, str]) -> PlanRecord | N
     keys = stored_document(campaign, "plan.json", (PLAN_FORMAT,), inputs)
     if keys is None:
         return None
-    again = "run `tvsbayes plan --given` again"
-    batches = keys.values.get("next")
-    if not isinstance(batches, list) or not all(isinstance(batch, dict) for batch in batches):
-        raise keys.refuse("next", "list", "a list of tables", again)
     keys.number("now", 0.0, 1e6)
-    # Reports show the experiments in words, without their steps.
-    shown = {**keys.values, "next": [{**batch, "actions": []} for batch in batches]}
-    return read_record(PlanRecord, Keys(shown, keys.file, keys.text), again)
+    return read_record(PlanRecord, keys, "run `tvsbayes plan --given` again")
