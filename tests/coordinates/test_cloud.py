@@ -87,10 +87,14 @@ def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
     ply, table = (
         write_cloud(cloud(one, blocks, SIMPLE), tmp_path / f"c.{kind}", ["nominal"]) for kind in ("ply", "csv")
     )
-    assert (ply.points, ply.refused) == (61, {"diverging": 9}) == (table.points, table.refused)
-    vertices = PlyData.read(str(ply.path))["vertex"].data
+    assert (
+        (ply.written, ply.refused, ply.reasons)
+        == (61, 9, {"diverging": 9})
+        == (table.written, table.refused, table.reasons)
+    )
+    vertices = PlyData.read(str(ply.cloud))["vertex"].data
     assert vertices.dtype.names == columns_of(["nominal"]) == ply.columns
-    with open(table.path, newline="") as stream:
+    with open(table.cloud, newline="") as stream:
         rows = list(csv.DictReader(stream))
     for name in columns_of(["nominal"]):
         own = name if name in ("line", "extrapolated") else f"{name}_mm"
@@ -99,20 +103,20 @@ def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
         np.testing.assert_allclose(vertices[name], written, atol=0.5e-4, rtol=FLOAT32)
     expected = np.concatenate([block.xyz_mm for block in cloud(one, blocks, SIMPLE)])
     np.testing.assert_allclose(np.stack([vertices[axis] for axis in "xyz"], axis=1), expected, rtol=FLOAT32)
-    with open(ply.refused_path, newline="") as stream:
+    with open(ply.refused_file, newline="") as stream:
         assert [int(row["line"]) for row in csv.DictReader(stream)] == [*range(8, 42, 7), *range(48, 72, 7)]
 
 
 def test_a_cloud_without_refused_looks_has_no_table_of_them(tmp_path):
     rows = looks(6)
     written = write_cloud(cloud(calibration(), [rows], {}), tmp_path / "c.ply", [])
-    assert written.refused_path is None and [path.name for path in tmp_path.iterdir()] == ["c.ply"]
+    assert written.refused_file is None and [path.name for path in tmp_path.iterdir()] == ["c.ply"]
 
 
 def test_the_table_of_an_earlier_cloud_goes_and_a_foreign_file_of_its_name_stays(tmp_path):
     place, table = tmp_path / "c.ply", tmp_path / "c.refused.csv"
-    assert write_cloud(cloud(calibration(), [looks(20)], {}), place, []).refused.total() == 2 and table.exists()
-    assert write_cloud(cloud(calibration(), [looks(6)], {}), place, []).refused_path is None
+    assert write_cloud(cloud(calibration(), [looks(20)], {}), place, []).refused == 2 and table.exists()
+    assert write_cloud(cloud(calibration(), [looks(6)], {}), place, []).refused_file is None
     assert not table.exists(), "it would tell of looks that are not refused"
     table.write_text("my own notes\n")
     write_cloud(cloud(calibration(), [looks(6)], {}), place, [])

@@ -17,6 +17,8 @@ from typing import Annotated, Any
 
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
+from tvsbayes.results.records import ClosedRecord
+
 Four = tuple[float, float, float, float]
 """u_left, v_left, u_right, v_right."""
 
@@ -129,16 +131,12 @@ FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
 """Names made by `instrument.campaign.frame_name`."""
 
 
-class Frame(Struct, frozen=True, forbid_unknown_fields=True, rename={"size": "bytes"}):
+class Frame(ClosedRecord, frozen=True, rename={"size": "bytes"}):
     """A stored picture: name relative to the folder, SHA-256 of the file, its size in bytes."""
 
     name: Annotated[str, Meta(pattern=rf"\A{FRAME_NAME.pattern}\Z")]
     sha256: str
     size: int
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in a look's event."""
-        return to_builtins(self)
 
 
 class Looked(Event, frozen=True):

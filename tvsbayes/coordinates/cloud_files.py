@@ -12,9 +12,8 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, ClassVar
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from tvsbayes.coordinates.cloud import CloudBlock
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.files.disk import written_whole
+from tvsbayes.results.records import Record
 
 AXIS_NAMES = "x", "y", "z"
 DIGITS = 4
@@ -29,36 +29,27 @@ DIGITS = 4
 REFUSED_COLUMNS = "line", "code", "message"
 
 
-@dataclass(frozen=True)
-class CloudFile:
+class CloudFile(Record, frozen=True):
     """Summary of a written cloud.
 
     Attributes:
-        path: file of the cloud.
+        cloud: file of the cloud.
         columns: its properties, in order.
-        points: number of points.
+        written: number of points.
         extrapolated: number of them outside the counters of the campaign's looks.
-        refused: number of looks without a point, by the code of the reason.
-        refused_path: table of these; None if there are none.
+        refused: number of looks without a point.
+        refused_file: table of these; None if there are none.
+        reasons: their number by the code of the reason; not part of the document.
     """
 
-    path: Path
+    cloud: str
     columns: tuple[str, ...]
-    points: int
+    written: int
     extrapolated: int
-    refused: Counter[str]
-    refused_path: Path | None
-
-    def as_json(self) -> dict[str, object]:
-        """Return the part of the document of `locate --cloud`."""
-        return {
-            "cloud": str(self.path),
-            "columns": list(self.columns),
-            "written": self.points,
-            "extrapolated": self.extrapolated,
-            "refused": self.refused.total(),
-            "refused_file": None if self.refused_path is None else str(self.refused_path),
-        }
+    refused: int
+    refused_file: str | None
+    reasons: dict[str, int]
+    beside: ClassVar = ("reasons",)
 
 
 def columns_of(names: Sequence[str]) -> tuple[str, ...]:
@@ -189,4 +180,5 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
     else:
         _removed_if_ours(table)
     reasons = Counter(code for _, code, _ in refused)
-    return CloudFile(path, columns_of(names), points, extrapolated, reasons, table if refused else None)
+    named = str(table) if refused else None
+    return CloudFile(str(path), columns_of(names), points, extrapolated, len(refused), named, reasons)

@@ -22,7 +22,7 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
-from tvsbayes.results.records import plain
+from tvsbayes.results.records import Record
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
 
 PROBE_PX = 0.01
@@ -90,13 +90,12 @@ class Selection:
         return np.where(self.axis == "tilt", tilt, pan)
 
 
-@dataclass(frozen=True)
-class DirectionResult:
+class DirectionResult(Record, frozen=True):
     """Mean of one direction's experiments, deg/step, with type A and GUM uncertainty.
 
     Fields that need two experiments (`sd`, `u`, intervals, degrees of freedom) are None for n = 1.
     `u_stereo_deg_per_step` is sqrt(J C J^T) of stereo parameters and focal scale alone. `effective_dof` is by
-    Welch-Satterthwaite, with infinite degrees of freedom for that type B part.
+    Welch-Satterthwaite, with infinite degrees of freedom for that type B part; None where it is infinite.
     """
 
     n: int
@@ -109,14 +108,8 @@ class DirectionResult:
     u_stereo_deg_per_step: float
     effective_dof: float | None
 
-    def as_json(self) -> dict[str, object]:
-        """Return the direction's object of `classic --json`; infinite dof become null."""
-        finite = self.effective_dof is not None and np.isfinite(self.effective_dof)
-        return {**plain(self), "effective_dof": self.effective_dof if finite else None}
 
-
-@dataclass(frozen=True, repr=False)
-class ClassicResult(Shown):
+class ClassicResult(Shown, Record, frozen=True):
     """The paper's estimate for a campaign; a direction without experiments is None."""
 
     directions: dict[str, DirectionResult | None]
@@ -134,11 +127,6 @@ class ClassicResult(Shown):
                 rows.append((name, r.n, r.mean_deg_per_step, *spread, *ends))
         left_out = f", {len(self.skipped)} left out" if self.skipped else ""
         return View(f"ClassicResult of {len(self.experiments)} experiments{left_out}", columns, rows)
-
-    def as_json(self) -> dict[str, object]:
-        """Return the document of `tvsbayes classic --json`."""
-        directions = {name: None if of is None else of.as_json() for name, of in self.directions.items()}
-        return {**plain(self), "directions": directions}
 
 
 def ratio_deg_per_step(
@@ -348,7 +336,7 @@ def _direction(campaign: Campaign, selection: Selection, rows: np.ndarray, ratio
         u_gum_deg_per_step=gum,
         interval95_gum=_interval(average, gum, dof),
         u_stereo_deg_per_step=type_b,
-        effective_dof=dof,
+        effective_dof=dof if math.isfinite(dof) else None,
     )
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import datetime
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -37,7 +36,7 @@ from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.sightings import SIGHTINGS, sighted_deg, sightings_of
 from tvsbayes.instrument.stereo_pair import SHORTEST_BASELINE_MM, baseline_doubt, pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
-from tvsbayes.results.records import plain
+from tvsbayes.results.records import Record
 
 RATIOS_TRIED, RATIO_SDS = 61, 3.0
 FAR_DEG, NEARER = 5.0, 4.0
@@ -104,8 +103,7 @@ SHALLOW = 1.2
 """Ratio of the largest to the smallest depth below which the sheet had one position (the paper's: 1.6)."""
 
 
-@dataclass(frozen=True)
-class CampaignCheck:
+class CampaignCheck(Record, frozen=True, tag_field="kind", tag="campaign"):
     """Result of `check` for a readable campaign: counts, findings, and all warnings in words."""
 
     moves: int
@@ -117,10 +115,6 @@ class CampaignCheck:
     experiments: int
     findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """Return the document of `check --json`."""
-        return {"kind": "campaign", **plain(self)}
 
 
 def _can_stand(depths_mm: np.ndarray) -> np.ndarray:

@@ -306,7 +306,7 @@ def _points(count: int) -> str:
 
 def cloud_text(cloud: CloudFile, check: LawChecked, calibration: Calibration) -> str:
     """A written cloud as text: files, refused points, validity of its uncertainties."""
-    lines = [f"written: {escaped(str(cloud.path), 200)}, {_points(cloud.points)}, frame T, mm"]
+    lines = [f"written: {escaped(cloud.cloud, 200)}, {_points(cloud.written)}, frame T, mm"]
     lines.append(f"properties: {', '.join(cloud.columns)}")
     agreement = (
         f"sds by the law of propagation (GUM): of {_points(check.points)} carried by draws too it holds to a digit or "
@@ -326,12 +326,11 @@ def cloud_text(cloud: CloudFile, check: LawChecked, calibration: Calibration) ->
             f"{_points(cloud.extrapolated)} EXTRAPOLATED: outside {ranges}, where looks were; errors of the gears are "
             "predicted there by their size alone"
         )
-    if cloud.refused_path is not None:
-        name = escaped(str(cloud.refused_path), 200)
-        count = cloud.refused.total()
-        reasons = ", ".join(f"{code} {number}" for code, number in sorted(cloud.refused.items()))
-        verb = "look has" if count == 1 else "looks have"
-        lines.append(f"{count} {verb} no point ({reasons}): lines and reasons in {name}")
+    if cloud.refused_file is not None:
+        reasons = ", ".join(f"{code} {number}" for code, number in sorted(cloud.reasons.items()))
+        verb = "look has" if cloud.refused == 1 else "looks have"
+        name = escaped(cloud.refused_file, 200)
+        lines.append(f"{cloud.refused} {verb} no point ({reasons}): lines and reasons in {name}")
     return "\n".join(lines)
 
 

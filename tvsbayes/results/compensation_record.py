@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta, structs
 
@@ -182,7 +182,7 @@ class Millimetres(Record, frozen=True):
     promised95: Positive
 
 
-class Verification(Shown, Record, frozen=True, kw_only=True):
+class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True):
     """Test of a promise by fresh readings of an axis with its table in force, or fresh looks aimed by a calibration.
 
     Attributes:
@@ -216,10 +216,6 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
     looks: bool = False
     shift_free: tuple[ErrorSize, float] | None = None
     beside: ClassVar = ("unit", "needed", "remarks", "looks", "shift_free")
-
-    def as_json(self) -> dict[str, Any]:
-        """The document; an axis has no points."""
-        return {key: value for key, value in super().as_json().items() if key != "millimetres" or value is not None}
 
     @property
     def world(self) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.planning.target import Target
 from tvsbayes.progress import Job, Show
+from tvsbayes.results.records import Record
 from tvsbayes.statistics.chances import LEVELS, binomial_bounds, rms_bounds, share_interval95
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.studies.executors import made_rows
@@ -27,8 +27,7 @@ from tvsbayes.studies.study_job import StudyJob
 CAMPAIGNS = "campaigns"
 
 
-@dataclass(frozen=True)
-class HeadlineStudy:
+class HeadlineStudy(Record, frozen=True, kw_only=True):
     """Results of one headline over the campaigns of a study.
 
     Attributes:
@@ -38,6 +37,7 @@ class HeadlineStudy:
         predicted_over_rms: root mean square of the predicted sd over RMS of (estimate - truth).
         power: share of campaigns whose estimate differs from its null (0, or the stated ratio) by 1.96 sd.
         sd: median reported sd.
+        within: whether coverage and z are within their bounds.
     """
 
     coverage: dict[str, float]
@@ -48,28 +48,21 @@ class HeadlineStudy:
     predicted_over_rms: float
     power: float
     sd: float
-
-    @property
-    def within(self) -> bool:
-        """Whether coverage and z are within their bounds."""
-        low, high = self.rms_bounds
-        covered = all(a <= self.coverage[level] <= b for level, (a, b) in self.bounds.items())
-        return covered and low <= self.rms_z <= high
+    within: bool
 
 
-@dataclass(frozen=True, repr=False)
-class StudyResult(Shown):
+class StudyResult(Shown, Record, frozen=True, kw_only=True):
     """Measured coverage, power and assurance of a plan.
 
     Attributes:
         design: hash of the design.
         estimator: estimator of the rows, "importance" or "laplace".
         campaigns, converged: number of simulated campaigns, and of converged fits.
-        headlines: results by name; one fixed by the priors is not estimated and left out.
-        target: target of the plan.
         assurance, assurance_interval95: share of ALL campaigns whose fit reports the target as met (Clopper-Pearson).
         reported: 5, 50 and 95 % quantiles of the reported value.
         seconds: median time of a row.
+        headlines: results by name; one fixed by the priors is not estimated and left out.
+        target: target of the plan.
         problems: failures, in words.
     """
 
@@ -77,12 +70,12 @@ class StudyResult(Shown):
     estimator: str
     campaigns: int
     converged: int
-    headlines: dict[str, HeadlineStudy]
-    target: Target
     assurance: float
     assurance_interval95: tuple[float, float]
     reported: tuple[float, float, float] | None
     seconds: float
+    headlines: dict[str, HeadlineStudy]
+    target: Target
     problems: tuple[str, ...]
 
     def shown(self) -> View:
@@ -94,15 +87,6 @@ class StudyResult(Shown):
         columns = ("quantity", "median sd", "RMS z", "predicted", "inside 95 %, %", "power")
         title = f"StudyResult of {self.campaigns} campaigns: {100 * self.assurance:.1f} % meet {self.target.text}"
         return View(title, columns, rows)
-
-    def as_json(self) -> dict[str, object]:
-        """Return the document of `study --json`."""
-        document = {key: value for key, value in vars(self).items() if key not in ("headlines", "target", "problems")}
-        document["headlines"] = {
-            name: {**vars(h), "bounds": {k: list(v) for k, v in h.bounds.items()}, "within": h.within}
-            for name, h in self.headlines.items()
-        }
-        return {**document, "target": self.target.as_json(), "problems": list(self.problems)}
 
 
 def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
@@ -117,6 +101,8 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
         message = "no fit of the study converged" + (f"; {problems[0]}" if problems else "")
         raise NotConverged("not-converged", message, remedy="check the plan with `tvsbayes check RIG PLAN`")
     n = len(good)
+    least_rms, most_rms = rms_bounds(n)
+    bounds = {f"{100 * level:g}": binomial_bounds(n, level) for level in LEVELS}
     headlines = {}
     for name, quantity in TARGETS.items():
         entries = [row.headlines[name] for row in good]
@@ -127,15 +113,19 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
         ).T
         error = value - truth
         null = job.rig.table.priors[quantity.stated].value if quantity.stated else 0.0
+        coverage = {f"{100 * level:g}": float(np.mean(np.abs(pit - 0.5) < level / 2)) for level in LEVELS}
+        covered = all(low <= coverage[level] <= high for level, (low, high) in bounds.items())
+        rms_z = float(np.sqrt(np.mean((error / sd) ** 2)))
         headlines[name] = HeadlineStudy(
-            coverage={f"{100 * level:g}": float(np.mean(np.abs(pit - 0.5) < level / 2)) for level in LEVELS},
-            bounds={f"{100 * level:g}": binomial_bounds(n, level) for level in LEVELS},
-            rms_z=float(np.sqrt(np.mean((error / sd) ** 2))),
+            coverage=coverage,
+            bounds=bounds,
+            rms_z=rms_z,
             rms_predicted=float(np.sqrt(np.mean((error / predicted) ** 2))),
-            rms_bounds=rms_bounds(n),
+            rms_bounds=(least_rms, most_rms),
             predicted_over_rms=float(np.sqrt(np.mean(predicted**2) / np.mean(error**2))),
             power=float(np.mean(np.abs(value - null) > NORMAL_95 * sd)),
             sd=float(np.median(sd)),
+            within=covered and least_rms <= rms_z <= most_rms,
         )
     reported = np.array([row.target for row in good if row.target is not None])
     hits = int(np.sum(reported <= job.target.limit))
