@@ -57,6 +57,7 @@ def test_bad_options_of_plan_are_refused(ask, options):
     assert document["error"]["allowed"] and document["error"]["remedy"]
 
 
+@pytest.mark.thorough
 def test_check_takes_a_rig_with_a_plan(ask):
     code, document = ask("check", MOUNTED / "rig.toml", MOUNTED / "grid.csv")
     assert code == 0 and document["kind"] == "rig with plan" and document["warnings"] == []

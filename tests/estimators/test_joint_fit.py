@@ -91,6 +91,7 @@ def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
     assert far.chi2 == pytest.approx(fitted.chi2, rel=0.05)
 
 
+@pytest.mark.thorough
 def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, mounted_rig, monkeypatch):
     """Other numbers of spots and of counters: every argument of a compiled function keeps its shape."""
     made, first = [], Compiled._made

@@ -179,6 +179,7 @@ def test_a_range_holds_more_waves_than_were_asked_for():
         assert abs(estimate.amplitude.value - amplitude) < 4 * estimate.amplitude.sd
 
 
+@pytest.mark.thorough
 def test_a_stated_period_of_position():
     """A wave of 8 deg on an axis with play, from both sides, at places that are not even."""
     rng = np.random.default_rng(3)

@@ -14,11 +14,11 @@ from tvsbayes.statistics.least_squares import KINK_FALL, least_squares_covarianc
 PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0
 """Digits wanted of every parameter and of every standard error."""
 HIGHER = {"MGH09", "Thurber", "BoxBOD", "Rat42", "MGH10", "Eckerle4", "Rat43", "Bennett5"}
-"""NIST's level of difficulty: where solvers fail. The others take a compilation each."""
+"""NIST's level of difficulty: where solvers fail. Every case takes a compilation."""
 CASES = [
-    pytest.param(name, start, id=f"{name}-start{start + 1}", marks=() if name in HIGHER else pytest.mark.slow)
+    pytest.param(name, start, id=f"{name}-start{start + 1}", marks=mark if name in HIGHER else pytest.mark.slow)
     for name in MODELS
-    for start in (0, 1)
+    for start, mark in enumerate((pytest.mark.thorough, ()))
 ]
 
 
