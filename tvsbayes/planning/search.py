@@ -218,11 +218,7 @@ class Scope:
 
 
 SUBSETS_MAX = 40
-
-
-def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
-    """List choices of sheets: all subsets of one to three, the farthest apart first."""
-    return sorted(sheet_choices(range(count), 3), key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
+"""Largest number of choices of sheets that are searched."""
 
 
 @dataclass(frozen=True)
@@ -360,7 +356,8 @@ def design_family(problem: DesignProblem, scope: Scope | None = None, advance: A
     scope, knowledge, candidates = scope or Scope(), problem.knowledge, problem.candidates
     search = problem.search(None if scope.criterion == "c" else _of_gears(knowledge, problem.seen), scope.criterion)
     families = []
-    subsets = list(_sheet_subsets(len(knowledge.sheets)))
+    # The sheets that are farthest apart come first.
+    subsets = sorted(sheet_choices(range(len(knowledge.sheets)), 3), key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
     for number, subset in enumerate(subsets):
         advance(number / len(subsets))
         allowed = np.isin(candidates.looks.sheet, subset)
