@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
 
 
-class CurvePoint(Record, frozen=True):
+class CurveRow(Record, frozen=True):
     """Results of up to n experiments: medians over draws of the instrument, in the target's unit.
 
     `classic` is None where the four-point method does not estimate the quantity or n is too small for it, `joint` where
@@ -109,7 +109,7 @@ class PlanResult(Shown, Record, frozen=True, kw_only=True, rename={"limit": "lim
     expected: float
     assurance: float | None
     assurance_se: float | None
-    curve: tuple[CurvePoint, ...]
+    curve: tuple[CurveRow, ...]
     n80: int | None
     n95: int | None
     baselines: tuple[Baseline, ...]
@@ -206,7 +206,7 @@ def plan(
 
 def _curve(
     assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], sizes: Sequence[int]
-) -> tuple[CurvePoint, ...]:
+) -> tuple[CurveRow, ...]:
     """Compute results of up to n experiments, for each size.
 
     Noise scales estimated from few stops make values vary from size to size. A row states the best of all sizes up to
@@ -220,7 +220,7 @@ def _curve(
         best_share = max(best_share, float(np.mean(reported <= target.limit)))
         classic_value = value_of_classic(forecast, target, n)
         joint = best_value if math.isfinite(best_value) else None
-        rows.append(CurvePoint(n, durations[n], classic_value, joint, best_share, share_error(best_share, draws)))
+        rows.append(CurveRow(n, durations[n], classic_value, joint, best_share, share_error(best_share, draws)))
     return tuple(rows)
 
 
@@ -283,7 +283,7 @@ def _durations(family: Family, scope: Scope) -> dict[int, float]:
 class _Size:
     """Number of experiments: the curve, and the smallest numbers with an assurance of 80 % and 95 %."""
 
-    curve: tuple[CurvePoint, ...]
+    curve: tuple[CurveRow, ...]
     n80: int | None
     n95: int | None
     experiments: int

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tvsbayes.coordinates.location import Locations
     from tvsbayes.instrument.stereo_pair import Stereo
     from tvsbayes.metrology.look_budget import Budget
-    from tvsbayes.planning.planner import CurvePoint, PlanResult
+    from tvsbayes.planning.planner import CurveRow, PlanResult
     from tvsbayes.studies.study import StudyResult
 
 
@@ -177,7 +177,7 @@ def plan_text(result: PlanResult) -> str:
     return "\n".join(lines)
 
 
-def _curve_shown(result: PlanResult) -> list[CurvePoint]:
+def _curve_shown(result: PlanResult) -> list[CurveRow]:
     """Points of the curve up to the first with the higher assurance, the next one, and the last."""
     enough = next((k for k, p in enumerate(result.curve) if p.assurance >= ASSURED[1]), len(result.curve))
     return [p for k, p in enumerate(result.curve) if k <= enough + 1 or k == len(result.curve) - 1]
