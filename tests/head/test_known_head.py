@@ -25,6 +25,7 @@ from tvsbayes.planning.looks import covariance_of
 from tvsbayes.posterior.transport import transport
 from tvsbayes.twin.head_physics import head_beam
 from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth
 
 pytestmark = pytest.mark.thorough
 
@@ -73,6 +74,14 @@ def test_the_map_exists_at_scales_far_from_the_mode(known_head):
     path = transport(fit(read_campaign(known_head[0])))
     noise = 6 * np.random.default_rng(0).standard_t(4, size=(768, path.noise))
     assert np.all(np.isfinite(path.conditional(noise).factor))
+
+
+def test_truth_is_read_back_with_the_constants_that_a_head_leaves_out():
+    run = simulate(head_rig(), rounds(), 3)
+    document = json.loads(json.dumps(run.truth.as_json(run.campaign), allow_nan=False))
+    again = Truth.from_json(document, None)
+    assert again.parameters == run.truth.parameters and again.parameters.keys() > document["parameters"].keys()
+    assert again.effective_deg_per_step(run.campaign) == pytest.approx(document["effective_deg_per_step"], rel=1e-12)
 
 
 def fresh(truth, steps, folder, seed=5, counters=lambda pan, tilt: (pan, tilt)):

@@ -17,6 +17,7 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
 from tvsbayes.instrument.axes import AXES, SENSES, SIDES
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.mechanisms import MECHANISMS
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
@@ -163,7 +164,9 @@ class Truth(WithStereo):
         # Older files without errors of gears, scatter of looks and shifts of zeros have none of them.
         perfect = {name: RIG_PRIORS[name].value for name in (*GEAR_ERROR_NAMES, *LATE_NAMES)}
         parameters = {name: float(value) for name, value in document["parameters"].items()}
-        parameters |= {name: value for name, value in perfect.items() if name not in parameters}
+        heads = [each for each in MECHANISMS.values() if any(term.name in parameters for term in each.terms.values())]
+        constants = {name: head.fixed[name] for head in heads for name in head.fixed.keys() - {*STEREO_PARAMETER_NAMES}}
+        parameters = {**perfect, **constants, **parameters}
         side, tables = document.get("homing_side"), document.get("gear_error")
         return cls(
             parameters=parameters,
