@@ -11,6 +11,7 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.inference.density import Points
 from tvsbayes.inference.importance import weighted_run
 from tvsbayes.inference.students import StudentMixture
+from tvsbayes.inference.summaries import reweighted
 from tvsbayes.inference.walkers import moves
 
 
@@ -62,7 +63,7 @@ def test_a_bent_target_is_followed_from_a_guess_that_is_far_too_narrow():
     run = weighted_run(Toy(bent, 0.1), 2)
     found = run.sample.convergence
     assert found.answer == "accepted", found.missing
-    second = run.sample.summarised(run.sample.quantities["second"][None])
+    second = reweighted(run.sample.quantities["second"][None], run.sample.weights)
     # E x^2 / 2 = 0.5; its variance is 0.5 + 0.25.
     assert abs(second.mean - 0.5) < SIGMAS * second.mcse_mean and abs(second.sd**2 - 0.75) < SIGMAS * 2 * second.mcse_sd
     evidence = found.importance

@@ -71,11 +71,10 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
     return SimpleNamespace(
         names=INPUT_NAMES,
         mode=SimpleNamespace(physical=calibration.mean, place_errors_rad=np.zeros(0)),
+        values=dict(zip(INPUT_NAMES, calibration.mean.tolist(), strict=True)),
         campaign=campaign,
         information=SimpleNamespace(place_mean=np.zeros(0)),
         linearised=linearised(residual, slope, angles),
-        arrays=SimpleNamespace(
-            spots=SimpleNamespace(valid=(np.arange(len(rows)) > 0).astype(float)), gears=no_gears(len(rows))
-        ),
+        arrays=SimpleNamespace(used=np.arange(len(rows)) > 0, gears=no_gears(len(rows))),
         reference_pose_rad=np.zeros(2),
     )

@@ -51,15 +51,14 @@ class _SplitInformation:
     groups: dict[str, list[int]]
 
 
-def _noise_of(fit: JointFit, readings: bool) -> str:
+def _noise_of(fit: JointFit) -> str:
     """Name the noise of single looks."""
     if fit.space.mechanism.sightings:
         return "noise of sightings"
-    return "pixel and aperture noise" if readings else "pixel noise"
+    return "pixel and aperture noise" if fit.arrays.read.any() else "pixel noise"
 
 
 def _split_information(fit: JointFit) -> _SplitInformation:
-    readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
     linear = linear_spots(fit.linearised, fit.arrays, fit.linearised.by_coordinates(fit.held))
     information = stop_information(linear.spelled_out(linear.places))
     gain = np.concatenate([group.jacobian for group in information.groups])
@@ -71,7 +70,7 @@ def _split_information(fit: JointFit) -> _SplitInformation:
     groups = dict(fit.space.mechanism.prior_groups)
     groups |= {TRANSMISSION_ERROR: error_columns.tolist(), PLAY_VARIATION: (error_columns + places).tolist()}
     return _SplitInformation(
-        _noise_of(fit, bool(readings)),
+        _noise_of(fit),
         noise - by_looks,
         by_looks,
         information.fisher - noise,

@@ -108,9 +108,8 @@ def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> t
     columns = {name: values for name, values in columns.items() if np.ptp(values) > 1e-12 * np.max(np.abs(values))}
     half = np.zeros(len(NAMES), dtype=bool)
     half[: len(fit.space.kind)] = np.asarray(fit.space.kind) == KINDS.index("half-normal")
-    z = posterior.z.reshape(-1, posterior.z.shape[-1])[:, rows]
     values = np.stack(list(columns.values()), axis=1)
-    return list(columns), SampledHeadlines(z, values, posterior.weights.ravel(), half[rows])
+    return list(columns), SampledHeadlines(posterior.joined_z[:, rows], values, posterior.weights.ravel(), half[rows])
 
 
 def prior_sensitivity(

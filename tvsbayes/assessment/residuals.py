@@ -77,14 +77,14 @@ def _seen_rests(fit: JointFit, axis: str, residual: np.ndarray) -> list[_SeenRes
     index, rests = AXES.index(axis), rests_of(fit.campaign.moves, axis)
     deviations = replace(fit.linearised, residual=residual).spot_deviations()
     deviation, variance = deviations.deviation_rad[:, index], deviations.covariance_rad2[:, index, index]
-    valid = np.asarray(fit.arrays.spots.valid)
     rows_of: dict[Rest, list[int]] = {}
+    determines = fit.arrays.used & (variance > 0)
     for row, spot in enumerate(ordered_spots(fit.campaign)):
         rows_of.setdefault(rests[spot.move], []).append(row)
     entries = []
     for rest, every in rows_of.items():
         # A variance of 0: the spot determines neither angle.
-        rows = np.array([row for row in every if valid[row] > 0 and variance[row] > 0], dtype=int)
+        rows = np.array([row for row in every if determines[row]], dtype=int)
         if len(rows):
             weight = 1 / variance[rows]
             total = float(weight.sum())
@@ -105,8 +105,7 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
     Returns:
         One row per stop with a known side and the play certainly taken up.
     """
-    values = dict(zip(fit.names, np.asarray(fit.mode.physical, dtype=float).tolist(), strict=True))
-    needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
+    needed = fit.values[f"backlash_deg.{axis}"] / abs(fit.values[f"degrees_per_step.{axis}"])
     rests = _seen_rests(fit, axis, np.asarray(fit.linearised.residual))
     kept = [one for one in rests if one.rest.sign != 0 and one.rest.leg >= needed]
     first = [one.rows[0] for one in kept]
@@ -120,7 +119,7 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
         u_deg=np.degrees(np.sqrt([one.mean_variance_rad2 for one in kept])),
         play_left_out=len(rests) - len(kept),
         reference_pose_deg=(pan, tilt),
-        values=values,
+        values=fit.values,
     )
 
 

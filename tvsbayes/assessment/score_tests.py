@@ -309,9 +309,8 @@ def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
     kept = values > ABSORBED
     along = np.einsum("nij,ni->nj", vectors, errors)
     distances = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=1)
-    readings = (np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))[: len(spots)]
     # Without a reading the fourth component is empty.
-    dof = np.maximum(kept.sum(axis=1) - (readings == 0), 1)
+    dof = np.maximum(kept.sum(axis=1) - ~fit.arrays.read, 1)
     chances = log_chance(distances, dof)
     worst = int(np.argmin(chances))
     return _Answer(

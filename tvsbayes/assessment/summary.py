@@ -126,8 +126,7 @@ class _Source:
 
 def _absent(fit: JointFit) -> set[str]:
     """Return parameters absent from the model: of gear errors, scatter of looks and shifts of zeros."""
-    value = dict(zip(fit.names, np.asarray(fit.mode.physical).tolist(), strict=True))
-    none = {name for name in ABSENT_AT_ZERO if not fit.free[INDEX[name]] and value[name] == 0}
+    none = {name for name in ABSENT_AT_ZERO if not fit.free[INDEX[name]] and fit.values[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")
@@ -244,8 +243,8 @@ def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]
 
 def seen_range(fit: JointFit) -> dict[str, tuple[int, int]]:
     """Return the lowest and highest counter of each axis with a used look."""
-    used = np.asarray(fit.arrays.spots.valid) > 0
-    moves = np.unique(np.asarray(fit.arrays.spots.move_index)[used])
+    used = fit.arrays.used
+    moves = np.unique(np.asarray(fit.arrays.spots.move_index)[: len(used)][used])
     steps = {axis: [getattr(fit.campaign.moves[move], f"{axis}_steps") for move in moves] for axis in AXES}
     return {axis: (min(counters), max(counters)) for axis, counters in steps.items()}
 
@@ -272,8 +271,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     moved = moved_directions(fit)
     usable = posterior if posterior is not None and posterior.converged else None
     source = _Source(fit, usable)
-    readings = np.sum(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
-    observations = components(fit.campaign.rig) * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
+    observations = float(components(fit.campaign.rig) * fit.arrays.used.sum() + fit.arrays.read.sum())
     determined = float(np.trace(fit.information.fisher @ fit.covariance))
     pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
     (a, b), (c, d) = np.asarray(source.centre.jacobian).tolist()

@@ -128,6 +128,18 @@ class CampaignArrays(eqx.Module):
         """Mark each spot that the fit uses, without padding; NumPy only."""
         return np.asarray(self.spots.valid)[: int(self.count)] > 0
 
+    @property
+    def read(self) -> Bool[np.ndarray, " spots"]:
+        """Mark each of `used` with an aperture reading; NumPy only."""
+        return self.used & (np.asarray(self.spots.has_aperture)[: int(self.count)] > 0)
+
+    def weighed(self, valid: np.ndarray, weight: np.ndarray) -> CampaignArrays:
+        """Return a copy with other `valid` and `weight` of the first spots, as many as given."""
+        both = [np.array(self.spots.valid), np.array(self.spots.weight)]
+        for array, first in zip(both, (valid, weight), strict=True):
+            array[: len(first)] = first
+        return eqx.tree_at(lambda a: (a.spots.valid, a.spots.weight), self, tuple(map(placed, both)))
+
     def of_spots(self, start: Int[Array, ""] | int, count: int) -> CampaignArrays:
         """Return the same moves with `count` spots from `start` on."""
 

@@ -40,6 +40,8 @@ STOPS_FREE_MIN, STOPS_CERTAIN, STOPS_MANY = 4, 8, 30
 play and scatter."""
 CERTAIN = 9.0
 """`BETTER` for certainty that rows are shifted."""
+OTHER = dict(zip(AXES, reversed(AXES), strict=True))
+"""The other axis, by axis."""
 LOOKS_TRIED, BEGINS_TRIED = 2000, 64
 """Evenly spread looks by which rows are compared with their neighbours, and how many of them are tried as the first
 shifted one before those around the best."""
@@ -171,10 +173,10 @@ def counter_findings(pattern: SpotPattern) -> list[Finding]:
     crossed: dict[Axis, _Followed] = {}
     added: dict[Axis, _Followed] = {}
     for axis in AXES:
-        other = table[AXES[axis == AXES[0]]]
+        other = table[OTHER[axis]]
         followed[axis] = _followed(seen, axis, table[axis], other)
         crossed[axis] = _followed(seen, axis, other, table[axis])
-        added[axis] = _followed(seen, axis, summed[axis], summed[AXES[axis == AXES[0]]])
+        added[axis] = _followed(seen, axis, summed[axis], summed[OTHER[axis]])
     enough = [axis for axis in AXES if followed[axis].stops_free >= STOPS_FREE_MIN]
     expected = [
         axis for axis in enough if followed[axis].spread_steps * seen.ratios[axis] > EXPECTED * seen.hidden_deg[axis]
@@ -269,8 +271,7 @@ def _shift_shows_the_same(seen: _Seen, axes: list[Axis], lag: int) -> bool:
     last = len(seen.campaign.moves) - 1
     at = np.clip(seen.at + lag, 0, last)
     for axis in axes:
-        other = AXES[axis == AXES[0]]
-        beside = _followed(seen, axis, seen.counters[axis][at], seen.counters[other][at])
+        beside = _followed(seen, axis, seen.counters[axis][at], seen.counters[OTHER[axis]][at])
         if not beside.follows or beside.slope < 0:
             return False
     return True

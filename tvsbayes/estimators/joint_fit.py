@@ -10,10 +10,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import jax
 import numpy as np
 from jaxtyping import Bool
+from scipy import special
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import MISFIT_REMEDY, NotConverged, NothingToEstimate, require_kind
@@ -35,7 +37,6 @@ from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.stored_draws import StoredMode
-from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.statistics.least_squares import LAPLACE_DRAWS, Mode, laplace_draws
 
@@ -150,6 +151,11 @@ class JointFit(Shown):
     def names(self) -> tuple[str, ...]:
         """Return the public names of the coordinates and of the columns of `draws.physical`."""
         return self.space.mechanism.names
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Return the values of the parameters at the mode by name."""
+        return dict(zip(self.names, np.asarray(self.mode.physical, dtype=float).tolist(), strict=True))
 
     @property
     def table(self) -> RigTable:
@@ -408,8 +414,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     lin = problem.linearised(mode.z)
     information = problem.information(lin)
     chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight)[: len(problem.spots)])
-    readings = problem.further
-    suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
+    suspect = used & (chi2_spots > special.chdtri(problem.dof, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)
     seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)
     places = place_arrays(seen_at)
@@ -441,7 +446,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     problems = mode.problems
     chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
     # Where the pixel scale is fixed, chi-square contains the misfit.
-    looks = max(float(np.sum(used * (3 + readings))), 1.0)
+    looks = max(float(np.sum(used * problem.dof)), 1.0)
     misfit = float(np.asarray(at_mode_and_draws.physical)[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
     if misfit > MISFIT_LIMIT:
         problems += (f"the spots miss the fitted beams by {misfit:.0f} times their stated uncertainty",)

@@ -9,10 +9,9 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
-from scipy import optimize
+from scipy import optimize, special
 
 from tvsbayes.estimators.annealed_stage import Fixed, linear_part, linearised_at, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays, components
@@ -28,12 +27,10 @@ from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.conditions import unseen_shifts
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import Places, place_root
 from tvsbayes.model.parameter_space import RATIO_COLUMNS, ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
-from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.least_squares import Mode, Objective, neighbouring_mode, newton_mode
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
@@ -130,11 +127,7 @@ class Problem:
         used = np.ones(len(self.spots), dtype=bool) if used is None else used
         self.space = parameter_space(table, campaign.stereo)
         arrays = campaign_arrays(campaign, table)
-        valid, weights = np.array(arrays.spots.valid), np.array(arrays.spots.weight)
-        valid[: len(used)] *= used
-        if weight is not None:
-            weights[: len(weight)] = weight
-        self.arrays = eqx.tree_at(lambda a: (a.spots.valid, a.spots.weight), arrays, (placed(valid), placed(weights)))
+        self.arrays = arrays.weighed(arrays.used * used, np.ones(0) if weight is None else weight)
         readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
         self.free = free_mask(self.space, any(readings), unseen_shifts(campaign.moves, table.priors))
         self.noise = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & self.free)
@@ -142,9 +135,9 @@ class Problem:
         self.repeated = np.isin(NAMES, GEAR_ERROR_NAMES) & self.free
 
     @property
-    def further(self) -> np.ndarray:
-        """Count each spot's residuals beyond the three of a stereo pair: +1 for the aperture, -1 for a sighting."""
-        return np.asarray(self.arrays.spots.has_aperture)[: len(self.spots)] + components(self.table) - 3
+    def dof(self) -> np.ndarray:
+        """Count each spot's residuals: those of a look, and a reading of the aperture."""
+        return components(self.table) + np.asarray(self.arrays.spots.has_aperture)[: len(self.spots)]
 
     def compile_aside(self, executor: ThreadPoolExecutor) -> None:
         """Start the compilation for later steps in another thread, while the first stage runs."""
@@ -291,28 +284,18 @@ class Problem:
         spots = self.arrays.spots
         count = len(self.spots)
         valid, weight = np.array(spots.valid)[:count], np.array(spots.weight)[:count]
-        readings = self.further
         chi2 = leave_one_out_chi2(self.information(self.linearised(z)), weight)
         used = valid > 0
         # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.
-        scale2 = np.median(chi2[used] / chi2_quantile(readings[used], 0.5))
+        scale2 = np.median(chi2[used] / special.chdtri(self.dof[used], 0.5))
         chi2 = chi2 / max(scale2, 1e-12)
-        over = used & (chi2 > chi2_quantile(readings, GATE_PROBABILITY))
+        over = used & (chi2 > special.chdtri(self.dof, GATE_PROBABILITY))
         # A bad spot also increases its neighbours' distances: only the worst of each run is excluded in one round.
         for index in np.flatnonzero(over):
             run = slice(max(index - 2, 0), index + 3)
             if chi2[index] >= np.max(np.where(used[run], chi2[run], 0.0)):
                 valid[index] = 0.0
-        core = chi2_quantile(readings, 1 - HUBER_CORE)
+        core = special.chdtri(self.dof, 1 - HUBER_CORE)
         new_weight = np.where(valid > 0, np.sqrt(np.minimum(1.0, core / np.maximum(chi2, 1e-12))), 1.0)
-        change = float(np.max(np.abs(new_weight - weight) + (valid != used)))
-
-        def padded(array, values):
-            return placed(np.concatenate([values, np.asarray(array)[count:]]))
-
-        self.arrays = eqx.tree_at(
-            lambda a: (a.spots.valid, a.spots.weight),
-            self.arrays,
-            (padded(spots.valid, valid), padded(spots.weight, new_weight)),
-        )
-        return change
+        self.arrays = self.arrays.weighed(valid, new_weight)
+        return float(np.max(np.abs(new_weight - weight) + (valid != used)))

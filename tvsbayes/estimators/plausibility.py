@@ -10,7 +10,6 @@ from __future__ import annotations
 import datetime
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,14 +46,16 @@ LEAST = 6
 LISTED = 6
 
 
+def _misspelt(campaign: Campaign, looks: str, file: str, most: int) -> list[Finding]:
+    """Find looks whose status is nearly the word ok; at most so many are listed."""
+    misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
+    said = f"{looks} {listed(misspelt, most)} are left out: their status is not spelt ok, in small letters"
+    return [Finding("status", said, file=file)] if misspelt else []
+
+
 def sighting_findings(campaign: Campaign) -> tuple[Finding, ...]:
     """Find sightings that no head can have made, as `implausible` does for spots."""
-    misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
-    findings = []
-    if misspelt:
-        named = listed(misspelt, LISTED)
-        said = f"sightings {named} are left out: their status is not spelt ok, in small letters"
-        findings.append(Finding("status", said, file=SIGHTINGS.file))
+    findings = _misspelt(campaign, "sightings", SIGHTINGS.file, LISTED)
     ok = ordered_spots(campaign)
     steps = np.array([(m.pan_steps, m.tilt_steps) for m in (campaign.moves[s.move] for s in ok)], float).reshape(-1, 2)
     angles_deg = sighted_deg(sightings_of(ok))
@@ -134,16 +135,13 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     if campaign.stereo is None:
         return sighting_findings(campaign)
     points_mm = campaign.usable_points_mm if points_mm is None else points_mm
-    few, spots = partial(listed, most=SPOTS_LISTED), stereo_spots(campaign.spots)
+    spots = stereo_spots(campaign.spots)
     ok = [spot for spot in spots if spot.status == "ok"]
-    findings = []
-    misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
-    if misspelt:
-        said = f"spots {few(misspelt)} are left out: their status is not spelt ok, in small letters"
-        findings.append(Finding("status", said, file="spots.csv"))
+    findings = _misspelt(campaign, "spots", "spots.csv", SPOTS_LISTED)
     stray = [s.spot for s in spots if s.status == UNDETECTED and s.u_left_px is not None]
     if stray:
-        said = f"spots {few(stray)} are undetected and have pixels, which nothing uses: ok, or refused?"
+        named = listed(stray, SPOTS_LISTED)
+        said = f"spots {named} are undetected and have pixels, which nothing uses: ok, or refused?"
         findings.append(Finding("status", said, file="spots.csv"))
     if not ok:
         return tuple(findings)

@@ -6,7 +6,7 @@ draw, ...); a chain is a walker.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from tvsbayes.inference.chain import GROUPS, Chain
 from tvsbayes.inference.density import Density, columns_of
 from tvsbayes.inference.importance import ImportanceRun, Sample, uncertain
-from tvsbayes.inference.summaries import monte_carlo_errors, propagated
+from tvsbayes.inference.summaries import monte_carlo_errors, propagated, reweighted
 from tvsbayes.inference.walkers import autocorrelation_time
 from tvsbayes.results.convergence import Agreement, Convergence, MonteCarloError, extreme
 from tvsbayes.results.records import Tier
@@ -143,6 +143,11 @@ class Comparison:
         return {name: MonteCarloError(mean, (*ends,)) for name, (mean, *ends) in zip(self.names, rows, strict=True)}
 
 
+def _stacked(columns: Mapping[str, np.ndarray], names: Iterable[str], shape: tuple[int, ...]) -> np.ndarray:
+    """Return draws (chain, draw) of quantities, by name along the last axis."""
+    return np.stack([columns[name].reshape(shape) for name in names], axis=-1)
+
+
 def compared(
     first: Sample, quantities: Mapping[str, np.ndarray], shape: tuple[int, int], names: tuple[str, ...]
 ) -> Comparison:
@@ -151,8 +156,8 @@ def compared(
     varying = [name for name in quantities if np.ptp(quantities[name]) > 0 and np.ptp(theirs[name]) > 0]
     # Where no headline varies, all other quantities are compared.
     names = tuple(name for name in names if name in varying) or tuple(varying)
-    ours = propagated(np.stack([quantities[name].reshape(shape) for name in names], axis=-1))
-    weighted = first.summarised(np.stack([theirs[name].reshape(first.weights.shape) for name in names], axis=-1))
+    ours = propagated(_stacked(quantities, names, shape))
+    weighted = reweighted(_stacked(theirs, names, first.weights.shape), first.weights)
     one, other = (np.stack([each.mean, *each.interval95]) for each in (ours, weighted))
     errors = (np.stack([each.mcse_mean, *each.mcse_interval95]) for each in (ours, weighted))
     return Comparison(names, np.abs(one - other), np.hypot(*errors), ours.sd)
@@ -163,7 +168,7 @@ def quality_of(chain: Chain, discarded: int, columns: Mapping[str, np.ndarray], 
     # Imported here: it loads a module named as JAX.
     from arviz_stats.base import array_stats
 
-    values = np.stack([column.reshape(shape) for column in columns.values()], axis=2)
+    values = _stacked(columns, columns, shape)
     axes = {"chain_axis": 0, "draw_axis": 1}
     return ChainQuality(
         tuple(columns),
@@ -181,9 +186,7 @@ def chain_errors(
 ) -> dict[str, MonteCarloError]:
     """Compute Monte Carlo errors of the headlines that vary, from draws (walker, draw) of a chain."""
     names = [name for name in headlines if np.ptp(quantities[name]) > 0]
-    if not names:
-        return {}
-    return monte_carlo_errors(names, propagated(np.stack([quantities[name].reshape(shape) for name in names], axis=-1)))
+    return monte_carlo_errors(names, propagated(_stacked(quantities, names, shape))) if names else {}
 
 
 def diagnose[D: Density](start: ImportanceRun[D], chain: Chain, tier: Tier = CHAIN) -> Sample:

@@ -19,7 +19,7 @@ import numpy as np
 
 from tvsbayes.errors import NotConverged
 from tvsbayes.inference.density import Density, Points, Proposal, columns_of
-from tvsbayes.inference.summaries import Propagated, monte_carlo_errors, propagated, reweighted
+from tvsbayes.inference.summaries import monte_carlo_errors
 from tvsbayes.progress import Advance, OpenEnded, unshown
 from tvsbayes.results.convergence import (
     END_ERROR_MAX,
@@ -31,7 +31,6 @@ from tvsbayes.results.convergence import (
     extreme,
 )
 from tvsbayes.results.records import AnswerKind, Tier
-from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import (
     SmoothedWeights,
@@ -131,15 +130,11 @@ def piloted(density: Density, generator: np.random.RandomState, rounds_max: int)
     pilot = Pool.empty(density.first_proposal())
     for number in range(1, rounds_max + 1):
         pilot = pilot.extended(density, generator, fitted=True)
-        if PILOT_ROUNDS <= number < rounds_max and _learnt(pilot):
-            break
+        if PILOT_ROUNDS <= number < rounds_max:
+            smooth = Weighing(density, pilot).smoothed
+            if smooth.pareto_k < K_MAX and effective_draws(smooth.weights) >= PILOT_EFFECTIVE:
+                break
     return Pool.empty(pilot.next_proposal, pilot.invalid)
-
-
-def _learnt(pilot: Pool) -> bool:
-    log_weights = pilot.log_weights
-    smooth = smoothed_weights(log_weights[np.isfinite(log_weights)])
-    return smooth.pareto_k < K_MAX and effective_draws(smooth.weights) >= PILOT_EFFECTIVE
 
 
 @dataclass(frozen=True)
@@ -164,10 +159,6 @@ class Sample:
     def tier(self) -> Tier:
         """Return the tier of the draws: weighted independent draws, or equally weighted ones of a chain."""
         return self.convergence.tier
-
-    def summarised(self, values: np.ndarray) -> Propagated:
-        """Compute mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
-        return reweighted(values, self.weights) if self.tier == IMPORTANCE else propagated(values)
 
     def equal(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Resample coordinates (count, d) with equal weights, in random order."""

@@ -50,10 +50,7 @@ class StoredPosterior(Shown):
     def shown(self) -> View:
         """Show means, sds and 95 % intervals."""
         propagated = self.propagate(lambda p: np.stack(list(p.values()), axis=1))
-        columns = (each.tolist() for each in (propagated.mean, propagated.sd, *propagated.interval95))
-        rows = list(zip(self.by_name, *columns, strict=True))
-        title = f"Posterior of {len(self.weights)} stored draws, {self.answer}"
-        return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), rows)
+        return propagated.by_quantity(f"Posterior of {len(self.weights)} stored draws, {self.answer}", self.by_name)
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return all draws by name, one row each, with their `weight` (sum 1)."""

@@ -5,18 +5,18 @@ Draws are ordered (chain, draw, ...); a chain is a walker. Weighted draws are in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from tvsbayes.display import Cell, Shown, View
 from tvsbayes.results.convergence import MonteCarloError
-from tvsbayes.statistics.weighted_draws import TAILS, WeightedSummary, weighted_summary
+from tvsbayes.statistics.weighted_draws import TAILS, Moments, weighted_summary
 
 
 @dataclass(frozen=True, repr=False)
-class Propagated(Shown):
+class Propagated(Moments, Shown):
     """A quantity under the posterior; every field but the last two has the shape of the quantity.
 
     Attributes:
@@ -28,12 +28,6 @@ class Propagated(Shown):
         weights: weights of the draws, sum 1, shape (chain, draw).
     """
 
-    mean: np.ndarray
-    sd: np.ndarray
-    interval95: np.ndarray
-    mcse_mean: np.ndarray
-    mcse_sd: np.ndarray
-    mcse_interval95: np.ndarray
     ess: np.ndarray
     draws: np.ndarray
     weights: np.ndarray
@@ -45,6 +39,11 @@ class Propagated(Shown):
         columns = zip(mean, sd, low.tolist(), high.tolist(), error, strict=True)
         rows: list[tuple[Cell, ...]] = [(str(k), *row) for k, row in enumerate(columns)]
         return View("Propagated quantity", ("element", "mean", "sd", "2.5 %", "97.5 %", "Monte Carlo error"), rows)
+
+    def by_quantity(self, title: str, names: Iterable[str]) -> View:
+        """Show mean, sd and interval of the quantities of these names, each of shape (names,)."""
+        columns = (each.tolist() for each in (self.mean, self.sd, *self.interval95))
+        return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), list(zip(names, *columns, strict=True)))
 
 
 def carried(
@@ -70,17 +69,8 @@ def carried(
 def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:
     """Summarise independent draws (chain, draw, ...) with weights (chain, draw)."""
     summary = weighted_summary(values.reshape(-1, *values.shape[2:]), weights.ravel())
-    return Propagated(
-        mean=summary.mean,
-        sd=summary.sd,
-        interval95=summary.interval95,
-        mcse_mean=summary.mcse_mean,
-        mcse_sd=summary.mcse_sd,
-        mcse_interval95=summary.mcse_interval95,
-        ess=summary.ess_mean,
-        draws=values,
-        weights=weights,
-    )
+    moments = {field.name: getattr(summary, field.name) for field in fields(Moments)}
+    return Propagated(**moments, ess=summary.ess_mean, draws=values, weights=weights)
 
 
 def propagated(values: np.ndarray) -> Propagated:
@@ -113,9 +103,9 @@ def propagated(values: np.ndarray) -> Propagated:
     )
 
 
-def monte_carlo_errors(names: Sequence[str], propagated: Propagated | WeightedSummary) -> dict[str, MonteCarloError]:
-    """Return Monte Carlo errors by quantity, the last axis of a summary, in posterior sds; 0 for constants."""
-    sd = np.where(propagated.sd > 0, propagated.sd, 1.0)
-    parts = propagated.mcse_mean / sd, *(propagated.mcse_interval95 / sd)
+def monte_carlo_errors(names: Sequence[str], moments: Moments) -> dict[str, MonteCarloError]:
+    """Return Monte Carlo errors by quantity, the last axis of moments, in posterior sds; 0 for constants."""
+    sd = np.where(moments.sd > 0, moments.sd, 1.0)
+    parts = moments.mcse_mean / sd, *(moments.mcse_interval95 / sd)
     rows = zip(*(np.reshape(part, len(names)).tolist() for part in parts), strict=True)
     return {name: MonteCarloError(mean, (low, high)) for name, (mean, low, high) in zip(names, rows, strict=True)}

@@ -104,10 +104,7 @@ class Posterior(Shown):
         state = "converged" if self.converged else "NOT CONVERGED"
         title = f"Posterior by {self.tier}, {self.weights.size} draws, {state}"
         names = headline_names(self.fit)
-        values = self.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
-        columns = (each.tolist() for each in (values.mean, values.sd, *values.interval95))
-        rows = list(zip(names, *columns, strict=True))
-        return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), rows)
+        return self.propagate(lambda p: np.stack([p[name] for name in names], axis=1)).by_quantity(title, names)
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return all draws by name, one row each, with their `weight` (sum 1)."""
@@ -136,6 +133,11 @@ class Posterior(Shown):
         return jax.tree.map(lambda x: x.reshape(self.weights.size, *x.shape[2:]), self.draws)
 
     @property
+    def joined_z(self) -> np.ndarray:
+        """Return the coordinates z of all draws, chains joined, shape (n, p)."""
+        return self.z.reshape(self.weights.size, -1)
+
+    @property
     def centre(self) -> Derived:
         """Compute the means of all fields of `draws`."""
         return jax.tree.map(lambda x: weighted_mean(np.asarray(x), self.weights.ravel()), self.joined)
@@ -152,7 +154,7 @@ class Posterior(Shown):
 
     def coordinates(self, count: int) -> np.ndarray:
         """Return the coordinates z of the `chosen` draws, shape (count, p)."""
-        return self.z.reshape(-1, self.z.shape[-1])[self.chosen(count)]
+        return self.joined_z[self.chosen(count)]
 
     def resampled(self, chains: int, draws: int) -> Posterior:
         """Resample to draws of equal weight, in chains; a draw of large weight is repeated."""
@@ -161,7 +163,7 @@ class Posterior(Shown):
         places = random_stream(self.seed, Stream.ORDER_OF_DRAWS).permutation(places).reshape(chains, draws)
         return replace(
             self,
-            z=self.z.reshape(-1, self.z.shape[-1])[places],
+            z=self.joined_z[places],
             log_density=self.log_density.ravel()[places],
             draws=jax.tree.map(lambda x: x[places], self.joined),
             weights=np.full((chains, draws), 1 / (chains * draws)),

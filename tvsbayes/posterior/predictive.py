@@ -185,8 +185,7 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
     fit = posterior.fit
     spots = ordered_spots(fit.campaign)
     used = fit.arrays.used
-    z = posterior.z.reshape(-1, posterior.z.shape[-1])
-    errors_rad = np.asarray(posterior.joined.place_errors_rad)
+    z, errors_rad = posterior.joined_z, np.asarray(posterior.joined.place_errors_rad)
 
     def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
         given = z[rows], errors_rad[rows]
@@ -246,8 +245,7 @@ def predictive_pixels(posterior: Posterior) -> xr.DataArray:
     generator = random_stream(posterior.seed, Stream.PREDICTED_MOVES)
     chains, draws = posterior.z.shape[:2]
     chosen = np.unique(np.linspace(0, draws - 1, min(PREDICTED_DRAWS, draws)).astype(int))
-    z, drawn = posterior.z.reshape(-1, posterior.z.shape[-1]), posterior.joined
-
+    z, drawn = posterior.joined_z, posterior.joined
     places = np.arange(chains * draws).reshape(chains, draws)[:, chosen].ravel()
 
     def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:

@@ -71,14 +71,11 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
             if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
                 times.append((end, begin, state, by_direction.ravel(), rest))
     times.sort(key=lambda each: each[:3])
-    load = np.zeros((spots, 4, len(times)))
-    for column, (end, begin, state, *_) in enumerate(times):
+    load, variance, constant = np.zeros((spots, 4, len(times))), np.zeros((len(times), 4)), np.zeros(len(times))
+    for column, (end, begin, state, by_direction, rest) in enumerate(times):
         load[begin:end, :, column] = linear.load[begin:end, :, state]
-    return StopStates(
-        load.reshape(4 * spots, len(times)),
-        np.array([each[3] for each in times]).reshape(len(times), 4),
-        np.array([each[4] for each in times], dtype=float),
-    )
+        variance[column], constant[column] = by_direction, rest
+    return StopStates(load.reshape(4 * spots, len(times)), variance, constant)
 
 
 @dataclass(frozen=True)

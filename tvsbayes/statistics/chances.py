@@ -73,13 +73,6 @@ def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
     return result
 
 
-def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
-    """Compute the chi-square that a spot's three residuals and aperture readings exceed with this probability."""
-    from scipy import special
-
-    return special.chdtri(3.0 + readings, probability)
-
-
 def student_log_density(errors: np.ndarray, dof: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Compute the log density of a scaled Student's t, normal for infinite degrees of freedom; equal shapes."""
     from scipy import special

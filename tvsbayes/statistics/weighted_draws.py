@@ -19,17 +19,13 @@ PRIOR_DRAWS, PRIOR_K = 10, 0.5
 
 
 @dataclass(frozen=True)
-class WeightedSummary:
-    """Summary of quantities by weighted draws; every field has the shape of the quantities.
-
-    Errors are those of self-normalised importance sampling (Owen, Monte Carlo theory, methods and examples, 9.2). The
-    effective draws of a statistic are the number of equally weighted, independent draws with the same error.
+class Moments:
+    """Quantities by draws; every field has the shape of the quantities.
 
     Attributes:
-        mean, sd: moments of the weighted draws.
+        mean, sd: moments of the draws.
         interval95: equal-tailed, first axis (low, high).
         mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
-        ess_mean, ess_sd, ess_interval95: effective draws behind each of them.
     """
 
     mean: np.ndarray
@@ -38,6 +34,16 @@ class WeightedSummary:
     mcse_mean: np.ndarray
     mcse_sd: np.ndarray
     mcse_interval95: np.ndarray
+
+
+@dataclass(frozen=True)
+class WeightedSummary(Moments):
+    """Moments of weighted draws, and in `ess_mean`, `ess_sd`, `ess_interval95` the effective draws behind each of them.
+
+    Errors are those of self-normalised importance sampling (Owen, Monte Carlo theory, methods and examples, 9.2). The
+    effective draws of a statistic are the number of equally weighted, independent draws with the same error.
+    """
+
     ess_mean: np.ndarray
     ess_sd: np.ndarray
     ess_interval95: np.ndarray
