@@ -400,6 +400,26 @@ def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformat
     return Gaussian(np.append(z, information.place_mean), np.block([[own, follows.T], [follows, lower]]))
 
 
+def _drawn(joint: Gaussian, free: Bool[np.ndarray, " parameters"], seed: int) -> np.ndarray:
+    """Draw coordinates, then errors at places, shape (draws, p + e).
+
+    Shifts of the zeros that are not estimated keep their mean: the draws of the others then do not depend on them.
+    """
+    drawn = np.ones(len(joint.mean), dtype=bool)
+    drawn[[INDEX[name] for name in ZERO_SHIFT_NAMES if not free[INDEX[name]]]] = False
+    both = np.tile(joint.mean, (LAPLACE_DRAWS, 1))
+    both[:, drawn] = laplace_draws(joint.mean[drawn], joint.covariance[np.ix_(drawn, drawn)], seed)
+    return both
+
+
+def _seen_line(campaign: Campaign, problem: Problem, pose_rad: np.ndarray) -> SeenLine:
+    """Build the line of the headlines from the used spots, at this mean pose (2,)."""
+    seen = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)
+    places = place_arrays(seen)
+    share = np.pad(line_share(seen, problem.arrays.used), (0, len(places.steps) - len(seen.steps)))
+    return SeenLine(pose_rad, places, placed(share))
+
+
 def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_draws: Derived | None = None) -> JointFit:
     """Build the fit at a mode: residuals, information, Laplace draws and diagnoses.
 
@@ -415,39 +435,29 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     information = problem.information(lin)
     chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight)[: len(problem.spots)])
     suspect = used & (chi2_spots > special.chdtri(problem.dof, GATE_PROBABILITY))
-    pose = lin.mirror_angles_rad[used].mean(axis=0)
-    seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)
-    places = place_arrays(seen_at)
-    share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
-    line = SeenLine(np.asarray(pose), places, share)
-    count, joint = len(NAMES), with_places(mode.z, mode.covariance, information)
-    # Shifts of the zeros that are not estimated are not drawn: the draws of the others then do not depend on them.
-    drawn = np.ones(len(joint.mean), dtype=bool)
-    drawn[[INDEX[name] for name in ZERO_SHIFT_NAMES if not problem.free[INDEX[name]]]] = False
-    both = np.tile(joint.mean, (LAPLACE_DRAWS, 1))
-    both[:, drawn] = laplace_draws(joint.mean[drawn], joint.covariance[np.ix_(drawn, drawn)], seed)
-    draws_z, draws_rad = both[:, :count], both[:, count:] @ np.asarray(lin.place_root).T
-    centre_rad = np.asarray(lin.place_root) @ information.place_mean
+    pose = np.asarray(lin.mirror_angles_rad[used].mean(axis=0))
+    line, joint = _seen_line(campaign, problem, pose), with_places(mode.z, mode.covariance, information)
+    draws_z, draws_places = np.split(_drawn(joint, problem.free, seed), [len(NAMES)], axis=1)
 
-    def derived(z: np.ndarray, errors_rad: np.ndarray) -> Derived:
-        """Compute derived quantities at the mode and of draws."""
+    def with_mode(z: np.ndarray, errors_rad: np.ndarray) -> Derived:
+        """Compute derived quantities at the mode, then of draws."""
+        centre_rad = np.asarray(lin.place_root) @ information.place_mean
         z, errors = np.concatenate([mode.z[None], z]), np.concatenate([centre_rad[None], errors_rad])
         return jax.tree.map(np.asarray, derived_quantities(z, errors, problem.space, line))
 
-    at_mode_and_draws = derived(draws_z, draws_rad)
+    at_mode_and_draws = with_mode(draws_z, draws_places @ np.asarray(lin.place_root).T)
     if prior_draws is None:
-        prior_both = np.zeros_like(both)
-        prior_both[:, drawn] = laplace_draws(np.zeros(drawn.sum()), np.eye(drawn.sum()), seed + 1)
-        prior_z = prior_both[:, :count]
-        prior_rad = np.asarray(prior_errors_at_places(prior_z, prior_both[:, count:], problem.space, problem.arrays))
-        prior_draws = jax.tree.map(lambda x: x[1:], derived(prior_z, prior_rad))
+        prior = Gaussian(np.zeros(len(joint.mean)), np.eye(len(joint.mean)))
+        prior_z, normal = np.split(_drawn(prior, problem.free, seed + 1), [len(NAMES)], axis=1)
+        prior_rad = np.asarray(prior_errors_at_places(prior_z, normal, problem.space, problem.arrays))
+        prior_draws = jax.tree.map(lambda x: x[1:], with_mode(prior_z, prior_rad))
     reach = NORMAL_95 * np.sqrt(np.diag(mode.covariance))
     ids = np.array([s.spot for s in problem.spots])
     problems = mode.problems
     chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
     # Where the pixel scale is fixed, chi-square contains the misfit.
     looks = max(float(np.sum(used * problem.dof)), 1.0)
-    misfit = float(np.asarray(at_mode_and_draws.physical)[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
+    misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
     if misfit > MISFIT_LIMIT:
         problems += (f"the spots miss the fitted beams by {misfit:.0f} times their stated uncertainty",)
     return JointFit(
@@ -460,14 +470,14 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
         linearised=lin,
         information=information,
         chi2=chi2,
-        reference_pose_rad=np.asarray(pose),
+        reference_pose_rad=pose,
         seen_line=line,
         free=problem.free,
         draws_z=draws_z,
-        draws_places=both[:, count:],
-        draws=jax.tree.map(lambda x: np.asarray(x)[1:], at_mode_and_draws),
+        draws_places=draws_places,
+        draws=jax.tree.map(lambda x: x[1:], at_mode_and_draws),
         prior_draws=prior_draws,
-        mode=jax.tree.map(lambda x: np.asarray(x)[0], at_mode_and_draws),
+        mode=jax.tree.map(lambda x: x[0], at_mode_and_draws),
         ends95=problem.space.values(np.stack([mode.z - reach, mode.z + reach])),
         excluded_spots=tuple(int(i) for i in ids[~used]),
         suspect_spots=tuple(int(i) for i in ids[suspect]),
