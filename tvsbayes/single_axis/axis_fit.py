@@ -133,7 +133,7 @@ class AxisFit(Shown):
     """A fitted axis.
 
     Attributes:
-        campaign, rows, model: data and model of the fit.
+        campaign, model: data and model of the fit.
         mode: mode of the sampled parameters.
         sample: the sampled posterior; None where nothing was sampled.
         w: coordinates of equal draws, (draws, d); from the Laplace approximation where no sample converged.
@@ -141,7 +141,6 @@ class AxisFit(Shown):
     """
 
     campaign: AxisCampaign
-    rows: AxisRows
     model: AxisModel
     mode: AxisMode
     sample: Sample | None
@@ -154,11 +153,16 @@ class AxisFit(Shown):
         state = "converged" if self.error is None else f"NOT CONVERGED: {self.error.message}"
         return View(f"AxisFit of {len(rows.value)} rows at {len(rows.positions)} positions by {method}, {state}")
 
+    @property
+    def rows(self) -> AxisRows:
+        """Averaged readings."""
+        return self.model.rows
+
     @classmethod
     def of_draws(cls, campaign: AxisCampaign, model: AxisModel, w: np.ndarray, seed: int) -> AxisFit:
         """A fit from stored draws, without their sample."""
         mode = AxisMode(w.mean(axis=0), np.atleast_2d(np.cov(w.T)), 0.0)
-        return cls(campaign, model.rows, model, mode, None, w, seed)
+        return cls(campaign, model, mode, None, w, seed)
 
     @property
     def answer(self) -> AnswerKind:
@@ -199,8 +203,7 @@ class AxisFit(Shown):
     @cached_property
     def conflicts(self) -> tuple[PriorConflict, ...]:
         """Priors that the readings contradict."""
-        stated, rows = self.campaign.stated, self.rows
-        return prior_conflicts(self.model, self.w, stated, default_priors(rows))
+        return prior_conflicts(self.model, self.w, self.campaign.stated, default_priors(self.rows))
 
     @cached_property
     def linear(self) -> LinearPosterior:
@@ -294,6 +297,6 @@ def fit_axis(
             w = rng.multivariate_normal(mode.w, mode.covariance, EQUAL_DRAWS, method="cholesky")
         else:
             w = np.zeros((EQUAL_DRAWS, 0))
-        fit = AxisFit(campaign, model.rows, model, mode, sample, w, seed)
+        fit = AxisFit(campaign, model, mode, sample, w, seed)
         assert fit.draws
     return fit

@@ -148,7 +148,7 @@ def _variance(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndar
     rows = replace(rows_of(campaign), line=fit.rows.line)
     model = AxisModel.of(rows, fit.model.priors, places, fit.model.coordinates.waves)
     model = replace(model, coordinates=fit.model.coordinates)
-    mean, sd = model.linear(fit.w).of(_functionals(replace(fit, rows=rows, model=model), target, places))
+    mean, sd = model.linear(fit.w).of(_functionals(replace(fit, model=model), target, places))
     return _Variance(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
 
 
