@@ -168,7 +168,7 @@ def test_every_draw_speaks_of_looks_by_its_own_way_of_homing(monkeypatch):
 
     spots = len(ordered_spots(small_campaign()))
     monkeypatch.setattr(predictive, "spot_constants", lambda campaign: np.zeros(spots))
-    monkeypatch.setattr(predictive, "repeated_rad", lambda fit, errors: errors)
+    monkeypatch.setattr(predictive, "turned_by", lambda arrays, errors: errors)
     monkeypatch.setattr(
         predictive, "move_log_density", lambda z, e, space, arrays: np.repeat(off(z, arrays.number), spots, axis=1)
     )

@@ -29,10 +29,10 @@ def shown(found):
 
 
 def test_spots_expected_are_those_of_the_fit(found, shown):
-    from tvsbayes.posterior.predictive import looks, repeated_rad
+    from tvsbayes.posterior.predictive import looks, turned_by
 
     fit = found.fitted.fit
-    turned = repeated_rad(fit, np.asarray(fit.mode.place_errors_rad)[None])
+    turned = turned_by(fit.arrays, np.asarray(fit.mode.place_errors_rad)[None])
     expected = looks(fit, fit.z[None], turned)[0]
     seen = [spot.spot for spot in ordered_spots(found.campaign)]
     rows = [shown.looks.spot.tolist().index(spot) for spot in seen]

@@ -143,7 +143,7 @@ class _Idealised:
 
 def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Idealised:
     from tvsbayes.posterior.draws import derived_of
-    from tvsbayes.posterior.predictive import by_way, looks, repeated_rad
+    from tvsbayes.posterior.predictive import by_way, looks, turned_by
 
     z, errors_rad = chosen.z, chosen.place_errors_rad
     # Without play there is no variation of play either.
@@ -162,7 +162,7 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
         repeating_rad = errors_rad if space is spaces[0] else straight_rad
 
         def of_way(fit: JointFit, values: np.ndarray, space=space, repeating_rad=repeating_rad) -> np.ndarray:
-            return looks(replace(fit, space=space), z[values], repeated_rad(fit, repeating_rad[values]))[:, rows]
+            return looks(replace(fit, space=space), z[values], turned_by(fit.arrays, repeating_rad[values]))[:, rows]
 
         pixels = by_way(chosen.ways, of_way)
         ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo_pair))

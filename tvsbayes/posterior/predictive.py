@@ -217,18 +217,13 @@ def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarra
     return np.stack(axes, axis=2)
 
 
-def repeated_rad(fit: JointFit, place_errors_rad: np.ndarray) -> np.ndarray:
-    """Compute `turned_by` for a fit's campaign."""
-    return turned_by(fit.arrays, place_errors_rad)
-
-
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
     """Compute pixels without noise and stop errors for draws of equal weight, shape (draws, spots, 4)."""
     z = posterior.coordinates(draws)
     errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
 
     def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
-        return looks(fit, z[rows], repeated_rad(fit, errors_rad[rows]))
+        return looks(fit, z[rows], turned_by(fit.arrays, errors_rad[rows]))
 
     return by_way(ways_of(posterior, posterior.chosen(draws)), of_way)
 
@@ -285,7 +280,7 @@ def looks_again(
     total = np.cumsum(walked, axis=1)
     # The zero drifts as a random walk from its homing on.
     error = error + home[:, segment] + total - (total - walked)[:, segment]
-    error = error + repeated_rad(fit, place_errors_rad)
+    error = error + turned_by(fit.arrays, place_errors_rad)
     # The position in the play is Gaussian after an unknown approach, as in the filter.
     place = generator.standard_normal(home.shape)[:, segment]
     error = error + fit.linearised.play_sd_rad * place

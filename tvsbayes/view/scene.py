@@ -30,7 +30,7 @@ from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.pipeline import StoredOrFitted, Tell, compile_for, no_output
-from tvsbayes.posterior.predictive import repeated_rad
+from tvsbayes.posterior.predictive import turned_by
 from tvsbayes.report.evidence import GearBand, gear_bands
 from tvsbayes.results.comparison_record import Comparison
 from tvsbayes.results.estimates import StopResidual
@@ -199,7 +199,7 @@ def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
         turned = np.zeros((int(arrays.count), 2))
         return laser_ways(np.zeros(len(NAMES)), turned, parameter_space(campaign.rig, campaign.stereo), arrays)
     fit = fitted.fit
-    turned = repeated_rad(fit, np.asarray(fit.mode.place_errors_rad)[None])[0]
+    turned = turned_by(fit.arrays, np.asarray(fit.mode.place_errors_rad)[None])[0]
     return laser_ways(fit.z, turned, fit.space, fit.arrays)
 
 
