@@ -20,11 +20,13 @@ from tvsbayes.results.estimates import PriorSensitivity
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights, weighted_mean
 
 FACTORS = 2.0, 0.5
+"""Factors on the u of a prior."""
 SENSITIVE_SHIFT = 0.2
 """Shift of a headline, in its sds, from which a prior is listed."""
 SENSITIVE_SD = 0.1
 """Relative change of a headline's sd from which it is listed."""
 LISTED = 16
+"""Largest number of changes listed."""
 K_LIMIT, ENOUGH = 0.5, 1000
 """Tail index of the new weights below which they are reliable, and least effective draws: two sds out in a posterior,
 where a prior in conflict with the data shifts it, there are few draws."""

@@ -21,6 +21,7 @@ from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 from tvsbayes.statistics.chances import one_way_chance, recursive_residuals
 
 CAUSE_BINS = 6
+"""Largest number of groups of one cause."""
 PLACEMENT_GAP = 1.03
 """Ratio of neighbouring depths above which placements differ: ten times the noise of a depth, 0.3 %."""
 CAUSE_LIMIT = 0.01

@@ -46,6 +46,7 @@ from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean,
 
 EFFECTIVE = "effective_deg_per_step"
 CLASSIC_DRAWS = 256
+"""Draws behind the predicted result of the classic estimator."""
 SEEN_SHARE = 0.5
 """Least share of draws with a finite ratio for an experiment to count, so that one outlying draw drops none."""
 LENGTH_NAMES = names_of("transmission_error_length_deg")
@@ -57,9 +58,8 @@ ABSENT_AT_ZERO = tuple(
 """Parameters that are not reported where they are fixed at 0."""
 MIXING_SEED = 11
 """Fixed seed, so that all results of one fit have the same draws row by row."""
-CURVE_POINTS = 7
-CURVE_DRAWS = 2048
-"""Draws of equal weight for a curve's points: the error of a mean is 1/45 of its sd, less than a line's width."""
+CURVE_POINTS, CURVE_DRAWS = 7, 2048
+"""Points of a curve; draws of equal weight for them: the error of a mean is 1/45 of its sd, below a line's width."""
 
 
 def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws: np.ndarray) -> Estimate:

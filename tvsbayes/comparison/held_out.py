@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 BLOCKS_MIN = 3
 """Least number of blocks for an interval."""
+HOLD_OUT_DRAWS, REGIONS = 256, 4
+"""Draws behind a prediction of the joint estimator; largest number of regions of an axis."""
 
 
 def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: dict[str, float]) -> HoldOut:
@@ -90,10 +92,6 @@ def ratio_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
     k = 1 + 2 * max(0.0, 1 - correlation**2) * coverage_factor(n - 1) ** 2 / (n - 1)
     root = np.sqrt(k**2 - 1)
     return float(ratio * np.sqrt(k - root)), float(ratio * np.sqrt(k + root))
-
-
-HOLD_OUT_DRAWS = 256
-REGIONS = 4
 
 
 def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.ndarray]:

@@ -38,12 +38,26 @@ from tvsbayes.instrument.stops import observed_stops, separation
 from tvsbayes.results.records import Record
 
 RATIOS_TRIED, RATIO_SDS = 61, 3.0
+"""Ratios by which sightings are compared with counters, up to so many u from the stated one."""
 FAR_DEG, NEARER = 5.0, 4.0
 """Median misfit of a line above which sightings do not follow their counters, and the factor by which it must fall with
 other counters to be certain."""
 LEAST = 6
 """Least number of different counters of an axis for a test."""
 LISTED = 6
+"""Largest number of sightings listed."""
+NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
+"""Possible depths of a sheet: nearer than a lens barrel or beyond a hall, the pair is mismatched."""
+SHORTEST_MM = 0.5
+"""All stated lengths of a rig are longer in mm, and shorter if given in metres."""
+CORNER_SHARE = 0.02
+"""Share of the picture's height: if all spots are nearer to the first pixel, they are not in pixels."""
+ODD_SHARE = 0.1
+"""Share of spots at impossible depths from which counters and names are not tested."""
+NOISE_OFF = 4.0
+"""Ratio of pixel noise to the stated one, either way, that a fit's prior (a factor of 1.6, log-normal) excludes."""
+SHALLOW = 1.2
+"""Ratio of the largest to the smallest depth below which the sheet had one position (the paper's: 1.6)."""
 
 
 def _misspelt(campaign: Campaign, looks: str, file: str, most: int) -> list[Finding]:
@@ -88,20 +102,6 @@ def _misfit_deg(campaign: Campaign, axis: str, steps: np.ndarray, angle_deg: np.
     mean = turned.mean(axis=1, keepdims=True)
     off = np.degrees(np.abs(np.angle(turned * np.conj(mean))))
     return float(np.median(off, axis=1).min())
-
-
-NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
-"""Possible depths of a sheet: nearer than a lens barrel or beyond a hall, the pair is mismatched."""
-SHORTEST_MM = 0.5
-"""All stated lengths of a rig are longer in mm, and shorter if given in metres."""
-CORNER_SHARE = 0.02
-"""Share of the picture's height: if all spots are nearer to the first pixel, they are not in pixels."""
-ODD_SHARE = 0.1
-"""Share of spots at impossible depths from which counters and names are not tested."""
-NOISE_OFF = 4.0
-"""Ratio of pixel noise to the stated one, either way, that a fit's prior (a factor of 1.6, log-normal) excludes."""
-SHALLOW = 1.2
-"""Ratio of the largest to the smallest depth below which the sheet had one position (the paper's: 1.6)."""
 
 
 class CampaignCheck(Record, frozen=True, tag_field="kind", tag="campaign"):

@@ -28,8 +28,8 @@ MARGIN = 1.1
 """Factor on the steps that a test of convergence predicts to be needed."""
 SETTLED = 4
 """A chain with this many times the required effective draws that still disagrees will not come to agree."""
-BLOCK = 50
-CHECKPOINT_SECONDS = 20.0
+BLOCK, CHECKPOINT_SECONDS = 50, 20.0
+"""Largest number of steps between two looks at the clock; least time between two checkpoints."""
 
 
 def lengthening(convergence: Convergence) -> float:

@@ -43,6 +43,7 @@ from tvsbayes.statistics.weighted_draws import (
 )
 
 ROUND = 1024
+"""Draws of a round."""
 PILOT_ROUNDS = 2
 """Least number of pilot rounds, where there are any; after each the proposal is fitted to all draws so far."""
 PILOT_EFFECTIVE = 200.0

@@ -21,6 +21,7 @@ from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_name
 from tvsbayes.posterior.transport import Mapped, Transport
 
 WALKERS = 64
+"""Least number of walkers in an ensemble: a whole `BATCH` in each half."""
 
 
 def walkers_for(dimension: int) -> int:

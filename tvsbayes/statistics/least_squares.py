@@ -37,8 +37,8 @@ NEWTON_SETTLED = 1e-8
 HESSIAN_KEPT = 2e-3
 """The Hessian is computed again if the mode has moved by more than this many sds; along a curved ridge it has changed
 by 1 % then."""
-QUASI_STEPS = 40
-LAPLACE_DRAWS = 2048
+QUASI_STEPS, LAPLACE_DRAWS = 40, 2048
+"""Largest number of quasi-Newton steps; number of draws of a Laplace approximation."""
 Objective = Callable[[np.ndarray], np.ndarray]
 """Negative log density of points (n, p), shape (n,); not finite where it is undefined."""
 Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residuals"]]
