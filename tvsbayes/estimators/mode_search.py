@@ -198,13 +198,14 @@ class Problem:
     def room(self, z: np.ndarray) -> Room:
         """Return the volume of geometry and cameras by scales of repeating errors, linearised at z."""
         places = self.arrays.gears.without_padding().places
-        if not len(places.steps):
-            return Room(self.space, np.zeros((len(NAMES), len(NAMES))), places.steps, places)
+        steps = np.asarray(places.steps)
+        if not len(steps):
+            return Room(self.space, np.zeros((len(NAMES), len(NAMES))), steps, places)
         lin = self.linearised(z)
         linear = linear_spots(lin, self.arrays, lin.by_coordinates(self.held))
         information = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
         ratio = np.radians(physical_at(z, self.space).value[RATIO_COLUMNS])
-        return Room(self.space, information.fisher, places.steps * ratio[places.on_tilt.astype(int)], places)
+        return Room(self.space, information.fisher, steps * ratio[places.on_tilt.astype(int)], places)
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
         """Alternate geometry and noise scales until the noise settles (formulation 4.2)."""

@@ -72,9 +72,9 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
                 times.append((end, begin, state, by_direction.ravel(), rest))
     times.sort(key=lambda each: each[:3])
     load, variance, constant = np.zeros((spots, 4, len(times))), np.zeros((len(times), 4)), np.zeros(len(times))
-    for column, (end, begin, state, by_direction, rest) in enumerate(times):
+    for column, (end, begin, state, *variances) in enumerate(times):
         load[begin:end, :, column] = linear.load[begin:end, :, state]
-        variance[column], constant[column] = by_direction, rest
+        variance[column], constant[column] = variances
     return StopStates(load.reshape(4 * spots, len(times)), variance, constant)
 
 
