@@ -77,7 +77,7 @@ def observed(source: str, seed: int) -> Observed:
             folder = Path(place) / "campaign"
             made = simulated.undetected()
             made.write(folder)
-            write_frames(folder, made, seed, views=0)
+            write_frames(folder, made, seed)
             # The cameras' sd of every coordinate as a user would have it: from the pictures alone.
             campaign = replace(detect(read_campaign(folder)).campaign, path=None)
     true = project(simulated.light.points_mm, simulated.truth.stereo, simulated.truth.parameters["focal_scale"])
@@ -205,7 +205,7 @@ def rendered(folder: Path, twin: str) -> Path:
             made = simulate(rig, shipped_plan("paper_twin"), 1, twin_of_table1.truth)
         made = made.undetected()
         made.write(place)
-        write_frames(place, made, 1, views=0)
+        write_frames(place, made, 1)
     return place
 
 

@@ -41,7 +41,7 @@ def two_looks(mounted_rig, tmp_path_factory):
     plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("move", 100, 30), ("look",))
     run = simulate(mounted_rig, plan, seed=5)
     folder = tmp_path_factory.mktemp("rendered")
-    write_frames(folder, run, 5, views=0)
+    write_frames(folder, run, 5)
     for path in (folder / "frames").iterdir():
         number, side = path.stem.split("_")
         path.rename(folder / f"{side.title()}_{int(number) + 1}.png")

@@ -6,7 +6,7 @@ are `Scene()` and `Sensor()`, the board is the paper's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from os import cpu_count
@@ -43,8 +43,8 @@ def write_with_frames(
     Args:
         folder: new, empty, or begun by the same simulation.
         simulated: what the twin did.
-        seed: see `write_frames`.
-        views: how many board views.
+        seed: seed of speckle, noise and board poses.
+        views: number of board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
         progress: receives the progress.
 
     Returns:
@@ -54,13 +54,14 @@ def write_with_frames(
         InputError: the folder holds anything else, cannot be written, or the cameras see no board together.
     """
     # Scenes that cannot be rendered are refused before anything is written.
-    poses = _board_poses(simulated, seed, views)
+    views = BOARD_VIEWS if views is None else views
+    poses = board_poses(cameras_of(simulated.truth.stereo_pair), Board(), views, seed) if views else []
     files = simulated.files()
     declaration = files.pop("campaign.toml")
     make_folder(folder, empty=not _begun(folder, files))
     for name, data in files.items():
         write_atomically(folder / name, data)
-    written = _render(folder, simulated, seed, poses, progress)
+    written = write_frames(folder, simulated, seed, poses, progress=progress)
     write_atomically(folder / "campaign.toml", declaration)
     return written
 
@@ -80,8 +81,8 @@ def write_frames(
     folder: Path,
     simulated: SimulatedCampaign,
     seed: int,
+    poses: Sequence[BoardPose] = (),
     *,
-    views: int | None = None,
     progress: Show | None = None,
 ) -> int:
     """Write `frames/000000_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
@@ -91,29 +92,16 @@ def write_frames(
     Args:
         folder: the campaign's folder, which exists.
         simulated: what the twin did.
-        seed: seed of speckle, noise and board poses.
-        views: number of board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
+        seed: seed of speckle and noise.
+        poses: those of the board, view by view; without them no `boards/` are written.
         progress: receives the progress.
 
     Returns:
         How many pictures lie there.
 
     Raises:
-        InputError: the folder cannot be written, or the cameras see no board together.
+        InputError: the folder cannot be written.
     """
-    return _render(folder, simulated, seed, _board_poses(simulated, seed, views), progress)
-
-
-def _board_poses(simulated: SimulatedCampaign, seed: int, views: int | None) -> list[BoardPose]:
-    """Draw the poses of the board, view by view."""
-    views = BOARD_VIEWS if views is None else views
-    return board_poses(cameras_of(simulated.truth.stereo_pair), Board(), views, seed) if views else []
-
-
-def _render(
-    folder: Path, simulated: SimulatedCampaign, seed: int, poses: list[BoardPose], progress: Show | None
-) -> int:
-    """Write the pictures of `write_frames`, for boards at these poses."""
     visible = cameras_of(simulated.truth.stereo_pair)
     make_folder(folder / "frames")
     if poses:

@@ -109,7 +109,7 @@ def rendered(folder: Path) -> Frames:
     twin = simulate(mounted_rig(), small_plan(("d1", "d3")), SEED)
     made = twin.undetected()
     made.write(folder)
-    write_frames(folder, made, SEED, views=0)
+    write_frames(folder, made, SEED)
     true = project(twin.light.points_mm, twin.truth.stereo, twin.truth.parameters["focal_scale"])
     campaign = read_campaign(folder)
     names = [f"{spot.spot:06d}_{side}.png" for spot in campaign.spots for side in ("left", "right")]
