@@ -23,13 +23,7 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
 from tvsbayes.instrument.sightings import Sighting
-from tvsbayes.twin.gear_errors import (
-    PERFECT,
-    draw_gear_errors,
-    drift_deg,
-    kelvin_of,
-    zero_shift_deg,
-)
+from tvsbayes.twin.gear_errors import PERFECT, draw_gear_errors, drift_deg, kelvin_of, zero_shift_deg
 from tvsbayes.twin.head_physics import sighted_angles, tilt_zero_deg
 from tvsbayes.twin.physics import (
     Light,
@@ -266,23 +260,27 @@ def look_scatter_deg(parameters: Mapping[str, float], normal: np.ndarray) -> np.
     return normal * np.array([parameters.get(f"look_scatter_deg.{axis}", 0.0) for axis in SIDES])
 
 
+def _seen_rad(log: PlanLog, truth: Truth, streams: _Streams) -> np.ndarray:
+    """Compute the angles of both axes at each look, with its scatter, shape (2, looks)."""
+    move = np.array([look.move for look in log.looks], int)
+    off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(move), 2)))
+    return np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
+
+
 def _light(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> Light:
     """Compute where each look's beam meets its sheet; NaN where it never does."""
     nominal_mm = np.array([rig.sheets_mm[name] for name in log.targets])
     sheets = placed_sheet(nominal_mm, streams.sheets.standard_normal((len(log.targets), 3)))
-    move, placement = np.array([(look.move, look.placement) for look in log.looks], int).reshape(-1, 2).T
-    off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(log.looks), 2)))
-    psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
+    placement = np.array([look.placement for look in log.looks], int)
+    psi, beta = _seen_rad(log, truth, streams)
     return light_on_sheet(psi, beta, truth.parameters, Sheet(sheets.depth_mm[placement], sheets.normal[placement]))
 
 
 def _sightings(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> tuple[Sighting, ...]:
     """Compute the sighting of each look; the noise is that of `[cameras] sighting_sd_deg`."""
-    move = np.array([look.move for look in log.looks], int)
-    off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(move), 2)))
-    psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
+    psi, beta = _seen_rad(log, truth, streams)
     directions = mirror_chain(psi, beta, truth.parameters)[1]
-    noise = truth.parameters["pixel_scale"] * rig.sighting_sd_deg * streams.pixels.standard_normal((len(move), 2))
+    noise = truth.parameters["pixel_scale"] * rig.sighting_sd_deg * streams.pixels.standard_normal((len(psi), 2))
     angles, u_deg = sighted_angles(directions, noise).tolist(), rig.sighting_sd_deg
     return tuple(
         Sighting(sighting=k, move=look.move, azimuth_deg=azimuth, elevation_deg=elevation, u_deg=u_deg)
