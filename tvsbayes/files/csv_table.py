@@ -17,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, refusal, shown
-from tvsbayes.files.disk import decode, flush_folder, line_in_file, opened
+from tvsbayes.files.disk import OTHER_PLACE, decode, flush_folder, line_in_file, opened, unwritable
 from tvsbayes.progress import Advance, unshown
 
 CSV_BYTES_MAX = 64 * 1024 * 1024
@@ -304,9 +304,7 @@ def append_line(path: Path, columns: Sequence[str], row: Sequence[object]) -> No
         if is_new:
             flush_folder(path.parent)
     except OSError as error:
-        found, allowed = escaped(error.strerror or str(error)), "a writable file on a disk with free space"
-        remedy = "name another place or free this one"
-        raise refusal("write", file=file, found=found, allowed=allowed, remedy=remedy) from error
+        raise unwritable(path, error, "a writable file on a disk with free space", OTHER_PLACE) from error
 
 
 def _write_all(descriptor: int, data: bytes, size: int) -> None:

@@ -184,6 +184,15 @@ def flush_folder(folder: Path, disk: Flushing = os) -> None:
         disk.close(descriptor)
 
 
+OTHER_PLACE = "name another place or free this one"
+
+
+def unwritable(path: Path, error: OSError, allowed: str, remedy: str) -> InputError:
+    """The refusal of a place that cannot be written."""
+    found = escaped(error.strerror or str(error))
+    return refusal("write", file=escaped(str(path), 200), found=found, allowed=allowed, remedy=remedy)
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Replace `path` by `data` so that a reader, or a crash, leaves the old file or the new one, never a part.
 
@@ -217,9 +226,7 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
         # The new name is durable only once its folder is flushed.
         flush_folder(path.parent)
     except OSError as error:
-        found, allowed = escaped(error.strerror or str(error)), "a writable folder with free space"
-        remedy, file = "name another place or free this one", escaped(str(path), 200)
-        raise refusal("write", file=file, found=found, allowed=allowed, remedy=remedy) from error
+        raise unwritable(path, error, "a writable folder with free space", OTHER_PLACE) from error
 
 
 def remove_unfinished(folder: Path, names: Iterable[str]) -> list[str]:
@@ -248,16 +255,15 @@ def make_folder(folder: Path, *, empty: bool = False) -> None:
     Raises:
         InputError: the folder cannot be created, or is not empty.
     """
-    shown_path = escaped(str(folder), 200)
+    allowed = "a new or empty folder"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         occupied = empty and any(folder.iterdir())
     except OSError as error:
-        found, allowed = escaped(error.strerror or str(error)), "a new or empty folder"
-        raise refusal("write", file=shown_path, found=found, allowed=allowed, remedy="name another") from error
+        raise unwritable(folder, error, allowed, "name another") from error
     if occupied:
-        allowed, remedy = "a new or empty folder", "name another folder; nothing is overwritten"
-        raise refusal("occupied", file=shown_path, found="a folder with files", allowed=allowed, remedy=remedy)
+        file, remedy = escaped(str(folder), 200), "name another folder; nothing is overwritten"
+        raise refusal("occupied", file=file, found="a folder with files", allowed=allowed, remedy=remedy)
 
 
 def require_writable(folder: Path) -> None:
@@ -275,9 +281,8 @@ def require_writable(folder: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=next(path for path in (folder, *folder.absolute().parents) if path.exists())).close()
     except OSError as error:
-        found, allowed = escaped(error.strerror or str(error)), "a folder that can be written"
-        remedy, shown_path = "free it, or name another place where the command has --out", escaped(str(folder), 200)
-        raise refusal("write", file=shown_path, found=found, allowed=allowed, remedy=remedy) from error
+        remedy = "free it, or name another place where the command has --out"
+        raise unwritable(folder, error, "a folder that can be written", remedy) from error
 
 
 def output_place(folder: Path, *names: str) -> Path:

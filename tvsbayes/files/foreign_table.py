@@ -222,11 +222,7 @@ def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int,
     The names are in the first row that is at least as wide as most rows, and are not numbers. It may be wider: a last
     column of remarks is empty in most rows.
     """
-
-    def width(cells: Sequence[str]) -> int:
-        return max((k for k, cell in enumerate(cells, start=1) if cell), default=0)
-
-    filled = [(width(cells), k) for k, (_, cells) in enumerate(rows) if any(cells)]
+    filled = [(_filled_width(cells), k) for k, (_, cells) in enumerate(rows) if any(cells)]
     commonest = Counter(count for count, _ in filled).most_common(1)
     if not commonest or commonest[0][0] < 2 or 2 * commonest[0][1] <= len(filled):
         return rows, []
@@ -239,6 +235,11 @@ def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int,
     text = " ".join(cell for cell in rows[heading[0]][1] if cell)
     amount = f"{len(heading)} lines" if len(heading) > 1 else "a line"
     return rows[first:], [f'{amount} above the names left out ("{escaped(text, 40)}")']
+
+
+def _filled_width(cells: Sequence[str]) -> int:
+    """Number of cells up to the last that is not empty."""
+    return max((k for k, cell in enumerate(cells, start=1) if cell), default=0)
 
 
 def _is_number(cell: str) -> bool:
@@ -284,10 +285,7 @@ def _refuse_wide(rows: Sequence[tuple[int, list[str]]], separator: str, file: st
     filled = [(line, cells) for line, cells in rows if any(cells)]
     width = len(filled[0][1]) if filled else 0
     for line, cells in filled:
-        count = len(cells)
-        while count > width and not cells[count - 1]:
-            count -= 1
-        if count <= width:
+        if (count := _filled_width(cells)) <= width:
             continue
         found = f"{count} cells under the {width} {'name' if width == 1 else 'names'} of line {filled[0][0]}"
         remedy = _WIDE.get(separator, "a separator inside a cell? put such cells in quotes; or a name is missing")
