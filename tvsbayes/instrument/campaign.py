@@ -410,18 +410,22 @@ def _in_image(table: Table, values: Values, stereo: Stereo) -> None:
     for column, centres in zip(PIXELS, pixels, strict=True):
         extent = float(stereo.image_width if column[0] == "u" else stereo.image_height)
         for row, value in enumerate(centres):
-            if statuses[row] == "ok" and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
+            if statuses[row] == "ok" and not _near(value, extent):
                 allowed = f"a position in the image, 0 to {extent:g} px, or close to it"
                 remedy = _outside_remedy(centres, extent, _exchanged(pixels, statuses, stereo))
                 raise table.refuse(row, column, "outside-image", allowed, remedy)
+
+
+def _near(value: float | None, extent: float) -> bool:
+    """Whether a centroid, if there is one, lies in the image or close to it."""
+    return value is None or -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN
 
 
 def _outside_remedy(values: Sequence[float | None], extent: float, exchanged: bool) -> str:
     """The remedy for pixels outside the image: correct a column, a cell, or the size of the pictures."""
     if exchanged:
         return "u and v are exchanged: u counts columns to the right, v rows down"
-    outside = sum(value is not None and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value in values)
-    if outside < 0.05 * len(values):
+    if sum(not _near(value, extent) for value in values) < 0.05 * len(values):
         return "correct the cell (a decimal point left out?), or give the spot a refusal reason"
     return "check the image size in stereo.json, or give the spot a refusal reason"
 
@@ -429,13 +433,12 @@ def _outside_remedy(values: Sequence[float | None], extent: float, exchanged: bo
 def _exchanged(pixels: Sequence[Sequence[float | None]], statuses: Sequence[str], stereo: Stereo) -> bool:
     """Whether all usable spots lie in the images once u and v of a row are exchanged; columns as in `PIXELS`."""
     extents = (stereo.image_height, stereo.image_width) * 2
-    cells = [
-        (column[row], extent)
+    return all(
+        _near(column[row], extent)
         for column, extent in zip(pixels, extents, strict=True)
         for row, status in enumerate(statuses)
         if status == "ok"
-    ]
-    return all(value is None or -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value, extent in cells)
+    )
 
 
 _BYTES_MAX = {".json": JSON_BYTES_MAX, ".csv": CSV_BYTES_MAX, ".toml": TOML_BYTES_MAX}

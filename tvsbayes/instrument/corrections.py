@@ -15,6 +15,7 @@ from typing import Any
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Look, Move, Spot, stereo_spots
+from tvsbayes.instrument.column_names import COUNTERS
 
 _SHIFT = re.compile(r"([+-]?[0-9]{1,9})(?:@([0-9]{1,9}))?")
 
@@ -66,11 +67,9 @@ def flipped_axis(text: str) -> Axis:
     Raises:
         InputError: no counter has this name.
     """
-    for axis in AXES:
-        if text == f"{axis}_steps":
-            return axis
-    allowed = ", ".join(f"{axis}_steps" for axis in AXES)
-    remedy = f"write --flip {AXES[0]}_steps, --flip {AXES[1]}_steps, or both"
+    if text in COUNTERS:
+        return AXES[COUNTERS.index(text)]
+    allowed, remedy = ", ".join(COUNTERS), f"write --flip {COUNTERS[0]}, --flip {COUNTERS[1]}, or both"
     raise InputError("usage", f"--flip {escaped(text)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
 
 
@@ -133,13 +132,9 @@ def _absolute(moves: tuple[Move, ...]) -> tuple[Move, ...]:
     """Absolute counters from the steps of each move; the first row of a segment has those after homing."""
     absolute = list(moves[:1])
     for previous, move in pairwise(moves):
-        start = absolute[-1] if move.segment == previous.segment else None
-        counters = {} if start is None else {n: getattr(start, n) + getattr(move, n) for n in _COUNTERS}
-        absolute.append(replace(move, **counters))
+        names = COUNTERS if move.segment == previous.segment else ()
+        absolute.append(replace(move, **{name: getattr(absolute[-1], name) + getattr(move, name) for name in names}))
     return tuple(absolute)
-
-
-_COUNTERS = tuple(f"{axis}_steps" for axis in AXES)
 
 
 def _shifted(spots: tuple[Look, ...], shift: Shift, count: int | None) -> tuple[tuple[Look, ...], str]:

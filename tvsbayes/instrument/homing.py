@@ -6,12 +6,13 @@ has one such hypothesis ("way"). A single unknown among recorded homings stays "
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
+from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign, Move
 
 ANYWHERE = "anywhere"
@@ -29,8 +30,7 @@ def unrecorded(moves: Sequence[Move]) -> tuple[str, ...]:
 
 def ways(axis: str) -> dict[str, float]:
     """Possible ways of homing of an axis, with their prior probabilities."""
-    sides = (side for side, (side_axis, _) in DIRECTION_SIGNS.items() if side_axis == axis)
-    return {**dict.fromkeys(sides, ONE_SIDED_CHANCE), ANYWHERE: 1 - 2 * ONE_SIDED_CHANCE}
+    return {**dict.fromkeys(reversed(SIDES[axis]), ONE_SIDED_CHANCE), ANYWHERE: 1 - 2 * ONE_SIDED_CHANCE}
 
 
 def every_way(axes: Sequence[str]) -> list[dict[str, str]]:
@@ -40,10 +40,7 @@ def every_way(axes: Sequence[str]) -> list[dict[str, str]]:
 
 def prior_chance(sides: Sides) -> float:
     """Prior probability of a combination: axes are independent."""
-    chance = 1.0
-    for axis, side in sides.items():
-        chance *= ways(axis)[side]
-    return chance
+    return math.prod((ways(axis)[side] for axis, side in sides.items()), start=1.0)
 
 
 def homed(campaign: Campaign, sides: Sides) -> Campaign:

@@ -208,30 +208,39 @@ COLUMNS: dict[str, int] = INDEX | {term.name: INDEX[name] for name, term in HEAD
 """Coordinates of parameters, including those of heads."""
 BLOCKS = REGISTRY.blocks
 """Names by block; the parameters of a block are consecutive."""
+
+
+def names_of(*blocks: str) -> tuple[str, ...]:
+    """Names of the parameters of blocks, in the order of the arguments."""
+    return tuple(name for block in blocks for name in BLOCKS[block])
+
+
 RIG_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place != "stereo")
 """Parameters with a prior in `[rig]`; they come first."""
 RIG_PRIORS: dict[str, Prior] = {name: REGISTRY[name].prior for name in RIG_NAMES}
 STEREO_PARAMETER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place == "stereo")
 """The 24 stereo parameters in the order of `parameter_covariance` of a stereo file."""
-HARMONIC_NAMES: tuple[str, ...] = BLOCKS["harmonic_deg"]
+HARMONIC_NAMES = names_of("harmonic_deg")
 """Transmission error by axis, order and phase."""
-AMPLITUDE_NAMES: tuple[str, ...] = BLOCKS["harmonic_amplitude_deg"]
+AMPLITUDE_NAMES = names_of("harmonic_amplitude_deg")
 """Amplitudes of the periodic parts of the transmission error by axis and number of the stated period."""
-GEAR_ERROR_NAMES: tuple[str, ...] = (
-    *BLOCKS["transmission_error_deg"],
-    *BLOCKS["transmission_error_length_deg"],
-    *BLOCKS["play_variation_deg"],
-    *BLOCKS["drift_deg_per_root_hour"],
-    *AMPLITUDE_NAMES,
+GEAR_ERROR_NAMES = names_of(
+    *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
+    "harmonic_amplitude_deg",
 )
 """Scales of the gears' errors that repeat by position, of play that varies and of zeros that drift."""
-LOOK_SCATTER_NAMES: tuple[str, ...] = BLOCKS["look_scatter_deg"]
+OPTICS_NAMES = names_of(
+    *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
+    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
+)
+"""Geometry of the beam's path through the positioner; all but the first are zero in the nominal rig."""
+LOOK_SCATTER_NAMES = names_of("look_scatter_deg")
 """Sds of the deviation of the beam's angle at a look from the angle of the axis."""
-CREEP_NAMES: tuple[str, ...] = (*BLOCKS["creep_deg"], *BLOCKS["creep_minutes"])
+CREEP_NAMES = names_of("creep_deg", "creep_minutes")
 """Creep of the zeros during warm-up, and its time constant, which both zeros share."""
-ZERO_SHIFT_NAMES: tuple[str, ...] = (*CREEP_NAMES, *BLOCKS["thermal_deg_per_K"])
+ZERO_SHIFT_NAMES = names_of("creep_deg", "creep_minutes", "thermal_deg_per_K")
 """Shifts of the zeros in time and with the temperature."""
-LATE_NAMES: tuple[str, ...] = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
+LATE_NAMES = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
 """Parameters that earlier versions did not have: files omit them where they have their defaults."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
@@ -241,18 +250,6 @@ HEADLINES = tuple(quantity for quantity in QUANTITIES.values() if quantity.headl
 TARGETS = {quantity.target: quantity for quantity in HEADLINES if quantity.target}
 """Headlines that plans and studies may target, by their target names."""
 TARGET_ROWS = {target: row for row, target in enumerate(TARGETS)}
-
-
-def names_of(*blocks: str) -> tuple[str, ...]:
-    """Names of the parameters of blocks, in the order of the arguments."""
-    return tuple(name for block in blocks for name in BLOCKS[block])
-
-
-OPTICS_NAMES: tuple[str, ...] = names_of(
-    *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
-    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
-)
-"""Geometry of the beam's path through the positioner; all but the first are zero in the nominal rig."""
 
 
 def parameter_of(name: str) -> Parameter | None:

@@ -144,11 +144,8 @@ def _has_period(name: str, period_deg: Mapping[str, tuple[float, ...]]) -> bool:
 
 def _without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> str | None:
     """The first periodic parameter that is not fixed at 0 and whose period is unstated."""
-    for name in PERIODIC_NAMES:
-        prior = priors.get(name)
-        if prior is not None and (prior.value != 0 or prior.u != 0) and not _has_period(name, period_deg):
-            return name
-    return None
+    free = (name for name in PERIODIC_NAMES if name in priors and (priors[name].value != 0 or priors[name].u != 0))
+    return next((name for name in free if not _has_period(name, period_deg)), None)
 
 
 def _period_remedy(name: str) -> str:
@@ -330,10 +327,7 @@ def rig_table_toml(table: RigTable) -> str:
         return toml_line(name, {"value": float(prior.value), "u": float(prior.u)})
 
     kind = table.mechanism
-    scanner = kind is TWO_MIRROR
-    convention = toml_line(
-        *(("aperture_convention", table.aperture_convention) if scanner else ("mechanism", kind.word))
-    )
+    own = ("aperture_convention", table.aperture_convention) if kind is TWO_MIRROR else ("mechanism", kind.word)
     stated = {name: table.harmonic_period_deg.get(axis, ()) for name, axis in _PERIOD_NAMES.items()}
     periods = [
         toml_line(name, {"value": numbers[0] if len(numbers) == 1 else numbers, "u": 0.0})
@@ -344,7 +338,7 @@ def rig_table_toml(table: RigTable) -> str:
     declared = map(entry, _names_at("rig", kind))
     omitted = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
     priors = (entry(name) for name in _names_at("rig.prior", kind) if name not in {*PERIODIC_NAMES, *omitted})
-    return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *periodic]) + "\n"
+    return "\n".join(["[rig]", *declared, *periods, toml_line(*own), "[rig.prior]", *priors, *periodic]) + "\n"
 
 
 COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
@@ -371,11 +365,10 @@ def _parse_options(table: Keys) -> dict[str, Setting]:
             values[f"options.{key}"] = options.text_value(key)
         elif isinstance(value, bool):
             values[f"options.{key}"] = int(value)
+        elif isinstance(value, int):
+            values[f"options.{key}"] = options.integer(key, -(2**53), 2**53)
         else:
-            is_integer = isinstance(value, int)
-            values[f"options.{key}"] = (
-                options.integer(key, -(2**53), 2**53) if is_integer else options.number(key, -1e300, 1e300)
-            )
+            values[f"options.{key}"] = options.number(key, -1e300, 1e300)
     return values
 
 
