@@ -112,20 +112,21 @@ def sightings_of_table(
     table, units = plain.table, plain.units
     cells_of = FieldCells(table, columns)
     listing = moves_of_rows(cells_of, notation, assumed)
-    angles = []
-    for field in (*ANGLES, *(["u_deg"] * ("u_deg" in columns))):
+    angles: dict[str, list[float | None]] = {}
+    for field in (name for name in (*ANGLES, "u_deg") if name in columns):
         scale, column = DEGREES[units[field]], SIGHTINGS[field]
         read = cells_of.read(column, column.low / scale, column.high / scale, optional=True)
-        angles.append([None if value is None else scale * value for value in read])
-    stated_u = angles[2] if len(angles) > 2 else [U_DEG if u_deg is None else u_deg] * len(table)
+        angles[field] = [None if value is None else scale * value for value in read]
     if "u_deg" not in columns:
+        u = U_DEG if u_deg is None else u_deg
+        angles["u_deg"] = [u] * len(table)
         how = "; --assume u_deg=NUMBER states another, and the fit finds the scale"
-        assumed.append(f"standard uncertainty of a sighting: {stated_u[0]:g} deg{how}")
+        assumed.append(f"standard uncertainty of a sighting: {u:g} deg{how}")
     statuses, sightings = cells_of.text("status"), []
-    for row, (azimuth, elevation, u) in enumerate(zip(*angles[:2], stated_u, strict=True)):
-        if azimuth is None and elevation is None and not statuses[row]:
+    for row in range(len(table)):
+        values = {field: column[row] for field, column in angles.items()}
+        if not statuses[row] and all(values[field] is None for field in ANGLES):
             continue
-        values = {"azimuth_deg": azimuth, "elevation_deg": elevation, "u_deg": u}
         sightings.append(
             Sighting(
                 sighting=row,
