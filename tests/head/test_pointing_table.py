@@ -89,3 +89,9 @@ def test_broken_blocks_are_left_out_and_malformed_ones_refused(tmp_path):
     path.write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="begin with CAT:"):
         read_stars(path)
+
+
+def test_a_head_without_sightings_has_nothing_to_estimate(ask, tmp_path):
+    assert ask("new", tmp_path / "head", "--mechanism", "pan-tilt", "--sightings")[0] == 0
+    code, document = ask("classic", tmp_path / "head")
+    assert (code, document["error"]["code"]) == (3, "too-few-sightings")

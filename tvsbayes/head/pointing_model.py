@@ -107,7 +107,7 @@ def pointing_model(campaign: Campaign) -> PointingModel:
     names = tuple(n for n in values if priors[n].u > (RATIO_KNOWN * abs(priors[n].value) if n in RATIOS else 0.0))
     steps, angles = _steps(campaign, rows), sighted_deg(rows)
     # A single counter of an axis determines its zero but no ratio.
-    names = tuple(n for n in names if n not in RATIOS or np.ptp(steps[:, RATIOS.index(n)]) > 0)
+    names = tuple(n for n in names if n not in RATIOS or len(np.unique(steps[:, RATIOS.index(n)])) > 1)
     if 2 * len(rows) <= len(names):
         raise NothingToEstimate(
             "too-few-sightings",
