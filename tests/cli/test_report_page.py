@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from tvsbayes.cli.report_page import DRAWING, PRINTING, written_page
+from tvsbayes.cli.report_page import DRAWING, PRINTING, WrittenPage, written_page
 from tvsbayes.errors import InputError
 
 
@@ -49,3 +50,15 @@ def test_a_missing_browser_is_known_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
     with pytest.raises(InputError, match="--pdf needs one of"):
         written_page(tmp_path, None, True, {DRAWING: 1.0}, lambda job: pytest.fail("made"))
+
+
+def test_what_makes_a_removed_file_again_is_what_there_is(capsys):
+    """`calibrate` has no --dcc, and an axis no certificate."""
+    page = WrittenPage("N1", b"", Path("r/report.html"), {"report": "r/report.html"}, ["report.pdf", "dcc.xml"])
+    page.report_removed(certificates=True)
+    assert "removed: report.pdf, dcc.xml" in (told := capsys.readouterr().err)
+    assert "`tvsbayes report --pdf` or `--dcc`" in told
+    page.report_removed()
+    assert "`tvsbayes report --pdf`" in (told := capsys.readouterr().err) and "--dcc" not in told
+    WrittenPage("N1", b"", page.path, {"pdf": "r/report.pdf"}, ["report.pdf"]).report_removed()
+    assert not capsys.readouterr().err

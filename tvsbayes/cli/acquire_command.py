@@ -22,8 +22,8 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
-from tvsbayes.cli.head_commands import refuse_sightings
 from tvsbayes.errors import InputError, escaped
+from tvsbayes.pipeline import compile_for, no_output, unusable
 
 if TYPE_CHECKING:
     from tvsbayes.acquisition.live_run import LiveRun
@@ -109,7 +109,7 @@ def acquire(
         refuse_options("for --live", "add --live, or leave it out", port=port, no_browser=no_browser)
     check_order(rig, plan)
     instrument = read_rig(rig)
-    refuse_sightings(instrument.table.mechanism.sightings)
+    _refuse_sightings(instrument.table.mechanism.sightings)
     steps = read_plan(plan)
     if dry_run:
         run_options = {"live": live, "place_command": place_command}
@@ -159,7 +159,6 @@ def laplace_estimate(folder: Path, looks: int) -> Estimate:
     from tvsbayes.assessment.summary import summarise
     from tvsbayes.estimators.joint_fit import fit
     from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.pipeline import compile_for, no_output, unusable
 
     compile_for(no_output)
     summary = summarise(fit(read_campaign(folder)))
@@ -178,7 +177,6 @@ def propose_looks(rig: Path, folder: Path, looks: int, target_u: float, count: i
     from tvsbayes.estimators.joint_fit import fit
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.rig import read_rig
-    from tvsbayes.pipeline import compile_for, no_output
     from tvsbayes.planning.next_looks import next_looks
     from tvsbayes.planning.target import parse_target
 
@@ -200,6 +198,18 @@ def proposal_of(chosen: NextLooks, looks: int) -> Ahead:
         return Ahead(laplace, proposal)
     sampled = Estimate.of(looks, confirmed.effective_deg_per_step, confirmed.tier)
     return Ahead(laplace, proposal, sampled, confirmed.accepted)
+
+
+def _refuse_sightings(sightings: bool) -> None:
+    """Refuse the rig file of a head with sightings for `acquire`, since it has no stereo pair.
+
+    Raises:
+        InputError: `sightings`.
+    """
+    if sightings:
+        message = "acquire looks at spots through a stereo pair, and this head says where it points"
+        remedy = "check RIG PLAN, drive the plan yourself, then `tvsbayes import LOG --sightings --to FOLDER`"
+        raise InputError("usage", message, remedy=f"{remedy}; the twin of the head: simulate RIG PLAN FOLDER")
 
 
 @contextmanager

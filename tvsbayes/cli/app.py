@@ -6,7 +6,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -131,17 +131,24 @@ def print_part(text: str, as_json: bool) -> None:
         _print(f"{text}\n")
 
 
-def report_removed(names: Iterable[str], written: Mapping[str, str], *, certificates: bool = True) -> None:
-    """Report the removed files of an earlier page, except those written again; an axis has no certificates."""
-    removed = [name for name in names if name not in {Path(place).name for place in written.values()}]
-    if removed:
-        command = "`tvsbayes report --pdf`" + " or `--dcc`" * certificates
-        report_line(f"removed: {', '.join(removed)}, made of an earlier report; {command} makes them again")
-
-
 def command_line(*words: object) -> str:
     """The text of a command, its words quoted where a shell needs it."""
     return "tvsbayes " + " ".join(typed(word, 400) for word in words)
+
+
+def write_files(to: Path, files: Mapping[str, bytes]) -> list[str]:
+    """Write files by name into a folder; returns their paths."""
+    for name, data in files.items():
+        write_atomically(to / name, data)
+    return [str(to / name) for name in files]
+
+
+def write_new(out: Path, files: Mapping[str, bytes], next_steps: str, as_json: bool) -> None:
+    """Write the files of an empty campaign into a new folder, and print them with the next steps."""
+    make_folder(out, empty=True)
+    write_files(out, files)
+    text = f"{escaped(str(out), 200)}: {', '.join(files)}\nnext: {next_steps}"
+    finish({"campaign": str(out), "files": list(files)}, text, as_json)
 
 
 def keep(document: Mapping[str, Any], path: Path) -> bool:
@@ -153,6 +160,14 @@ def keep(document: Mapping[str, Any], path: Path) -> bool:
         report_line(f"warning: not kept for the report: {error.message}")
         return False
     return True
+
+
+def finish_kept(document: Mapping[str, Any], text: str, path: Path, as_json: bool) -> None:
+    """Print a result that is kept for a later report, with its file."""
+    files: dict[str, str] = {}
+    if keep(document, path):
+        files, text = {path.stem: str(path)}, f"{text}\nwritten: {path}"
+    finish({**document, "files": files}, text, as_json)
 
 
 PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv", "log.jsonl")
@@ -168,9 +183,26 @@ def is_part(path: Path) -> bool:
 
 def refuse_options(reason: str, remedy: str, **given: object) -> None:
     """Refuse options that this use of a command would ignore; None and False are options not given."""
-    names = ["--" + name.replace("_", "-") for name, value in given.items() if value is not None and value is not False]
+    names = [option_of(name) for name, value in given.items() if value is not None and value is not False]
     if names:
         raise InputError("usage", f"{' and '.join(names)} {'are' if len(names) > 1 else 'is'} {reason}", remedy=remedy)
+
+
+def check_word(option: str, given: str | None, allowed: Collection[str], remedy: str) -> None:
+    """Refuse a word that an option does not take; None is an option not given."""
+    if given is not None and given not in allowed:
+        names = ", ".join(allowed)
+        raise InputError("usage", f"{option} {escaped(given)}; allowed: {names}", allowed=names, remedy=remedy)
+
+
+def missing_options(**given: object) -> list[str]:
+    """The options that are not given."""
+    return [option_of(name) for name, value in given.items() if value is None]
+
+
+def option_of(name: str) -> str:
+    """The option of a parameter: `--pan-steps` of pan_steps."""
+    return f"--{name.replace('_', '-')}"
 
 
 def check_order(rig: Path, plan: Path) -> None:
@@ -200,6 +232,5 @@ def finite(**values: float | None) -> None:
     """Refuse NaN and infinity, which option parsing accepts."""
     for name, value in values.items():
         if value is not None and not math.isfinite(value):
-            option = "--" + name.replace("_", "-")
-            allowed, remedy = "a finite number", "write a decimal number"
+            option, allowed, remedy = option_of(name), "a finite number", "write a decimal number"
             raise InputError("number", f"{option} is {value}", column=option, allowed=allowed, remedy=remedy)

@@ -10,19 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import command_line, finish, keep, report_line
+from tvsbayes.cli.app import command_line, finish, finish_kept, keep, report_line, write_new
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
-from tvsbayes.files.disk import make_folder, output_place, write_atomically
+from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.files.disk import output_place, read_bytes, write_atomically
 from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
 from tvsbayes.results.records import plain
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, axis_templates, parse_axis_moves, read_axis
+from tvsbayes.single_axis.axis_rows import rows_of
 
 if TYPE_CHECKING:
     from tvsbayes.report.document import Document, Issue
-    from tvsbayes.single_axis.axis_campaign import AxisCampaign
     from tvsbayes.single_axis.axis_record import AxisSummary
 
 FITTING, PLANNING = "fit", "choosing stops"
@@ -30,22 +32,13 @@ FITTING, PLANNING = "fit", "choosing stops"
 
 def new(out: Path, as_json: bool) -> None:
     """Write an empty axis folder, explained in campaign.toml."""
-    from tvsbayes.single_axis.axis_campaign import axis_templates
-
-    make_folder(out, empty=True)
-    names = list(files := axis_templates())
-    for name, data in files.items():
-        write_atomically(out / name, data)
-    text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
-    text += "next: log moves and readings, then `tvsbayes check` this folder, then `tvsbayes fit`"
-    finish({"campaign": str(out), "files": names}, text, as_json)
+    next_steps = "log moves and readings, then `tvsbayes check` this folder, then `tvsbayes fit`"
+    write_new(out, axis_templates(), next_steps, as_json)
 
 
 def contents(folder: Path) -> dict[str, Any]:
     """The document of `check` for an axis folder."""
-    from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_doubts import axis_warnings
-    from tvsbayes.single_axis.axis_rows import rows_of
 
     data = read_axis(folder)
     commands = [m.command for m in data.moves]
@@ -68,20 +61,17 @@ def contents(folder: Path) -> dict[str, Any]:
 
 def classic(folder: Path, as_json: bool) -> None:
     """Print the least-squares line with one reversal, and ISO 230-2."""
-    from tvsbayes.single_axis.axis_campaign import read_axis
-
-    document, text = _classic(read_axis(folder))
-    finish(document, text, as_json)
+    part = _classic(read_axis(folder))
+    finish(part.document or {}, part.text, as_json)
 
 
-def _classic(data: AxisCampaign) -> tuple[dict[str, Any], str]:
-    """The result of `classic`, as a document and as text."""
+def _classic(data: AxisCampaign) -> Part:
+    """The result of `classic`."""
     from tvsbayes.report.axis_document import classic_text
-    from tvsbayes.single_axis.axis_rows import rows_of
     from tvsbayes.single_axis.classic_line import classic_axis
 
     line = classic_axis(rows_of(data))
-    return {"unit": data.unit, **plain(line)}, classic_text(line, data.unit)
+    return Part("classic", {"unit": data.unit, **plain(line)}, classic_text(line, data.unit))
 
 
 def fit(
@@ -97,7 +87,6 @@ def fit(
 ) -> None:
     """Fit an axis; write results into its folder or `out`."""
     from tvsbayes.report.axis_document import axis_fit_text
-    from tvsbayes.single_axis.axis_campaign import read_axis
 
     place = out or output_place(folder, "results")
     stored = _kept_fit(read_axis(folder), place, quick, no_sample, max_minutes, seed)
@@ -147,12 +136,11 @@ def _parts(folder: Path, issue: Issue, quick: bool, no_sample: bool, seed: int, 
     """The parts of `calibrate`; options as of it."""
     from tvsbayes.report.axis_document import axis_fit_text
     from tvsbayes.report.command_text import check_text
-    from tvsbayes.single_axis.axis_campaign import read_axis
 
     data = read_axis(folder)
     check = contents(folder)
     yield Part("check", check, check_text(check))
-    yield Part("classic", *_classic(data))
+    yield _classic(data)
     stored = _kept_fit(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)
     text = axis_fit_text(stored.summary, written=list(stored.files.values()))
     yield Part("fit", stored.as_json(seed), text, stored.error)
@@ -168,7 +156,6 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
         raise InputError("usage", message, remedy="leave out B")
     from tvsbayes.report.axis_document import axis_hold_out_text
     from tvsbayes.results.comparison_record import hold_out_document
-    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.held_out_positions import hold_out_positions
 
     if by not in (None, "positions"):
@@ -178,16 +165,12 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
     with waiting() as progress:
         holdout = hold_out_positions(data, seed, progress)
     document = hold_out_document(holdout, data.unit) | {"inputs": axis_hashes(data), "seed": seed}
-    files, text = {}, axis_hold_out_text(holdout, data.unit)
-    if keep(document, path := output_place(folder, "results") / "compare.json"):
-        files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"
-    finish({**document, "files": files}, text, as_json)
+    place = output_place(folder, "results") / "compare.json"
+    finish_kept(document, axis_hold_out_text(holdout, data.unit), place, as_json)
 
 
 def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:
     """Write the page of an axis."""
-    from tvsbayes.single_axis.axis_campaign import read_axis
-
     _page(read_axis(folder), folder, issue, pdf, out).finish(as_json)
 
 
@@ -195,7 +178,6 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
     """Write the page of an axis, and print it with `pdf`."""
     from tvsbayes.report.axis_document import axis_document, curve_commands
     from tvsbayes.single_axis.axis_record import results_for
-    from tvsbayes.single_axis.axis_rows import rows_of
 
     def make(job: Job) -> Document:
         commands = rows_of(data).command
@@ -215,7 +197,6 @@ def plan(
         message, remedy = "an axis is planned from its folder alone", "give --given FOLDER without RIG"
         raise InputError("usage", message, remedy=remedy)
     from tvsbayes.report.axis_document import axis_plan_text
-    from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.next_stops import TARGETS, plan_next, unit_of
 
@@ -242,9 +223,6 @@ def plan(
 
 def simulate(folder: Path, *, moves: Path | None, out: Path, seed: int, as_json: bool) -> None:
     """Simulate a random axis from the priors of a folder, with the listed moves."""
-    from tvsbayes.files.csv_table import CSV_BYTES_MAX
-    from tvsbayes.files.disk import read_bytes
-    from tvsbayes.single_axis.axis_campaign import parse_axis_moves, read_axis
     from tvsbayes.twin.simulated_axis import simulate_axis
 
     template = read_axis(folder)

@@ -5,19 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from tvsbayes.cli.app import finish, refuse_options
-from tvsbayes.cli.confirmed_import import Import, write_files
+from tvsbayes.cli.app import finish, refuse_options, write_files
+from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
-from tvsbayes.files.disk import make_folder
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
+from tvsbayes.files.disk import make_folder, read_bytes
 from tvsbayes.files.documents import toml_line
-
-if TYPE_CHECKING:
-    from tvsbayes.files.foreign_table import ForeignTable
-    from tvsbayes.single_axis.foreign_readings import ForeignReadings, LoggedDrive
-    from tvsbayes.single_axis.guide_log import GuideRun
+from tvsbayes.files.foreign_table import ForeignTable, read_foreign, text_of
+from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
+from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, axis_templates, readings_bytes, unit_of_folder
+from tvsbayes.single_axis.foreign_columns import deviation_columns, long_table, refuse_small
+from tvsbayes.single_axis.foreign_readings import (
+    AXIS_FIELDS,
+    ForeignReadings,
+    LoggedDrive,
+    map_axis_columns,
+    readings_of,
+    unwrapped,
+)
+from tvsbayes.single_axis.guide_log import GuideRun, is_guide_log, read_runs, readings_of_run, run_rows
+from tvsbayes.single_axis.joined_series import camonitor_table, is_camonitor, is_klipper, klipper_table
 
 KINDS = ("csv", "phd2", "epics", "klipper")
 """Kinds of files of an axis: tables, guide logs, series logged by camonitor or Klipper."""
@@ -68,12 +78,6 @@ def import_readings(
 
     Returns None where the runs of a log were listed instead.
     """
-    from tvsbayes.files.csv_table import CSV_BYTES_MAX
-    from tvsbayes.files.disk import read_bytes
-    from tvsbayes.files.foreign_table import read_foreign, text_of
-    from tvsbayes.single_axis.guide_log import is_guide_log, read_runs
-    from tvsbayes.single_axis.joined_series import camonitor_table, is_camonitor, is_klipper, klipper_table
-
     data, name = read_bytes(file, CSV_BYTES_MAX), escaped(file.name)
     packed = data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"\x1f\x8b"))
     text = "" if packed else data.decode("utf-8-sig", errors="replace")
@@ -139,7 +143,6 @@ def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_
         InputError: --yes without the number of a run.
     """
     from tvsbayes.report.tables import TableView
-    from tvsbayes.single_axis.guide_log import run_rows
 
     rows = run_rows(runs)
     longest = max(rows, key=lambda row: row["minutes"])["run"]  # type: ignore[arg-type, return-value]
@@ -157,8 +160,6 @@ def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_
 
 def _read_run(runs: Sequence[GuideRun], file: Path, options: FileOptions) -> _ReadFile:
     """One run of a guide log."""
-    from tvsbayes.single_axis.guide_log import readings_of_run, run_rows
-
     number = 1 if options.run is None else options.run
     if not 1 <= number <= len(runs):
         message = f"--run {number}: {escaped(file.name)} holds {len(runs)} runs; allowed: 1 to {len(runs)}"
@@ -179,12 +180,6 @@ def _read_table(table: ForeignTable, stated: Mapping[str, str], options: FileOpt
     Raises:
         InputError: missing or ambiguous columns, or cells that are not valid.
     """
-    from tvsbayes.files.csv_table import NUMBER
-    from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
-    from tvsbayes.single_axis.axis_campaign import unit_of_folder
-    from tvsbayes.single_axis.foreign_columns import deviation_columns, long_table, refuse_small
-    from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, map_axis_columns, readings_of, unwrapped
-
     rows = long_table(table, stated)
     table, stated, remarks = rows.table, rows.stated, rows.remarks
     known = map_axis_columns(table.columns, stated)
@@ -242,8 +237,6 @@ def _unit_line(to: Path, unit: str | None) -> str:
 
 def _refuse_filled(to: Path) -> None:
     """Refuse a folder with tables that have rows: nothing is overwritten."""
-    from tvsbayes.single_axis.axis_campaign import axis_templates
-
     if not (to / "campaign.toml").is_file():
         if to.exists():
             make_folder(to, empty=True)
@@ -251,14 +244,11 @@ def _refuse_filled(to: Path) -> None:
     for name, template in axis_templates().items():
         path = to / name
         if name.endswith(".csv") and path.is_file() and path.read_bytes() != template:
-            allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
-            raise refusal("occupied", file=escaped(str(path), 200), found="rows", allowed=allowed, remedy=remedy)
+            raise occupied(path)
 
 
 def _write(to: Path, rows: ForeignReadings, unit: str | None) -> list[str]:
     """Write the tables and last the commented campaign.toml; `unit` is that of the column."""
-    from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, axis_templates, readings_bytes
-
     contents = {"moves.csv": axis_moves_bytes(rows.moves), "readings.csv": readings_bytes(rows.readings)}
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)

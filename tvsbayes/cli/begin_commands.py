@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, finish, refuse_options
+from tvsbayes.cli.app import Json, check_word, finish, refuse_options, write_files, write_new
 from tvsbayes.cli.instruments import INSTRUMENTS
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.understood_columns import first_names
@@ -49,11 +49,11 @@ def new(
     as_json: Json = False,
 ) -> None:
     """An empty campaign, explained in campaign.toml, and a rig file. With --pictures: its looks and their frames."""
+    from tvsbayes.instrument.campaign import campaign_templates, head_templates
+
     if pictures is None:
         refuse_options("for pictures", "add --pictures FOLDER, or leave it out", pair=pair, swap=swap)
-    if mechanism not in WORDS:
-        found, allowed = f"--mechanism {escaped(mechanism)}", ", ".join(WORDS)
-        raise InputError("usage", f"{found}; allowed: {allowed}", allowed=allowed, remedy="name one of them")
+    check_word("--mechanism", mechanism, WORDS, "name one of them")
     is_head = mechanism != WORDS[0]
     if sightings and not is_head:
         raise InputError("usage", "--sightings are those of a head", remedy="add --mechanism pan-tilt")
@@ -64,52 +64,26 @@ def new(
         return
     if is_head:
         refuse_options("for a scanner", "leave it out, and copy what `tvsbayes new` makes", pictures=pictures)
-        _new_head(out, sightings, as_json)
+        tables = "log moves and sightings" if sightings else "put stereo.json beside them, log moves and spots"
+        write_new(out, head_templates(sightings), f"{tables}, then `tvsbayes check` this folder", as_json)
         return
     if pictures is not None:
         _with_pictures(out, pictures, pair, swap, as_json)
         return
-    make_folder(out, empty=True)
-    names = write_templates(out)
-    text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
-    text += "next: put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder\n"
-    text += "pictures of the spots: fill in moves.csv, then `tvsbayes new` this folder again with --pictures FOLDER\n"
-    text += "a table of your own: `tvsbayes import FILE --to` this folder"
-    finish({"campaign": str(out), "files": names}, text, as_json)
-
-
-def _new_head(out: Path, sightings: bool, as_json: bool) -> None:
-    """Write an empty campaign of a pan-tilt head and its rig file."""
-    from tvsbayes.instrument.campaign import head_templates
-
-    make_folder(out, empty=True)
-    files = head_templates(sightings)
-    for name, data in files.items():
-        write_atomically(out / name, data)
-    text = f"{escaped(str(out), 200)}: {', '.join(files)}\n"
-    tables = "moves and sightings" if sightings else "put stereo.json beside them, log moves and spots"
-    text += f"next: {f'log {tables}' if sightings else tables}, then `tvsbayes check` this folder"
-    finish({"campaign": str(out), "files": list(files)}, text, as_json)
-
-
-def write_templates(out: Path) -> list[str]:
-    """Write the commented files of an empty campaign."""
-    from tvsbayes.instrument.campaign import campaign_templates
-
-    files = campaign_templates()
-    for name, data in files.items():
-        write_atomically(out / name, data)
-    return list(files)
+    next_steps = (
+        "put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder\n"
+        "pictures of the spots: fill in moves.csv, then `tvsbayes new` this folder again with --pictures FOLDER\n"
+        "a table of your own: `tvsbayes import FILE --to` this folder"
+    )
+    write_new(out, campaign_templates(), next_steps, as_json)
 
 
 def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_json: bool) -> None:
     """Add looks and frames of a folder of pictures to a new campaign or one without pictures."""
     from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
-    from tvsbayes.instrument.campaign import spots_bytes
+    from tvsbayes.instrument.campaign import campaign_templates, spots_bytes
 
-    if pair is not None and pair not in ("number", "order"):
-        found, remedy = f"--pair {escaped(pair)}", "write --pair number or --pair order, or leave it out"
-        raise InputError("usage", f"{found}; allowed: number, order", allowed="number, order", remedy=remedy)
+    check_word("--pair", pair, ("number", "order"), "write --pair number or --pair order, or leave it out")
     moves_path = moves_file(out, folder)
     rows = _rows_of(out)
     views = views_of(folder, swap=swap)
@@ -119,7 +93,7 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     _refuse_other_size(out, views)
     if not (out / "campaign.toml").is_file():
         make_folder(out, empty=True)
-        write_templates(out)
+        write_files(out, campaign_templates())
     if moves_path is None:
         write_atomically(out / "moves.csv", _blank_moves(1 + max(spot.move for spot in paired.spots)))
     elif moves_path.parent != out:

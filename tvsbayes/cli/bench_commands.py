@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli.app import Json, finish, finite, refuse_options, report_line
+from tvsbayes.cli.app import Json, finish, finite, missing_options, option_of, refuse_options, report_line
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import write_atomically
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
@@ -94,10 +95,7 @@ def stereo(
     as_json: Json = False,
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
-    words = (
-        *((export, ("opencv", "ros")), (finder, ("classic", "sector"))),
-        (pair, ("name", "order")),
-    )
+    words = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (pair, ("name", "order"))
     if invalid := [escaped(str(value)) for value, allowed in words if value not in (None, *allowed)]:
         remedy = "--export opencv or ros, --finder classic or sector, --pair name or order"
         raise InputError("usage", f"{', '.join(invalid)}: no option of stereo takes this value", remedy=remedy)
@@ -120,13 +118,9 @@ def stereo(
         provenance = _provenance(board, pitch_mm, pitch_u_mm, made_by)
         pair_made = _imported(imports or [], image_size, import_unit, provenance, _keys_by_field(key))
     else:
-        given = {
-            "image_size": image_size,
-            "import_unit": import_unit,
-            "joint": fixed_intrinsics is False,
-            "key": bool(key),
-        }
-        refuse_options("for --import", "leave it out: it is found from the pictures", **given, **made_by)
+        given = {"image_size": image_size, "import_unit": import_unit, "joint": fixed_intrinsics is False}
+        remedy = "leave it out: it is found from the pictures"
+        refuse_options("for --import", remedy, **given, key=bool(key), **made_by)
         if charuco is not None:
             refuse_options("of no use beside --charuco", "leave it out", board=board, finder=finder)
             pattern = _marker_board(charuco, dictionary, pitch_mm, marker_mm, pitch_u_mm or 0.0)
@@ -191,9 +185,7 @@ def _board(board: str | None, pitch_mm: float | None, pitch_u_mm: float) -> Boar
     from tvsbayes.cameras.boards import Board
 
     if board is None or pitch_mm is None:
-        missing = " and ".join(
-            name for name, given in {"--board": board, "--pitch-mm": pitch_mm}.items() if given is None
-        )
+        missing = " and ".join(missing_options(board=board, pitch_mm=pitch_mm))
         remedy = f"give {missing}: inner corners, columns x rows, and the side of a square: --board 9x6 --pitch-mm 25"
         raise InputError("usage", f"stereo FOLDER needs {missing}", remedy=remedy)
     return Board.named(board, pitch_mm, pitch_u_mm)
@@ -206,9 +198,7 @@ def _marker_board(
     from tvsbayes.cameras.boards import Board
 
     if dictionary is None or pitch_mm is None:
-        missing = " and ".join(
-            name for name, given in {"--dictionary": dictionary, "--pitch-mm": pitch_mm}.items() if given is None
-        )
+        missing = " and ".join(missing_options(dictionary=dictionary, pitch_mm=pitch_mm))
         remedy = f"give {missing}, for example --charuco 15x10 --dictionary 5X5_100 --pitch-mm 45"
         raise InputError("usage", f"stereo FOLDER --charuco needs {missing}", remedy=remedy)
     return Board.with_markers(squares, dictionary, pitch_mm, marker_mm, pitch_u_mm)
@@ -218,8 +208,8 @@ def _positive(**values: float | None) -> None:
     """Refuse options that are 0 or less."""
     for name, value in values.items():
         if value is not None and not value > 0:
-            option = f"--{name.replace('_', '-')}"
-            raise InputError("usage", f"{option} {value:g}: allowed are numbers above 0", remedy="correct it")
+            message = f"{option_of(name)} {value:g}: allowed are numbers above 0"
+            raise InputError("usage", message, remedy="correct it")
 
 
 def _provenance(
@@ -254,7 +244,6 @@ def _imported(
 ) -> PrintedPair:
     """A calibration of another program, or a `stereo.json`."""
     from tvsbayes.cameras.calibration_formats import UNITS_MM, read_calibration
-    from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
     from tvsbayes.report.command_text import stereo_text
 
     unit_mm = None if import_unit is None else UNITS_MM.get(import_unit)
@@ -327,7 +316,6 @@ def doctor(
         raise InputError("usage", message, remedy="goggles on, nothing in the way, then add --laser")
     from tvsbayes.acquisition.doctor import Check, examine
     from tvsbayes.acquisition.doctor import contract as contract_checks
-    from tvsbayes.errors import DeviceFault
     from tvsbayes.instrument.rig import read_rig
     from tvsbayes.model.compilation_cache import cache_state
     from tvsbayes.results.records import plain

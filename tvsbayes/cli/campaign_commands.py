@@ -5,27 +5,19 @@ Reads options, calls the library, prints a table or JSON; heavy imports are insi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import (
-    CampaignFolder,
-    Json,
-    Seed,
-    check_order,
-    finish,
-    finite,
-    is_part,
-    report_line,
-)
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, check_order, finish, finite, is_part, report_line
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
+from tvsbayes.instrument.axes import DIRECTIONS, HOME_APPROACH
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
+from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.pipeline import FITTING, SAMPLING, calibrate, compile_for, unusable
 from tvsbayes.progress import Job, Show
 
@@ -52,9 +44,7 @@ def demo(
             write_atomically(folder / part.name, part.read_bytes())
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
         from tvsbayes.estimators.four_point import classic as estimate_classic
-        from tvsbayes.instrument.axes import DIRECTIONS
         from tvsbayes.instrument.campaign import read_campaign
-        from tvsbayes.instrument.parameters import TARGETS
         from tvsbayes.report.fit_text import demo_text
         from tvsbayes.twin.true_rig import read_truth
 
@@ -107,7 +97,6 @@ def simulate(
     if out is None:
         raise InputError("usage", "Missing argument 'OUT'.", remedy="see tvsbayes --help")
     check_order(rig, plan)
-    from tvsbayes.instrument.axes import HOME_APPROACH
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
     from tvsbayes.twin.simulated_campaign import simulate as run_plan
@@ -129,7 +118,7 @@ def simulate(
         from tvsbayes.twin.frames import write_with_frames
 
         board = Board()
-        with _frame_progress() as progress:
+        with waiting("the pictures so far are kept; the same command goes on with them") as progress:
             pictures = write_with_frames(out, result.undetected(), seed, progress=progress)
         size = f"{board.columns}x{board.rows}"
         board_drawn = {"columns": board.columns, "rows": board.rows, "pitch_mm": board.pitch_mm}
@@ -140,17 +129,6 @@ def simulate(
     else:
         result.write(out)
     finish(document, text, as_json)
-
-
-@contextmanager
-def _frame_progress() -> Iterator[Show | None]:
-    """`waiting` for pictures; after Ctrl-C a line says how to continue."""
-    try:
-        with waiting() as shown:
-            yield shown
-    except KeyboardInterrupt:
-        report_line("the pictures so far are kept; the same command goes on with them")
-        raise
 
 
 def detect(
@@ -221,7 +199,6 @@ def check(
 
 def _contents(path: Path, plan_file: Path | None) -> dict[str, Any]:
     """Contents of a plan with its rig, a plan, a rig, a journal or a campaign; warnings under their own key."""
-    from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
@@ -249,8 +226,9 @@ def _contents(path: Path, plan_file: Path | None) -> dict[str, Any]:
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     instrument = instrument_of(path)
-    has_own = instrument is not None and "check" not in instrument.shared
-    return campaign_contents(path) if instrument is None or not has_own else instrument.command("contents")(path)
+    if instrument is None or "check" in instrument.shared:
+        return campaign_contents(path)
+    return instrument.command("contents")(path)
 
 
 def _check_rig_and_plan(path: Path, plan_file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +22,6 @@ from tvsbayes.cli.app import (
     keep,
     report_line,
 )
-from tvsbayes.cli.head_commands import compensate as compensate_head
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
@@ -32,7 +32,6 @@ from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
     from tvsbayes.instrument.mechanisms import Mechanism
-    from tvsbayes.results.compensation_record import Verification
 
 FITTING, MAKING = "fit", "compensation"
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
@@ -94,6 +93,8 @@ def compensate(
             remedy = f"its compensation is `tvsbayes compensate CAMPAIGN --to {default}`{counters}"
             raise InputError("usage", message, remedy=remedy)
         if mechanism.terms:
+            from tvsbayes.cli.head_commands import compensate as compensate_head
+
             compensate_head(campaign, out, as_json)
         else:
             export_calibration(campaign, to, out, as_json)
@@ -171,11 +172,14 @@ def verify(
     correction; of a scanner or head the counters that steps-for or the header gave, and the looks there. The
     most probable of: applied, not applied, applied twice, wrong sign, another machine.
     """
+    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
+    from tvsbayes.compensation.verification import stored_compensation
+    from tvsbayes.instrument.campaign import input_hashes, read_campaign
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis
 
     mechanism = _two_axis_mechanism(campaign)
-    scanner = mechanism is not None
     if mechanism is not _two_axis_mechanism(fresh):
         kind = "an axis" if mechanism is None else "a head" if mechanism.terms else "a scanner"
         message = f"{escaped(str(campaign), 200)} is of {kind}, {escaped(str(fresh), 200)} is not"
@@ -183,44 +187,20 @@ def verify(
     if distance_mm is not None and (mechanism is None or mechanism.sightings):
         message = "--distance-mm is not for an axis, nor for a head that says where it points"
         raise InputError("usage", message, remedy="leave it out")
-    verify_machine = _verify_scanner if scanner else _verify_axis
-    result, inputs = verify_machine(campaign, fresh, seed, distance_mm)
-    keep(
-        {"format": VERIFICATION_FORMAT, **inputs, **result.as_json()},
-        output_place(campaign, "results") / "verification.json",
-    )
+    known = read_axis(campaign) if mechanism is None else read_campaign(campaign)
+    made = stored_compensation(known) if isinstance(known, AxisCampaign) else None
+    with waiting() as progress:
+        new, distance = fresh if made is None else read_axis(fresh), distance_mm or 1000.0
+        result = verified(known, new, made=made, distance_mm=distance, seed=seed, tell=report_line, progress=progress)
+    inputs = axis_hashes(known) if isinstance(known, AxisCampaign) else input_hashes(known)
+    table = content_sha256(calibration_json(load_calibration(campaign))) if made is None else made.digest
+    document = {"format": VERIFICATION_FORMAT, "inputs": inputs, "table": table, **result.as_json()}
+    keep(document, output_place(campaign, "results") / "verification.json")
     for remark in result.remarks if as_json else ():
         report_line(f"warning: {remark}")
     finish(result.as_json(), verification_text(result), as_json)
     if result.verdict != KEPT:
         raise Ended(NothingToEstimate.exit_code if result.verdict == CANNOT_TELL else TARGET_MISSED)
-
-
-def _verify_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple[Verification, dict[str, object]]:
-    """Verify an axis; also return the hashes of its data and table."""
-    from tvsbayes.compensation.verification import stored_compensation, verify_axis
-    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
-
-    data = read_axis(folder)
-    compensation = stored_compensation(data)
-    with waiting() as progress:
-        result = verify_axis(data, fresh, made=compensation, seed=seed, progress=progress)
-    return result, {"inputs": axis_hashes(data), "table": compensation.digest}
-
-
-def _verify_scanner(
-    folder: Path, fresh: Path, seed: int, distance_mm: float | None
-) -> tuple[Verification, dict[str, object]]:
-    """Verify a scanner or head; also return the hashes of its data and calibration."""
-    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
-    from tvsbayes.instrument.campaign import input_hashes, read_campaign
-
-    data = read_campaign(folder)
-    with waiting() as progress:
-        result = verified(
-            data, fresh, distance_mm=distance_mm or 1000.0, seed=seed, tell=report_line, progress=progress
-        )
-    return result, {"inputs": input_hashes(data), "table": content_sha256(calibration_json(load_calibration(folder)))}
 
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
@@ -254,8 +234,6 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
 
 def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
     """Plan the fewest looks that verify a scanner or head, at the target with most looks in the campaign."""
-    from collections import Counter
-
     from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.plan import write_plan

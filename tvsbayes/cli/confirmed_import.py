@@ -10,8 +10,7 @@ from typing import Any
 import typer
 
 from tvsbayes.cli.app import finish, is_interactive
-from tvsbayes.errors import escaped
-from tvsbayes.files.disk import write_atomically
+from tvsbayes.errors import InputError, escaped, refusal
 
 
 def _as_paths(written: list[str]) -> dict[str, Any]:
@@ -53,8 +52,7 @@ class Import:
         finish({**self.document, **self.outcome(written)}, "\n".join(lines), as_json)
 
 
-def write_files(to: Path, files: Mapping[str, bytes]) -> list[str]:
-    """Write files by name into a folder; returns their paths."""
-    for name, data in files.items():
-        write_atomically(to / name, data)
-    return [str(to / name) for name in files]
+def occupied(path: Path, what: str = "rows") -> InputError:
+    """The refusal of a table that is filled already: nothing is overwritten."""
+    remedy = "name another folder with --to; nothing is overwritten"
+    return refusal("occupied", file=escaped(str(path), 200), found=what, allowed=f"no {what} yet", remedy=remedy)

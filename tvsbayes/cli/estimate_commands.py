@@ -17,8 +17,8 @@ from tvsbayes.cli.app import (
     Seed,
     command_line,
     finish,
+    finish_kept,
     finite,
-    keep,
     refuse_options,
     report_line,
 )
@@ -26,6 +26,7 @@ from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_progress, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
+from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.pipeline import FITTING, MAX_MINUTES, StoredOrFitted, calibrate, compile_for
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
@@ -120,7 +121,6 @@ def fit(
 
     data = read_campaign(campaign)
     _warn_implausible(data, stops=not anyway)
-    from tvsbayes.instrument.model_choice import ModelChoice
     from tvsbayes.report.advice import assumed_stereo
     from tvsbayes.report.fit_text import fit_text
 
@@ -209,11 +209,8 @@ def compare(
         return
     from tvsbayes.report.command_text import gap_text, hold_out_text
 
-    document = record.as_json()
-    files, text = {}, f"{gap_text(record.directions)}\n\n{hold_out_text(record.held_out)}"
-    if keep(document, path := results / "compare.json"):
-        files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"
-    finish({**document, "files": files}, text, as_json)
+    text = f"{gap_text(record.directions)}\n\n{hold_out_text(record.held_out)}"
+    finish_kept(record.as_json(), text, results / "compare.json", as_json)
 
 
 def _compare_positions(campaign: Path, as_json: bool) -> None:

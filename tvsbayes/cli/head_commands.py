@@ -5,30 +5,46 @@ Reads options, calls the library, prints a table or JSON; heavy imports are insi
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import check_output, command_line, finish, report_line
-from tvsbayes.cli.confirmed_import import Import, write_files
+import numpy as np
+
+from tvsbayes.cli.app import check_output, command_line, finish, report_line, write_files
+from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
-from tvsbayes.errors import InputError, escaped, refusal, typed
+from tvsbayes.display import concise
+from tvsbayes.errors import escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
+from tvsbayes.files.foreign_table import read_foreign
+from tvsbayes.head.foreign_sightings import (
+    NEEDED,
+    SIGHTING_FIELDS,
+    ForeignSightings,
+    sighting_field,
+    sightings_of_table,
+)
+from tvsbayes.head.pointing_model import pointing_model
+from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadJoints, HeadModel, head_joints, ratios_of
 from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import MOVES, head_templates, input_hashes, read_campaign
+from tvsbayes.instrument.campaign_header import header_values, mechanism_key
+from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, map_columns, unit_of_name
+from tvsbayes.instrument.corrections import Correction
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
+from tvsbayes.instrument.foreign_looks import Notation
+from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
+from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.sightings import SIGHTINGS
 from tvsbayes.pipeline import FITTING, StoredOrFitted
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
-    from tvsbayes.calibration.pointing import Calibration
-    from tvsbayes.head.foreign_sightings import ForeignSightings
-    from tvsbayes.head.urdf import HeadJoints
-    from tvsbayes.instrument.corrections import Correction
-    from tvsbayes.instrument.foreign_looks import Notation
-    from tvsbayes.instrument.parameters import Prior
     from tvsbayes.report.document import Document, Issue
 
 HEAD_URDF = "head.urdf"
@@ -41,38 +57,8 @@ RATIO_U = 0.01
 """Relative u of a nominal ratio."""
 
 
-def refuse_sightings(sightings: bool) -> None:
-    """Refuse the rig file of a head with sightings for `acquire`, since it has no stereo pair.
-
-    Raises:
-        InputError: `sightings`.
-    """
-    if sightings:
-        message = "acquire looks at spots through a stereo pair, and this head says where it points"
-        remedy = "check RIG PLAN, drive the plan yourself, then `tvsbayes import LOG --sightings --to FOLDER`"
-        raise InputError("usage", message, remedy=f"{remedy}; the twin of the head: simulate RIG PLAN FOLDER")
-
-
-def refuse_head(calibration: Calibration) -> None:
-    """Refuse a head for `locate`, which needs the scanner's aperture.
-
-    Raises:
-        InputError: the calibration belongs to a head.
-    """
-    from tvsbayes.calibration.pointing import INPUT_NAMES
-
-    if calibration.names != INPUT_NAMES:
-        message = "locate meets the beam with the scanner's aperture, and a pan-tilt head has none"
-        raise InputError("usage", message, remedy="steps-for says which counters point along a direction")
-
-
 def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_per_turn: float | None) -> Import:
     """Import the nominal geometry of two joints into a new campaign of a head, or into one made by `new`."""
-    from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints, ratios_of
-    from tvsbayes.instrument.campaign import head_templates
-    from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
-    from tvsbayes.instrument.parameters import Prior
-
     data = read_bytes(file, URDF_BYTES_MAX)
     head = head_joints(data, escaped(file.name), joints)
     spots = {name: (to / name).read_bytes() for name in TEMPLATE_FILES if (to / name).is_file()}
@@ -124,9 +110,6 @@ def import_sightings(
     u_deg: float | None,
 ) -> Import:
     """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
-    from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.head.foreign_sightings import NEEDED, SIGHTING_FIELDS, sighting_field, sightings_of_table
-    from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, map_columns, unit_of_name
 
     def unit(field: str, name: str) -> str:
         stated_unit = unit_of_name(name, SECONDS if field == "time_s" else DEGREES)
@@ -170,11 +153,6 @@ def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFi
     Raises:
         InputError: the folder has another instrument, rows, or stated ratios for angles of an encoder.
     """
-    from tvsbayes.instrument.campaign import MOVES, head_templates
-    from tvsbayes.instrument.campaign_header import mechanism_key
-    from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
-    from tvsbayes.instrument.sightings import SIGHTINGS
-
     current = templates = head_templates(True)
     stated: set[str] = set()
     if not (is_new := not (to / "campaign.toml").is_file()):
@@ -189,8 +167,7 @@ def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFi
     for name in (MOVES.file, SIGHTINGS.file):
         path = to / name
         if path.is_file() and path.read_bytes() != templates[name]:
-            allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
-            raise refusal("occupied", file=escaped(str(path), 200), found="rows", allowed=allowed, remedy=remedy)
+            raise occupied(path)
     for axis in sorted(rows.encoders):
         if (name := f"degrees_per_step.{axis}") in stated:
             found, allowed = f"angles of an encoder, and {name} in campaign.toml", "counters of the stated ratio"
@@ -205,9 +182,6 @@ def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFi
 
 def _joints_of(folder: Path) -> HeadJoints | None:
     """The joints of the URDF in a campaign folder; None if none."""
-    from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints
-    from tvsbayes.instrument.campaign_header import header_values
-
     if not ((folder / "campaign.toml").is_file() and (folder / HEAD_URDF).is_file()):
         return None
     stated = header_values(folder).get("urdf")
@@ -218,8 +192,6 @@ def _joints_of(folder: Path) -> HeadJoints | None:
 
 def _stated_priors(folder: Path) -> set[str]:
     """Names in [rig.prior] of a campaign folder."""
-    from tvsbayes.instrument.campaign_header import header_values
-
     rig = header_values(folder).get("rig")
     priors = rig.get("prior") if isinstance(rig, dict) else None
     return set(priors) if isinstance(priors, dict) else set()
@@ -234,7 +206,8 @@ def with_priors(
     ]
     files = {}
     for name in (name for name in PRIOR_FILES if name in templates):
-        lines = [line for line in templates[name].decode().splitlines() if not _is_prior_line(line, priors)]
+        lines = templates[name].decode().splitlines()
+        lines = [line for line in lines if line.partition("=")[0].strip().strip('"') not in priors]
         if "[rig.prior]" not in lines:
             lines.append("[rig.prior]")
         at, end = lines.index("[rig.prior]") + 1, (tables or {}).get(name, ())
@@ -258,23 +231,12 @@ def _urdf_files(
     return {**templates, **with_priors(templates, priors, tables)}
 
 
-def _is_prior_line(line: str, priors: Mapping[str, Prior]) -> bool:
-    """Whether a line of a template states one of these priors."""
-    return line.partition("=")[0].strip().strip('"') in priors
-
-
 def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
     """Write the model of the robot with the estimated terms, and YAML with their covariance."""
-    import hashlib
-
-    import numpy as np
     import yaml
 
     from tvsbayes.calibration.calibration_file import Origin
     from tvsbayes.comparison.verified_looks import accepted_calibration
-    from tvsbayes.display import concise
-    from tvsbayes.head.urdf import HeadModel
-    from tvsbayes.instrument.campaign import input_hashes, read_campaign
 
     data = read_campaign(folder)
     calibration, origin = accepted_calibration(data), Origin.of(data)
@@ -320,8 +282,6 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
 
 def classic(folder: Path, as_json: bool) -> None:
     """Print a pointing model by least squares, without gears."""
-    from tvsbayes.head.pointing_model import pointing_model
-    from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.result_tables import pointing_table
 
     model = pointing_model(read_campaign(folder))
@@ -331,7 +291,6 @@ def classic(folder: Path, as_json: bool) -> None:
 def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:
     """Write the page of a head; fit first where results are missing."""
     from tvsbayes.estimators.plausibility import check_campaign
-    from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.head_document import head_document
 
     def make(job: Job) -> Document:

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, is_interactive, refuse_options, report_line
-from tvsbayes.cli.begin_commands import has_rows, moves_file, write_templates
-from tvsbayes.cli.confirmed_import import Import, write_files
-from tvsbayes.cli.head_commands import HEAD_URDF, import_sightings, import_urdf
+from tvsbayes.cli.app import Json, check_word, is_interactive, refuse_options, report_line, write_files
+from tvsbayes.cli.begin_commands import has_rows
+from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
 from tvsbayes.files.disk import make_folder, read_bytes
+from tvsbayes.instrument.axes import sides_of
 
 if TYPE_CHECKING:
     from tvsbayes.files.foreign_table import ForeignTable
@@ -113,12 +113,12 @@ def import_(
     A campaign folder as FILE: a copy, corrected by the options that change its tables.
     """
     options = locals()
-    from tvsbayes.instrument.axes import sides_of
     from tvsbayes.instrument.corrections import Correction, flipped_axis, shift_of
     from tvsbayes.instrument.foreign_looks import SD_PX, Notation
 
     approach = (pan_approach, tilt_approach)
-    notation = Notation(pixels_from, _angle_unit(angles), SD_PX if sd_px is None else sd_px, relative, approach)
+    check_word("--angles", angles, ("deg", "rad"), "write --angles deg or --angles rad")
+    notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
     sides_of(approach)
     stated = dict(map(_field_and_column, column or ()))
     flipped = tuple(dict.fromkeys(map(flipped_axis, flip or ())))
@@ -129,17 +129,22 @@ def import_(
     if kind_of_file == COPY:
         found = _corrected_campaign(file, to, replace(correction, pixels_from=pixels_from, relative=relative), options)
     elif kind_of_file == URDF:
+        from tvsbayes.cli.head_commands import import_urdf
+
         found = import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn)
     elif kind_of_file == POINTING:
         found = _pointing_table(file, to)
     elif kind_of_file == AXIS:
-        from tvsbayes.cli.axis_import import FileOptions, import_readings
+        from tvsbayes.cli.axis_import import KINDS, FileOptions, import_readings
         from tvsbayes.single_axis.guide_log import ASSUMPTIONS
 
         assumed = _assumptions(assume, ASSUMPTIONS, "declination_deg=45.9")
-        wish = FileOptions(_axis_kind(kind), run, deviations, counts_per_turn, assumed)
+        check_word("--format", kind, ("auto", *KINDS), closest(kind, KINDS, "leave it out: it is in the file"))
+        wish = FileOptions(kind, run, deviations, counts_per_turn, assumed)
         found = import_readings(file, to, stated, sheet, wish, yes=yes, as_json=as_json)
     elif kind_of_file == SIGHTINGS:
+        from tvsbayes.cli.head_commands import import_sightings
+
         u_deg = _assumptions(assume, {"u_deg": "standard uncertainty"}, "u_deg=0.005").get("u_deg")
         found = import_sightings(file, to, stated, sheet, notation, correction, u_deg)
     else:
@@ -225,12 +230,19 @@ def _looks(
     spots = None if changed.spots is None else stereo_spots(changed.spots)
     looks = replace(looks, moves=changed.moves, spots=spots, assumed=(*looks.assumed, *changed.changes))
     _check_no_rows(to, looks)
-    document = _mapping_document(table, mapping, looks) | {"campaign": str(to)}
-    lines = [_mapping_text(table, mapping, notation, looks)]
+    document = {
+        **table_document(table, mapping),
+        "assumed": list(looks.assumed),
+        "moves": None if looks.moves is None else len(looks.moves),
+        "spots": None if looks.spots is None else len(looks.spots),
+        "ok": None if looks.spots is None else sum(spot.status == "ok" for spot in looks.spots),
+        "campaign": str(to),
+    }
     next_step = f"`tvsbayes check {typed(to)}`"
     if not (to / "stereo.json").is_file():
         cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
         next_step = f"`{cameras}`, or of pictures of a board, then {next_step}"
+    lines = _mapping_lines(table, mapping, notation, looks)
     return Import(lines, document, lambda: _write_looks(to, looks), next_step, CORRECT_HINT)
 
 
@@ -271,25 +283,6 @@ def _field_and_column(text: str) -> tuple[str, str]:
     return field.strip(), name.strip()
 
 
-def _angle_unit(unit: str | None) -> str | None:
-    """The value of --angles."""
-    if unit not in (None, "deg", "rad"):
-        found, remedy = f"--angles {escaped(unit)}", "write --angles deg or --angles rad"
-        raise InputError("usage", f"{found}; allowed: deg, rad", allowed="deg, rad", remedy=remedy)
-    return unit
-
-
-def _axis_kind(kind: str) -> str:
-    """The value of --format for an axis."""
-    from tvsbayes.cli.axis_import import KINDS
-
-    if kind not in ("auto", *KINDS):
-        allowed = ", ".join(("auto", *KINDS))
-        remedy = closest(kind, KINDS, "leave it out: it is in the file")
-        raise InputError("usage", f"--format {escaped(kind)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
-    return kind
-
-
 def _assumptions(texts: list[str] | None, known: Mapping[str, str], example: str) -> dict[str, float]:
     """The values of --assume NAME=NUMBER; `known` holds the names with their meanings."""
     assumed = {}
@@ -305,6 +298,7 @@ def _assumptions(texts: list[str] | None, known: Mapping[str, str], example: str
 
 def _corrected_campaign(folder: Path, to: Path, correction: Correction, options: Mapping[str, Any]) -> Import:
     """Write a copy of a campaign with corrected tables; other files of its folder are not copied."""
+    from tvsbayes.cli.head_commands import HEAD_URDF
     from tvsbayes.instrument.campaign import looks_bytes, moves_bytes, read_campaign
     from tvsbayes.instrument.corrections import Correction, corrected
 
@@ -338,11 +332,10 @@ def _listed_moves(to: Path) -> tuple[Move, ...] | None:
     from tvsbayes.instrument.campaign import campaign_templates, parse_moves
     from tvsbayes.instrument.column_names import COUNTERS
 
-    file = moves_file(to, to)
-    if file is None or (to / "campaign.toml").is_file() is False:
+    if not (file := to / "moves.csv").is_file():
         return None
     data = read_bytes(file, CSV_BYTES_MAX)
-    if data == campaign_templates()["moves.csv"]:
+    if not (to / "campaign.toml").is_file() or data == campaign_templates()["moves.csv"]:
         return None
     try:
         return parse_moves(data, str(file))
@@ -395,39 +388,25 @@ def _check_no_rows(to: Path, looks: ForeignLooks) -> None:
     """Refuse a folder whose tables have rows: nothing is overwritten."""
     if to.exists() and not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
-    remedy = "name another folder with --to; nothing is overwritten"
     if looks.moves is not None and _listed_moves(to) is not None:
-        path, allowed = escaped(str(to / "moves.csv"), 200), "no moves yet"
-        raise refusal("occupied", file=path, found="moves", allowed=allowed, remedy=remedy)
+        raise occupied(to / "moves.csv", "moves")
     if looks.spots is not None and has_rows(to):
-        path, allowed = escaped(str(to / "spots.csv"), 200), "no looks yet"
-        raise refusal("occupied", file=path, found="looks", allowed=allowed, remedy=remedy)
+        raise occupied(to / "spots.csv", "looks")
 
 
 def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
     """Write the tables, and templates of the other files of a campaign where they are missing."""
-    from tvsbayes.instrument.campaign import moves_bytes, spots_bytes
+    from tvsbayes.instrument.campaign import campaign_templates, moves_bytes, spots_bytes
 
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
-        write_templates(to)
+        write_files(to, campaign_templates())
     contents = {} if looks.moves is None else {"moves.csv": moves_bytes(looks.moves)}
     contents |= {} if looks.spots is None else {"spots.csv": spots_bytes(looks.spots)}
     return write_files(to, contents)
 
 
-def _mapping_document(table: ForeignTable, mapping: ColumnMapping, looks: ForeignLooks) -> dict[str, Any]:
-    """The content of `_mapping_text`, for programs."""
-    return {
-        **table_document(table, mapping),
-        "assumed": list(looks.assumed),
-        "moves": None if looks.moves is None else len(looks.moves),
-        "spots": None if looks.spots is None else len(looks.spots),
-        "ok": None if looks.spots is None else sum(spot.status == "ok" for spot in looks.spots),
-    }
-
-
-def _mapping_text(table: ForeignTable, mapping: ColumnMapping, notation: Notation, looks: ForeignLooks) -> str:
+def _mapping_lines(table: ForeignTable, mapping: ColumnMapping, notation: Notation, looks: ForeignLooks) -> list[str]:
     """Fields with columns, units and first values; assumptions; counts of the result."""
     from tvsbayes.instrument.column_names import DEGREES, FIELDS, SECONDS, unit_of_name
 
@@ -445,4 +424,4 @@ def _mapping_text(table: ForeignTable, mapping: ColumnMapping, notation: Notatio
     ok = sum(spot.status == "ok" for spot in looks.spots or ())
     counts = [] if looks.moves is None else [f"{len(looks.moves)} moves"]
     counts += [] if looks.spots is None else [f"{len(looks.spots)} looks, {ok} with a spot"]
-    return "\n".join([*lines, f"gives: {', '.join(counts)}"])
+    return [*lines, f"gives: {', '.join(counts)}"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 
 from tvsbayes.cli.app import report_line
 from tvsbayes.pipeline import SAMPLING
@@ -16,16 +16,16 @@ from tvsbayes.results.tiers import CHAIN
 
 
 @contextmanager
-def waiting() -> Iterator[Show | None]:
-    """A function that shows the progress of the block; None without a terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    display = DelayedDisplay("", _bar)
+def waiting(kept: str = "") -> Iterator[Show | None]:
+    """A function that shows the progress of the block; None without a terminal. After Ctrl-C the line `kept`."""
+    display = DelayedDisplay("", _bar) if sys.stderr.isatty() else None
     try:
-        yield display.show
-    finally:
-        display.close()
+        with nullcontext() if display is None else closing(display):
+            yield None if display is None else display.show
+    except KeyboardInterrupt:
+        if kept:
+            report_line(kept)
+        raise
 
 
 @contextmanager

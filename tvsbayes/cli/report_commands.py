@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -263,7 +263,7 @@ def _parts(content: PageContent, quick: bool, no_sample: bool, seed: int, pdf: b
     yield Part("check", check, check_text(check))
     if not anyway:
         stop_at(implausible(data), OVERRIDE_HINT)
-    yield Part("classic", *_classic(data))
+    yield _classic(data)
     compile_for(report_line)
     with chain_progress(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
         results = calibrate_campaign(
@@ -283,13 +283,13 @@ def _parts(content: PageContent, quick: bool, no_sample: bool, seed: int, pdf: b
     yield page.part(content.lines(page), content.evidence.criteria)
 
 
-def _classic(data: Campaign) -> tuple[dict[str, Any] | None, str]:
-    """Document and table of the four-point estimator; without a complete experiment None and the reason."""
+def _classic(data: Campaign) -> Part:
+    """The part of the four-point estimator; without a complete experiment the reason in place of a document."""
     from tvsbayes.estimators.four_point import classic
     from tvsbayes.report.fit_text import classic_text
 
     try:
         result = classic(data)
     except NothingToEstimate as error:
-        return None, f"classic four-point estimator: {error.message}"
-    return result.as_json(), classic_text(result)
+        return Part("classic", None, f"classic four-point estimator: {error.message}")
+    return Part("classic", result.as_json(), classic_text(result))

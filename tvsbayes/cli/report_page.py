@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import finish, print_part, report_removed
+from tvsbayes.cli.app import finish, print_part, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import TvsError
 from tvsbayes.files.disk import output_place
@@ -53,8 +53,11 @@ class WrittenPage:
         return {"criteria": [asdict(c) for c in criteria], "number": self.number, "files": self.files}
 
     def report_removed(self, *, certificates: bool = False) -> None:
-        """Report the removed files; only pages of scanners have certificates."""
-        report_removed(self.removed, self.files, certificates=certificates)
+        """Report the removed files, except those written again; only pages of scanners have certificates."""
+        written = {Path(place).name for place in self.files.values()}
+        if removed := [name for name in self.removed if name not in written]:
+            command = "`tvsbayes report --pdf`" + " or `--dcc`" * certificates
+            report_line(f"removed: {', '.join(removed)}, made of an earlier report; {command} makes them again")
 
     def finish(self, as_json: bool) -> None:
         """Print the result of `report` for a page without limits and certificate."""

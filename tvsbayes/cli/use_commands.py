@@ -24,20 +24,23 @@ from tvsbayes.cli.app import (
     finish,
     finite,
     keep,
+    missing_options,
+    option_of,
     refuse_options,
     report_line,
 )
 from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
-from tvsbayes.cli.head_commands import refuse_head
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import output_place
+from tvsbayes.instrument.axes import AXES, sides_of
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
+    from tvsbayes.calibration.pointing import Calibration
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.instrument.rig import Rig
     from tvsbayes.planning.target import Target
@@ -77,9 +80,9 @@ def locate(
     """Where the scanner points, in millimetres. Frame T, with covariance and 95 % half widths."""
     if serve("locate", **locals()):
         return
+    counters = {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
     if points is not None:
-        options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "budget": budget or None}
-        counters = {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
+        options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "budget": budget}
         refuse_options("for one point", "leave out --points, or give the columns of its file", **options, **counters)
         if cloud is None:
             _locate_all(campaign, points, draws, seed, as_json)
@@ -88,13 +91,11 @@ def locate(
         return
     refuse_options("for files of points", "give --points FILE.csv with it", cloud=cloud)
     if pan_steps is None or tilt_steps is None or aperture_deg is None:
-        given = {"--pan-steps": pan_steps, "--tilt-steps": tilt_steps, "--aperture-deg": aperture_deg}
-        missing = [name for name, value in given.items() if value is None]
+        missing = missing_options(**counters)
         message = f"locate needs one point or a file of points; missing: {', '.join(missing)}"
         remedy = f"give {' and '.join(missing)} too, or --points FILE.csv"
-        raise InputError("usage", message, allowed=", ".join(given), remedy=remedy)
-    finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
-    from tvsbayes.instrument.axes import sides_of
+        raise InputError("usage", message, allowed=", ".join(map(option_of, counters)), remedy=remedy)
+    finite(**counters)
     from tvsbayes.instrument.campaign import read_campaign
 
     look = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
@@ -105,7 +106,7 @@ def locate(
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
-    refuse_head(calibration)
+    _refuse_head(calibration)
     located = locate_points(calibration, *look, draws=draws, seed=seed)
     if located.refused[0] is not None:
         raise located.refused[0]
@@ -133,7 +134,7 @@ def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool
         from tvsbayes.coordinates.location import locate as locate_points
         from tvsbayes.report.command_text import locations_text
 
-        refuse_head(calibration)
+        _refuse_head(calibration)
         located = locate_points(calibration, *looks, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [located.as_json(k) for k in range(len(located.refused))]
     document = {"estimator": located.estimator, "draws": located.draws, "points": entries}
@@ -155,7 +156,7 @@ def _write_cloud(campaign: Path, file: Path, out: Path, draws: int, seed: int, a
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         measured = read_campaign(campaign)
         calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
-        refuse_head(calibration)
+        _refuse_head(calibration)
         simple = simple_calibrations(measured.rig.priors, classic_of(measured))
         job.begin(LOCATING)
         sample = EvenSample()
@@ -164,6 +165,19 @@ def _write_cloud(campaign: Path, file: Path, out: Path, draws: int, seed: int, a
         check = checked(calibration, sample, draws, seed)
     document = {"estimator": calibration.estimator, **written.as_json(), "checked": asdict(check)}
     finish(document, cloud_text(written, check, calibration), as_json)
+
+
+def _refuse_head(calibration: Calibration) -> None:
+    """Refuse a head for `locate`, which needs the scanner's aperture.
+
+    Raises:
+        InputError: the calibration belongs to a head.
+    """
+    from tvsbayes.calibration.pointing import INPUT_NAMES
+
+    if calibration.names != INPUT_NAMES:
+        message = "locate meets the beam with the scanner's aperture, and a pan-tilt head has none"
+        raise InputError("usage", message, remedy="steps-for says which counters point along a direction")
 
 
 def steps_for(
@@ -183,16 +197,16 @@ def steps_for(
     """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
     if serve("steps-for", **locals()):
         return
-    finite(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    target = {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+    finite(**target)
     point = None if x_mm is None or y_mm is None or z_mm is None else (x_mm, y_mm, z_mm)
     direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
-    given = sum(value is not None for value in (x_mm, y_mm, z_mm, azimuth_deg, elevation_deg))
+    given = sum(value is not None for value in target.values())
     if export not in (None, "header", "json"):
         message, remedy = f"--export {escaped(export)}: allowed are header and json", "write --export header for C"
         raise InputError("usage", message, allowed="header, json", remedy=remedy)
     if export:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "rig": rig}
-        target = {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
         check_output(out)
         remedy = "leave it out, --export writes the calibration itself; or leave out --export"
         refuse_options("for one target", remedy, **target, **options)
@@ -398,15 +412,10 @@ def study(
     stored = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
     missing = n - sum(index < n for index in stored.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(stored.path), 200)}")
-
-    try:
-        with waiting() as progress:
-            result = run_study(
-                job, n, stored, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
-            )
-    except KeyboardInterrupt:
-        report_line("every campaign that is done is kept; the same command goes on from there")
-        raise
+    with waiting("every campaign that is done is kept; the same command goes on from there") as progress:
+        result = run_study(
+            job, n, stored, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
+        )
     document = {**result.as_json(), "rows": str(stored.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:
@@ -415,7 +424,6 @@ def study(
 
 def _limits(path: Path) -> dict[str, tuple[float, float]]:
     """Counter limits by axis from [positioner] of a rig file."""
-    from tvsbayes.instrument.axes import AXES
     from tvsbayes.instrument.rig import read_rig
 
     return read_rig(path).limits.within(dict.fromkeys(AXES, (-math.inf, math.inf)))

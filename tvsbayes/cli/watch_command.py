@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,7 @@ from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, f
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
+from tvsbayes.files.csv_table import append_line
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
@@ -60,9 +62,6 @@ def watch(
 
 def _append(table: Path, result: Watch) -> InputError | None:
     """Append the current line (time in UTC); returns the error of a failure, so that the result is still printed."""
-    import datetime
-
-    from tvsbayes.files.csv_table import append_line
     from tvsbayes.report.watch_text import moved_text
 
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
