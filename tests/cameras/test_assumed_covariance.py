@@ -250,12 +250,16 @@ def test_a_fit_says_how_much_comes_from_it(mounted):
     other = structs.replace(row, share=0.01)
     tables = [
         BudgetTable(name, "deg", 1.0, (entry,), 0.1, None, 2.0, 0.95, 0.2, ())
-        for name, entry in (("effective_deg_per_step.left", row), ("backlash_deg.pan", other))
+        for name, entry in (
+            ("effective_deg_per_step.left", row),
+            ("effective_deg_per_step.right", row),
+            ("backlash_deg.pan", other),
+        )
     ]
     assert assumed_stereo(mounted, tables) is None
     assumed = replace(mounted, assumed=True, assumed_from="RMS 0.21 px (stated)")
     told = assumed_stereo(assumed, tables)
     assert told is not None and "(from RMS 0.21 px (stated))" in told and "backlash" not in told
-    assert "62 % of the variance of effective_deg_per_step.left" in told and "--rms-px" in told
-    told = assumed_stereo(assumed, tables[1:])
+    assert "62 % of the variance of the effective ratio (left, right);" in told and "--rms-px" in told
+    told = assumed_stereo(assumed, tables[2:])
     assert told is not None and "less than 5 %" in told and "--rms-px" not in told

@@ -13,7 +13,7 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import REGISTRY, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import ASSUMED_REMEDY, Stereo
 from tvsbayes.report.document import sentence
-from tvsbayes.report.parameter_words import sentence_in_words
+from tvsbayes.report.parameter_words import quantity_in_words, sentence_in_words
 from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 from tvsbayes.results.metrology_tables import BudgetTable
 
@@ -112,12 +112,13 @@ def assumed_stereo(stereo: Stereo | None, budgets: Sequence[BudgetTable]) -> str
     if stereo is None or not stereo.assumed:
         return None
     cause = REGISTRY[STEREO_PARAMETER_NAMES[0]].cause
-    shares = [
-        f"{100 * row.share:.0f} % of the variance of {table.quantity}"
-        for table in budgets
-        for row in table.rows
-        if row.quantity == cause and row.share >= SHARE_NAMED
-    ]
+    parts: dict[str, list[str]] = {}
+    for table in budgets:
+        for row in table.rows:
+            if row.quantity == cause and row.share >= SHARE_NAMED:
+                words, part = quantity_in_words(table.quantity)
+                parts.setdefault(f"{100 * row.share:.0f} % of the variance of {words}", []).append(part)
+    shares = [f"{share} ({', '.join(named)})" if any(named) else share for share, named in parts.items()]
     text = "the stereo covariance is assumed, not estimated"
     origin = f" (from {stereo.assumed_from})" if stereo.assumed_from else ""
     if not budgets:

@@ -313,7 +313,8 @@ def _wave_figures(fit: AxisFit) -> list[FigureView]:
     figures = []
     for sample in wave_samples(fit):
         if sample.probability > LIKELY:
-            period = f"{float(np.mean(sample.period)):.4g} {'s' if sample.wave.clock == 'seconds' else unit}"
+            period_unit = "s" if sample.wave.clock == "seconds" else unit
+            period = f"{float(np.mean(sample.period[sample.likeliest])):.4g} {period_unit}"
             name = "encoder" if sample.wave.clock == "encoder" else "gear"
             caption = f"Wave of the {name} every {period}: one period, both harmonics, with its 95 % band."
             figures.append(FigureView(wave(sample, fit.campaign.unit), alt, caption))

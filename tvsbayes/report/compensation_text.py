@@ -189,7 +189,7 @@ def compensation_section(result: Compensation, verification: Verification | None
     low, high = result.range_command
     text = [
         f"Made for {result.target}, to be applied by the {result.applied_by}, for commands from {low:.10g} to "
-        f"{high:.10g}; {_validity(result)[0]}.",
+        f"{high:.10g}; {'; '.join(_validity(result)[: 1 + result.in_motion])}.",
         "No fresh readings have verified it." if verification is None else _verdict(verification),
     ]
     tables = [promise_table(result), *([] if verification is None else [sizes_table(verification)])]

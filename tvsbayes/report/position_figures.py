@@ -90,7 +90,7 @@ def wave(sample: WaveSample, unit: str) -> Figure:
     period_unit = "s" if sample.wave.clock == "seconds" else unit
     with drawing(2.4) as figure:
         axes = figure.add_subplot()
-        _banded(axes, turn * float(np.mean(sample.period)), band95(sample.curve(turn)), "wave")
+        _banded(axes, turn * float(np.mean(sample.period[sample.likeliest])), band95(sample.curve(turn)), "wave")
         axes.set(xlabel=f"{period_unit}, from {sample.record.middle:.6g} on", ylabel=unit)
         legend(figure, 2)
     return figure
