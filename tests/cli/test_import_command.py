@@ -318,3 +318,49 @@ def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
     assert ask("new", tmp_path / "scanner")[0] == 0
     assert_error(ask(*words, tmp_path / "scanner", "--yes")[1], "instrument")
     assert not (tmp_path / "scanner" / "sightings.csv").exists()
+
+
+SWEEPS = [(cm, step) for cm in ("17,5", "27,5") for step in (-60, 0, 60, 0)]
+
+
+@pytest.mark.parametrize(
+    ("distances", "targets"),
+    [
+        ([cm for cm, _ in SWEEPS], {"17.5", "27.5"}),
+        # Put back to a distance: another placement. A distance of every look: none.
+        (["17,5", "27,5"] * 4, {""}),
+        ([f"{17 + k},5" for k in range(8)], {""}),
+        ([], {""}),
+    ],
+)
+def test_a_sheet_is_named_by_its_distance_where_each_is_one_run(ask, tmp_path, distances, targets):
+    """Without a name for each placement a fit knows of no sheet that several looks share."""
+    file, out = tmp_path / "looks.csv", tmp_path / "out"
+    rows = [f"{step};0;{640 + step};360;{500 + step};360" for _, step in SWEEPS]
+    head = "Pan;Tilt;XL;YL;XR;YR" + ";Abstand [cm]" * bool(distances)
+    cells = [f"{row};{cm}" for row, cm in zip(rows, distances, strict=True)] if distances else rows
+    file.write_text("\n".join([head, *cells]) + "\n")
+    out.mkdir()
+    shutil.copy(MOUNTED / "stereo.json", out)
+    code, document = ask("import", file, "--to", out, "--yes")
+    assert code == 0 and ("Abstand [cm]" in document["unused"]) == (bool(distances) and targets == {""})
+    assert {spot.target for spot in read_campaign(out).spots} == targets
+    assert any("one placement" in text for text in document["assumed"]) == (targets != {""})
+    shutil.rmtree(out)
+    if targets != {""}:
+        code, document = ask("import", file, "--to", out, "--yes", "--column", "target=")
+        assert code == 0 and "Abstand [cm]" in document["unused"]
+
+
+def test_cameras_may_come_first(ask, table, tmp_path):
+    """`stereo` makes the folder that it writes into; `import` takes one that holds nothing else."""
+    out = tmp_path / "mine"
+    code, document = ask("stereo", "--import", MOUNTED / "stereo.json", "-o", out / "stereo.json")
+    assert code == 0 and document["files"] == {"stereo": str(out / "stereo.json")}
+    cameras = (out / "stereo.json").read_bytes()
+    assert ask("import", table, "--to", out, "--yes")[0] == 0
+    assert (out / "stereo.json").read_bytes() == cameras and len(read_campaign(out).spots) == 2
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    code, document = ask("import", table, "--to", tmp_path / "other", "--yes")
+    assert code == 2 and assert_error(document, "occupied")["found"] == "a folder with files"

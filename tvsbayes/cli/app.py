@@ -143,9 +143,13 @@ def write_files(to: Path, files: Mapping[str, bytes]) -> list[str]:
     return [str(to / name) for name in files]
 
 
+CAMERAS = ("stereo.json",)
+"""Files that the folder of a new campaign may contain: cameras are often calibrated before."""
+
+
 def write_new(out: Path, files: Mapping[str, bytes], next_steps: str, as_json: bool) -> None:
     """Write the files of an empty campaign into a new folder, and print them with the next steps."""
-    make_folder(out, empty=True)
+    make_folder(out, empty=True, but=CAMERAS)
     write_files(out, files)
     text = f"{escaped(str(out), 200)}: {', '.join(files)}\nnext: {next_steps}"
     finish({"campaign": str(out), "files": list(files)}, text, as_json)

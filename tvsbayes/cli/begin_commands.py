@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, check_word, finish, refuse_options, write_files, write_new
+from tvsbayes.cli.app import CAMERAS, Json, check_word, finish, refuse_options, write_files, write_new
 from tvsbayes.cli.instruments import INSTRUMENTS
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.understood_columns import first_names
@@ -92,7 +92,7 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     paired = pair_looks(views.views, numbers, rows, pair)  # type: ignore[arg-type]
     _refuse_other_size(out, views)
     if not (out / "campaign.toml").is_file():
-        make_folder(out, empty=True)
+        make_folder(out, empty=True, but=CAMERAS)
         write_files(out, campaign_templates())
     if moves_path is None:
         write_atomically(out / "moves.csv", _blank_moves(1 + max(spot.move for spot in paired.spots)))

@@ -18,7 +18,7 @@ from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.files.disk import write_atomically
+from tvsbayes.files.disk import make_folder, require_writable, write_atomically
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.pipeline import compile_for
 
@@ -171,6 +171,8 @@ def _output_paths(out: Path | None, export: Format | None) -> dict[str, Path]:
     folder = Path() if out is None else out.parent
     places = {} if out is None else {"stereo": out}
     places |= {name: folder / name for name in (() if export is None else EXPORT_NAMES[export])}
+    if places:
+        require_writable(folder)
     for path in places.values():
         if os.path.lexists(path):
             # Fits refer to a calibration by its hash, so it is not overwritten.
@@ -275,6 +277,8 @@ def _write_pair(pair: PrintedPair, places: dict[str, Path], export: Format | Non
     from tvsbayes.instrument.stereo_pair import write_stereo
 
     contents = {} if export is None else exported(pair.stereo, export)
+    for folder in {path.parent for path in places.values()}:
+        make_folder(folder)
     for name, path in places.items():
         if name == "stereo":
             write_stereo(pair.stereo, path)

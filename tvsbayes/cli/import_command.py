@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, check_word, is_interactive, refuse_options, report_line, write_files
+from tvsbayes.cli.app import CAMERAS, Json, check_word, is_interactive, refuse_options, report_line, write_files
 from tvsbayes.cli.begin_commands import has_rows
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
@@ -218,17 +218,22 @@ def _looks(
     """Import a table of moves and looks; missing columns are asked for where `interactive`."""
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.instrument.campaign import stereo_spots
-    from tvsbayes.instrument.column_names import map_columns
+    from tvsbayes.instrument.column_names import map_columns, with_placements
     from tvsbayes.instrument.corrections import corrected
     from tvsbayes.instrument.foreign_looks import looks_of
 
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
-    mapping = _complete_mapping(table, map_columns(table.columns, stated), stated, listed is not None, interactive)
+    known = _complete_mapping(table, map_columns(table.columns, stated), stated, listed is not None, interactive)
+    mapping = with_placements(known, table.columns, stated)
     looks = looks_of(table, mapping.columns, notation, listed)
     changed = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
     spots = None if changed.spots is None else stereo_spots(changed.spots)
-    looks = replace(looks, moves=changed.moves, spots=spots, assumed=(*looks.assumed, *changed.changes))
+    by_distance = ()
+    if mapping is not known:
+        name = escaped(mapping.columns["target"])
+        by_distance = (f"target: every value of {name} is one placement of the sheet; --column target= says no",)
+    looks = replace(looks, moves=changed.moves, spots=spots, assumed=(*looks.assumed, *by_distance, *changed.changes))
     _check_no_rows(to, looks)
     document = {
         **table_document(table, mapping),
@@ -387,7 +392,7 @@ def _complete_mapping(
 def _check_no_rows(to: Path, looks: ForeignLooks) -> None:
     """Refuse a folder whose tables have rows: nothing is overwritten."""
     if to.exists() and not (to / "campaign.toml").is_file():
-        make_folder(to, empty=True)
+        make_folder(to, empty=True, but=CAMERAS)
     if looks.moves is not None and _listed_moves(to) is not None:
         raise occupied(to / "moves.csv", "moves")
     if looks.spots is not None and has_rows(to):
@@ -399,7 +404,7 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
     from tvsbayes.instrument.campaign import campaign_templates, moves_bytes, spots_bytes
 
     if not (to / "campaign.toml").is_file():
-        make_folder(to, empty=True)
+        make_folder(to, empty=True, but=CAMERAS)
         write_files(to, campaign_templates())
     contents = {} if looks.moves is None else {"moves.csv": moves_bytes(looks.moves)}
     contents |= {} if looks.spots is None else {"spots.csv": spots_bytes(looks.spots)}

@@ -196,7 +196,7 @@ def _name_doubts(pattern: SpotPattern) -> tuple[str, ...]:
         means = [f"{depths[group == g].mean():.0f}" for g in sorted({int(group[k]) for k in blank})]
         return (
             f"the column target is empty for {len(blank)} spots, which lie at {listed_text(means)} mm: "
-            "name each placement of the sheet",
+            "name each placement of the sheet in spots.csv, or import the table with --column target=NAME",
         )
     counts = Counter(zip(names, group.tolist(), strict=True))
     home = {name: max((g for n, g in counts if n == name), key=lambda g: counts[name, g]) for name in set(names)}

@@ -17,7 +17,7 @@ import secrets
 import stat
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib import resources
@@ -245,12 +245,13 @@ def remove_unfinished(folder: Path, names: Iterable[str]) -> list[str]:
     return removed
 
 
-def make_folder(folder: Path, *, empty: bool = False) -> None:
+def make_folder(folder: Path, *, empty: bool = False, but: Collection[str] = ()) -> None:
     """Create a folder and its parents.
 
     Args:
         folder: the folder.
         empty: refuse a folder that is not empty, so that nothing is overwritten.
+        but: names of files that an empty folder may contain.
 
     Raises:
         InputError: the folder cannot be created, or is not empty.
@@ -258,7 +259,7 @@ def make_folder(folder: Path, *, empty: bool = False) -> None:
     allowed = "a new or empty folder"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        occupied = empty and any(folder.iterdir())
+        occupied = empty and any(path.name not in but for path in folder.iterdir())
     except OSError as error:
         raise unwritable(folder, error, allowed, "name another") from error
     if occupied:

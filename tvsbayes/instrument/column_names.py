@@ -68,6 +68,15 @@ _UNITS = {
 }
 
 
+DISTANCES = {
+    *("distance", "dist", "depth", "range", "abstand", "distanz", "entfernung", "tiefe"),
+    *("distancia", "profundidad", "profondeur", "eloignement"),
+}
+"""Words of a distance to the sheet."""
+PLACEMENT_ROWS = 4
+"""Fewest rows of a distance that stands for a placement of the sheet; distances of single rows are measured ones."""
+
+
 @dataclass(frozen=True)
 class ColumnMapping:
     """Columns of a table by the field to which they belong.
@@ -163,6 +172,30 @@ def map_columns(
     ambiguous = {field: tuple(candidates) for field, candidates in claims.items() if len(candidates) > 1}
     used = {*mapping.values(), *(name for candidates in ambiguous.values() for name in candidates)}
     return ColumnMapping(mapping, ambiguous, tuple(name for name in names if name not in used))
+
+
+def with_placements(mapping: ColumnMapping, cells: Mapping[str, Sequence[str]], stated: Iterable[str]) -> ColumnMapping:
+    """The mapping with the sheet named by its distance, where no column names it.
+
+    That needs one unused column of a distance, whose every value fills one run of rows: a sheet that is put back to a
+    distance is a new placement, and a distance of each row is none.
+
+    Args:
+        mapping: columns by field.
+        cells: cells by column.
+        stated: fields for which the user named a column, or none.
+    """
+    if "target" in {*mapping.columns, *mapping.ambiguous, *stated} or not set(PIXELS) <= set(mapping.columns):
+        return mapping
+    named = [name for name in mapping.unused if set(words_of(name)) & DISTANCES]
+    if len(named) != 1:
+        return mapping
+    filled = [cell for cell in cells[named[0]] if cell]
+    runs = [filled[k] for k in range(len(filled)) if k == 0 or filled[k] != filled[k - 1]]
+    if not runs or len(set(runs)) < len(runs) or min(map(filled.count, runs)) < PLACEMENT_ROWS:
+        return mapping
+    unused = tuple(name for name in mapping.unused if name != named[0])
+    return ColumnMapping({**mapping.columns, "target": named[0]}, mapping.ambiguous, unused)
 
 
 def missing(columns: Iterable[str], moves_known: bool) -> list[str]:
