@@ -6,6 +6,7 @@ import base64
 import datetime
 import hashlib
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -21,7 +22,7 @@ from support.small_results import estimate
 from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import RIG_NAMES
@@ -44,7 +45,7 @@ from tvsbayes.report.parameter_words import (
     share_in_words,
     source_in_words,
 )
-from tvsbayes.report.scanner_document import NO_APERTURE, _cells, answer_table, report_document
+from tvsbayes.report.scanner_document import NO_APERTURE, _cells, answer_table, report_document, step_sizes
 from tvsbayes.report.tables import TableView, chance_text
 
 BYTES_MAX = 3_000_000
@@ -156,6 +157,16 @@ def test_millimetres_without_aperture_readings_say_what_they_rest_on(evidence, n
     first, *others = evidence.campaign.spots
     read = replace(evidence.campaign, spots=(replace(first, aperture_deg=70.0), *others))
     assert NO_APERTURE not in text(replace(evidence, campaign=read))
+
+
+def test_a_step_is_given_in_millimetres(evidence, no_pictures):
+    """Degrees per step times the range, with both directions of an axis."""
+    (said,) = step_sizes(evidence)
+    for axis, (one, other) in SENSES.items():
+        ratios = [evidence.fit.summary.effective[side].value for side in (one, other)]
+        mm = float(re.search(rf"(\S+)\(\d[\d.]*\) mm in {axis}", said)[1])
+        assert mm == pytest.approx(evidence.range_mm * math.radians(sum(ratios) / 2), rel=1e-2)
+    assert said in " ".join(" ".join(Nodes(report_html(evidence)).text).split())
 
 
 def test_a_long_cell_wraps_and_is_not_cut(evidence, no_pictures):

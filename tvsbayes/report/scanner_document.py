@@ -5,6 +5,7 @@ Ratios in deg/step, lost motion in deg, distances in mm.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import msgspec
@@ -59,7 +60,7 @@ def report_document(e: Evidence, issue: Issue | None = None) -> Document:
             about=about_table(e.campaign.header, measured_days(e.campaign, issue), issue),
             verdict=verdict_of(e.fit.summary, e.criteria, e.doubts),
             numbers=point_errors(e),
-            why=error_sources(e),
+            why=[*step_sizes(e), *error_sources(e)],
             answer=answer_table(e.fit.summary, e.classic),
             picture=both_estimators(e),
             steps=_steps(e),
@@ -196,6 +197,20 @@ def point_errors(e: Evidence) -> list[Number]:
     limits = {name: float(np.quantile(v, 0.95)) for name, v in e.distances_mm.items()}
     note = f"95 % of 3D errors {e.range_mm:g} mm away stay below this"
     return [Number(f"{name} calibration", _mm(limits[name]), note) for name in ESTIMATOR_STYLE if name in limits]
+
+
+def step_sizes(e: Evidence) -> list[str]:
+    """What one step moves the spot by at the stated range, across the beam; empty without a fit."""
+    sizes = []
+    for axis in AXES if e.fit.summary.explained else ():
+        ratios = [ratio for side in SENSES[axis] if (ratio := e.fit.summary.effective[side]) is not None]
+        if ratios:
+            mm = e.range_mm * math.radians(sum(abs(ratio.value) for ratio in ratios) / len(ratios))
+            u_mm = e.range_mm * math.radians(max(ratio.sd for ratio in ratios))
+            sizes.append(f"{concise(mm, u_mm)} mm in {axis}")
+    if not sizes:
+        return []
+    return [f"At {e.range_mm:g} mm one step moves the spot by about {' and '.join(sizes)}, across the beam."]
 
 
 def error_sources(e: Evidence) -> list[str]:
