@@ -229,7 +229,7 @@ def _looks(
     looks = looks_of(table, mapping.columns, notation, listed)
     changed = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
     spots = None if changed.spots is None else stereo_spots(changed.spots)
-    by_distance = ()
+    by_distance: tuple[str, ...] = ()
     if mapping is not known:
         name = escaped(mapping.columns["target"])
         by_distance = (f"target: every value of {name} is one placement of the sheet; --column target= says no",)
