@@ -75,7 +75,7 @@ def test_a_way_that_shares_all_draws_adds_no_knowledge(first):
     one = Mixture((first,), 0)
     for name, error in one.errors.items():
         assert mixture.errors[name].mean == pytest.approx(error.mean, rel=1e-9)
-    assert mixture.missing == one.missing == () and mixture.improved() is None
+    assert mixture.acceptance.missing == one.acceptance.missing == () and mixture.improved() is None
 
 
 def test_independent_draws_add_their_squared_errors(first, own):
@@ -119,7 +119,7 @@ def few(way: WayDraws) -> WayDraws:
 def test_rounds_go_to_the_way_that_the_error_comes_from(first, own, monkeypatch):
     """Of an equally probable way there are a few draws only: it is extended, as far as rounds are left."""
     mixture = Mixture((first, few(own)), 5)
-    assert mixture.missing and mixture.shares_of_error[1] > 0.9
+    assert mixture.acceptance.missing and mixture.shares_of_error[1] > 0.9
     monkeypatch.setattr(WayDraws, "reliable", True)
     better = mixture.improved()
     assert better is not None and better.ways[0] is first and better.left == 4
@@ -151,8 +151,8 @@ def test_an_improbable_way_need_not_be_reliable(first, own, monkeypatch):
     for chance, k in ((0.05, first.weighed.smoothed.pareto_k), (0.2, 0.9)):
         mixture = Mixture((first, heavy), 0)
         mixture.__dict__["probabilities"] = np.array([1 - chance, chance])
-        assert mixture.pareto_k == k
-        assert bool(mixture.missing) == (k == 0.9)
+        assert mixture.acceptance.pareto_k == k
+        assert bool(mixture.acceptance.missing) == (k == 0.9)
 
 
 def test_the_posterior_says_how_probable_each_way_is(first, own):

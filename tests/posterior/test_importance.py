@@ -21,7 +21,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.inference import importance
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.importance import Pool, Weighing, k_max, lacking, uncertain
+from tvsbayes.inference.importance import Acceptance, Pool, Weighing, k_max, uncertain
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.inference.tables import Tables
 from tvsbayes.instrument.campaign import read_campaign
@@ -296,18 +296,18 @@ def errors(mean: float = 0.05, low: float = 0.1, high: float = 0.1) -> dict[str,
 
 def test_every_limit_is_said():
     """Each is crossed alone, from just inside."""
-    inside = {"pareto": 0.69, "heaviest": 0.05, "draws": 4096, "errors": errors(0.1, 0.2, 0.2)}
-    assert lacking(**inside) == ()
+    inside = {"pareto_k": 0.69, "heaviest": 0.05, "draws": 4096, "errors": errors(0.1, 0.2, 0.2)}
+    assert Acceptance(**inside).missing == ()
     for changed, words in (
-        ({"pareto": 0.71}, "the weights of importance sampling have Pareto k 0.71, wanted below 0.70"),
-        ({"pareto": np.nan}, "Pareto k nan"),
+        ({"pareto_k": 0.71}, "the weights of importance sampling have Pareto k 0.71, wanted below 0.70"),
+        ({"pareto_k": np.nan}, "Pareto k nan"),
         ({"draws": 1000}, "Pareto k 0.69, wanted below 0.67"),
         ({"heaviest": 0.061}, "one draw holds 6.1 % of the weight, wanted at most 5 %"),
         ({"errors": errors(mean=0.13)}, "backlash_deg.tilt: 0.13 sd of its mean, 0.10 sd of its interval's ends"),
         ({"errors": errors(low=0.25)}, "0.25 sd of its interval's ends, wanted at most 0.1 and 0.2"),
         ({"errors": errors(high=np.nan)}, "backlash_deg.tilt"),
     ):
-        (sentence,) = lacking(**{**inside, **changed})
+        (sentence,) = Acceptance(**{**inside, **changed}).missing
         assert words in sentence
     assert uncertain(errors()) == ()
 

@@ -230,22 +230,22 @@ class Weighing:
         raw = np.exp(self.log_weights - np.max(self.log_weights))
         kish, count = effective_draws(raw), len(self.log_weights)
         deviations = {n: self.columns[n] - mean for n, mean in zip(self.headlines, summary.mean, strict=True)}
-        pareto, heaviest = self.smoothed.pareto_k, float(np.max(self.smoothed.weights))
-        missing = lacking(pareto, heaviest, count, self.monte_carlo_error)
+        heaviest = float(np.max(self.smoothed.weights))
+        acceptance = Acceptance(self.smoothed.pareto_k, heaviest, count, self.monte_carlo_error)
         return Importance(
-            accepted=not missing,
-            missing=missing,
+            accepted=not acceptance.missing,
+            missing=acceptance.missing,
             rounds=count // ROUND,
             draws=count,
             effective_share=kish / count,
             least_ess=extreme(dict(zip(self.headlines, summary.ess_least.tolist(), strict=True)), min),
-            pareto_k=pareto,
+            pareto_k=acceptance.pareto_k,
             worst_pareto_k=extreme({name: pareto_k(raw[self.finite] * x**2) for name, x in deviations.items()}, max),
             heaviest_share=heaviest,
             log_evidence=self.log_evidence,
             log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
             invalid_evaluations=self.pool.invalid,
-            answer=answer_of(missing, pareto, heaviest, self.monte_carlo_error),
+            answer=acceptance.answer,
         )
 
     @property
@@ -274,32 +274,41 @@ def k_max(draws: int) -> float:
     return min(1 - 1 / np.log10(draws), K_MAX)
 
 
-def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
-    """Say in sentences which limits of an accepted answer are not met.
+@dataclass(frozen=True)
+class Acceptance:
+    """What weighted draws are judged by, and the answer that they allow.
 
-    Args:
-        pareto: tail index of the weights.
+    Attributes:
+        pareto_k: tail index of the weights.
         heaviest: share of the weight in one draw.
         draws: their number.
         errors: Monte Carlo errors of every headline.
     """
-    missing, limit = [], k_max(draws)
-    if not pareto < limit:
-        missing.append(f"the weights of importance sampling have Pareto k {pareto:.2f}, wanted below {limit:.2f}")
-    if not heaviest <= HEAVIEST_MAX:
-        wanted = f"wanted at most {100 * HEAVIEST_MAX:.0f} %"
-        missing.append(f"one draw holds {100 * heaviest:.1f} % of the weight, {wanted}")
-    return (*missing, *uncertain(errors))
 
+    pareto_k: float
+    heaviest: float
+    draws: int
+    errors: Mapping[str, MonteCarloError]
 
-def answer_of(
-    missing: tuple[str, ...], pareto: float, heaviest: float, errors: Mapping[str, MonteCarloError]
-) -> AnswerKind:
-    """Choose the answer that draws allow: `missing` is what `lacking` says of the other arguments."""
-    if not missing:
-        return "accepted"
-    known = all(error.roughly_known for error in errors.values())
-    return "rough" if pareto < ROUGH_K_MAX and heaviest <= ROUGH_HEAVIEST_MAX and known else "laplace"
+    @cached_property
+    def missing(self) -> tuple[str, ...]:
+        """Say in sentences which limits of an accepted answer are not met."""
+        missing, limit = [], k_max(self.draws)
+        if not self.pareto_k < limit:
+            found = f"Pareto k {self.pareto_k:.2f}, wanted below {limit:.2f}"
+            missing.append(f"the weights of importance sampling have {found}")
+        if not self.heaviest <= HEAVIEST_MAX:
+            wanted = f"wanted at most {100 * HEAVIEST_MAX:.0f} %"
+            missing.append(f"one draw holds {100 * self.heaviest:.1f} % of the weight, {wanted}")
+        return (*missing, *uncertain(self.errors))
+
+    @property
+    def answer(self) -> AnswerKind:
+        """Return the answer."""
+        if not self.missing:
+            return "accepted"
+        known = all(error.roughly_known for error in self.errors.values())
+        return "rough" if self.pareto_k < ROUGH_K_MAX and self.heaviest <= ROUGH_HEAVIEST_MAX and known else "laplace"
 
 
 def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.importance import K_MAX, ROUND, ImportanceRun, Pool, Weighing, answer_of, lacking
+from tvsbayes.inference.importance import K_MAX, ROUND, Acceptance, ImportanceRun, Pool, Weighing
 from tvsbayes.inference.summaries import monte_carlo_errors
 from tvsbayes.instrument.homing import prior_chance
 from tvsbayes.posterior.draws import Posterior
@@ -160,20 +160,12 @@ class Mixture:
         return monte_carlo_errors(self.names, self.summary)
 
     @cached_property
-    def pareto_k(self) -> float:
-        """Return the largest tail index of a way that counts."""
+    def acceptance(self) -> Acceptance:
+        """Judge the draws, by the largest tail index of a way that counts and the largest weight of a draw."""
         counts = zip(self.probabilities, self.ways, strict=True)
-        return max(way.weighed.smoothed.pareto_k for p, way in counts if p >= WORTH_RELIABLE_WEIGHTS)
-
-    @cached_property
-    def heaviest(self) -> float:
-        """Return the largest weight of a draw."""
-        return float(max(weights.max() for weights in self._weights))
-
-    @cached_property
-    def missing(self) -> tuple[str, ...]:
-        """Say which limits of an accepted answer are not met."""
-        return lacking(self.pareto_k, self.heaviest, sum(map(len, self._weights)), self.errors)
+        pareto_k = max(way.weighed.smoothed.pareto_k for p, way in counts if p >= WORTH_RELIABLE_WEIGHTS)
+        heaviest = float(max(weights.max() for weights in self._weights))
+        return Acceptance(pareto_k, heaviest, sum(map(len, self._weights)), self.errors)
 
     @property
     def worst(self) -> str:
@@ -198,7 +190,7 @@ class Mixture:
 
     def improved(self) -> Mixture | None:
         """Draw more where it helps most; None where the draws suffice or no rounds are left."""
-        return self._with_reliable_weights() or (self._with_smaller_error() if self.missing else None)
+        return self._with_reliable_weights() or (self._with_smaller_error() if self.acceptance.missing else None)
 
     def _with_reliable_weights(self) -> Mixture | None:
         """Draw otherwise under the first way whose weights are unreliable."""
@@ -254,11 +246,11 @@ class Mixture:
         assert isinstance(diagnosis, Reweighted)
         importance = replace(
             diagnosis.importance,
-            accepted=not self.missing,
-            missing=self.missing,
-            pareto_k=self.pareto_k,
-            heaviest_share=self.heaviest,
-            answer=answer_of(self.missing, self.pareto_k, self.heaviest, self.errors),
+            accepted=not self.acceptance.missing,
+            missing=self.acceptance.missing,
+            pareto_k=self.acceptance.pareto_k,
+            heaviest_share=self.acceptance.heaviest,
+            answer=self.acceptance.answer,
         )
         convergence = replace(diagnosis, importance=importance, monte_carlo_error=self.errors)
         return replace(mixed(parts, self.probabilities), convergence=convergence, seconds=seconds)
