@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable, regular_counters
-from tvsbayes.calibration.optics import ERROR_AT
+from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.parameters import INDEX, PERIODS_MAX
@@ -118,16 +119,6 @@ def conditional(
     return Conditional(expected, left_open)
 
 
-def _axis(name: str) -> Axis:
-    """Return the axis of one of `GEAR_INPUTS`."""
-    return AXES[0] if name.endswith(AXES[0]) else AXES[1]
-
-
-def stated_periods(fit: JointFit, axis: Axis) -> tuple[float, ...]:
-    """Return the periods of an axis that the rig states, deg."""
-    return tuple(np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist())
-
-
 def seen_places(fit: JointFit) -> dict[Axis, np.ndarray]:
     """Return the indices of each axis' places among those of the fit."""
     places = fit.arrays.gears.places
@@ -135,15 +126,14 @@ def seen_places(fit: JointFit) -> dict[Axis, np.ndarray]:
     return {axis: np.flatnonzero(valid & (on_tilt == (axis == AXES[1]))) for axis in AXES}
 
 
-def process_of(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> Process:
-    """Return the scales of one of `GEAR_INPUTS` from draws (n, parameters)."""
-    axis = _axis(name)
+def process_of(fit: JointFit, physical: np.ndarray, kind: str, axis: Axis) -> Process:
+    """Return the scales of `ERROR_AT` or `PLAY_AT` of an axis from draws (n, parameters)."""
     length = physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]
-    if not name.startswith(ERROR_AT):
+    if kind == PLAY_AT:
         return Process(physical[:, INDEX[f"play_variation_deg.{axis}"]], length, np.zeros((len(physical), 0)))
-    columns = [INDEX[f"harmonic_amplitude_deg.{axis}.{k + 1}"] for k in range(min(len(periods), PERIODS_MAX))]
-    sd = physical[:, INDEX[f"transmission_error_deg.{axis}"]]
-    return Process(sd, length, physical[:, columns], periods[: len(columns)])
+    periods = np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist()[:PERIODS_MAX]
+    columns = [INDEX[f"harmonic_amplitude_deg.{axis}.{k + 1}"] for k in range(len(periods))]
+    return Process(physical[:, INDEX[f"transmission_error_deg.{axis}"]], length, physical[:, columns], tuple(periods))
 
 
 def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray]) -> GearTable:
@@ -185,17 +175,15 @@ def drawn_gears(
     generator = random_stream(seed, Stream.GEAR_TABLES)
     expected, left_open = np.zeros((count, table.size)), np.zeros((count, table.size))
     by_places = np.zeros((table.size, errors))
-    for name, part in table.parts.items():
-        axis = _axis(name)
-        at = seen_of[axis] + (0 if name.startswith(ERROR_AT) else errors // 2)
-        periods = stated_periods(fit, axis)
+    for kind, axis in product((ERROR_AT, PLAY_AT), AXES):
+        part, at = table.parts[f"{kind}.{axis}"], seen_of[axis] + (0 if kind == ERROR_AT else errors // 2)
         known, new = steps[seen_of[axis]], np.array(table.steps[AXES.index(axis)])
         normal = generator.standard_normal((count, len(new) + 1))
-        process, ratio = process_of(physical, name, periods), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
+        process, ratio = process_of(fit, physical, kind, axis), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
         values = place_errors_rad[:, at] * DEGREES
         drawn = conditional(process, ratio * known, values, ratio * new, normal[:, :-1])
         own_ratio = float(mode[INDEX[f"degrees_per_step.{axis}"]])
-        follows = _following(process_of(mode[None], name, periods), own_ratio * known, own_ratio * new)
+        follows = _following(process_of(fit, mode[None], kind, axis), own_ratio * known, own_ratio * new)
         inner = slice(part.start, part.stop - 1)
         by_places[inner] = follows @ root[at]
         expected[:, inner] = drawn.expected if own_scales else values @ follows.T

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.assessment.gear_tables import BLOCK, Process, process_of, seen_places, stated_periods
+from tvsbayes.assessment.gear_tables import BLOCK, Process, process_of, seen_places
 from tvsbayes.calibration.optics import ERROR_AT
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.parameters import INDEX
@@ -112,7 +112,7 @@ def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:
         return ()
     places = seen_places(fit)
     for axis in AXES:
-        process = process_of(physical, f"{ERROR_AT}{axis}", stated_periods(fit, axis))
+        process = process_of(fit, physical, ERROR_AT, axis)
         at, steps = places[axis], np.asarray(fit.arrays.gears.places.steps)[places[axis]]
         angle_deg = physical[:, INDEX[f"degrees_per_step.{axis}"], None] * steps
         for number, period in enumerate(process.periods):

@@ -79,7 +79,7 @@ class LaplaceDraws(NamedTuple):
     weights: np.ndarray
 
 
-def laplace_draws(fit: JointFit) -> LaplaceDraws:
+def draws_of_ways(fit: JointFit) -> LaplaceDraws:
     """Concatenate the draws of all ways of homing; those of the fit alone where the sides were recorded."""
     parts = [(way.probability, way.fit.draws) for way in fit.mixture if way.fit is not None]
     counts = [len(part.physical) for _, part in parts]
@@ -89,10 +89,10 @@ def laplace_draws(fit: JointFit) -> LaplaceDraws:
 
 
 def equal_laplace_draws(fit: JointFit) -> Derived:
-    """Resample `laplace_draws` with equal weights, as many as the fit has; its own draws if there is one way."""
+    """Resample `draws_of_ways` with equal weights, as many as the fit has; its own draws if there is one way."""
     if len(fit.mixture) == 1:
         return fit.draws
-    weighted, count = laplace_draws(fit), len(fit.draws.physical)
+    weighted, count = draws_of_ways(fit), len(fit.draws.physical)
     # Without the permutation the first draws would be of one way only.
     places = np.random.default_rng(MIXING_SEED).permutation(systematic(weighted.weights, count, 0.5))
     return jax.tree.map(lambda x: x[places], weighted.draws)
@@ -106,7 +106,7 @@ class _Source:
         self.prior = fit.prior_draws
         if posterior is None:
             self.centre = fit.mode
-            self.draws, self.weights = laplace_draws(fit)
+            self.draws, self.weights = draws_of_ways(fit)
         else:
             self.centre, self.draws, self.weights = posterior.centre, posterior.joined, posterior.weights.ravel()
 
