@@ -367,31 +367,27 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
 
 def _moved(departures: DrawnDepartures, limit: float) -> tuple[MovedPart, ...]:
     """Find changes that explain the looks, the best first, each given those before it."""
-    known: list[slice] = []
+    moved: list[int] = []
     places = departures.centre.columns
-    while len(known) < len(places):
-        logs = log_chances(departures, known)[1:]
+    while len(moved) < len(places):
+        logs = log_chances(departures, [places[k] for k in moved])[1:]
         best = int(np.argmin(logs))
         if logs[best] > limit:
             break
-        known.append(places[best])
-    if not known:
+        moved.append(best)
+    if not moved:
         return ()
-    rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
+    rows = np.concatenate([np.arange(places[k].start, places[k].stop) for k in moved])
     covariance = _inverse(departures.centre.information[np.ix_(rows, rows)])
     sizes, us = covariance @ departures.centre.score[rows], np.sqrt(np.diag(covariance))
-    named = [(part, change.unit) for change in departures.centre.changes for part in change.parts]
     parts: list[MovedPart] = []
     start = 0
-    for columns in known:
-        rows_of_change = slice(start, start := start + columns.stop - columns.start)
-        value, u = sizes[rows_of_change], us[rows_of_change]
+    for change in (departures.centre.changes[k] for k in moved):
+        own = slice(start, start := start + len(change.parts))
+        value, u = sizes[own], us[own]
         ratio = np.abs(value) / u
         significant = [k for k in np.argsort(-ratio).tolist() if ratio[k] > TOLD_U] or [int(np.argmax(ratio))]
-        parts += [
-            MovedPart(named[columns.start + k][0], float(value[k]), float(u[k]), named[columns.start + k][1])
-            for k in significant
-        ]
+        parts += [MovedPart(change.parts[k], float(value[k]), float(u[k]), change.unit) for k in significant]
     return tuple(parts)
 
 

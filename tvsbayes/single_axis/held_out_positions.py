@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -30,16 +31,15 @@ REFITTED_MAX, DRAWS_WEIGHTED, EFFECTIVE_MIN = 30, 400, 80
 last number of them are effective. At most `POSITIONS_MAX` are predicted."""
 
 
-def _means_of(rows: AxisRows, members: np.ndarray) -> tuple[np.ndarray, int]:
-    """Weights (rows,) of the mean of all readings in these rows, and the number of readings."""
-    count = rows.count[members]
-    return count / count.sum(), int(count.sum())
+def _mean_weights(rows: AxisRows, members: np.ndarray) -> np.ndarray:
+    """Weights (rows,) of the mean of all readings in these rows."""
+    return rows.count[members] / rows.count[members].sum()
 
 
 def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> tuple[float, float]:
     """Mean of rows `members` from offset, scale and play fitted to the other rows, and its u."""
     line = fit_line(rows, ~left_out)
-    weights, _ = _means_of(rows, members)
+    weights = _mean_weights(rows, members)
     design_row = weights @ line_design(rows)[members]
     variance = float(design_row @ line.covariance @ design_row + line.scatter**2 * weights @ weights)
     return float(design_row @ line.solution), float(np.sqrt(variance))
@@ -103,7 +103,13 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     if len(positions) > POSITIONS_MAX:
         warnings.append(f"of {len(positions)} positions {POSITIONS_MAX} are left out in turn, evenly chosen")
         positions = positions[np.linspace(0, len(positions) - 1, POSITIONS_MAX).astype(int)]
-    draws = None
+
+    @cache
+    def draws() -> np.ndarray:
+        """Coordinates of the scales, from all rows."""
+        rng = random_stream(seed, AxisStream.HELD_OUT_BY_WEIGHTS)
+        return _equal_draws(model, DRAWS_WEIGHTED, seed, rng).w
+
     with Job({"hold-out": 1.0}, progress) as job:
         for number, position in enumerate(positions):
             job.at(number / len(positions), f"position {position:.10g}")
@@ -111,14 +117,12 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
             if len(np.unique(rows.command[~left_out])) < 2 or (~left_out).sum() < 3:
                 warnings.append(f"position {position:.10g}: too few readings elsewhere to predict it")
                 continue
-            rows_left_out, prediction = np.flatnonzero(left_out), None
-            if len(positions) > REFITTED_MAX:
-                draws = _draws_of_all_rows(model, seed) if draws is None else draws
-                prediction = _reweighted(model, draws, rows_left_out)
+            rows_left_out = np.flatnonzero(left_out)
+            prediction = _reweighted(model, draws(), rows_left_out) if len(positions) > REFITTED_MAX else None
             prediction = prediction or _refitted(model, left_out, seed + number)
             if prediction.fault:
                 warnings.append(f"position {position:.10g}: {prediction.fault}")
-            predictions += _scores(rows, position, rows_left_out, prediction.mean, prediction.covariance)
+            predictions += _scores(rows, position, prediction)
     return AxisHoldOut(
         positions=tuple(predictions),
         rms_z=rms([p.z for p in predictions]),
@@ -126,12 +130,6 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
         inside_share=sum(p.inside for p in predictions) / max(sum(p.rows for p in predictions), 1),
         warnings=tuple(warnings),
     )
-
-
-def _draws_of_all_rows(model: AxisModel, seed: int) -> np.ndarray:
-    """Coordinates (`DRAWS_WEIGHTED`, d) of the scales, from all rows."""
-    rng = random_stream(seed, AxisStream.HELD_OUT_BY_WEIGHTS)
-    return _equal_draws(model, DRAWS_WEIGHTED, seed, rng).w
 
 
 @dataclass(frozen=True)
@@ -151,18 +149,17 @@ def _equal_draws(model: AxisModel, count: int, seed: int, rng: np.random.Generat
     return _EqualDraws(sample.equal(count, rng), "; ".join(sample.convergence.missing))
 
 
-def _scores(
-    rows: AxisRows, position: float, rows_left_out: np.ndarray, mean: np.ndarray, covariance: np.ndarray
-) -> list[HeldOutReadings]:
+def _scores(rows: AxisRows, position: float, prediction: _Prediction) -> list[HeldOutReadings]:
     """Scores of the position by side of approach."""
-    predictions = []
+    predictions, mean, covariance = [], prediction.mean, prediction.covariance
     left_out = rows.command == position
+    rows_left_out = np.flatnonzero(left_out)
     for side in (1, -1, 0):
         of_side = np.flatnonzero(rows.side[rows_left_out] == side)
         if not len(of_side):
             continue
         members = rows_left_out[of_side]
-        weights, n = _means_of(rows, members)
+        weights = _mean_weights(rows, members)
         predicted = float(weights @ mean[of_side])
         u = float(np.sqrt(weights @ covariance[np.ix_(of_side, of_side)] @ weights))
         z = (rows.value[members] - mean[of_side]) / np.sqrt(np.diag(covariance)[of_side])
@@ -171,7 +168,7 @@ def _scores(
             HeldOutReadings(
                 position=float(position),
                 direction=DIRECTIONS[side],
-                n=n,
+                n=int(rows.count[members].sum()),
                 mean=float(weights @ rows.value[members]),
                 predicted=predicted,
                 u=u,
