@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_kind import ID_MAX
@@ -213,7 +214,7 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
         text = f"standard uncertainty of a centroid: {notation.sd_px:g} px; --sd-px states another"
         assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in sd_columns) else text)
     numbers = cells.read(SPOTS["spot"], optional=True)
-    optional = {name: cells.read(SPOTS[name]) for name in SPOTS.optional}
+    optional: dict[str, Sequence[Any]] = {name: cells.read(SPOTS[name]) for name in SPOTS.optional}
     statuses, targets = cells.text("status"), cells.text("target")
     # The other rows are moves without a look.
     is_look = [
@@ -224,17 +225,7 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
     unique = None not in look_numbers and len(set(look_numbers)) == len(look_numbers)
     if "spot" in cells and not unique:
         assumed.append("spot: numbers are missing or repeated, so looks are numbered by their rows")
-    four_point = [field for field in FOUR_POINT if field in cells]
-    if len(four_point) == 1:
-        # A column "point" with 1 ... 200 counts looks.
-        column = escaped(cells.columns[four_point[0]])
-        assumed.append(f"column {column} is left out: no column gives the other of {' and '.join(FOUR_POINT)}")
-    experiments, points = (
-        cells.read(SPOTS[field]) if len(four_point) == 2 else [None] * len(move_of_row) for field in FOUR_POINT
-    )
-    half = sum((a is None) != (b is None) for a, b in zip(experiments, points, strict=True))
-    if half:
-        assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with only one of them, which is left out")
+    optional |= _four_point(cells, assumed)
     scale_deg = DEGREES[notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""), DEGREES) or "deg"]
     limit = APERTURE_MAX_DEG / scale_deg
     readings = cells.read(SPOTS["aperture_deg"], -limit, limit)
@@ -248,7 +239,6 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
         status = "no centre in the table" if no_centre else status_of(cells, row, centre_by_field, "look")
         number = numbers[row] if unique else row
         reading = None if (raw := readings[row]) is None else scale_deg * raw
-        of_experiment = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
         values = {name: column[row] for name, column in optional.items()}
         if status == "ok":
             sds = [_sd_px(cells, row, *column, notation) for column in zip(PIXEL_SDS, sd_columns, strict=True)]
@@ -259,8 +249,6 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
                 spot=number,
                 move=move,
                 target=readable(targets[row], "sheet", 100),
-                experiment=of_experiment[0],
-                point=of_experiment[1],
                 aperture_deg=reading,
                 status=status,
                 **values,
@@ -268,6 +256,23 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
         )
     assumed += left_out(cells, statuses, "look")
     return tuple(spots)
+
+
+def _four_point(cells: FieldCells, assumed: list[str]) -> dict[str, Sequence[int | None]]:
+    """The columns of the four-point method by field; none where the table has only one of them."""
+    fields = [field for field in FOUR_POINT if field in cells]
+    if len(fields) == 1:
+        # A column "point" with 1 ... 200 counts looks.
+        column = escaped(cells.columns[fields[0]])
+        assumed.append(f"column {column} is left out: no column gives the other of {' and '.join(FOUR_POINT)}")
+    if len(fields) < len(FOUR_POINT):
+        return {}
+    rows = list(zip(*(cells.read(SPOTS[field]) for field in FOUR_POINT), strict=True))
+    half = sum((experiment is None) != (point is None) for experiment, point in rows)
+    if half:
+        assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with only one of them, which is left out")
+    whole = [(None, None) if None in row else row for row in rows]
+    return dict(zip(FOUR_POINT, zip(*whole, strict=True), strict=True))
 
 
 def _sd_px(cells: FieldCells, row: int, field: str, column: Sequence[float | None] | None, notation: Notation) -> float:
