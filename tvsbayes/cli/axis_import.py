@@ -186,8 +186,7 @@ def _read_table(table: ForeignTable, stated: Mapping[str, str], options: FileOpt
     missing = [field for field in NEEDED if field not in known.columns]
     if missing or known.ambiguous:
         besides = "; or is a column actual less commanded position: --column value=NAME --deviations"
-        fields = [*missing, *(f for f in known.ambiguous if f not in missing)]
-        raise column_refusal(table, known, fields, AXIS_FIELDS, NEEDED, besides * ("value" in missing))
+        raise column_refusal(table, known, missing, AXIS_FIELDS, NEEDED, besides * ("value" in missing))
     if not options.deviations and "value" not in stated:
         refuse_small(table, known.columns)
     deviations = {} if options.deviations else deviation_columns(table, known.columns)

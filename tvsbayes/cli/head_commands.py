@@ -120,8 +120,7 @@ def import_sightings(
     mapping = map_columns(table.columns, stated, SIGHTING_FIELDS, sighting_field)
     missing = [field for field in NEEDED if field not in mapping.columns]
     if missing or mapping.ambiguous:
-        fields = [*missing, *(field for field in mapping.ambiguous if field not in missing)]
-        raise column_refusal(table, mapping, fields, SIGHTING_FIELDS, NEEDED)
+        raise column_refusal(table, mapping, missing, SIGHTING_FIELDS, NEEDED)
     joints = _joints_of(to)
     reversed_axes = () if joints is None else [axis for axis in AXES if joints.sign[axis] < 0]
     sightings = sightings_of_table(table, mapping.columns, notation, correction, u_deg, reversed_axes)

@@ -190,11 +190,9 @@ def _why_refused(kind_of_file: str, option: str) -> tuple[str, str]:
     remedy = "leave it out"
     if kind_of_file == COPY:
         return "for tables of other programs, and FILE is a folder", remedy
-    if kind_of_file == URDF:
-        return "for other tables", remedy
     if KINDS_OF[option] == (URDF,):
         return "for a URDF", "add --urdf, or leave it out"
-    if kind_of_file == POINTING:
+    if kind_of_file in (URDF, POINTING):
         return "for other tables", remedy
     if kind_of_file == AXIS:
         machine = "a head" if option == "sightings" else "a scanner"
@@ -383,10 +381,9 @@ def _complete_mapping(
         open_fields = missing(mapping.columns, moves_known)
         if not open_fields:
             return mapping
-    no_columns = set(mapping.columns).isdisjoint((*PIXELS, *COUNTERS))
     hint = "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
-    hint *= no_columns
-    raise column_refusal(table, mapping, list(dict.fromkeys(open_fields)), FIELDS, (*PIXELS, *COUNTERS), hint)
+    hint *= set(mapping.columns).isdisjoint((*PIXELS, *COUNTERS))
+    raise column_refusal(table, mapping, open_fields, FIELDS, (*PIXELS, *COUNTERS), hint)
 
 
 def _check_no_rows(to: Path, looks: ForeignLooks) -> None:

@@ -66,6 +66,7 @@ def column_refusal(
     hint: str = "",
 ) -> InputError:
     """The refusal of a table with missing or ambiguous columns, with the known ones; `needed` fields are required."""
+    missing = list(dict.fromkeys((*missing, *known.ambiguous)))
     ambiguous = [f"{field} ({' or '.join(map(escaped, columns))})" for field, columns in known.ambiguous.items()]
     found = f"no column that is surely {', '.join([*(f for f in missing if f not in known.ambiguous), *ambiguous])}"
     understood = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in fields if field in known.columns)
