@@ -131,7 +131,9 @@ def test_leave_one_out_is_the_prediction_by_all_others():
         error = residual[own] - gain @ residual[rest]
         spread = covariance[np.ix_(own, own)] - gain @ covariance[np.ix_(rest, own)]
         expected.append(error @ np.linalg.solve(spread, error))
-    np.testing.assert_allclose(leave_one_out_chi2(stop_information(spots)), expected, rtol=DENSE)
+    np.testing.assert_allclose(
+        leave_one_out_chi2(stop_information(spots), np.ones(len(expected))), expected, rtol=DENSE
+    )
 
 
 def test_leave_one_out_of_weighted_spots_is_that_of_full_weight():
@@ -145,7 +147,8 @@ def test_leave_one_out_of_weighted_spots_is_that_of_full_weight():
         alone = root.copy()
         alone[k] = 1.0
         full = replace(spots, residual=alone * spots.residual, load=alone[..., None] * spots.load)
-        assert found[k] == pytest.approx(leave_one_out_chi2(stop_information(full))[k], rel=DENSE)
+        expected = leave_one_out_chi2(stop_information(full), np.ones(len(weight)))[k]
+        assert found[k] == pytest.approx(expected, rel=DENSE)
 
 
 def test_standard_deviations_without_a_stop_are_those_of_a_fit_without_it():
@@ -197,10 +200,13 @@ def test_outlier_of_a_stop_is_blamed_on_its_spot(seed, blamed):
     direction /= np.linalg.norm(direction)
     wrong = clean.copy()
     wrong[pair[blamed]] += 12.0 * direction
-    distance = leave_one_out_chi2(stop_information(replace(spots, residual=wrong)))
+    distance, usual = (
+        leave_one_out_chi2(stop_information(replace(spots, residual=each)), np.ones(len(each)))
+        for each in (wrong, clean)
+    )
     assert np.argmax(distance) == pair[blamed]
     # Median of chi2 with 4 degrees of freedom is 3.4; a clean spot exceeds 30 once in 2e5.
-    assert distance[pair[blamed]] > 30 > np.median(leave_one_out_chi2(stop_information(replace(spots, residual=clean))))
+    assert distance[pair[blamed]] > 30 > np.median(usual)
 
 
 @pytest.mark.thorough

@@ -291,13 +291,13 @@ def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
         seed: seed of the Laplace draws.
         advance: receives the progress.
     """
-    start = Mode(first.z, first.covariance, -first.log_density, ())
+    start, weight = Mode(first.z, first.covariance, -first.log_density, ()), np.asarray(problem.arrays.spots.weight)
     modes: dict[tuple[tuple[str, str], ...], tuple[Problem, Mode]] = {}
 
     def mode_under(sides: Sides) -> tuple[Problem, Mode]:
         key = tuple(sorted(sides.items()))
         if key not in modes:
-            under = _problem_under(first, problem, sides)
+            under = Problem(homed(first.campaign, sides), problem.table, first.arrays.used, weight)
             modes[key] = under, under.mode_beside(start)
             advance(len(modes) / most_fits(axes))
         return modes[key]
@@ -319,12 +319,6 @@ def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
         for way, fitted in zip(weighed_ways, (best, *others), strict=True)
     )
     return replace(best, alternatives=alternatives)
-
-
-def _problem_under(found: JointFit, problem: Problem, sides: Sides) -> Problem:
-    """Build the problem of a fit with these sides of the homings."""
-    weight = np.asarray(problem.arrays.spots.weight)
-    return Problem(homed(found.campaign, sides), problem.table, found.arrays.used, weight)
 
 
 def laplace_evidence(mode: Mode, free: Bool[np.ndarray, " parameters"]) -> float:

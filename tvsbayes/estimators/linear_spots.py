@@ -311,7 +311,7 @@ def _without_places(groups: list[StopGroup], whole: np.ndarray, parameters: int)
     return StopInformation(tuple(groups), fisher, explained[:, 0], -explained[:, 1:], covariance)
 
 
-def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None = None) -> np.ndarray:
+def leave_one_out_chi2(information: StopInformation, weight: np.ndarray) -> np.ndarray:
     """Compute the squared distance of each spot from its prediction by all OTHER spots, shape (n,).
 
     It equals twice the gain in log density from leaving the spot out, up to the determinant: of two spots of a stop
@@ -322,7 +322,6 @@ def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None =
         weight: robust weights w that are in its residuals, shape (n,). Distances are those at full weight: in the
             covariance I + w P of a weighted innovation, with P predicted, only the noise is scaled back.
     """
-    weight = np.ones(sum(len(g.residual) // 4 for g in information.groups)) if weight is None else weight
     values: list[float] = []
     for group in information.groups:
         for k in range(len(group.residual) // 4):

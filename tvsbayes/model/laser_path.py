@@ -125,9 +125,8 @@ def nowhere() -> Reached:
     return Reached(*(jnp.zeros(2) for _ in range(4)))
 
 
-def way_steps(moves: MoveArrays, before: Reached | None = None) -> Float[Array, "moves 2"]:
+def way_steps(moves: MoveArrays, before: Reached) -> Float[Array, "moves 2"]:
     """Count the steps that each axis has gone, forwards and backwards, since its segment began."""
-    before = nowhere() if before is None else before
     gone = jnp.abs(jnp.diff(moves.steps, axis=0, prepend=before.steps[None]))
     total = before.way_steps + jnp.cumsum(jnp.where(moves.first[:, None], 0.0, gone), axis=0)
     begun = jnp.where(moves.first[:, None], total, 0.0)

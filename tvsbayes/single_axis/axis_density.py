@@ -55,7 +55,7 @@ def line_functionals(model: AxisModel) -> np.ndarray:
 
 
 def line_factors(model: AxisModel) -> dict[str, Mapping[str, float]]:
-    """Factors of `AxisModel.head` by name of `LINES`."""
+    """Factors of `AxisModel.line_terms` by name of `LINES`."""
     return {each.name: each.line(model.middle, model.rows.travel) for each in LINES if each.line}
 
 
