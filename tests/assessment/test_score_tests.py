@@ -19,7 +19,7 @@ from support.dozen_spots import coordinates
 from support.drawn_residuals import drawn_residual
 from support.small_results import small_summary
 
-from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _defects_in_place, _holm, _SeenAxis, validate
+from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _defects_in_place, _holm, _SeenAxis, _Tested, validate
 from tvsbayes.estimators.joint_fit import JointFit, fit_at
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.mode_search import Problem
@@ -159,7 +159,7 @@ def test_one_bad_spot_is_named_and_moves_no_uncertainty(clean):
 
 def test_holm_shares_the_level_and_the_factor_takes_failed_tests_alone():
     logs = np.log([0.004, 1e-5, 0.5, 0.004999])
-    answers = [_Answer(float(p), f"t{k}", "here", 9.0, 1, 2.0 + k) for k, p in enumerate(logs)]
+    answers = [_Tested(float(p), f"t{k}", "here", 9.0, 1, 2.0 + k) for k, p in enumerate(logs)]
     found = _holm(answers)
     # Four tests: 1e-5 <= 0.01/4, then 0.004 > 0.01/3.
     assert [t.name for t in found.tests if t.failed] == ["t1"]
@@ -231,7 +231,7 @@ def test_the_larger_of_two_gross_defects_is_the_cause():
         ends = log_chance(np.array([1000.0, 2000.0, 1e5]), dof)
         assert np.all(np.isfinite(ends)) and np.all(np.diff(ends) < 0)
         assert (ends[1] - ends[0]) / 1000 == pytest.approx(-0.5, abs=3 / 1000)
-    spot, cameras = (_Answer(float(log_chance(x, 3)), str(x), "", x, 3, 0.0) for x in (1600.0, 1e5))
+    spot, cameras = (_Tested(float(log_chance(x, 3)), str(x), "", x, 3, 0.0) for x in (1600.0, 1e5))
     assert _holm([spot, cameras]).cause.startswith("100000.0")
 
 

@@ -173,7 +173,7 @@ def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]
 
 
 @dataclass(frozen=True)
-class _Answer:
+class _Tested:
     """A test before the joint decision; `log_p`, since p of chi-squares of hundreds underflows."""
 
     log_p: float
@@ -199,7 +199,7 @@ class _Scores:
     variance: np.ndarray
     moved_by: np.ndarray
 
-    def answer(self, name: str, place: str, rows: slice) -> _Answer | None:
+    def test(self, name: str, place: str, rows: slice) -> _Tested | None:
         """Test some columns; None where the fit can absorb them entirely."""
         values, vectors = np.linalg.eigh(self.variance[rows, rows])
         kept = values > ABSORBED
@@ -209,11 +209,11 @@ class _Scores:
         chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
         size = (vectors[:, kept] / values[kept]) @ along
         shift = float(np.max(np.abs(self.moved_by[:, rows] @ size)))
-        return _Answer(float(log_chance(chi2, dof)), name, place, chi2, dof, shift)
+        return _Tested(float(log_chance(chi2, dof)), name, place, chi2, dof, shift)
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Common:
     """Arrays common to all tests.
 
     Attributes:
@@ -229,7 +229,7 @@ class _Asked:
     scores: _Scores
 
 
-def _ask(fit: JointFit, defects: Sequence[_Defect]) -> _Asked:
+def _common(fit: JointFit, defects: Sequence[_Defect]) -> _Common:
     columns_of_fit = fit.linearised.by_coordinates(fit.held)
     columns_of_all = np.concatenate(
         [columns_of_fit, *(columns for defect in defects for columns in defect.columns)], axis=2
@@ -251,7 +251,7 @@ def _ask(fit: JointFit, defects: Sequence[_Defect]) -> _Asked:
         variance=(information.fisher[p:, p:] - cross.T @ followed) * np.outer(scale, scale),
         moved_by=gradient @ fit.covariance @ cross * scale / sd[:, None],
     )
-    return _Asked(information.groups, score[:p], inverse, scores)
+    return _Common(information.groups, score[:p], inverse, scores)
 
 
 def validate(fit: JointFit) -> Validation:
@@ -275,35 +275,35 @@ def validate(fit: JointFit) -> Validation:
     """
     axes = _seen_axes(fit)
     defects = [*_defects_in_time(fit, axes), *_defects_in_place(fit, axes)]
-    question = _ask(fit, defects)
-    results = [_single_spots(fit, question)]
+    common = _common(fit, defects)
+    results = [_single_spots(fit, common)]
     start = 0
     for defect in defects:
-        answers = []
+        tested = []
         for place, columns in zip(defect.places, defect.columns, strict=True):
             rows = slice(start, start + columns.shape[2])
             start = rows.stop
-            answer = question.scores.answer(defect.name, place, rows)
-            if answer is not None:
-                answers.append(answer)
-        if answers:
-            worst = min(answers, key=lambda a: a.log_p)
-            results.append(replace(worst, log_p=worst.log_p + np.log(len(answers)), places=len(answers)))
+            one = common.scores.test(defect.name, place, rows)
+            if one is not None:
+                tested.append(one)
+        if tested:
+            worst = min(tested, key=lambda a: a.log_p)
+            results.append(replace(worst, log_p=worst.log_p + np.log(len(tested)), places=len(tested)))
     return _holm(results)
 
 
-def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
+def _single_spots(fit: JointFit, common: _Common) -> _Tested:
     """Test the spot that all others predict worst; its effect on headlines is not computed (`--robust` drops it).
 
     As `linear_spots.leave_one_out_chi2`, with the fit's coordinates eliminated.
     """
     spots = ordered_spots(fit.campaign)
-    p, shift = len(question.own_score), question.followed @ question.own_score
-    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in question.groups])
+    p, shift = len(common.own_score), common.followed @ common.own_score
+    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in common.groups])
     blocks = []
-    for group in question.groups:
+    for group in common.groups:
         fitted = group.jacobian[:, :p]
-        left = group.precision - fitted @ question.followed @ fitted.T
+        left = group.precision - fitted @ common.followed @ fitted.T
         blocks += [left[k : k + 4, k : k + 4] for k in range(0, len(left), 4)]
     values, vectors = np.linalg.eigh(np.stack(blocks))
     kept = values > ABSORBED
@@ -313,7 +313,7 @@ def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
     dof = np.maximum(kept.sum(axis=1) - ~fit.arrays.read, 1)
     chances = log_chance(distances, dof)
     worst = int(np.argmin(chances))
-    return _Answer(
+    return _Tested(
         log_p=float(chances[worst] + np.log(len(spots))),
         name="single spots disagree with all others",
         where=f"most of all spot {spots[worst].spot}",
@@ -324,11 +324,11 @@ def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
     )
 
 
-def _holm(answers: Sequence[_Answer]) -> Validation:
+def _holm(tested: Sequence[_Tested]) -> Validation:
     """Decide all tests together at `VALIDATION_LEVEL`; the defect with the least p is named as the cause."""
-    answers = sorted(answers, key=lambda a: a.log_p)
+    tested = sorted(tested, key=lambda a: a.log_p)
     bad = 0
-    while bad < len(answers) and answers[bad].log_p <= np.log(VALIDATION_LEVEL / (len(answers) - bad)):
+    while bad < len(tested) and tested[bad].log_p <= np.log(VALIDATION_LEVEL / (len(tested) - bad)):
         bad += 1
     tests = tuple(
         ValidationTest(
@@ -341,7 +341,7 @@ def _holm(answers: Sequence[_Answer]) -> Validation:
             failed=rank < bad,
             shift_sd=a.shift_sd,
         )
-        for rank, a in enumerate(answers)
+        for rank, a in enumerate(tested)
     )
     cause = f"{tests[0].name}: {tests[0].where}" if bad else ""
     inflation = float(np.hypot(1.0, max((t.shift_sd for t in tests[:bad]), default=0.0)))
