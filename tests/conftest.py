@@ -169,7 +169,7 @@ def evaluate():
     def compiled(z, space, arrays):
         model = space.model(z)
         angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-        found = likelihood.standing(model, arrays)
+        found = likelihood.look_terms(model, arrays)
         terms = {
             "residual": jnp.stack(found.terms.residual, axis=1),
             "slope": jnp.stack([jnp.stack(found.terms.by_pan, 1), jnp.stack(found.terms.by_tilt, 1)], axis=2),

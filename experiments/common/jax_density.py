@@ -13,7 +13,7 @@ from jax.scipy.linalg import block_diag, solve_triangular
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays
 from tvsbayes.estimators.kalman_filter import filtered, no_belief
-from tvsbayes.estimators.likelihood import filter_input, place_columns, standing
+from tvsbayes.estimators.likelihood import filter_input, look_terms, place_columns
 from tvsbayes.model.gear_processes import FLOOR_RAD2
 from tvsbayes.model.laser_path import mirror_angles
 from tvsbayes.model.parameter_space import Model, ParameterSpace
@@ -67,7 +67,7 @@ def innovations(z: jax.Array, space: ParameterSpace, arrays: CampaignArrays) -> 
     model = space.model(z)
     every = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
     angles = jax.tree.map(lambda of_moves: of_moves[arrays.spots.move_index], every)
-    given, stood = filter_input(model, arrays, angles), standing(model, arrays, angles=angles)
+    given, stood = filter_input(model, arrays, angles), look_terms(model, arrays, angles=angles)
     free = jnp.stack(stood.to_states.of_many(stood.terms.residual)[2:], axis=1)
     root = root_at_places(model, arrays.gears)
     both = [given.rows.residual[..., None], place_columns(given.slope, arrays.gears) @ root]

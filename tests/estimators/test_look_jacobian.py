@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.estimators.likelihood import standing
+from tvsbayes.estimators.likelihood import look_terms
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.estimators.looks import observe
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
@@ -33,7 +33,7 @@ def both(dozen):
 
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def compute(z):
-        looks = standing(dozen.space.model(z), dozen.arrays).looks
+        looks = look_terms(dozen.space.model(z), dozen.arrays).looks
         parts = jnp.stack(look_jacobian(dozen.space.point(z), dozen.space, looks, dozen.arrays))
         return parts, jax.jacfwd(whole)(z, looks.range_mm).transpose(0, 2, 1), looks
 

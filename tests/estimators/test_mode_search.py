@@ -22,7 +22,7 @@ class Known(Problem):
     def __init__(self, wall: float):
         self.noise, self.wall, self.calls = np.arange(3), wall, 0
 
-    def room(self, z):
+    def log_volume(self, z):
         """None."""
         return lambda points: np.zeros(len(points))
 

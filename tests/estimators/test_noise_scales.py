@@ -8,7 +8,7 @@ import pytest
 from tests.support.dense_spots import dense_covariance
 from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.linear_spots import linear_spots
-from tvsbayes.estimators.noise_scales import ScalesAlone, noise_draws
+from tvsbayes.estimators.noise_scales import MarginalScales, noise_draws
 from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, names_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.statistics.weighted_draws import effective_draws
@@ -40,14 +40,14 @@ def dense_density(fit, z: np.ndarray) -> float:
 def test_the_density_is_that_of_a_dense_gaussian(mixed_fit, column):
     other = mixed_fit.z.copy()
     other[column] += 0.4
-    found = np.diff(ScalesAlone(mixed_fit)(np.stack([mixed_fit.z, other])))[0]
+    found = np.diff(MarginalScales(mixed_fit)(np.stack([mixed_fit.z, other])))[0]
     # Priors of 1e5 sds of the looks: the dense determinant keeps that many digits.
     assert found == pytest.approx(dense_density(mixed_fit, other) - dense_density(mixed_fit, mixed_fit.z), abs=1e-4)
 
 
 def test_what_geometry_took_is_given_back(mixed_fit):
     """The centre is a maximum along every scale, and its pixel noise larger than at the mode of everything."""
-    found, alone = noise_draws(mixed_fit, 32, seed=0), ScalesAlone(mixed_fit)
+    found, alone = noise_draws(mixed_fit, 32, seed=0), MarginalScales(mixed_fit)
     sd = np.sqrt(np.diag(mixed_fit.covariance))
     assert found.centre[PIXEL] - mixed_fit.z[PIXEL] > 0.3 * sd[PIXEL]
     columns = [*STOPS, PIXEL]

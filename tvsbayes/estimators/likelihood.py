@@ -68,7 +68,7 @@ def place_columns(
     return jnp.concatenate([by_place * gears.error_share[:, None], by_place * gears.play_share[:, None]], axis=2)
 
 
-class Standing(eqx.Module):
+class LookTerms(eqx.Module):
     """Input of the filter at a point of parameter space: looks, their residuals, variances of the states."""
 
     looks: Looks
@@ -81,12 +81,12 @@ class Standing(eqx.Module):
     to_states: ToStates
 
 
-def standing(
+def look_terms(
     model: Model,
     arrays: CampaignArrays,
     inflation: Float[Array | np.ndarray, ""] | float = 1.0,
     angles: MirrorAngles | None = None,
-) -> Standing:
+) -> LookTerms:
     """Linearise all spots; `inflation` scales pixel and aperture noise (annealing), `angles` are the spots'."""
     spots = arrays.spots
     angles = spot_angles(model, arrays) if angles is None else angles
@@ -94,7 +94,7 @@ def standing(
     looks = looks_at(model, pan, tilt, arrays)
     noise, scattered = noise_scales(model, spots, inflation), scatter_variances(model.noise.look_scatter_rad, spots)
     terms = spot_residuals(looks, noise, model, spots)
-    return Standing(
+    return LookTerms(
         looks,
         noise,
         terms,
@@ -120,11 +120,11 @@ class FilterInput(eqx.Module):
 
 def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | None = None) -> FilterInput:
     """Linearise all spots for the filter; `angles` are the spots', if known."""
-    stood = standing(model, arrays, angles=angles)
-    terms, turned = stood.terms, stood.to_states
+    given = look_terms(model, arrays, angles=angles)
+    terms, turned = given.terms, given.to_states
     first, second, *free = turned.of_many(terms.residual)
     load, slope = jnp.stack([first, second], axis=1), turned.slope
-    rows = filter_rows(load, slope, stood.play_sd_rad, stood.stop_variance, stood.drift_variance, arrays.spots)
+    rows = filter_rows(load, slope, given.play_sd_rad, given.stop_variance, given.drift_variance, arrays.spots)
     log_scale = terms.log_scale + turned.log_scale - 0.5 * sum(number**2 for number in free)
     return FilterInput(rows, slope, log_scale)
 
@@ -392,8 +392,8 @@ def _residuals(
             before, stretch = so_far
             part = arrays.of_spots(first + number * size, size)
             angles = angles_at(model.transmission, model.tilt_zero_rad, arrays.moves, part.spots.move_index, stretch)
-            stood = standing(model, part, angles=angles.angles)
-            residual = jnp.stack(stood.to_states.in_place(stood.terms.residual), axis=1)
+            given = look_terms(model, part, angles=angles.angles)
+            residual = jnp.stack(given.to_states.in_place(given.terms.residual), axis=1)
             return jax.lax.dynamic_update_slice_in_dim(before, residual, number * size, 0), angles.stretch
 
         return jax.lax.fori_loop(0, blocks, through, (jnp.zeros((window, 4)), no_moves(arrays.moves)))[0]

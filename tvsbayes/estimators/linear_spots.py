@@ -22,7 +22,7 @@ from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.kalman_filter import filter_rows
-from tvsbayes.estimators.likelihood import place_columns, roots_at, standing
+from tvsbayes.estimators.likelihood import look_terms, place_columns, roots_at
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.model.parameter_space import ParameterSpace, Point
 
@@ -124,21 +124,21 @@ def linearise(
         inflation: factor on pixel and aperture noise.
     """
     model = space.model_at(jnp.asarray(at.values))
-    standard = standing(model, arrays, inflation)
-    looks, terms = standard.looks, standard.terms
+    given = look_terms(model, arrays, inflation)
+    looks, terms = given.looks, given.terms
     by_coordinates = look_jacobian(at, space, looks, arrays)
-    unit_noise = standard.to_states.in_place
-    residuals = unit_noise(terms.range_out.of_many(standard.noise.whitened(by_coordinates, arrays.spots))[1:])
+    unit_noise = given.to_states.in_place
+    residuals = unit_noise(terms.range_out.of_many(given.noise.whitened(by_coordinates, arrays.spots))[1:])
     slope = jnp.stack([jnp.stack(unit_noise(own), axis=1) for own in (terms.by_pan, terms.by_tilt)], axis=2)
     return LinearLooks(
         residual=jnp.stack(unit_noise(terms.residual), axis=1),
         slope=slope,
-        play_sd_rad=standard.play_sd_rad,
+        play_sd_rad=given.play_sd_rad,
         mirror_angles_rad=jnp.stack([looks.pan_rad, looks.tilt_rad], axis=1),
         predicted=jnp.stack(looks.predicted, axis=1),
-        stop_variance=standard.stop_variance,
-        drift_variance=standard.drift_variance,
-        scatter_variance=standard.scatter_variance,
+        stop_variance=given.stop_variance,
+        drift_variance=given.drift_variance,
+        scatter_variance=given.scatter_variance,
         place_columns=place_columns(slope, arrays.gears),
         residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),
         predicted_jacobian=jnp.stack(by_coordinates).transpose(2, 0, 1),

@@ -63,7 +63,7 @@ def search_stages(robust: bool) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Room:
+class LogVolume:
     """Log volume of geometry and cameras at given scales of repeating errors, up to a constant.
 
     Attributes:
@@ -166,13 +166,13 @@ class Problem:
         count = self.noise.size
         if not count:
             return z
-        room = self.room(z)
+        volume = self.log_volume(z)
         steps = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)]) * NOISE_STEP
 
         def about(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
             points = np.repeat(z[None], len(steps), axis=0)
             points[:, self.noise] = values + steps
-            value = self.negative_log_density(points) - room(points)
+            value = self.negative_log_density(points) - volume(points)
             centre, ahead, behind = np.split(value, [1, 1 + count])
             curvature = (ahead + behind - 2 * centre) / NOISE_STEP**2
             return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP), curvature
@@ -195,17 +195,17 @@ class Problem:
         result[self.noise] = optimum.x * unit
         return result
 
-    def room(self, z: np.ndarray) -> Room:
+    def log_volume(self, z: np.ndarray) -> LogVolume:
         """Return the volume of geometry and cameras by scales of repeating errors, linearised at z."""
         places = self.arrays.gears.without_padding().places
         steps = np.asarray(places.steps)
         if not len(steps):
-            return Room(self.space, np.zeros((len(NAMES), len(NAMES))), steps, places)
+            return LogVolume(self.space, np.zeros((len(NAMES), len(NAMES))), steps, places)
         lin = self.linearised(z)
         linear = linear_spots(lin, self.arrays, lin.by_coordinates(self.held))
         information = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
         ratio = np.radians(physical_at(z, self.space).value[RATIO_COLUMNS])
-        return Room(self.space, information.fisher, steps * ratio[places.on_tilt.astype(int)], places)
+        return LogVolume(self.space, information.fisher, steps * ratio[places.on_tilt.astype(int)], places)
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
         """Alternate geometry and noise scales until the noise settles (formulation 4.2)."""
@@ -252,8 +252,8 @@ class Problem:
         repeated = np.flatnonzero(self.repeated)
         if not repeated.size:
             return optimum
-        room, covariance = self.room(optimum.z), optimum.covariance.copy()
-        bent = _curvatures(lambda z: self.negative_log_density(z) - room(z), optimum.z, repeated, SCALE_STEP)
+        volume, covariance = self.log_volume(optimum.z), optimum.covariance.copy()
+        bent = _curvatures(lambda z: self.negative_log_density(z) - volume(z), optimum.z, repeated, SCALE_STEP)
         covariance[repeated, repeated] = 1 / np.clip(bent, 1.0, None)
         return replace(optimum, covariance=covariance)
 

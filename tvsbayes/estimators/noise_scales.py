@@ -41,7 +41,7 @@ class NoiseDraws:
     weights: np.ndarray
 
 
-class ScalesAlone:
+class MarginalScales:
     """Marginal log density of the noise scales of a fit, geometry and cameras integrated out, up to a constant.
 
     These are normal at given scales, as the campaign is linearised there.
@@ -55,10 +55,10 @@ class ScalesAlone:
         """Evaluate at points (n, p) that differ in their noise scales, shape (n,)."""
         arrays = self.fit.arrays
         joint = evaluate(z, no_draw(len(z), arrays), self.fit.space, arrays).log_density
-        log_density = joint + np.array([self._room(point) for point in z])
+        log_density = joint + np.array([self._log_integral(point) for point in z])
         return np.where(np.isfinite(log_density), log_density, -np.inf)
 
-    def _room(self, z: np.ndarray) -> float:
+    def _log_integral(self, z: np.ndarray) -> float:
         """Compute the log density's increase at z by integrating out geometry and cameras."""
         arrays, held = self.fit.arrays, self.fit.held
         lin = linearised_at(z, self.fit.space, arrays)
@@ -77,8 +77,8 @@ def noise_draws(fit: JointFit, count: int, seed: int) -> NoiseDraws:
         count: number of draws, even.
         seed: seed of the draws.
     """
-    alone = ScalesAlone(fit)
-    columns, centre = alone.columns, fit.z.copy()
+    marginal = MarginalScales(fit)
+    columns, centre = marginal.columns, fit.z.copy()
     if not columns.size:
         return NoiseDraws(centre, centre[None], np.ones(1))
     # Scales of repeating errors are at their marginal mode already, by the search for the mode.
@@ -87,7 +87,7 @@ def noise_draws(fit: JointFit, count: int, seed: int) -> NoiseDraws:
     for _ in range(STEPS_TO_MODE if taken.size else 0):
         points = np.repeat(centre[None], 2 * taken.size, axis=0)
         points[:, taken] += STEP * np.concatenate([root.T, -root.T])
-        ahead, behind = np.split(alone(points), 2)
+        ahead, behind = np.split(marginal(points), 2)
         step = (ahead - behind) / (2 * STEP)
         length = float(np.linalg.norm(step))
         centre[taken] += root @ step * min(1.0, LONGEST_STEP / max(length, 1e-300))
@@ -96,6 +96,6 @@ def noise_draws(fit: JointFit, count: int, seed: int) -> NoiseDraws:
     normal = np.concatenate([half, -half])
     z = np.repeat(centre[None], len(normal), axis=0)
     z[:, columns] += WIDER * normal @ root.T
-    log_weights = alone(z) + 0.5 * np.sum(normal**2, axis=1)
+    log_weights = marginal(z) + 0.5 * np.sum(normal**2, axis=1)
     weights = np.exp(log_weights - np.max(log_weights))
     return NoiseDraws(centre, z, weights / weights.sum())
