@@ -148,11 +148,11 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     lit_in_motion = []
     moved = instrument.mechanics.moved
     instrument.mechanics.moved = lambda *a: (lit_in_motion.append(instrument.mechanics.laser_on), moved(*a))
-    asked = []
+    questions = []
 
     def ask(question):
-        asked.append(question)
-        instrument.place("d1" if "d1" in question else "d2", len(asked))
+        questions.append(question)
+        instrument.place("d1" if "d1" in question else "d2", len(questions))
         return ""
 
     plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
@@ -163,17 +163,17 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     ):
         table = {"driver": "serial", "port": port, "settle_s": 0.0}
         real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
-        said = []
+        lines = []
         outcome = acquire(
             real,
             plan,
             tmp_path / "c",
             laser_class="3B",
             vision=Vision(centroids),
-            terminal=Terminal(said.append, ask=ask),
+            terminal=Terminal(lines.append, ask=ask),
         )
-    assert (outcome.reason, outcome.ok, len(asked)) == ("done", 3, 2), said
-    assert any("808 nm is invisible" in line for line in said)
+    assert (outcome.reason, outcome.ok, len(questions)) == ("done", 3, 2), lines
+    assert any("808 nm is invisible" in line for line in lines)
     assert not instrument.mechanics.laser_on and lit_in_motion and not any(lit_in_motion)
     assert verify(tmp_path / "c").frames == 12 and len(read_campaign(tmp_path / "c").spots) == 3
     assert "synthetic" not in read_campaign(tmp_path / "c").header
@@ -185,7 +185,7 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
 @needs_pseudo_terminals
 def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
     """As after a reboot: the board comes back as ttyACM1, the camera at another address, and both are logged."""
-    instrument, said = Instrument(small_rig, 7), []
+    instrument, lines = Instrument(small_rig, 7), []
     instrument.place("d1", 0)
     plan = [
         PlanStep(0, "home", 0, 0),
@@ -212,12 +212,12 @@ def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
             name.symlink_to(port)
             table = {"port": str(name), "settle_s": 0.0}
             rig = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
-            terminal, vision = Terminal(said.append, ask=lambda question: ""), Vision(failing_once)
+            terminal, vision = Terminal(lines.append, ask=lambda question: ""), Vision(failing_once)
             return acquire(rig, plan, tmp_path / "c", resume=resume, laser_class="3B", vision=vision, terminal=terminal)
 
     with pytest.raises(DeviceFault, match="has gone"):
         go(False)
     assert go(True).reason == "done"
-    changed = [line for line in said if line.endswith(": logged")]
-    assert [line.split(" was ")[0] for line in changed] == ["[cameras] source", "[positioner] port"], said
+    changed = [line for line in lines if line.endswith(": logged")]
+    assert [line.split(" was ")[0] for line in changed] == ["[cameras] source", "[positioner] port"], lines
     assert 'tty0" and is ' in changed[1] and verify(tmp_path / "c").stopped == "done"

@@ -21,16 +21,16 @@ pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 
 
 def test_campaign_is_readable_after_every_look(mounted_rig, tmp_path):
-    seen = []
+    counts = []
 
     def show(progress):
         if (tmp_path / "c" / "campaign.toml").exists():
-            seen.append(len(read_campaign(tmp_path / "c").spots))
-            assert seen[-1] == progress.looks and progress.looks_total == 8
+            counts.append(len(read_campaign(tmp_path / "c").spots))
+            assert counts[-1] == progress.looks and progress.looks_total == 8
             assert progress.seconds_left >= 0
 
     Run(mounted_rig, tmp_path / "c", show=show).engine.run()
-    assert seen[-1] == 7 and len(seen) > 10
+    assert counts[-1] == 7 and len(counts) > 10
 
 
 @pytest.mark.parametrize("refusals", [3, 10_000])
@@ -69,8 +69,8 @@ def test_what_somebody_changed_since_is_kept_beside(mounted_rig, tmp_path):
     outcome = Run(mounted_rig, tmp_path / "c", resume=True, start=1).engine.run()
     assert (tmp_path / "c" / "spots.edited-1.csv").read_text() == edited
     assert (tmp_path / "c" / "campaign.edited-1.toml").read_text() == stated
-    told = [w.split(" was")[0] for w in outcome.warnings if "edited" in w]
-    assert sorted(told) == ["campaign.toml", "spots.csv"]
+    named = [w.split(" was")[0] for w in outcome.warnings if "edited" in w]
+    assert sorted(named) == ["campaign.toml", "spots.csv"]
     assert not list((tmp_path / "c").glob("moves.edited*"))
     again = Run(mounted_rig, tmp_path / "c", resume=True, start=2).engine.run()
     assert (
@@ -94,8 +94,8 @@ def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp
     assert run(["check", str(folder), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     looks = document["journal"]["looks"] if kept == "half" else 0
-    told = [warning for warning in document["warnings"] if "lost looks" in warning]
-    assert len(told) == 1 and f"{8 - looks} looks" in told[0] and "-" not in told[0].split(" looks and ")[0][-5:]
+    lost = [warning for warning in document["warnings"] if "lost looks" in warning]
+    assert len(lost) == 1 and f"{8 - looks} looks" in lost[0] and "-" not in lost[0].split(" looks and ")[0][-5:]
     assert not any("behind the journal" in warning for warning in document["warnings"])
     outcome = Run(mounted_rig, folder, plan, resume=True, start=1).engine.run()
     assert outcome.reason == "done" and sum(s.experiment is not None for s in read_campaign(folder).spots) == 8
@@ -163,8 +163,8 @@ def test_an_empty_journal_has_one_remedy(mounted_rig, tmp_path, capsys):
     folder.mkdir()
     (folder / LOG).write_bytes(b"")
     assert run(["check", str(folder), "--json"]) == 0
-    told = [warning for warning in json.loads(capsys.readouterr().out)["warnings"] if "no event" in warning]
-    assert len(told) == 1 and EMPTY_REMEDY in told[0]
+    warnings = [warning for warning in json.loads(capsys.readouterr().out)["warnings"] if "no event" in warning]
+    assert len(warnings) == 1 and EMPTY_REMEDY in warnings[0]
     for resume in (True, False):
         with pytest.raises(InputError) as caught:
             begin(folder, mounted_rig, small_plan(), resume, HEADER)

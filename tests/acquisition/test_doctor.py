@@ -97,10 +97,10 @@ def test_a_grbl_board_is_examined_by_its_own_rules(tmp_path):
         open_camera=lambda: camera,
         clock=device.clock,
     )
-    found = {check.name: check for check in checks}
-    assert (found["firmware"].status, found["firmware"].found) == ("ok", "version Grbl 1.1h")
-    assert "no watchdog" in found["positioner"].found and found["positioner"].remedy
-    assert (found["homing"].status, found["homing"].found) == ("warning", "alarm") and board.steps == [400, 250]
+    checks_of = {check.name: check for check in checks}
+    assert (checks_of["firmware"].status, checks_of["firmware"].found) == ("ok", "version Grbl 1.1h")
+    assert "no watchdog" in checks_of["positioner"].found and checks_of["positioner"].remedy
+    assert (checks_of["homing"].status, checks_of["homing"].found) == ("warning", "alarm") and board.steps == [400, 250]
 
 
 def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):
@@ -142,11 +142,11 @@ def test_bad_pictures_are_named_with_a_remedy(tmp_path, camera, name, word):
 
 def test_laser_stays_off_unless_asked_for(tmp_path):
     device, camera = bench()
-    seen = []
+    lasers = []
     grab = camera.grab
-    camera.grab = lambda: (seen.append(device.mechanics.laser_on), grab())[1]
+    camera.grab = lambda: (lasers.append(device.mechanics.laser_on), grab())[1]
     assert found(device, camera, tmp_path)["laser"].status == "skipped"
-    assert seen and not any(seen)
+    assert lasers and not any(lasers)
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])

@@ -23,15 +23,15 @@ def test_without_an_emulator_nothing_is_begun(tmp_path, monkeypatch):
 @pytest.mark.skipif(bool(NO_EMULATOR), reason=NO_EMULATOR)
 def test_emulated_firmware_measures_what_its_model_measures(tmp_path):
     """Same rig, same stops, same noise; only the drift of the zeros knows that real time has passed."""
-    rig, found = read_rig(RIG_FILE), {}
+    rig, measured = read_rig(RIG_FILE), {}
     for emulate in (False, True):
         outcome = acquire(rig, small_plan(1), tmp_path / str(emulate), simulate=True, emulate=emulate, seed=3)
         assert (outcome.reason, outcome.ok) == ("done", 4)
         campaign = read_campaign(tmp_path / str(emulate))
         counters = [(move.pan_steps, move.tilt_steps) for move in campaign.moves]
         pixels = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
-        found[emulate] = counters, [[getattr(spot, name) for name in pixels] for spot in campaign.spots]
-    assert found[True][0] == found[False][0]
-    for ours, model in zip(found[True][1], found[False][1], strict=True):
+        measured[emulate] = counters, [[getattr(spot, name) for name in pixels] for spot in campaign.spots]
+    assert measured[True][0] == measured[False][0]
+    for ours, model in zip(measured[True][1], measured[False][1], strict=True):
         # Half of the noise of a pixel coordinate, 0.08 px; a step is worth some 5 px.
         assert ours == pytest.approx(model, abs=0.04)

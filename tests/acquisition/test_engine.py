@@ -38,8 +38,8 @@ def test_a_run_leaves_a_readable_campaign_with_every_look(mounted_rig, tmp_path)
     looks = [(s.experiment, s.point) for s in run_.plan if s.action == "look"]
     assert [(s.experiment, s.point) for s in campaign.spots] == looks
     assert campaign.header["synthetic"] is True and run_.dark() and len(run_.lit_while_moving) > 8
-    found = verify(tmp_path / "c")
-    assert found.stopped == "done" and recorded(read_journal(tmp_path / "c").records).unverified == ()
+    journal = verify(tmp_path / "c")
+    assert journal.stopped == "done" and recorded(read_journal(tmp_path / "c").records).unverified == ()
     assert check_journal(tmp_path / "c")["warnings"] == []
 
 
@@ -347,19 +347,19 @@ def test_pictures_of_a_segment_with_lost_steps_no_longer_wait_for_detection(moun
 
 
 def test_forgotten_sheet_is_noticed_by_its_spot(mounted_rig, tmp_path):
-    asked = []
+    requests = []
 
     class Forgetful(SimulatedOperator):
         def place(self, target, x_mm, placement, remark):
-            asked.append((target, remark))
-            if target == "d2" and not remark and sum(t == "d2" for t, _ in asked) == 1:
+            requests.append((target, remark))
+            if target == "d2" and not remark and sum(t == "d2" for t, _ in requests) == 1:
                 return True
             return super().place(target, x_mm, placement, remark)
 
     run_ = Run(mounted_rig, tmp_path / "c", operator=lambda r: Forgetful(r.instrument))
     assert run_.engine.run().ok == 8
-    assert [t for t, remark in asked if remark] == ["d2"]
-    assert "spot lies at X = 17" in next(remark for _, remark in asked if remark)
+    assert [t for t, remark in requests if remark] == ["d2"]
+    assert "spot lies at X = 17" in next(remark for _, remark in requests if remark)
     campaign = read_campaign(tmp_path / "c")
     plain = Run(mounted_rig, tmp_path / "plain")
     plain.engine.run()
@@ -384,9 +384,9 @@ def test_looks_without_a_spot_are_repeated_and_then_refused(mounted_rig, tmp_pat
 
         def observe(self, positioner, spot):
             self.calls += 1
-            found = self.inner.observe(positioner, spot)
+            observation = self.inner.observe(positioner, spot)
             blind = spot == 2 or (spot == 4 and self.calls % 2 == 0)
-            return replace(found, spot=DetectedSpot("no-spot")) if blind else found
+            return replace(observation, spot=DetectedSpot("no-spot")) if blind else observation
 
     run_ = Run(mounted_rig, tmp_path / "c", observer=Blind)
     outcome = run_.engine.run()

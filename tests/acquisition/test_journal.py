@@ -24,9 +24,9 @@ def test_what_is_written_is_read_back(folder):
     reading = read_journal(folder)
     assert [r.event for r in reading.records] == ["created", *["intent", "looked"] * 3, "stop"]
     assert reading.records[2].data["frames"][1]["name"] == "frames/000000_right.png" and not reading.torn
-    found = verify(folder)
-    assert (found.records, found.frames, found.orphans, found.torn_bytes, found.stopped) == (8, 6, (), 0, "done")
-    assert found.warnings == []
+    check = verify(folder)
+    assert (check.records, check.frames, check.orphans, check.torn_bytes, check.stopped) == (8, 6, (), 0, "done")
+    assert check.warnings == []
 
 
 def test_line_format_is_the_documented_one():
@@ -292,9 +292,9 @@ def test_the_folder_of_the_first_frame_is_durable_before_an_event_names_it(tmp_p
         disk.calls.clear()
         frame = journal.store(f"frames/{number:06d}_left.png", b"picture")
         journal.append("looked", frames=[frame.as_json()])
-        made = ["flush c"] * (number == 0)
+        created = ["flush c"] * (number == 0)
         picture_calls = [f"{call} c/frames/.{number:06d}_left.png.tmp" for call in ("write", "flush")]
-        assert disk.calls == [*picture_calls, *made, "flush c/frames", f"write c/{LOG}", f"flush c/{LOG}"]
+        assert disk.calls == [*picture_calls, *created, "flush c/frames", f"write c/{LOG}", f"flush c/{LOG}"]
     journal.close()
 
 
@@ -400,7 +400,7 @@ def power_cuts(tmp_path: Path, forget: str, looks: int) -> tuple[int, int, int]:
         disk.acknowledged = number
 
     write_looks(origin, looks, disk, acknowledge)
-    seen, lost, refused = 0, 0, 0
+    cuts, lost, refused = 0, 0, 0
     target = tmp_path / "after"
     for part in ("frames", "dark"):
         (target / part).mkdir(parents=True)
@@ -411,7 +411,7 @@ def power_cuts(tmp_path: Path, forget: str, looks: int) -> tuple[int, int, int]:
             if key in done:
                 continue
             done.add(key)
-            seen += 1
+            cuts += 1
             for old in target.rglob("*"):
                 if old.is_file():
                     old.unlink()
@@ -421,24 +421,24 @@ def power_cuts(tmp_path: Path, forget: str, looks: int) -> tuple[int, int, int]:
                 lost += acknowledged > 0
                 continue
             try:
-                found = verify(target).records
+                records = verify(target).records
             except InputError:
                 refused += 1
             else:
-                lost += found < acknowledged
-    return seen, lost, refused
+                lost += records < acknowledged
+    return cuts, lost, refused
 
 
 def test_no_power_cut_loses_or_damages_what_was_acknowledged(tmp_path):
-    seen, lost, refused = power_cuts(tmp_path, "", 3)
-    assert seen > 25 and lost == refused == 0
+    cuts, lost, refused = power_cuts(tmp_path, "", 3)
+    assert cuts > 25 and lost == refused == 0
 
 
 @pytest.mark.parametrize("forget", ["folder", "frame", "log"])
 def test_power_cut_bench_sees_every_forgotten_flush(tmp_path, forget):
     """The enumeration can fail: without one kind of flush it finds losses."""
-    seen, lost, refused = power_cuts(tmp_path, forget, 1)
-    assert lost + refused > 10, (seen, lost, refused)
+    cuts, lost, refused = power_cuts(tmp_path, forget, 1)
+    assert lost + refused > 10, (cuts, lost, refused)
 
 
 WRITER = """

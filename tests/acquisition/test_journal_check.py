@@ -32,9 +32,9 @@ def test_frames_swapped_stale_missing_or_grown_are_found(folder):
 
 def test_frames_of_an_interrupted_look_are_listed_and_kept(folder):
     (folder / "frames" / "000003_left.png").write_bytes(b"taken, not logged")
-    found = verify(folder)
-    assert found.orphans == ("frames/000003_left.png",)
-    assert "interrupted" in found.warnings[0]
+    check = verify(folder)
+    assert check.orphans == ("frames/000003_left.png",)
+    assert "interrupted" in check.warnings[0]
 
 
 def test_repair_keeps_what_is_whole_and_marks_the_gap(folder, tmp_path):
@@ -102,8 +102,8 @@ def test_what_follows_a_lost_look_counts_and_what_follows_a_lost_motion_does_not
     del lines[{"intent": 6, "moved": 7, "looked": 8}[lost]]
     (tmp_path / "run" / LOG).write_bytes(b"".join(lines))
     repair(tmp_path / "run", tmp_path / "new")
-    found = recorded(read_journal(tmp_path / "new").records)
-    assert [spot.spot for spot in found.spots] == spots and len(found.moves) == moves
+    history = recorded(read_journal(tmp_path / "new").records)
+    assert [spot.spot for spot in history.spots] == spots and len(history.moves) == moves
 
 
 def test_lines_that_changed_places_are_put_back(tmp_path):
@@ -112,6 +112,6 @@ def test_lines_that_changed_places_are_put_back(tmp_path):
     (tmp_path / "run" / LOG).write_bytes(b"".join(lines))
     done = repair(tmp_path / "run", tmp_path / "new")
     assert done.lost_lines == [] and done.kept == len(lines)
-    found = recorded(read_journal(tmp_path / "new").records)
-    assert (len(found.spots), len(found.moves), found.ignored_lines) == (4, 5, ())
+    history = recorded(read_journal(tmp_path / "new").records)
+    assert (len(history.spots), len(history.moves), history.ignored_lines) == (4, 5, ())
     assert "gap" not in [record.event for record in read_journal(tmp_path / "new").records]

@@ -43,12 +43,12 @@ def run_with(rig, folder, live, at, *whats, **options) -> Run:
 def test_pause_and_resume_lose_nothing(mounted_rig, tmp_path):
     live = scripted_run("resume")
     run = run_with(mounted_rig, tmp_path / "c", live, 3, "pause")
-    seen = []
+    pauses = []
     wait = live.requests.wait
-    live.requests.wait = lambda longest_s: (seen.append((live.latest.state, live.latest.device.laser_on)), wait(1))
+    live.requests.wait = lambda longest_s: (pauses.append((live.latest.state, live.latest.device.laser_on)), wait(1))
     outcome = run.engine.run()
     assert (outcome.reason, outcome.looks, outcome.ok) == ("done", 8, 8)
-    assert seen == [("paused", False)]
+    assert pauses == [("paused", False)]
     assert asked(tmp_path / "c") == [("pause", False), ("resume", False)]
     assert states(live) == [("pause", "acknowledged"), ("resume", "acknowledged")]
     assert all("laser off" in request.answer and request.waited_s >= 0 for request in live.requests.recent())

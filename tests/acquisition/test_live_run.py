@@ -28,23 +28,23 @@ def looked(spot: int, side: int = 64) -> SeenLook:
 
 def test_a_run_tells_where_it_stands(mounted_rig, tmp_path):
     live = LiveRun()
-    told = []
+    documents = []
 
     class Told(TwinObserver):
         def observe(self, positioner, spot):
-            told.append(live.document())
+            documents.append(live.document())
             return super().observe(positioner, spot)
 
     Run(mounted_rig, tmp_path / "c", observer=lambda i: Told(i, 0.08), live=live).engine.run()
-    assert [one["progress"]["looks"] for one in told] == list(range(8))
-    assert all(one["state"] == "running" and one["simulated"] and one["name"] == "test" for one in told)
-    third, last = told[2], live.document()
+    assert [one["progress"]["looks"] for one in documents] == list(range(8))
+    assert all(one["state"] == "running" and one["simulated"] and one["name"] == "test" for one in documents)
+    third, last = documents[2], live.document()
     assert third["progress"]["doing"] == "looking" and third["coming"][0] == "placing d1"
-    assert third["progress"]["seconds_left"] > told[3]["progress"]["seconds_left"] > 0
+    assert third["progress"]["seconds_left"] > documents[3]["progress"]["seconds_left"] > 0
     assert third["look"]["spot"] == 1 and third["look"]["pictured"] == [] and len(third["trail"]) == 2
     assert third["device"]["pan_steps"] == 100 and not third["device"]["laser_on"]
     assert (last["state"], last["reason"], last["fault"]) == ("ended", "done", None)
-    assert [one["number"] for one in told] == sorted({one["number"] for one in told})
+    assert [one["number"] for one in documents] == sorted({one["number"] for one in documents})
     assert json.loads(json.dumps(last, allow_nan=False)) == json.loads(json.dumps(last))
 
 
@@ -63,21 +63,21 @@ def test_faults_and_repeated_looks_are_told_in_words(mounted_rig, tmp_path):
 
     with pytest.raises(DeviceFault):
         Run(mounted_rig, tmp_path / "c", observer=lambda i: Dies(i, 0.08), live=live).engine.run()
-    told = live.document()
-    assert told["fault"] == {"code": "no-frame", "message": "the left camera delivers nothing", "remedy": "plug it in"}
-    assert told["remarks"] == tuple(f"look {spot}: no-spot; taken again" for spot in (0, 0, 1, 1))
-    assert told["look"]["status"] == "no-spot" and told["trail"] == []
+    doc = live.document()
+    assert doc["fault"] == {"code": "no-frame", "message": "the left camera delivers nothing", "remedy": "plug it in"}
+    assert doc["remarks"] == tuple(f"look {spot}: no-spot; taken again" for spot in (0, 0, 1, 1))
+    assert doc["look"]["status"] == "no-spot" and doc["trail"] == []
 
 
 def test_darkness_is_not_promised_after_a_fault():
     """A device that does not answer has not said that its laser is off."""
-    told = []
+    answers = []
     for error in (None, DeviceFault("unplugged", "gone", remedy="plug it in")):
         live = LiveRun()
         live.ask("laser off")
         live.ended("done" if error is None else "unplugged", error)
-        told.append(live.document()["requests"][0]["answer"])
-    assert "cut the laser's supply" in told[1] and "supply" not in told[0] and "is off" not in " ".join(told)
+        answers.append(live.document()["requests"][0]["answer"])
+    assert "cut the laser's supply" in answers[1] and "supply" not in answers[0] and "is off" not in " ".join(answers)
 
 
 def test_an_error_of_the_program_is_told_too(mounted_rig, tmp_path):

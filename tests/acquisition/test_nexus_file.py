@@ -63,8 +63,8 @@ def test_the_default_plot_is_found_by_the_rules_of_nexus(exported):
         assert np.allclose(entry["instrument/stereo/translation"][()], np.ravel(campaign.stereo.T), atol=0)
         assert entry["instrument/prior/focal_scale"].attrs["uncertainty"] == 0.002
         groups = [node for node in every(file) if isinstance(node, h5py.Group)]
-        found = [group.attrs["NX_class"] for group in groups]
-        assert set(found) <= CLASSES, "every group says what it is"
+        classes = [group.attrs["NX_class"] for group in groups]
+        assert set(classes) <= CLASSES, "every group says what it is"
 
 
 def test_the_files_come_back_byte_for_byte(exported):

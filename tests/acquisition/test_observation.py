@@ -32,19 +32,19 @@ def test_pictures_that_are_no_pair_are_refused(small_rig):
     light = Instrument(small_rig, 7)
     light.place("d1", 0)
     light.mechanics.laser_on = True
-    made = twin_renderer(small_rig, 7)(light.light(), 0, 0)
+    pair = twin_renderer(small_rig, 7)(light.light(), 0, 0)
     detector = live_detector(small_rig.stereo)
-    assert detector(made, made).status == "ok"
-    assert detector(StereoImage(dark, dark), made).status == "no-spot both"
-    assert detector(StereoImage(made.left, dark), made).status == "no-spot right"
-    lifted = np.roll(made.right, 20, axis=0)
-    assert detector(StereoImage(made.left, lifted), made).status == "epipolar"
+    assert detector(pair, pair).status == "ok"
+    assert detector(StereoImage(dark, dark), pair).status == "no-spot both"
+    assert detector(StereoImage(pair.left, dark), pair).status == "no-spot right"
+    lifted = np.roll(pair.right, 20, axis=0)
+    assert detector(StereoImage(pair.left, lifted), pair).status == "epipolar"
     # The same light in 12 bits, a quarter of it on the right: one scale for both, though the right one's peak fits 10.
-    dim = StereoImage(made.left, made.right // 4)
+    dim = StereoImage(pair.left, pair.right // 4)
     deep = StereoImage(*(picture.astype(np.uint16) * 16 for picture in (dim.left, dim.right)))
-    shallow, found = detector(dim, made), detector(deep, deep)
+    shallow, spot = detector(dim, pair), detector(deep, deep)
     # 4080 of 4095 are 254 of 255 grey levels.
-    assert found.status == shallow.status == "ok" and found.sds_px == pytest.approx(shallow.sds_px, rel=0.01)
+    assert spot.status == shallow.status == "ok" and spot.sds_px == pytest.approx(shallow.sds_px, rel=0.01)
     assert detector(replace(deep, white=65535), deep).status == "no-spot both"
 
 
@@ -70,9 +70,9 @@ def test_pictures_without_a_visible_spot_wait_for_detection(mounted_rig):
     positioner = instrument.positioner()
     positioner.home()
     camera = Scripted(instrument.clock, lambda n: n % 30)
-    found = CameraObserver(camera).observe(positioner, 3)
-    assert found.spot.status == "undetected" and camera.count == 22
-    assert sorted(found.pictures)[0] == "dark/000003_left.png" and len(found.pictures) == 4
+    observation = CameraObserver(camera).observe(positioner, 3)
+    assert observation.spot.status == "undetected" and camera.count == 22
+    assert sorted(observation.pictures)[0] == "dark/000003_left.png" and len(observation.pictures) == 4
 
 
 class AlwaysLit:
@@ -125,12 +125,12 @@ def test_noise_of_twelve_bits_is_no_light(mounted_rig, known):
                 pair[:, 1, 1] = 3000
             return StereoImage(*pair, *stated)
 
-    observer, seen = CameraObserver(Camera(), keep_pictures=False), []
-    observer.detector = lambda lit, dark: seen.append((lit.white, rises_dn(dark, lit))) or DetectedSpot("no-spot")
+    observer, pairs = CameraObserver(Camera(), keep_pictures=False), []
+    observer.detector = lambda lit, dark: pairs.append((lit.white, rises_dn(dark, lit))) or DetectedSpot("no-spot")
     for look in range(3):
         assert observer.observe(positioner, look).spot.status == "no-spot"
     # 3000 less 90 to 190 counts, in 255 of 4095.
-    assert all(white == 4095 and 174 <= min(rises) <= max(rises) <= 181 for white, rises in seen) and len(seen) == 3
+    assert all(white == 4095 and 174 <= min(rises) <= max(rises) <= 181 for white, rises in pairs) and len(pairs) == 3
 
 
 @pytest.mark.parametrize("depth", range(0, 12))
@@ -161,15 +161,15 @@ def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
         u = float(light.argmax())
         return DetectedSpot("ok", (u,) * 4, (0.1,) * 4) if light.max() > 300 else DetectedSpot("no-spot")
 
-    observer, found = CameraObserver(Camera(), detector, keep_pictures=False), []
+    observer, columns = CameraObserver(Camera(), detector, keep_pictures=False), []
     for step in range(12):
         positioner.move_to(3 * step, 0)
         # The spot is where the positioner is.
         moved_to[0] = 3 * step
         for _ in range(ATTEMPTS_PER_LOOK):
-            seen = observer.observe(positioner, step).spot
-            if seen.status == "ok":
-                found.append(seen.pixels_px[0])
-                assert seen.pixels_px[0] == 3 * step
+            spot = observer.observe(positioner, step).spot
+            if spot.status == "ok":
+                columns.append(spot.pixels_px[0])
+                assert spot.pixels_px[0] == 3 * step
                 break
-    assert found == [3.0 * step for step in range(12)]
+    assert columns == [3.0 * step for step in range(12)]

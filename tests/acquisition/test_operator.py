@@ -44,25 +44,25 @@ def test_without_standard_input_nobody_can_be_asked(monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(InputError, match="the laser hazard cannot be asked"):
         check_hazard(None, simulate=False)
-    said = []
-    operator = TerminalOperator(StopKey(), Terminal(said.append, ask=LiveLine().ask), laser_class="3B")
+    lines = []
+    operator = TerminalOperator(StopKey(), Terminal(lines.append, ask=LiveLine().ask), laser_class="3B")
     assert operator.place("d1", 175.0, 0, "") is False and operator.stop.requested
-    assert said == ["standard input has ended, the question cannot be asked: go on in a terminal, with --resume"]
+    assert lines == ["standard input has ended, the question cannot be asked: go on in a terminal, with --resume"]
 
 
 def test_stop_key_interrupts_a_question_at_once():
-    said = []
+    lines = []
 
     def ask(question):
         signal.raise_signal(signal.SIGINT)
         return "never"
 
-    with StopKey(said.append) as stop:
-        operator = TerminalOperator(stop, Terminal(said.append, ask=ask))
+    with StopKey(lines.append) as stop:
+        operator = TerminalOperator(stop, Terminal(lines.append, ask=ask))
         assert operator.accept("line one\nline two") is False and stop.requested
-        assert said == ["line one", "line two"]
+        assert lines == ["line one", "line two"]
         assert operator.place("d1", 175.0, 0, "") is False
     stop = StopKey()
-    assert TerminalOperator(stop, Terminal(said.append, ask=lambda q: " YES ")).accept("x") is True
-    assert TerminalOperator(stop, Terminal(said.append, ask=lambda q: "y")).accept("x") is False
-    assert TerminalOperator(stop, Terminal(said.append), laser_class="3B").accept("x") is True
+    assert TerminalOperator(stop, Terminal(lines.append, ask=lambda q: " YES ")).accept("x") is True
+    assert TerminalOperator(stop, Terminal(lines.append, ask=lambda q: "y")).accept("x") is False
+    assert TerminalOperator(stop, Terminal(lines.append), laser_class="3B").accept("x") is True

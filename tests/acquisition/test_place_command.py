@@ -36,9 +36,9 @@ def test_every_placement_is_made_by_the_program_in_the_dark(mounted_rig, tmp_pat
     ordinary, light = PlaceCommand.run, []
     run_ = Run(mounted_rig, tmp_path / "c", place_command=program(SAYS))
 
-    def seen(self, *given):
+    def seen(self, *arguments):
         light.append(run_.instrument.mechanics.laser_on)
-        return ordinary(self, *given)
+        return ordinary(self, *arguments)
 
     monkeypatch.setattr(PlaceCommand, "run", seen)
     outcome = run_.engine.run()
@@ -67,10 +67,10 @@ def test_the_stage_of_the_page_stands_at_every_target(mounted_rig, tmp_path, mon
     ordinary = PlaceCommand.run
     with EmulatedBoard(on_step) as board:
 
-        def seen(self, *given):
-            done = ordinary(self, *given)
+        def seen(self, *arguments):
+            done = ordinary(self, *arguments)
             board.drain()
-            stood.append((given[1], at[0]))
+            stood.append((arguments[1], at[0]))
             return done
 
         monkeypatch.setattr(PlaceCommand, "run", seen)

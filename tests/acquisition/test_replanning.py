@@ -38,10 +38,10 @@ def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
         run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate)
         outcome = run_.engine.run()
     assert (outcome.reason, outcome.looks) == ("target met", 27) and run_.dark() and not outcome.warnings
-    told = changes(tmp_path / "c")
-    assert [event["looks"] for event in told] == [12, 15, 18, 22]
-    assert told[0]["why"] == "8 looks at d2 help most"
-    looks = [step for step in told[0]["steps"] if step["action"] == "look"]
+    changed = changes(tmp_path / "c")
+    assert [event["looks"] for event in changed] == [12, 15, 18, 22]
+    assert changed[0]["why"] == "8 looks at d2 help most"
+    looks = [step for step in changed[0]["steps"] if step["action"] == "look"]
     assert [look["u_before_deg_per_step"] for look in looks[1:]] == [
         look["u_after_deg_per_step"] for look in looks[:-1]
     ]
@@ -62,9 +62,9 @@ def test_the_sampled_posterior_has_the_last_word(mounted_rig, tmp_path):
     with Replanning(tmp_path / "c", ahead(ratio=1.5), 4.6e-4, 60.0, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(20), estimate=estimate).engine.run()
     assert (outcome.reason, outcome.looks) == ("target met", 40)
-    told = changes(tmp_path / "c", "confirmed")
-    assert [(event["looks"], event["reached"]) for event in told] == [(27, False), (40, True)]
-    assert told[0]["importance_u_deg_per_step"] == pytest.approx(1.5 * told[0]["laplace_u_deg_per_step"])
+    events = changes(tmp_path / "c", "confirmed")
+    assert [(event["looks"], event["reached"]) for event in events] == [(27, False), (40, True)]
+    assert events[0]["importance_u_deg_per_step"] == pytest.approx(1.5 * events[0]["laplace_u_deg_per_step"])
     assert [event["looks"] for event in changes(tmp_path / "c")] == [12, 15, 18, 22, 27, 33]
     assert outcome.as_json()["estimate"]["tier"] == "importance"
     assert outcome.estimate.looks == 40 and set(outcome.estimate.deg_per_step.values()) == {0.061}
@@ -74,9 +74,9 @@ def test_weights_that_cannot_be_used_end_no_run(mounted_rig, tmp_path):
     minutes = plan_minutes(mounted_rig, small_plan(3)) + 2.5
     with Replanning(tmp_path / "c", ahead(accepted=False), 4.6e-4, minutes, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(3), estimate=estimate).engine.run()
-    told = changes(tmp_path / "c", "confirmed")
+    events = changes(tmp_path / "c", "confirmed")
     assert outcome.reason == "time over" and outcome.looks > 33 and outcome.estimate.tier == "laplace"
-    assert [event["looks"] for event in told][:2] == [27, 33] and not any(event["reached"] for event in told)
+    assert [event["looks"] for event in events][:2] == [27, 33] and not any(event["reached"] for event in events)
 
 
 def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
@@ -104,9 +104,9 @@ def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
     rig, plan = shipped_data() / "rigs" / "mounted" / "rig.toml", tmp_path / "plan.csv"
     words = ["acquire", rig, plan, tmp_path / "c", "--simulate", "--centroids", "--adapt", "--target-u", "8e-4"]
     assert run([*map(str, words), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["estimate"]
-    assert (told["tier"], told["looks"]) == ("importance", 15)
-    assert told["effective_deg_per_step"]["up"] == {"value": 0.061, "sd": pytest.approx(8e-4)}
+    estimate = json.loads(capsys.readouterr().out)["estimate"]
+    assert (estimate["tier"], estimate["looks"]) == ("importance", 15)
+    assert estimate["effective_deg_per_step"]["up"] == {"value": 0.061, "sd": pytest.approx(8e-4)}
     assert run([*map(str, [*words[:3], tmp_path / "d", *words[4:]])]) == 0
     line = "deg/step by the sampled posterior of 15 looks: left 0.06100(80)"
     assert line in capsys.readouterr().out
@@ -161,8 +161,8 @@ def test_a_damaged_change_of_plan_is_refused(mounted_rig, tmp_path):
     from types import SimpleNamespace
 
     data = {"row": 3, "looks": 4, "why": "", "steps": [{"action": "fly"}]}
-    for entries, found in ((data, "fly"), ({**data, "row": "3"}, "row")):
-        with pytest.raises(InputError, match=f"line 7: .*{found}.*entries of the event adapted"):
+    for entries, fault in ((data, "fly"), ({**data, "row": "3"}, "row")):
+        with pytest.raises(InputError, match=f"line 7: .*{fault}.*entries of the event adapted"):
             adapted_plan(small_plan(1), [SimpleNamespace(event="adapted", line=7, data=entries)])
 
 

@@ -42,10 +42,10 @@ def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_pa
             assert not estimate.update(27) and estimate.latest is not None, "a direction without a figure is not met"
 
 
-@pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
-def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, asked, shown):
+@pytest.mark.parametrize(("enabled", "shown"), [(None, False), (True, True), (False, False)])
+def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, enabled, shown):
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
-    wish = EstimateOptions(two_directions, enabled=asked)
+    wish = EstimateOptions(two_directions, enabled=enabled)
     texts = []
 
     def show(progress):
@@ -79,8 +79,8 @@ def test_fits_share_a_process_and_another_takes_over_from_one_that_was_killed(tm
 
 
 @pytest.mark.usefixtures("ctrl_c_works")
-@pytest.mark.parametrize("asked", ["laser off", "stop"])
-def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, monkeypatch, asked):
+@pytest.mark.parametrize("what", ["laser off", "stop"])
+def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, monkeypatch, what):
     """Laser off is acknowledged while the fit still works: only then is the fit let go. A stop ends the fit."""
     monkeypatch.setattr(running_estimate, "FIT_MAX_S", 60.0)
     os.mkfifo(tmp_path / "go")
@@ -90,7 +90,7 @@ def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, mo
     class Asking(RunningEstimate):
         def _arguments(self, looks):
             if not states:
-                live.ask(asked)
+                live.ask(what)
             return super()._arguments(looks)
 
     def settled(request, state, answer):
@@ -104,9 +104,9 @@ def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, mo
     monkeypatch.setattr(live.requests, "settle", settled)
     with Asking(tmp_path / "c", waiting, None, {"left"}, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate, live=live).engine.run()
-        assert len(multiprocessing.active_children()) == (asked != "stop"), "a stop ends the fit"
-    assert states[0] == (asked, "acknowledged", 1)
-    assert (outcome.reason, outcome.looks) == (("interrupted", 12) if asked == "stop" else ("done", 16))
+        assert len(multiprocessing.active_children()) == (what != "stop"), "a stop ends the fit"
+    assert states[0] == (what, "acknowledged", 1)
+    assert (outcome.reason, outcome.looks) == (("interrupted", 12) if what == "stop" else ("done", 16))
 
 
 def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path, monkeypatch):
@@ -125,10 +125,10 @@ def test_estimate_of_the_command_is_the_laplace_fit(monkeypatch):
     fits = {"paper twin": summary}
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda campaign: campaign.title)
     monkeypatch.setattr("tvsbayes.assessment.summary.summarise", lambda fit: fits[fit])
-    found = acquire_command.laplace_estimate(campaign, 384)
-    assert (found.looks, found.tier) == (384, "laplace")
-    assert found.deg_per_step == {"left": summary.effective["left"].value}
-    assert found.u_deg_per_step == {"left": summary.effective["left"].sd}
+    estimate = acquire_command.laplace_estimate(campaign, 384)
+    assert (estimate.looks, estimate.tier) == (384, "laplace")
+    assert estimate.deg_per_step == {"left": summary.effective["left"].value}
+    assert estimate.u_deg_per_step == {"left": summary.effective["left"].sd}
     astray = structs.replace(summary, problems=("astray",), answer=None, converged=False)
     monkeypatch.setattr("tvsbayes.assessment.summary.summarise", lambda fit: astray)
     with pytest.raises(NotConverged):

@@ -91,8 +91,8 @@ def test_a_rig_that_is_reached_or_driven_otherwise_goes_on(mounted_rig, tmp_path
     plan, (table, change) = small_plan(1), SETUPS[what]
     stopped_run(mounted_rig, tmp_path / "c", plan)
     changed = replace(mounted_rig, **{table: {**getattr(mounted_rig, table), **change}})
-    said = setup_changes(read_journal(tmp_path / "c").records, changed, synthetic=True)
-    assert len(said) == (what != "costs") and all("was not stated and is" in line for line in said), said
+    changes = setup_changes(read_journal(tmp_path / "c").records, changed, synthetic=True)
+    assert len(changes) == (what != "costs") and all("was not stated and is" in line for line in changes), changes
     assert Run(changed, tmp_path / "c", plan, resume=True, start=1).engine.run().reason == "done"
     starts = [r.data["setup"] for r in read_journal(tmp_path / "c").records if r.event == "start"]
     key, value = next(iter(change.items()))

@@ -50,12 +50,12 @@ def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monk
             lambda: SIMULATED_START + datetime.timedelta(seconds=instrument.clock.monotonic()),
         ),
     ).run()
-    found = read_campaign(folder)
-    assert [(m.segment, m.pan_steps, m.pan_approach) for m in found.moves] == [
+    campaign = read_campaign(folder)
+    assert [(m.segment, m.pan_steps, m.pan_approach) for m in campaign.moves] == [
         (m.segment, m.pan_steps, m.pan_approach) for m in wanted.moves
     ]
     names = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
-    ours, theirs = ([[getattr(s, n) for n in names] for s in c.spots] for c in (found, wanted))
+    ours, theirs = ([[getattr(s, n) for n in names] for s in c.spots] for c in (campaign, wanted))
     # Motion by motion against commanded counters: the same angles to rounding, 1e-12 rad x 1000 px.
     assert np.abs(np.subtract(ours, theirs)).max() < 1e-8
 

@@ -65,13 +65,13 @@ def test_headline_causes_are_what_refitting_shows(linear_fit):
     by_datum, by_prior = refitted(jacobian, load)
     pixels, stops = gradient @ by_datum, gradient @ by_datum @ load
     scale = np.abs(causes.contribution).max()
-    found = {name: causes.contribution[:, k] for k, name in enumerate(causes.names)}
-    np.testing.assert_allclose(found["pixel noise"], np.linalg.norm(pixels, axis=1), rtol=1e-6)
-    np.testing.assert_allclose(found["stop errors of the campaign"], np.linalg.norm(stops, axis=1), rtol=1e-6)
+    sd_by = {name: causes.contribution[:, k] for k, name in enumerate(causes.names)}
+    np.testing.assert_allclose(sd_by["pixel noise"], np.linalg.norm(pixels, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(sd_by["stop errors of the campaign"], np.linalg.norm(stops, axis=1), rtol=1e-6)
     cameras = gradient @ by_prior[:, len(RIG_NAMES) :]
-    np.testing.assert_allclose(found["stereo calibration"], np.linalg.norm(cameras, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(sd_by["stereo calibration"], np.linalg.norm(cameras, axis=1), rtol=1e-6)
     for name in ("mirror_offset_mm", "laser_tilt_deg.y", "focal_scale", "backlash_deg.pan"):
-        np.testing.assert_allclose(found[name], gradient @ by_prior[:, INDEX[name]], atol=1e-6 * scale, rtol=1e-6)
+        np.testing.assert_allclose(sd_by[name], gradient @ by_prior[:, INDEX[name]], atol=1e-6 * scale, rtol=1e-6)
     # They add up to the variance: nothing is forgotten, nothing counted twice.
     total = np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient)
     np.testing.assert_allclose((causes.contribution**2).sum(axis=1), total, rtol=1e-6)
@@ -86,14 +86,14 @@ def test_the_scatter_of_looks_has_its_share_of_their_noise(linear_fit):
     variance = 0.3 * np.random.default_rng(13).uniform(size=slope.shape[::2]) / np.sum(slope**2, axis=1)
     shaking = copy.copy(fit)
     object.__setattr__(shaking, "linearised", eqx.tree_at(lambda x: x.scatter_variance, fit.linearised, variance))
-    plain, found = (
+    plain, parts = (
         dict(zip(causes.names, causes.contribution.T, strict=True)) for causes in map(headline_causes, (fit, shaking))
     )
     by_datum = (gradient[[0, 1, 2, 4, 5]] @ refitted(jacobian, load)[0]).reshape(5, *slope.shape[:2])
     scattered = np.einsum("qni,nia->qna", by_datum, slope * np.sqrt(variance)[:, None])
     expected = np.sqrt(np.sum(scattered**2, axis=(1, 2)))
-    np.testing.assert_allclose(found["scatter of the campaign's looks"], expected, rtol=1e-6)
-    both = np.hypot(found["pixel noise"], found["scatter of the campaign's looks"])
+    np.testing.assert_allclose(parts["scatter of the campaign's looks"], expected, rtol=1e-6)
+    both = np.hypot(parts["pixel noise"], parts["scatter of the campaign's looks"])
     np.testing.assert_allclose(both, plain["pixel noise"], rtol=1e-9)
     assert "scatter of the campaign's looks" not in plain
 
@@ -128,8 +128,8 @@ def test_headline_budget_is_a_gum_table(linear_fit):
     # Errors that the gears repeat are known by their prior, as the cameras are by theirs.
     for name in ("transmission error", "play variation"):
         renamed = replace(causes, names=tuple(name if n == "stereo calibration" else n for n in causes.names))
-        told = headline_budget(renamed, "effective_deg_per_step.right", Estimate(0.06, sd, (0.05, 0.07), 1.0, 0.9))
-        assert {row.quantity: row.kind for row in told.rows}[name] == "B"
+        corrected = headline_budget(renamed, "effective_deg_per_step.right", Estimate(0.06, sd, (0.05, 0.07), 1.0, 0.9))
+        assert {row.quantity: row.kind for row in corrected.rows}[name] == "B"
     assert abs(rows[CORRELATIONS].share) < 1e-6
     prior = next(row for row in table.rows if row.quantity.startswith("prior of ") and row.distribution == "normal")
     assert prior.kind == "B" and prior.contribution == pytest.approx(prior.sensitivity * prior.u)
@@ -182,9 +182,9 @@ def test_causes_are_what_refitting_shows(mounted_rig, readings):
         moved = slope @ by_prior[:, columns]
         expected["focal scale" if stem == "focal_scale" else f"prior of {stem}"] = moved @ moved.T
     for name, part in expected.items():
-        found = causes.covariance[causes.names.index(name)]
+        covariance = causes.covariance[causes.names.index(name)]
         scale = np.sqrt(np.outer(np.diag(part), np.diag(part))) + 1e-300
-        assert np.abs((found - part) / scale).max() < 10 * DIFFERENCES, name
+        assert np.abs((covariance - part) / scale).max() < 10 * DIFFERENCES, name
     assert len(set(causes.names)) == len(causes.names)
 
 

@@ -34,21 +34,21 @@ def dense(one: np.ndarray, other: np.ndarray, sd: float, length: float, wave: fl
 @pytest.mark.parametrize("wave", [0.0, 0.03])
 def test_a_table_is_the_process_given_its_places(wave):
     """Mean and covariance of one draw at new angles are those of a dense Gaussian process (GPML 2.19)."""
-    seen, new = np.array([-9.0, -4.2, 0.0, 1.1, 6.0, 8.5]), np.linspace(-30.0, 30.0, 23)
+    places, new = np.array([-9.0, -4.2, 0.0, 1.1, 6.0, 8.5]), np.linspace(-30.0, 30.0, 23)
     values = np.array([0.03, -0.02, 0.05, 0.04, -0.06, -0.01])
     one = Process(np.array([0.05]), np.array([7.0]), np.array([[wave]]), (25.0,))
-    floor = 1e-10 * (0.05**2 + wave**2) * np.eye(len(seen))
-    own = dense(seen, seen, 0.05, 7.0, wave, 25.0) + floor
-    across = dense(new, seen, 0.05, 7.0, wave, 25.0)
-    found = conditional(one, seen[None], values[None], new[None], np.zeros((1, len(new))))
-    np.testing.assert_allclose(found.expected[0], across @ np.linalg.solve(own, values), atol=AGREEMENT)
-    assert np.all(found.left_open == 0)
+    floor = 1e-10 * (0.05**2 + wave**2) * np.eye(len(places))
+    prior = dense(places, places, 0.05, 7.0, wave, 25.0) + floor
+    across = dense(new, places, 0.05, 7.0, wave, 25.0)
+    table = conditional(one, places[None], values[None], new[None], np.zeros((1, len(new))))
+    np.testing.assert_allclose(table.expected[0], across @ np.linalg.solve(prior, values), atol=AGREEMENT)
+    assert np.all(table.left_open == 0)
     # As many equal draws as angles, with unit normals in turn: the factor of what is left open, column by column.
     count = len(new)
     same = Process(*(np.repeat(x, count, axis=0) for x in (one.sd, one.length, one.amplitudes)), one.periods)
-    tiled = [np.tile(x, (count, 1)) for x in (seen, values, new)]
+    tiled = [np.tile(x, (count, 1)) for x in (places, values, new)]
     factor = conditional(same, *tiled, np.eye(count)).left_open
-    left = dense(new, new, 0.05, 7.0, wave, 25.0) - across @ np.linalg.solve(own, across.T)
+    left = dense(new, new, 0.05, 7.0, wave, 25.0) - across @ np.linalg.solve(prior, across.T)
     np.testing.assert_allclose(factor.T @ factor, left, atol=0.05 * AGREEMENT)
 
 
@@ -93,8 +93,8 @@ def test_tables_hold_what_draws_hold_at_places_and_forget_it_beyond(own_scales):
     fit, mode, root = fitted(STEPS, SCALES)
     rng = np.random.default_rng(5)
     errors = rng.standard_normal((DRAWS, len(root))) @ root.T
-    found = drawn_gears(fit, np.tile(mode, (DRAWS, 1)), errors, 3, own_scales)
-    drawn, half = found.expected + found.left_open, len(root) // 2
+    gears = drawn_gears(fit, np.tile(mode, (DRAWS, 1)), errors, 3, own_scales)
+    drawn, half = gears.expected + gears.left_open, len(root) // 2
     for name in GEAR_INPUTS:
         kind, axis = name.split(".")
         block, first = (
@@ -106,11 +106,11 @@ def test_tables_hold_what_draws_hold_at_places_and_forget_it_beyond(own_scales):
             + np.flatnonzero(fit.arrays.gears.places.valid & (fit.arrays.gears.places.on_tilt == (axis == "tilt"))),
         )
         counters = np.array(STEPS[axis])
-        at = found.table.at(drawn, (counters, counters))[name]
+        at = gears.table.at(drawn, (counters, counters))[name]
         off = at - np.degrees(errors[:, places])
         assert np.sqrt(np.mean(off**2)) < 0.02 * sd, name
-        part = found.table.parts[name]
-        nodes = np.array(found.table.steps[axis == "tilt"])
+        part = gears.table.parts[name]
+        nodes = np.array(gears.table.steps[axis == "tilt"])
         # Three lengths beyond: 400 steps of pan, and a standard deviation from 1500 draws is known to 2 %.
         reach = 3 * 8.0 / abs(RATIO[axis])
         assert nodes[0] == pytest.approx(counters.min() - reach) and nodes[-1] == pytest.approx(counters.max() + reach)
@@ -120,7 +120,7 @@ def test_tables_hold_what_draws_hold_at_places_and_forget_it_beyond(own_scales):
         np.testing.assert_allclose(drawn[:, part.stop - 1].mean(), 0, atol=1e-12)
     # At the scales of the mode the means follow the places as `by_places` says.
     normal = np.linalg.solve(root, errors.T).T
-    np.testing.assert_allclose(found.expected, normal @ found.by_places.T, atol=1e-6)
+    np.testing.assert_allclose(gears.expected, normal @ gears.by_places.T, atol=1e-6)
 
 
 def test_every_draw_has_scales_of_its_own():
@@ -130,17 +130,17 @@ def test_every_draw_has_scales_of_its_own():
     physical = np.tile(mode, (DRAWS, 1))
     large = np.arange(DRAWS) % 2 == 1
     physical[large, INDEX["transmission_error_deg.pan"]] *= 2
-    found = drawn_gears(fit, physical, rng.standard_normal((DRAWS, len(root))) @ root.T, 3)
-    part = found.table.parts["transmission_error_at_deg.pan"]
+    gears = drawn_gears(fit, physical, rng.standard_normal((DRAWS, len(root))) @ root.T, 3)
+    part = gears.table.parts["transmission_error_at_deg.pan"]
     for column in (part.start, part.stop - 1):
-        sds = [np.std(found.left_open[rows, column]) for rows in (~large, large)]
+        sds = [np.std(gears.left_open[rows, column]) for rows in (~large, large)]
         # Each known to 3 %.
         assert sds[1] / sds[0] == pytest.approx(2.0, rel=0.15)
 
 
 def test_gears_that_do_not_vary_have_no_table():
-    found = drawn_gears(SimpleNamespace(), np.zeros((7, len(NAMES))), np.zeros((7, 0)), 0)
-    assert found.table.size == 0 and found.expected.shape == found.left_open.shape == (7, 0)
+    gears = drawn_gears(SimpleNamespace(), np.zeros((7, len(NAMES))), np.zeros((7, 0)), 0)
+    assert gears.table.size == 0 and gears.expected.shape == gears.left_open.shape == (7, 0)
 
 
 TWINS, TWIN_DRAWS = 30, 200
@@ -173,9 +173,9 @@ def calibrated(gears: list[AxisErrors], seed: int) -> Calibration:
     ]
     tiled = np.tile(mode, (TWIN_DRAWS, 1))
     drawn = drawn_gears(fit, tiled, np.tile(np.radians(np.concatenate(known)), (TWIN_DRAWS, 1)), seed)
-    seen = np.array([[-200.0, 210.0], [-90.0, 140.0]])
-    found = calibration_of_draws(NAMES, tiled, small_campaign(), "posterior", 0, seen, drawn)
-    return replace(found, azimuth=False, period_deg={})
+    counters = np.array([[-200.0, 210.0], [-90.0, 140.0]])
+    calibration = calibration_of_draws(NAMES, tiled, small_campaign(), "posterior", 0, counters, drawn)
+    return replace(calibration, azimuth=False, period_deg={})
 
 
 def true_point(gears: list[AxisErrors], steps: tuple[float, float], reading_deg: float) -> np.ndarray:
@@ -198,15 +198,15 @@ def test_located_points_of_twins_whose_gears_err():
     widths: dict[str, list[np.ndarray]] = {name: [] for name in POSES}
     for number in range(TWINS):
         gears = twin_gears(number)
-        found = calibrated(gears, number)
+        one = calibrated(gears, number)
         for name, steps in POSES.items():
-            told = found.locate(*steps, READINGS_DEG[name])
-            assert told.extrapolated is (name in ("outside", "beyond"))
-            off = true_point(gears, steps, READINGS_DEG[name]) - told.xyz_mm
-            scores[name].append(off / np.sqrt(np.diag(told.covariance_mm2)))
-            widths[name].append(found.beam_u95_deg(steps, (1.0, 1.0)))
-    seen, between, outside, _ = (np.mean(widths[name], axis=0) for name in POSES)
-    assert np.all(seen < 0.2 * between) and np.all(between < 0.5 * outside)
+            point = one.locate(*steps, READINGS_DEG[name])
+            assert point.extrapolated is (name in ("outside", "beyond"))
+            off = true_point(gears, steps, READINGS_DEG[name]) - point.xyz_mm
+            scores[name].append(off / np.sqrt(np.diag(point.covariance_mm2)))
+            widths[name].append(one.beam_u95_deg(steps, (1.0, 1.0)))
+    near, between, outside, _ = (np.mean(widths[name], axis=0) for name in POSES)
+    assert np.all(near < 0.2 * between) and np.all(between < 0.5 * outside)
     # Two angles err of each of 30 twins: RMS z to 9 %, and to a few more for the twin's sums of waves.
     for name in ("between", "outside", "beyond"):
         assert 0.7 < np.sqrt(np.mean(np.square(scores[name]))) < 1.35, name

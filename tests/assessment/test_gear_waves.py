@@ -41,38 +41,38 @@ def errors(wave: float, seed: int) -> np.ndarray:
 
 def test_parts_of_a_wave_are_normal_given_the_errors():
     """Mean, covariance and evidence ratio are those of the dense joint Gaussian of parts and errors."""
-    amplitude, seen = 0.03, errors(0.03, 1)
+    amplitude, sample = 0.03, errors(0.03, 1)
     phase = 2 * np.pi * ANGLES / PERIOD
     across = amplitude**2 * np.stack([np.cos(phase), np.sin(phase)])
     gain = across @ np.linalg.inv(covariance(amplitude))
     normal = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    tiled = [np.tile(x, (3, 1)) for x in (ANGLES, seen)]
-    found = wave_draws(process(np.full(3, amplitude)), 0, *tiled, normal)
-    parts = np.stack([found.cosine, found.sine], axis=1)
-    np.testing.assert_allclose(parts[0], gain @ seen, atol=AGREEMENT)
+    tiled = [np.tile(x, (3, 1)) for x in (ANGLES, sample)]
+    waves = wave_draws(process(np.full(3, amplitude)), 0, *tiled, normal)
+    parts = np.stack([waves.cosine, waves.sine], axis=1)
+    np.testing.assert_allclose(parts[0], gain @ sample, atol=AGREEMENT)
     root = (parts[1:] - parts[0]).T
     left = amplitude**2 * np.eye(2) - gain @ across.T
     np.testing.assert_allclose(root @ root.T, left, atol=AGREEMENT * amplitude**2 * 1e2)
-    with_wave, without = (multivariate_normal(cov=covariance(a)).logpdf(seen) for a in (amplitude, 0.0))
-    np.testing.assert_allclose(found.log_evidence_ratio, without - with_wave, rtol=1e-6)
+    with_wave, without = (multivariate_normal(cov=covariance(a)).logpdf(sample) for a in (amplitude, 0.0))
+    np.testing.assert_allclose(waves.log_evidence_ratio, without - with_wave, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("wave", "likely"), [(0.0, False), (0.02, None), (0.06, True)])
 def test_probability_is_that_of_both_evidences(wave, likely):
     """The mean of density ratios over the posterior is the ratio of evidences, by quadrature over the wave's sd."""
-    seen = errors(wave, 2)
+    sample = errors(wave, 2)
     quantiles = (np.arange(4000) + 0.5) / 4000
     sds = halfnorm.ppf(quantiles, scale=SCALE)
-    logs = np.array([multivariate_normal(cov=covariance(sd)).logpdf(seen) for sd in sds])
-    alone = multivariate_normal(cov=covariance(0.0)).logpdf(seen)
+    logs = np.array([multivariate_normal(cov=covariance(sd)).logpdf(sample) for sd in sds])
+    alone = multivariate_normal(cov=covariance(0.0)).logpdf(sample)
     truth = 1 / (1 + np.exp(alone) / np.mean(np.exp(logs)))
     shares = np.cumsum(np.exp(logs - logs.max()))
     drawn = sds[np.searchsorted(shares / shares[-1], (np.arange(DRAWS) + 0.5) / DRAWS)]
-    tiled = [np.tile(x, (DRAWS, 1)) for x in (ANGLES, seen)]
-    found = wave_draws(process(drawn), 0, *tiled, np.zeros((DRAWS, 2)))
+    tiled = [np.tile(x, (DRAWS, 1)) for x in (ANGLES, sample)]
+    waves = wave_draws(process(drawn), 0, *tiled, np.zeros((DRAWS, 2)))
     # Even draws of a posterior on 4000 nodes: a few of the nodes' share of probability each.
-    assert found.probability == pytest.approx(truth, abs=0.01)
-    assert likely is None or (found.probability > 0.5) == likely
+    assert waves.probability == pytest.approx(truth, abs=0.01)
+    assert likely is None or (waves.probability > 0.5) == likely
 
 
 def test_waves_of_a_posterior_by_axis():
@@ -96,8 +96,8 @@ def test_waves_of_a_posterior_by_axis():
         campaign=SimpleNamespace(rig=SimpleNamespace(harmonic_period_deg={"tilt": (PERIOD,)})),
     )
     posterior = SimpleNamespace(fit=fit, seed=0, resampled=lambda chains, draws: SimpleNamespace(joined=drawn))
-    (found,) = gear_periods(posterior)
-    assert (found.axis, found.source, found.period.value) == ("tilt", "stated", PERIOD)
-    assert found.amplitude.value == pytest.approx(0.05, abs=2e-3)
-    assert found.phase_deg.value == pytest.approx(40.0, abs=2.0)
-    assert found.probability > 0.999
+    (row,) = gear_periods(posterior)
+    assert (row.axis, row.source, row.period.value) == ("tilt", "stated", PERIOD)
+    assert row.amplitude.value == pytest.approx(0.05, abs=2e-3)
+    assert row.phase_deg.value == pytest.approx(40.0, abs=2.0)
+    assert row.probability > 0.999

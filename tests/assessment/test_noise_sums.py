@@ -27,7 +27,7 @@ def known_sum_of(*parts: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("parts", "told"),
+    ("parts", "text"),
     [
         ((LEFT, LOOK), "only the sum of the variances of stop scatter left and look scatter pan is known ("),
         (
@@ -36,17 +36,17 @@ def known_sum_of(*parts: str) -> np.ndarray:
         ),
     ],
 )
-def test_what_is_known_in_a_sum_alone_is_named(parts, told):
+def test_what_is_known_in_a_sum_alone_is_named(parts, text):
     """Two parts of a known sum correlate with -1, three with -0.5: together the others explain each."""
-    (found,) = sum_directions(FREE, known_sum_of(*parts), EVEN)
-    assert found.of_sums and told in found.text and found.text.endswith("; look twice at some stops")
-    assert found.loadings.pop(LEFT) == pytest.approx(1.0)
-    assert set(found.loadings) == {*parts} - {LEFT} and all(-1 <= value < -0.4 for value in found.loadings.values())
+    (weak,) = sum_directions(FREE, known_sum_of(*parts), EVEN)
+    assert weak.of_sums and text in weak.text and weak.text.endswith("; look twice at some stops")
+    assert weak.loadings.pop(LEFT) == pytest.approx(1.0)
+    assert set(weak.loadings) == {*parts} - {LEFT} and all(-1 <= value < -0.4 for value in weak.loadings.values())
 
 
 def test_noise_and_looks_without_stops_ask_for_no_second_look():
-    (found,) = sum_directions(FREE, known_sum_of(LOOK, NOISE), EVEN)
-    assert "look scatter pan and noise / stated is known" in found.text and "look twice" not in found.text
+    (weak,) = sum_directions(FREE, known_sum_of(LOOK, NOISE), EVEN)
+    assert "look scatter pan and noise / stated is known" in weak.text and "look twice" not in weak.text
 
 
 def test_what_is_told_apart_or_fixed_is_not_named():

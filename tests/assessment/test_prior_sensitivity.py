@@ -39,10 +39,10 @@ def test_a_normal_prior_of_another_width_gives_the_conjugate_posterior(factor):
     ratio = np.sqrt(after[1] @ LOAD**2) / sd
     draws = sampled()
     assert abs(shift) > 0.1, "nothing would be seen"
-    for found in (draws.changed(np.array([0]), factor), draws.normal.changed(np.array([0]), factor)):
+    for change in (draws.changed(np.array([0]), factor), draws.normal.changed(np.array([0]), factor)):
         # Means and sds of 20 000 draws, of which the new prior leaves a third at least.
-        assert found.shift_sd[0] == pytest.approx(shift, abs=SIGMAS / np.sqrt(COUNT / 6))
-        assert found.sd_ratio[0] == pytest.approx(ratio, abs=SIGMAS / np.sqrt(COUNT / 3))
+        assert change.shift_sd[0] == pytest.approx(shift, abs=SIGMAS / np.sqrt(COUNT / 6))
+        assert change.sd_ratio[0] == pytest.approx(ratio, abs=SIGMAS / np.sqrt(COUNT / 3))
 
 
 @pytest.mark.parametrize("factor", FACTORS)
@@ -50,14 +50,14 @@ def test_a_half_normal_prior_is_weighed_by_its_quantity(factor):
     """B = halfnorm(u) with a coordinate that the data know: the mean of z under twice or half the u, by quadrature."""
     z = np.linspace(-9.0, 9.0, 200_001)
     b = stats.halfnorm.isf(stats.norm.sf(z))
-    seen = stats.norm.pdf(z, DATA[0], SPREAD) * stats.norm.pdf(z)
-    wanted = seen * np.exp(-0.5 * b**2 * (factor**-2 - 1))
-    means = [np.sum(z * p) / np.sum(p) for p in (seen, wanted)]
-    found = sampled(half=True).changed(np.array([0]), factor)
+    density = stats.norm.pdf(z, DATA[0], SPREAD) * stats.norm.pdf(z)
+    wanted = density * np.exp(-0.5 * b**2 * (factor**-2 - 1))
+    means = [np.sum(z * p) / np.sum(p) for p in (density, wanted)]
+    change = sampled(half=True).changed(np.array([0]), factor)
     sd = np.sqrt(conjugate(np.ones(2))[1] @ LOAD**2)
-    assert found.shift_sd[0] == pytest.approx(LOAD[0] * (means[1] - means[0]) / sd, abs=SIGMAS / np.sqrt(COUNT / 6))
+    assert change.shift_sd[0] == pytest.approx(LOAD[0] * (means[1] - means[0]) / sd, abs=SIGMAS / np.sqrt(COUNT / 6))
     as_normal = sampled().changed(np.array([0]), factor)
-    assert abs(as_normal.shift_sd[0] - found.shift_sd[0]) > 0.08, "the kind of the prior makes no difference"
+    assert abs(as_normal.shift_sd[0] - change.shift_sd[0]) > 0.08, "the kind of the prior makes no difference"
 
 
 def test_a_prior_that_too_few_draws_bear_is_left_to_the_moments():
@@ -65,7 +65,7 @@ def test_a_prior_that_too_few_draws_bear_is_left_to_the_moments():
     z = np.random.default_rng(2).standard_normal((5000, 20))
     draws = SampledHeadlines(z, z[:, :1], np.full(5000, 1 / 5000), np.zeros(20, bool))
     assert draws.changed(np.arange(20), 0.5) is None
-    found = draws.normal.changed(np.arange(20), 0.5)
+    change = draws.normal.changed(np.arange(20), 0.5)
     # With the prior alone the headline, one of the coordinates, is half as wide.
-    assert found.sd_ratio[0] == pytest.approx(0.5, abs=SIGMAS * 0.5 / np.sqrt(2 * 5000))
-    assert abs(found.shift_sd[0]) < SIGMAS / np.sqrt(5000)
+    assert change.sd_ratio[0] == pytest.approx(0.5, abs=SIGMAS * 0.5 / np.sqrt(2 * 5000))
+    assert abs(change.shift_sd[0]) < SIGMAS / np.sqrt(5000)

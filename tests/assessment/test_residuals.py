@@ -23,13 +23,13 @@ from tvsbayes.statistics.chances import recursive_residuals
 def test_stops_are_read_as_they_were():
     offsets = np.random.default_rng(4).normal(0.0, 0.1, STOPS)
     fit = stops_of(offsets)
-    found = stop_readings(fit, "pan")
+    readings = stop_readings(fit, "pan")
     # All but 102 and 104, where the play may not be taken up; the other axis' errors leave no trace.
-    assert found.play_left_out == 2
-    assert found.steps.tolist() == [*(4 * [0, 100, 200, 300, 200, 100]), 106]
-    expected = found.steps * 0.06 - 0.15 * found.side + offsets[[*range(24), 26]]
-    np.testing.assert_allclose(found.mirror_deg, expected, atol=1e-9)
-    np.testing.assert_array_equal(found.side, np.sign(np.diff([-100, *found.steps])))
+    assert readings.play_left_out == 2
+    assert readings.steps.tolist() == [*(4 * [0, 100, 200, 300, 200, 100]), 106]
+    expected = readings.steps * 0.06 - 0.15 * readings.side + offsets[[*range(24), 26]]
+    np.testing.assert_allclose(readings.mirror_deg, expected, atol=1e-9)
+    np.testing.assert_array_equal(readings.side, np.sign(np.diff([-100, *readings.steps])))
 
 
 def test_reading_uncertainty_is_what_noise_does():
@@ -39,8 +39,8 @@ def test_reading_uncertainty_is_what_noise_does():
         rng = np.random.default_rng(seed)
         residual = rng.normal(size=fit.linearised.residual.shape)
         fit.linearised = linearised(residual, fit.linearised.slope, fit.linearised.mirror_angles_rad)
-        found = stop_readings(fit, "pan")
-        errors.append((found.mirror_deg - found.steps * 0.06 + 0.15 * found.side) / found.u_deg)
+        readings = stop_readings(fit, "pan")
+        errors.append((readings.mirror_deg - readings.steps * 0.06 + 0.15 * readings.side) / readings.u_deg)
     z = np.concatenate(errors)
     # 1000 standard normal numbers: 1e-4 bounds of their rms.
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4 / np.sqrt(2 * z.size))
@@ -88,9 +88,9 @@ def test_a_zero_that_creeps_is_no_deviation_of_the_stops(mixed_fit):
         residual = drawn_residual(linear_spots(creeping, mixed_fit.arrays, columns), seed)
         lin = replace(creeping, residual=residual)
         information = stop_information(linear_spots(lin, mixed_fit.arrays, columns))
-        found = stop_residuals(replace(mixed_fit, linearised=lin, information=information))
-        alarms += any(cause.suspicious for cause in residual_causes(found))
-        squares.append(np.mean([(stop.deviation_deg / stop.u_deg) ** 2 for stop in found]))
+        residuals = stop_residuals(replace(mixed_fit, linearised=lin, information=information))
+        alarms += any(cause.suspicious for cause in residual_causes(residuals))
+        squares.append(np.mean([(stop.deviation_deg / stop.u_deg) ** 2 for stop in residuals]))
     assert alarms <= stats.binom.ppf(1 - 1e-4, 100, CAUSE_LIMIT)
     # What follows zeros and gears follows the stops' own errors a little: some is taken, never more left than stated.
     assert 0.25 < np.mean(squares) < 1.0
@@ -98,17 +98,17 @@ def test_a_zero_that_creeps_is_no_deviation_of_the_stops(mixed_fit):
 
 def stops(generator: np.random.Generator, count: int = 60) -> list[StopResidual]:
     """Stops of one axis whose deviations depend on nothing."""
-    found = []
+    rows = []
     for k in range(count):
         noise, looks = generator.standard_normal(), generator.standard_normal(2)
         within = recursive_residuals(looks, np.ones(2), backwards=k % 2 == 1)
         direction = ("left", "right")[k % 2]
         places = (175.0 + 0.1 * generator.random(), 275.0 + 0.1 * generator.random())
         leg = int(generator.choice([50, 100, 200]))
-        found.append(
+        rows.append(
             StopResidual("pan", (2 * k, 2 * k + 1), k, direction, leg, places, within, 10.0 * k, 0.03 * noise, 0.03)
         )
-    return found
+    return rows
 
 
 PLANTED = {
@@ -122,11 +122,11 @@ PLANTED = {
 
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_cause_is_found_and_no_other_blamed_alone(name):
-    found = residual_causes([PLANTED[name](r) for r in stops(np.random.default_rng(6), 120)])
-    assert {c.name for c in found if c.suspicious} >= {name}
+    causes = residual_causes([PLANTED[name](r) for r in stops(np.random.default_rng(6), 120)])
+    assert {c.name for c in causes if c.suspicious} >= {name}
     # Counters alternate with directions here: a phase of two steps is a direction as well.
     related = {"step phase": {"direction"}, "direction": {"step phase"}}.get(name, set())
-    assert {c.name for c in found if c.suspicious} <= {name} | related
+    assert {c.name for c in causes if c.suspicious} <= {name} | related
 
 
 def test_false_alarms_of_causes_stay_rare():

@@ -85,17 +85,17 @@ def test_what_the_fit_can_follow_is_not_seen(clean):
 
 def test_p_values_are_uniform_and_false_alarms_rare(clean):
     """Twenty-five clean campaigns: one-place tests by Kolmogorov-Smirnov, all by the number of alarms, both at 1e-4."""
-    found = [validate(with_residual(clean, drawn(clean, seed))) for seed in range(25)]
-    alarms = sum(not v.passed for v in found)
-    assert alarms <= stats.binom.isf(1e-4, len(found), VALIDATION_LEVEL)
+    validations = [validate(with_residual(clean, drawn(clean, seed))) for seed in range(25)]
+    alarms = sum(not v.passed for v in validations)
+    assert alarms <= stats.binom.isf(1e-4, len(validations), VALIDATION_LEVEL)
     by_name: dict[str, list[ValidationTest]] = {}
-    for validation in found:
+    for validation in validations:
         for test in validation.tests:
             by_name.setdefault(test.name, []).append(test)
     drift = [t.p for t in by_name["the cameras drifted (pose or focal length)"]]
     assert stats.kstest(drift, "uniform").pvalue > 1e-4
     for name, tests in by_name.items():
-        assert len(tests) == len(found), name
+        assert len(tests) == len(validations), name
         # Shared levels are conservative: small p at most as often as they say.
         share = sum(t.p < 0.1 for t in tests)
         assert share <= stats.binom.isf(1e-4, len(tests), 0.1), name
@@ -136,37 +136,37 @@ def planted(fit: JointFit, name: str) -> np.ndarray:
     ],
 )
 def test_a_planted_defect_is_named(clean, name):
-    found = validate(with_residual(clean, drawn(clean, 5) + planted(clean, name)))
-    assert not found.passed
-    assert found.cause.startswith(name)
-    assert found.inflation > 1
+    validation = validate(with_residual(clean, drawn(clean, 5) + planted(clean, name)))
+    assert not validation.passed
+    assert validation.cause.startswith(name)
+    assert validation.inflation > 1
 
 
 def test_a_lost_step_is_placed(clean):
-    found = validate(with_residual(clean, drawn(clean, 5) + planted(clean, "steps were lost")))
-    row = int(found.cause.split("from spot ")[1].split(" ")[0])
+    validation = validate(with_residual(clean, drawn(clean, 5) + planted(clean, "steps were lost")))
+    row = int(validation.cause.split("from spot ")[1].split(" ")[0])
     # 32 places over 60 spots: the nearest lies within two.
-    assert found.cause.split(": ")[1].startswith("pan") and abs(row - 24) <= 2
+    assert validation.cause.split(": ")[1].startswith("pan") and abs(row - 24) <= 2
 
 
 def test_one_bad_spot_is_named_and_moves_no_uncertainty(clean):
     residual = drawn(clean, 6)
     residual[33, :3] += 12.0
-    found = validate(with_residual(clean, residual))
-    worst = next(t for t in found.tests if t.name.startswith("single"))
+    validation = validate(with_residual(clean, residual))
+    worst = next(t for t in validation.tests if t.name.startswith("single"))
     assert worst.failed and worst.where.endswith(f"spot {ordered_spots(clean.campaign)[33].spot}")
 
 
 def test_holm_shares_the_level_and_the_factor_takes_failed_tests_alone():
     logs = np.log([0.004, 1e-5, 0.5, 0.004999])
     answers = [_Tested(float(p), f"t{k}", "here", 9.0, 1, 2.0 + k) for k, p in enumerate(logs)]
-    found = _holm(answers)
+    check = _holm(answers)
     # Four tests: 1e-5 <= 0.01/4, then 0.004 > 0.01/3.
-    assert [t.name for t in found.tests if t.failed] == ["t1"]
-    assert found.cause == "t1: here" and found.inflation == pytest.approx(np.hypot(1, 3.0))
+    assert [t.name for t in check.tests if t.failed] == ["t1"]
+    assert check.cause == "t1: here" and check.inflation == pytest.approx(np.hypot(1, 3.0))
     # 0.004 <= 0.01/2 once only two are left.
-    found = _holm([answers[0], answers[2]])
-    assert [t.failed for t in found.tests] == [True, False] and found.inflation == pytest.approx(np.hypot(1, 2.0))
+    check = _holm([answers[0], answers[2]])
+    assert [t.failed for t in check.tests] == [True, False] and check.inflation == pytest.approx(np.hypot(1, 2.0))
     nothing = _holm([answers[2]])
     assert nothing.passed and nothing.inflation == 1.0 and nothing.cause == ""
 
@@ -193,8 +193,8 @@ def test_no_reader_of_the_text_can_miss_a_failure():
     # Spots that scatter eleven times as far: noise to be stated where the model holds, its failure where not.
     scale = structs.replace(small_summary().parameters["pixel_scale"], value=11.0)
     noisy = structs.replace(small_summary(), parameters={**small_summary().parameters, "pixel_scale": scale})
-    told = [("state larger ones" in fit_text(structs.replace(noisy, validation=each))) for each in (passed, FAILED)]
-    assert told == [True, False]
+    warned = [("state larger ones" in fit_text(structs.replace(noisy, validation=each))) for each in (passed, FAILED)]
+    assert warned == [True, False]
     text = fit_text(structs.replace(small_summary(), validation=passed), details=True)
     assert "VALIDATION" not in text and "validation: no sign of a model error in 1 tests" in text
 

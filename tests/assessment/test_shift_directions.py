@@ -19,8 +19,8 @@ def fit_with(correlation: float, shift: str, *, free: bool = True) -> SimpleName
     rng = np.random.default_rng(3)
     physical = rng.standard_normal((DRAWS, len(NAMES)))
     ratios = 0.06 + 1e-5 * rng.standard_normal((DRAWS, len(DIRECTIONS)))
-    own = physical[:, INDEX[shift]]
-    apart = correlation * own + np.sqrt(1 - correlation**2) * rng.standard_normal(DRAWS)
+    column = physical[:, INDEX[shift]]
+    apart = correlation * column + np.sqrt(1 - correlation**2) * rng.standard_normal(DRAWS)
     left, right = DIRECTIONS.index("left"), DIRECTIONS.index("right")
     mean = 0.5 * (ratios[:, left] + ratios[:, right])
     ratios[:, left], ratios[:, right] = mean + 1e-4 * apart, mean - 1e-4 * apart
@@ -29,13 +29,13 @@ def fit_with(correlation: float, shift: str, *, free: bool = True) -> SimpleName
 
 
 @pytest.mark.parametrize(
-    ("shift", "cure"), [("creep_deg.pan", "alternate the directions"), ("thermal_deg_per_K.pan", "another temperature")]
+    ("shift", "word"), [("creep_deg.pan", "alternate the directions"), ("thermal_deg_per_K.pan", "another temperature")]
 )
-def test_a_contrast_that_goes_with_a_shift_is_named_with_its_cure(shift, cure):
-    (found,) = _shift_directions(fit_with(0.8, shift), "pan")
-    assert found.text.startswith("the contrast of left and right and a ") and cure in found.text
-    assert set(found.loadings) == {"ratio_contrast_deg_per_step.pan", shift}
-    assert found.loadings[shift] == pytest.approx(0.8, abs=4 / np.sqrt(DRAWS))
+def test_a_contrast_that_goes_with_a_shift_is_named_with_its_cure(shift, word):
+    (weak,) = _shift_directions(fit_with(0.8, shift), "pan")
+    assert weak.text.startswith("the contrast of left and right and a ") and word in weak.text
+    assert set(weak.loadings) == {"ratio_contrast_deg_per_step.pan", shift}
+    assert weak.loadings[shift] == pytest.approx(0.8, abs=4 / np.sqrt(DRAWS))
 
 
 def test_what_is_told_apart_or_not_estimated_is_not_named():

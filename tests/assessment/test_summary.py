@@ -111,12 +111,12 @@ def test_contraction_tells_data_from_prior(summary):
 @pytest.mark.parametrize("problem", [None, "it stopped", "nothing was learned"])
 def test_only_a_converged_fit_that_learned_something_is_worth_sampling(fitted, problem):
     """By the same rule as what is said of the whole summary, which takes much longer to make."""
-    found = fitted
+    fit = fitted
     if problem == "it stopped":
-        found = replace(found, converged=False, problems=(problem,))
+        fit = replace(fit, converged=False, problems=(problem,))
     elif problem == "nothing was learned":
-        found = replace(found, prior_draws=found.draws)
-    assert worth_sampling(found) == (unusable(summarise(found)) is None) == (problem is None)
+        fit = replace(fit, prior_draws=fit.draws)
+    assert worth_sampling(fit) == (unusable(summarise(fit)) is None) == (problem is None)
 
 
 def test_one_step_count_is_named_as_a_weak_direction(summary):
@@ -202,10 +202,10 @@ def test_a_draw_that_went_astray_drops_no_experiment(paper, fitted, monkeypatch)
     direction = selection.direction[0]
     mine = selection.direction == direction
     mine[1] = False
-    found = _classic_predicted(SimpleNamespace(fit=fitted, posterior=object()))[direction]
+    predicted = _classic_predicted(SimpleNamespace(fit=fitted, posterior=object()))[direction]
     # The draw itself tells nothing of the mean of all; the experiment is in it.
-    assert found.sd == pytest.approx(ratios[1:, mine].mean(axis=1).std(), rel=1e-9)
-    assert found.value == pytest.approx(np.nanmean(ratios[:, mine], axis=0).mean(), rel=1e-12)
+    assert predicted.sd == pytest.approx(ratios[1:, mine].mean(axis=1).std(), rel=1e-9)
+    assert predicted.value == pytest.approx(np.nanmean(ratios[:, mine], axis=0).mean(), rel=1e-12)
 
 
 def test_the_prediction_holds_the_classic_bias(paper, summary):

@@ -38,9 +38,9 @@ def test_steps_for_a_point_come_back_to_it(rig, request):
         counters = (steps.pan_steps, steps.tilt_steps)
         ray = one.ray(*counters, steps.approach)
         np.testing.assert_array_equal(steps.ray.direction, ray.direction)
-        found = one.locate(*counters, steps.aperture_deg, steps.approach).xyz_mm
+        point = one.locate(*counters, steps.aperture_deg, steps.approach).xyz_mm
         # The reading's rounding of 1e-14 of 100 deg, times at most 700 mm per degree at 1.5 m.
-        assert np.abs(found - steps.xyz_mm).max() < 1e-6
+        assert np.abs(point - steps.xyz_mm).max() < 1e-6
         across = target - steps.xyz_mm
         assert abs(across @ ray.direction) < ROUNDING_MM * 10
         assert steps.rounding_mm == pytest.approx(np.linalg.norm(across), rel=1e-12)

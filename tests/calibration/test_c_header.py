@@ -48,7 +48,7 @@ def python_answer(one, kind: int, target: tuple[float, float, float], sides: tup
     names = [
         {1: positive, -1: negative}.get(side) for side, (negative, positive) in zip(sides, SIDES.values(), strict=True)
     ]
-    asked = {"xyz_mm": target} if kind else {"azimuth_deg": target[0], "elevation_deg": target[1]}
+    wish = {"xyz_mm": target} if kind else {"azimuth_deg": target[0], "elevation_deg": target[1]}
     # The header's 0 is the user's None, of each axis by itself.
     ways = [
         (pan, tilt)
@@ -57,14 +57,14 @@ def python_answer(one, kind: int, target: tuple[float, float, float], sides: tup
     ]
     for k, way in enumerate(ways):
         try:
-            s = one.steps_for(**asked, approach=way, limits=INVERSE_LIMITS)
+            s = one.steps_for(**wish, approach=way, limits=INVERSE_LIMITS)
             break
         except InputError as error:
             if error.code != "outside-limits" or k == len(ways) - 1:
                 return [{"out-of-reach": 0, "outside-limits": -1}[error.code]]
-    told = [1 if side in ("left", "up") else -1 for side in s.approach]
+    signs = [1 if side in ("left", "up") else -1 for side in s.approach]
     counters = [s.pan_steps, s.tilt_steps, s.via_pan_steps, s.via_tilt_steps]
-    return [2 if s.extrapolated else 1, *counters, *told, int(s.extrapolated)]
+    return [2 if s.extrapolated else 1, *counters, *signs, int(s.extrapolated)]
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
@@ -82,19 +82,19 @@ def test_the_c_header_finds_the_same_counters(tmp_path, periods, azimuth, vary):
     points = [(1, x, y, z) for x in (40.0, 300.0, 1000.0, 5000.0) for y in (-350.0, 20.0, 130.0) for z in (-60.0, 90.0)]
     points += [(1, -50.0, 0.0, 0.0), (1, 1e-3, 0.0, 900.0), (1, 600.0, 0.0, 0.0)]
     directions = [(0, a, e, 0.0) for a in (-89.0, -20.0, 3.0, 24.0) for e in (-9.0, 0.0, 5.0)] + [(0, 95.0, 0.0, 0.0)]
-    asked = [(*target, *sides) for target in points + directions for sides in product((1, -1, 0), repeat=2)]
-    text = "".join(" ".join(map(repr, row)) + "\n" for row in asked)
+    requests = [(*target, *sides) for target in points + directions for sides in product((1, -1, 0), repeat=2)]
+    text = "".join(" ".join(map(repr, row)) + "\n" for row in requests)
     done = subprocess.run([tmp_path / "inverse"], input=text, capture_output=True, text=True, check=True)
-    seen = set()
-    for (kind, x, y, z, *sides), line in zip(asked, done.stdout.splitlines(), strict=True):
-        *told, pan_deg, tilt_deg, reading = line.split()
+    codes = set()
+    for (kind, x, y, z, *sides), line in zip(requests, done.stdout.splitlines(), strict=True):
+        *numbers, pan_deg, tilt_deg, reading = line.split()
         wanted = python_answer(one, kind, (x, y, z), tuple(sides))
-        assert list(map(int, told))[: len(wanted)] == wanted, (kind, x, y, z, sides)
-        seen.add(wanted[0])
+        assert list(map(int, numbers))[: len(wanted)] == wanted, (kind, x, y, z, sides)
+        codes.add(wanted[0])
         if wanted[0]:
             target = Point(np.array([x, y, z])) if kind else Direction(x, y)
             angles = mirror_angles(one.estimates, target)
             np.testing.assert_allclose((float(pan_deg), float(tilt_deg)), angles, atol=1e-9)
         if kind and x > 0:
             assert float(reading) == pytest.approx(one.reading(np.array([x, y, z])), abs=1e-9)
-    assert seen == {0, -1, 1, 2}
+    assert codes == {0, -1, 1, 2}

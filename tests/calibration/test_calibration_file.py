@@ -94,36 +94,36 @@ def test_files_of_the_first_format_are_of_gears_without_errors(tmp_path):
     document = {**calibration_json(one), "format": FORMATS[0]}
     del document["gear_errors"]
     (tmp_path / "robot.json").write_text(json.dumps(document))
-    found = load_calibration(tmp_path / "robot.json")
-    assert differing(one, found, without=MOMENTS_ALONE, rel=PRINTED) == []
+    loaded = load_calibration(tmp_path / "robot.json")
+    assert differing(one, loaded, without=MOMENTS_ALONE, rel=PRINTED) == []
 
 
 def test_json_export_tells_the_gears_errors():
     one = geared_complete()
-    told, count = calibration_json(one)["gear_errors"], len(one.mean) - one.gears.size
+    table, count = calibration_json(one)["gear_errors"], len(one.mean) - one.gears.size
     assert calibration_json(complete())["gear_errors"] == {}
     for axis, nodes in zip(("pan", "tilt"), one.gears.steps, strict=True):
-        assert told[axis]["steps"] == list(nodes)
+        assert table[axis]["steps"] == list(nodes)
         part = one.gears.parts[f"play_variation_at_deg.{axis}"]
         u = np.sqrt(np.diag(one.covariance)[count:][part])
-        np.testing.assert_allclose(told[axis]["play_variation_deg"], one.mean[count:][part][:-1], rtol=PRINTED)
-        told_u = [*told[axis]["u_play_variation_deg"], told[axis]["beyond_u_play_variation_deg"]]
+        np.testing.assert_allclose(table[axis]["play_variation_deg"], one.mean[count:][part][:-1], rtol=PRINTED)
+        told_u = [*table[axis]["u_play_variation_deg"], table[axis]["beyond_u_play_variation_deg"]]
         np.testing.assert_allclose(told_u, u, rtol=PRINTED)
 
 
 def test_exports_print_what_a_double_keeps_and_say_what_they_are(bent):
     """No residue of binary fractions; campaign, day, version and a digest that only the calibration changes."""
     one = replace(bent, range_steps=np.array([[0.1 + 0.2, 300.0], [40.0, 60.0]]))
-    here, there = (Origin(name, "2026-01-15", day, "1.0") for name, day in (("a", "2026-02-01"), ("b", "2026-02-02")))
-    document, other = calibration_json(one, here), calibration_json(one, there)
+    old, new = (Origin(name, "2026-01-15", day, "1.0") for name, day in (("a", "2026-02-01"), ("b", "2026-02-02")))
+    document, other = calibration_json(one, old), calibration_json(one, new)
     assert document["range_steps"]["pan"] == [0.3, 300.0] and "0000000000004" not in json.dumps(document)
-    told = document["origin"]
-    assert told["campaign"] == "a" and told["sha256"] == other["origin"]["sha256"] == content_sha256(document)
-    assert content_sha256(calibration_json(bent)) != told["sha256"]
-    header = calibration_header(one, here)
+    meta = document["origin"]
+    assert meta["campaign"] == "a" and meta["sha256"] == other["origin"]["sha256"] == content_sha256(document)
+    assert content_sha256(calibration_json(bent)) != meta["sha256"]
+    header = calibration_header(one, old)
     assert "#define TVS_SEEN_PAN_LOW 0.3\n#define TVS_SEEN_PAN_HIGH 300.0\n" in header
     first = header.split("#ifndef")[0]
-    assert "Campaign: a, measured 2026-01-15; exported 2026-02-01 by tvsbayes 1.0" in first and told["sha256"] in first
+    assert "Campaign: a, measured 2026-01-15; exported 2026-02-01 by tvsbayes 1.0" in first and meta["sha256"] in first
 
 
 @pytest.mark.parametrize("name", ["*/ int x; /*", "??/", "a\\\nb", "\u00fc"])
@@ -138,8 +138,8 @@ def test_draws_file_brings_everything_back(tmp_path, vary):
     (tmp_path / "results").mkdir()
     path = tmp_path / "results" / "draws.npz"
     path.write_bytes(calibration_bytes(one, physical=np.zeros((3, 65))))
-    for asked in (tmp_path, str(tmp_path), tmp_path / "results", path):
-        assert differing(one, load_calibration(asked)) == []
+    for place in (tmp_path, str(tmp_path), tmp_path / "results", path):
+        assert differing(one, load_calibration(place)) == []
 
 
 def test_results_without_a_calibration_are_no_damage(tmp_path):
@@ -163,9 +163,9 @@ def test_json_export_brings_back_all_but_the_draws(tmp_path, vary):
     assert differing(one, other, without=MOMENTS_ALONE, rel=PRINTED) == []
     assert len(other.inputs) == len(other.noise) == len(other.causes) == 0
     assert other.locate(100, 50, 75.0).u95_mm == pytest.approx(one.locate(100, 50, 75.0).u95_mm, rel=ROUNDING)
-    there, here = (each.steps_for((600, 0, 0)) for each in (other, one))
-    assert (there.pan_steps, there.tilt_steps, there.approach) == (here.pan_steps, here.tilt_steps, here.approach)
-    np.testing.assert_allclose(there.xyz_mm, here.xyz_mm, rtol=ROUNDING, atol=ROUNDING_MM)
+    after, before = (each.steps_for((600, 0, 0)) for each in (other, one))
+    assert (after.pan_steps, after.tilt_steps, after.approach) == (before.pan_steps, before.tilt_steps, before.approach)
+    np.testing.assert_allclose(after.xyz_mm, before.xyz_mm, rtol=ROUNDING, atol=ROUNDING_MM)
 
 
 def test_expected_error_is_that_of_the_middle():
@@ -364,26 +364,26 @@ def test_the_c_header_computes_the_same(tmp_path, periods, azimuth, vary):
     poses = (*POSES, (2600, 90, 110.0), (350, 10, 120.0), (-799.5, 3, 95.0), (-850, 500.25, 100.0), (-400, 300, 95.0))
     # The last one meets the other nappe of the cone, which no reading is of.
     poses = (*poses, (-50, 200, 179.8))
-    asked = [(pan, tilt, left, up, reading) for (pan, tilt, reading), left, up in product(poses, (1, -1), (1, -1))]
-    text = "".join(" ".join(map(repr, row)) + "\n" for row in asked)
+    requests = [(pan, tilt, left, up, reading) for (pan, tilt, reading), left, up in product(poses, (1, -1), (1, -1))]
+    text = "".join(" ".join(map(repr, row)) + "\n" for row in requests)
     done = subprocess.run([tmp_path / "main"], input=text, capture_output=True, text=True, check=True)
     rows = [list(map(float, line.split())) for line in done.stdout.splitlines()]
     refused, count = 0, len(INPUT_NAMES)
-    for (pan, tilt, left, up, reading), (found, u_pan, u_tilt, *numbers) in zip(asked, rows, strict=True):
+    for (pan, tilt, left, up, reading), (code, u_pan, u_tilt, *numbers) in zip(requests, rows, strict=True):
         approach = ("left" if left > 0 else "right", "up" if up > 0 else "down")
         origin, direction, point = np.array(numbers).reshape(3, 3).T
         ray = one.ray(pan, tilt, approach)
         u = dict.fromkeys(GEAR_INPUTS, 0.0)
         u |= one.gears.at(np.sqrt(np.diag(one.covariance))[count:], (float(pan), float(tilt)))
-        for axis, told in (("pan", u_pan), ("tilt", u_tilt)):
+        for axis, u_axis in (("pan", u_pan), ("tilt", u_tilt)):
             wanted = math.hypot(u[f"transmission_error_at_deg.{axis}"], 0.5 * u[f"play_variation_at_deg.{axis}"])
-            assert told == pytest.approx(wanted, abs=ROUNDING)
+            assert u_axis == pytest.approx(wanted, abs=ROUNDING)
         np.testing.assert_allclose(origin, ray.origin_mm, atol=ROUNDING_MM)
         np.testing.assert_allclose(direction, ray.direction, atol=ROUNDING_MM / 1000)
-        if found:
+        if code:
             there = one.locate(pan, tilt, reading, approach)
             np.testing.assert_allclose(point, there.xyz_mm, atol=ROUNDING_MM)
-            assert found == (2 if there.extrapolated else 1)
+            assert code == (2 if there.extrapolated else 1)
         else:
             assert refusal(lambda a=(pan, tilt, reading, approach): one.locate(*a)).code in CODES
             refused += 1

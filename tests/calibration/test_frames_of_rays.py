@@ -33,10 +33,10 @@ def placed():
 
 
 def angles_rad(values):
-    found = [
+    angles = [
         twin_angle_deg(values, axis, n, TWIN_SIDE[side]) for axis, n, side in zip(AXES, STEPS, APPROACH, strict=True)
     ]
-    return np.radians(found)
+    return np.radians(angles)
 
 
 def test_frame_p_is_where_the_mirrors_stand(placed):
@@ -56,8 +56,8 @@ def test_frame_s_is_where_the_twins_light_goes(placed):
     np.testing.assert_allclose(ray.origin_mm + reach * ray.direction, light.points_mm, atol=ROUNDING_MM)
     np.testing.assert_allclose(ray.direction, light.directions, atol=ROUNDING)
     camera = placed.ray(*STEPS, APPROACH, frame="camera")
-    for seen, own in ((ray.origin_mm, camera.origin_mm), (ray.direction, camera.direction)):
-        np.testing.assert_allclose(seen, [own[2], -own[0], -own[1]], atol=ROUNDING_MM)
+    for in_s, in_camera in ((ray.origin_mm, camera.origin_mm), (ray.direction, camera.direction)):
+        np.testing.assert_allclose(in_s, [in_camera[2], -in_camera[0], -in_camera[1]], atol=ROUNDING_MM)
 
 
 def rays_of_draws(placed, frame):
@@ -66,18 +66,14 @@ def rays_of_draws(placed, frame):
     values = looks.values_at(placed, tuple(np.array([n]) for n in STEPS))
     values = {name: np.ravel(each) for name, each in values.items()} | ({} if frame == "T" else dict(P_INPUTS))
     beam = placed.noisy_beam(values, looks.noise.T, STEPS, sides_of(APPROACH))
-    found = np.array([*beam.origin, *beam.direction]).T
+    rays = np.array([*beam.origin, *beam.direction]).T
     if frame not in ("S", "camera"):
-        return found
-    poses = placed.extrinsics[np.arange(len(found)) % len(placed.extrinsics)]
+        return rays
+    poses = placed.extrinsics[np.arange(len(rays)) % len(placed.extrinsics)]
     turns = np.array([rotation_matrix(pose[:3]) for pose in poses])
-    origin = np.einsum("nij,nj->ni", turns, found[:, :3]) + poses[:, 3:]
-    found = np.c_[origin, np.einsum("nij,nj->ni", turns, found[:, 3:])]
-    return (
-        found
-        if frame == "S"
-        else np.c_[-found[:, 1], -found[:, 2], found[:, 0], -found[:, 4], -found[:, 5], found[:, 3]]
-    )
+    origin = np.einsum("nij,nj->ni", turns, rays[:, :3]) + poses[:, 3:]
+    rays = np.c_[origin, np.einsum("nij,nj->ni", turns, rays[:, 3:])]
+    return rays if frame == "S" else np.c_[-rays[:, 1], -rays[:, 2], rays[:, 0], -rays[:, 4], -rays[:, 5], rays[:, 3]]
 
 
 @pytest.mark.parametrize("frame", ["T", "P", "S", "camera"])
@@ -89,10 +85,10 @@ def test_covariance_is_that_of_the_draws(placed, frame):
     ray = placed.ray(*STEPS, APPROACH, frame=frame, covariance=True)
     along = np.c_[np.eye(3), 500.0 * np.eye(3)]
     expected = np.cov(rays_of_draws(placed, frame) @ along.T, rowvar=False)
-    found = along @ ray.covariance @ along.T
-    sd, own = np.sqrt(np.diag(expected)), np.sqrt(np.diag(found))
-    np.testing.assert_allclose(own, sd, rtol=0.03)
-    np.testing.assert_allclose(found / np.outer(own, own), expected / np.outer(sd, sd), atol=0.03)
+    covariance = along @ ray.covariance @ along.T
+    sd, ray_sd = np.sqrt(np.diag(expected)), np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(ray_sd, sd, rtol=0.03)
+    np.testing.assert_allclose(covariance / np.outer(ray_sd, ray_sd), expected / np.outer(sd, sd), atol=0.03)
     np.testing.assert_allclose(ray.covariance, ray.covariance.T, atol=1e-9)
 
 

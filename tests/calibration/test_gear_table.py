@@ -28,12 +28,12 @@ def test_interpolation_is_exact_for_cubics_and_at_the_tables_own_counters():
     for name, part in table.parts.items():
         nodes = np.array(STEPS[name.endswith("tilt")]) / 500
         columns[part.start : part.stop - 1] = 1 + nodes - 2 * nodes**2 + 0.5 * nodes**3
-    asked = np.array([-700.0, -699.0, -0.5, 0.0, 333.3, 700.0])
-    found, x = table.at(columns, (asked, asked)), asked / 500
+    counters = np.array([-700.0, -699.0, -0.5, 0.0, 333.3, 700.0])
+    values, x = table.at(columns, (counters, counters)), counters / 500
     for name in GEAR_INPUTS:
-        np.testing.assert_allclose(found[name], 1 + x - 2 * x**2 + 0.5 * x**3, atol=100 * ROUNDING)
-        one = table.at(columns, (float(asked[4]), float(asked[4])))[name]
-        assert float(one) == pytest.approx(found[name][4], abs=ROUNDING)
+        np.testing.assert_allclose(values[name], 1 + x - 2 * x**2 + 0.5 * x**3, atol=100 * ROUNDING)
+        one = table.at(columns, (float(counters[4]), float(counters[4])))[name]
+        assert float(one) == pytest.approx(values[name][4], abs=ROUNDING)
     rng = np.random.default_rng(1)
     any_columns = rng.standard_normal((3, table.size))
     nodes = np.array(STEPS[0])
@@ -47,9 +47,9 @@ def test_beyond_the_table_stands_a_column_of_its_own():
     table = GearTable(STEPS)
     columns = np.random.default_rng(2).standard_normal(table.size)
     for pan in (-800.001, 801.0, 1e7):
-        found = table.at(columns, (pan, 0.0))
+        values = table.at(columns, (pan, 0.0))
         for kind in ("transmission_error_at_deg", "play_variation_at_deg"):
-            assert float(found[f"{kind}.pan"]) == columns[table.parts[f"{kind}.pan"].stop - 1]
+            assert float(values[f"{kind}.pan"]) == columns[table.parts[f"{kind}.pan"].stop - 1]
     assert table.names[32] == "transmission_error_at_deg.pan.800"
     assert table.names[33] == "transmission_error_at_deg.pan.beyond" and len(set(table.names)) == table.size
 
@@ -63,10 +63,10 @@ def test_covariance_of_a_look_is_that_of_the_interpolated_draws():
         varies = np.diag(one.covariance)[:count] > 0
         kept = np.flatnonzero([*varies, *4 * [True]])
         wanted = np.cov(look, rowvar=False)[np.ix_(kept, kept)]
-        found = one.gears.look_covariance(one.covariance, counters)[k]
-        np.testing.assert_allclose(found[np.ix_(kept, kept)], wanted, atol=1e3 * ROUNDING)
+        covariance = one.gears.look_covariance(one.covariance, counters)[k]
+        np.testing.assert_allclose(covariance[np.ix_(kept, kept)], wanted, atol=1e3 * ROUNDING)
         alone = one.gears.look_covariance(one.covariance, (float(counters[0][k]), float(counters[1][k])))
-        np.testing.assert_allclose(alone, found, atol=ROUNDING)
+        np.testing.assert_allclose(alone, covariance, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("approach", [("left", "up"), ("right", "down"), ("left", "unknown")])
@@ -96,18 +96,18 @@ def test_draws_and_the_law_of_propagation_agree_over_varying_gears():
     one = geared(calibration(spread=0.1))
     pan, tilt = np.array([37.0, -380.0, -700.0, -850.0]), np.array([-5.0, 250.0, -400.0, 30.0])
     reading = np.array([60.0, 75.0, 95.0, 100.0])
-    found = locate(one, pan, tilt, reading, draws=1000)
+    point = locate(one, pan, tilt, reading, draws=1000)
     law = locate_linear(one, settings_of(pan, tilt, reading))
-    kept = [error is None for error in found.refused]
+    kept = [error is None for error in point.refused]
     assert all(kept)
     u = np.sqrt(np.diagonal(law.covariance, 0, 1, 2))
-    assert np.all(np.abs(found.xyz_mm - law.value)[kept] < 5 * u[kept] / np.sqrt(1000) + 0.02 * u[kept])
-    np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance_mm2, 0, 1, 2))[kept], u[kept], rtol=0.12)
+    assert np.all(np.abs(point.xyz_mm - law.value)[kept] < 5 * u[kept] / np.sqrt(1000) + 0.02 * u[kept])
+    np.testing.assert_allclose(np.sqrt(np.diagonal(point.covariance_mm2, 0, 1, 2))[kept], u[kept], rtol=0.12)
     for k in np.flatnonzero(kept):
         alone = one.locate(pan[k], tilt[k], reading[k])
         np.testing.assert_allclose(alone.xyz_mm, law.value[k], atol=ROUNDING_MM)
         np.testing.assert_allclose(alone.covariance_mm2, law.covariance[k], rtol=1e-9)
-        assert alone.extrapolated == found.extrapolated[k] == bool(found.as_json(k)["extrapolated"])
+        assert alone.extrapolated == point.extrapolated[k] == bool(point.as_json(k)["extrapolated"])
 
 
 def test_outside_the_counters_seen_uncertainty_grows_and_everybody_says_so():
@@ -129,12 +129,12 @@ def test_outside_the_counters_seen_uncertainty_grows_and_everybody_says_so():
 def test_steps_take_the_gears_errors_back():
     one = geared(calibration())
     for azimuth, elevation in ((3.0, 2.0), (-14.0, 9.0), (25.0, -12.0)):
-        found = one.steps_for(azimuth_deg=azimuth, elevation_deg=elevation)
+        steps = one.steps_for(azimuth_deg=azimuth, elevation_deg=elevation)
         # Half a step of both axes.
-        assert found.rounding_deg < np.sqrt(2) * HALF_STEP_DEG
+        assert steps.rounding_deg < np.sqrt(2) * HALF_STEP_DEG
         plain = replace(one, gears=NO_GEARS, mean=one.mean[: -one.gears.size])
-        assert plain.beam_at((found.pan_steps, found.tilt_steps), (1.0, 1.0)) != one.beam_at(
-            (found.pan_steps, found.tilt_steps), (1.0, 1.0)
+        assert plain.beam_at((steps.pan_steps, steps.tilt_steps), (1.0, 1.0)) != one.beam_at(
+            (steps.pan_steps, steps.tilt_steps), (1.0, 1.0)
         )
 
 

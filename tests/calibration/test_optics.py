@@ -27,9 +27,9 @@ def test_transmission_error_is_that_of_wheel_or_pinion(wobbling):
     """The wheel's error follows the output, which the play shifts; the pinion's the driving angle."""
     for axis, side in product(AXES, (1.0, -1.0, 0.0)):
         for steps in (-211, 0, 55, 180):
-            found = output_deg(wobbling.estimates, axis, steps, side, PERIODS_DEG[axis])
+            angle = output_deg(wobbling.estimates, axis, steps, side, PERIODS_DEG[axis])
             expected = twin_angle_deg(wobbling.estimates, axis, steps, -side / 2, PERIODS_DEG[axis])
-            assert found == pytest.approx(expected, abs=ROUNDING * 100)
+            assert angle == pytest.approx(expected, abs=ROUNDING * 100)
     values = wobbling.estimates
     ratio, play = values["degrees_per_step.pan"], values["backlash_deg.pan"]
     gap = [output_deg(values, "pan", 55, side, 360.0) - (ratio * 55 - side * play / 2) for side in (1, -1)]
@@ -49,16 +49,16 @@ def test_ranges_are_those_of_jax_from_anywhere(azimuth):
         expected = meeting(*arrays)
     meets = np.asarray(expected.meets)
     assert 400 < meets.sum() < 1600
-    found = range_components(tuple(origin), tuple(direction), 200.0, angle_deg, azimuth)
+    ranges = range_components(tuple(origin), tuple(direction), 200.0, angle_deg, azimuth)
     with np.errstate(invalid="ignore"):
         # Points behind the baseline are refused by anyone who asks for the range.
-        np.testing.assert_array_equal((found > 0) & (origin[0] + found * direction[0] > 0), meets)
-    np.testing.assert_allclose(found[meets], np.asarray(expected.range_mm)[meets], rtol=1e3 * ROUNDING)
+        np.testing.assert_array_equal((ranges > 0) & (origin[0] + ranges * direction[0] > 0), meets)
+    np.testing.assert_allclose(ranges[meets], np.asarray(expected.range_mm)[meets], rtol=1e3 * ROUNDING)
     for k in range(100):
         single = range_components(
             tuple(origin[:, k].tolist()), tuple(direction[:, k].tolist()), 200.0, angle_deg[k], azimuth, math
         )
-        assert single == pytest.approx(found[k], rel=1e3 * ROUNDING, nan_ok=True)
+        assert single == pytest.approx(ranges[k], rel=1e3 * ROUNDING, nan_ok=True)
 
 
 def test_ratio_of_the_beam_is_the_twins():
@@ -103,10 +103,10 @@ def test_the_reading_of_a_point_leads_back_to_it(azimuth):
     origin, direction, points = bent_beams(200, 3)
     reading = aperture_angle_deg(points, A_MM, "azimuth" if azimuth else "in-plane")
     assert (reading > 90).sum() > 20 and (reading < 90).sum() > 20
-    found, range_mm, meets = met(origin, direction, reading, azimuth)
+    xyz, range_mm, meets = met(origin, direction, reading, azimuth)
     assert meets.all()
     # The reading's rounding of 2e-14 deg at up to r^2 / (a sin) = 200 mm per degree, and of the discriminant's root.
-    np.testing.assert_allclose(found, points, atol=1e-7)
+    np.testing.assert_allclose(xyz, points, atol=1e-7)
     np.testing.assert_allclose(range_mm, np.linalg.norm(points - origin, axis=1), atol=1e-7)
 
 
@@ -117,11 +117,11 @@ def test_a_right_angle_is_no_exception(azimuth):
     reach = (-A_MM / 2 - origin[:, 1]) / direction[:, 1]
     ahead = (reach > 0) & (origin[:, 0] + reach * direction[:, 0] > 0)
     points = origin + reach[:, None] * direction
-    found, _, meets = met(origin, direction, np.full(200, 90.0), azimuth)
+    xyz, _, meets = met(origin, direction, np.full(200, 90.0), azimuth)
     assert ahead.sum() > 50
     # cos(90 deg) is 6e-17, not 0: it decides about beams that run behind the positioner only.
     np.testing.assert_array_equal(meets, ahead)
-    np.testing.assert_allclose(found[ahead], points[ahead], atol=ROUNDING_MM, rtol=1e-10)
+    np.testing.assert_allclose(xyz[ahead], points[ahead], atol=ROUNDING_MM, rtol=1e-10)
 
 
 @pytest.mark.parametrize("azimuth", [False, True])
@@ -155,9 +155,9 @@ def test_beams_from_the_baseline_give_the_published_point():
     cr, br = np.radians(C), np.radians(beta)
     direction = np.stack([np.sin(cr) * np.cos(br), -np.cos(cr), np.sin(cr) * np.sin(br)], axis=1)
     origin = np.tile([0.0, A_MM / 2, 0.0], (200, 1))
-    found, _, meets = met(origin, direction, B, False)
+    xyz, _, meets = met(origin, direction, B, False)
     assert meets.all()
-    np.testing.assert_allclose(found, published_point(B, C, beta, A_MM).T, atol=1e-7)
+    np.testing.assert_allclose(xyz, published_point(B, C, beta, A_MM).T, atol=1e-7)
 
 
 def test_conventions_differ_by_the_documented_share():
@@ -199,8 +199,8 @@ def test_a_beam_that_passes_beside_the_cone_does_not_meet():
     up = np.array([[0.0, 0.0, 1.0]])
     for reading, expected in ((nearest - 0.1, False), (nearest + 0.1, True)):
         assert met(origin, up, [reading], False)[2][0] == expected
-    found = met(origin, up, [nearest + 0.1], False)[0]
-    assert aperture_angle_deg(found[0], A_MM, "in-plane") == pytest.approx(nearest + 0.1, abs=1e-9)
+    xyz = met(origin, up, [nearest + 0.1], False)[0]
+    assert aperture_angle_deg(xyz[0], A_MM, "in-plane") == pytest.approx(nearest + 0.1, abs=1e-9)
 
 
 def test_a_point_behind_the_scanner_is_no_azimuth():

@@ -67,9 +67,9 @@ def test_ray_of_the_test_vector():
     assert np.abs(turned[0] - [5.371658918, -29.176887333, -0.940368833]).max() <= LAST_9 * 1.01
     assert np.abs(turned[1] - [0.981182562588, 0.177188586189, 0.076713648059]).max() <= LAST_12 * 1.01
     for azimuth, reading in ((False, 48.834423), (True, 48.759278)):
-        found = replace(one, azimuth=azimuth).locate(200, 100, reading).xyz_mm
+        xyz = replace(one, azimuth=azimuth).locate(200, 100, reading).xyz_mm
         # Half a unit of the last digit of the reading moves the point by a sin(C) / sin(B + C)^2 = 14 mm per degree.
-        assert np.abs(found - printed).max() <= LAST_6 + 14.0 * LAST_6
+        assert np.abs(xyz - printed).max() <= LAST_6 + 14.0 * LAST_6
 
 
 def test_sides_differ_by_the_play(bent):
@@ -102,20 +102,20 @@ def test_locate_is_where_the_twin_reads_the_same_angle(rig, approach, request):
 @pytest.mark.parametrize("rig", ["bent", "wobbling"])
 def test_locate_is_the_law_of_propagation_in_jax(rig, request):
     one = request.getfixturevalue(rig)
-    asked = [(*pose, side) for pose in POSES for side in SIDES]
-    pan, tilt, reading = np.array([a[:3] for a in asked]).T
-    settings = settings_of(pan, tilt, reading, [a[3] for a in asked])
+    cases = [(*pose, side) for pose in POSES for side in SIDES]
+    pan, tilt, reading = np.array([a[:3] for a in cases]).T
+    settings = settings_of(pan, tilt, reading, [a[3] for a in cases])
     law, numpy = jax_law(one, settings), locate_linear(one, settings)
     varies = np.diag(one.covariance_with_noise) > 0
     slopes = np.asarray(law.jacobian)[..., varies]
     np.testing.assert_allclose(numpy.value, law.value, atol=ROUNDING_MM)
     np.testing.assert_allclose(numpy.jacobian[..., varies], slopes, rtol=ROUNDING, atol=ROUNDING * np.abs(slopes).max())
-    for i, (pan, tilt, reading, approach) in enumerate(asked):
-        found = one.locate(pan, tilt, reading, approach)
-        np.testing.assert_allclose(found.xyz_mm, law.value[i], atol=ROUNDING_MM)
+    for i, (pan, tilt, reading, approach) in enumerate(cases):
+        point = one.locate(pan, tilt, reading, approach)
+        np.testing.assert_allclose(point.xyz_mm, law.value[i], atol=ROUNDING_MM)
         scale = np.sqrt(np.outer(np.diag(numpy.covariance[i]), np.diag(numpy.covariance[i])))
-        assert np.abs((found.covariance_mm2 - law.covariance[i]) / scale).max() < 100 * ROUNDING
-        np.testing.assert_allclose(found.u95_mm, NORMAL_95 * np.sqrt(np.diag(found.covariance_mm2)), rtol=ROUNDING)
+        assert np.abs((point.covariance_mm2 - law.covariance[i]) / scale).max() < 100 * ROUNDING
+        np.testing.assert_allclose(point.u95_mm, NORMAL_95 * np.sqrt(np.diag(point.covariance_mm2)), rtol=ROUNDING)
 
 
 @pytest.mark.parametrize("rig", ["bent", "wobbling"])
@@ -124,12 +124,12 @@ def test_derivatives_are_the_jacobian_of_jax(rig, request):
     one = request.getfixturevalue(rig)
     varies = np.diag(one.covariance_with_noise) > 0
     assert varies.sum() >= 20
-    asked = list(product(POSES, SIDES))
-    pan, tilt, reading = np.array([pose for pose, _ in asked]).T
-    law = jax_law(one, settings_of(pan, tilt, reading, [side for _, side in asked]))
-    for (pose, side), expected in zip(asked, np.asarray(law.jacobian)[..., varies], strict=True):
-        found = one.derivatives(*pose, side)[:, varies]
-        np.testing.assert_allclose(found, expected, rtol=ROUNDING, atol=ROUNDING * np.abs(expected).max())
+    cases = list(product(POSES, SIDES))
+    pan, tilt, reading = np.array([pose for pose, _ in cases]).T
+    law = jax_law(one, settings_of(pan, tilt, reading, [side for _, side in cases]))
+    for (pose, side), expected in zip(cases, np.asarray(law.jacobian)[..., varies], strict=True):
+        slopes = one.derivatives(*pose, side)[:, varies]
+        np.testing.assert_allclose(slopes, expected, rtol=ROUNDING, atol=ROUNDING * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("azimuth", [False, True])

@@ -77,14 +77,14 @@ def test_a_changed_gear_is_named(mounted_rig):
     parameters = dict(first.truth.parameters)
     parameters["degrees_per_step.pan"] *= 1.02
     second = simulate(mounted_rig, protocol, seed=4, truth=replace(first.truth, parameters=parameters)).campaign
-    made = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+    created = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
     dated = [
-        replace(campaign, header={**campaign.header, "created": made + datetime.timedelta(days=30 * k)})
+        replace(campaign, header={**campaign.header, "created": created + datetime.timedelta(days=30 * k)})
         for k, campaign in enumerate((first.campaign, second))
     ]
-    found = compare(*map(fit, dated))
-    moved = {c.quantity for c in found.changes if c.significant}
+    comparison = compare(*map(fit, dated))
+    moved = {c.quantity for c in comparison.changes if c.significant}
     assert moved == {"effective_deg_per_step.left", "effective_deg_per_step.right"}
-    assert found.days == 30.0 and found.verdict.startswith("changed: local_deg_per_step.left by +")
-    for change in found.changes[:2]:
+    assert comparison.days == 30.0 and comparison.verdict.startswith("changed: local_deg_per_step.left by +")
+    for change in comparison.changes[:2]:
         assert change.difference == pytest.approx(0.02 * change.first, abs=4 * change.u)

@@ -33,10 +33,10 @@ def paper_gaps(paper_fit) -> dict[str, Gap]:
     return explain_gap(paper_fit)
 
 
-def true_terms(found: JointFit, truth: Truth) -> dict[str, dict[str, float]]:
+def true_terms(joint: JointFit, truth: Truth) -> dict[str, dict[str, float]]:
     """Terms on the true rig: the first row of the Laplace draws is where the fit stands."""
-    space = jax.tree.map(np.asarray, found.space)
-    gaps = explain_gap(replace(found, z=coordinates(space, truth)), draws=2)
+    space = jax.tree.map(np.asarray, joint.space)
+    gaps = explain_gap(replace(joint, z=coordinates(space, truth)), draws=2)
     return {d: {t.name: t.value for t in g.terms} for d, g in gaps.items() if g is not None}
 
 
@@ -50,9 +50,9 @@ def test_terms_add_up_to_the_gap(paper_fit, paper_gaps):
         assert sum(term.value for term in gap.terms) == pytest.approx(gap.total.value, abs=10 * rounding)
         assert gap.total.value == pytest.approx(mean - gap.joint.value, abs=rounding)
     # One ratio, one uncertainty: what the fit's own table states.
-    for direction, told in summarise(paper_fit).effective.items():
+    for direction, ratio in summarise(paper_fit).effective.items():
         joint = paper_gaps[direction].joint
-        assert (joint.value, joint.sd, joint.interval95) == (told.value, told.sd, told.interval95)
+        assert (joint.value, joint.sd, joint.interval95) == (ratio.value, ratio.sd, ratio.interval95)
 
 
 def test_terms_of_a_posterior_add_up_to_the_ratio_of_all_its_draws(paper_fit):
@@ -79,20 +79,20 @@ def test_draws_of_several_ways_of_homing_see_the_spots_of_their_own(paper_fit, m
     both = replace(paper_fit, alternatives=ways)
     way = np.random.default_rng(5).integers(0, 2, z.shape[:2])
     posterior = Posterior(both, z, np.zeros(z.shape[:2]), chains, weights, None, 0, 0.0, way=way)
-    asked, looked = {}, predictive.looks
+    points_of, looked = {}, predictive.looks
 
     def looks(fit, points, *others):
-        asked.setdefault(fit.campaign.title, []).append(points)
+        points_of.setdefault(fit.campaign.title, []).append(points)
         return looked(fit, points, *others)
 
     monkeypatch.setattr(predictive, "looks", looks)
-    found, places = explain_gap(both, posterior, draws=64), posterior.chosen(64)
-    for own, title in enumerate((paper_fit.campaign.title, "the other way")):
-        assert len(asked[title]) == 4
-        for points in asked[title]:
-            np.testing.assert_array_equal(points, z[0, places[way[0, places] == own]])
+    gaps, places = explain_gap(both, posterior, draws=64), posterior.chosen(64)
+    for number, title in enumerate((paper_fit.campaign.title, "the other way")):
+        assert len(points_of[title]) == 4
+        for points in points_of[title]:
+            np.testing.assert_array_equal(points, z[0, places[way[0, places] == number]])
     alone = explain_gap(paper_fit, replace(posterior, fit=paper_fit, way=None), draws=64)
-    assert {d: gap.terms for d, gap in found.items()} == {d: gap.terms for d, gap in alone.items()}
+    assert {d: gap.terms for d, gap in gaps.items()} == {d: gap.terms for d, gap in alone.items()}
 
 
 def test_terms_name_the_true_causes_with_sign_and_size(paper_fit, paper_gaps, paper_truth):

@@ -47,19 +47,19 @@ def test_regions_of_one_counter_ask_for_another_counter(paper_fit, monkeypatch):
 
 
 def test_joint_predicts_a_step_count_it_never_saw(mixed_fit):
-    told = []
-    held = hold_out(mixed_fit, progress=told.append)
-    check_forward(told)
-    assert [name.split(" =")[0] for name in doings(told)] == ["|N|"] * len(doings(told)) and len(doings(told)) > 1
+    waits = []
+    held = hold_out(mixed_fit, progress=waits.append)
+    check_forward(waits)
+    assert [name.split(" =")[0] for name in doings(waits)] == ["|N|"] * len(doings(waits)) and len(doings(waits)) > 1
     assert held.verdict == BETTER_JOINT and held.interval95[0] > 1
     assert held.joint.rms_block_deg < held.classic.rms_block_deg
     assert len(held.predictions) == len(select_experiments(mixed_fit.campaign).experiments)
     # 48 predictions whose stop errors pairs share: half of them count, 1e-4 two-sided.
     least = stats.binom.ppf(1e-4, 24, 0.95) / 24
     assert held.joint.coverage >= least
-    seen = {p.experiment: p.angle_deg / p.steps for p in held.predictions}
+    ratios = {p.experiment: p.angle_deg / p.steps for p in held.predictions}
     for experiment in classic(mixed_fit.campaign).experiments:
-        assert seen[experiment.experiment] == pytest.approx(experiment.deg_per_step, rel=1e-12)
+        assert ratios[experiment.experiment] == pytest.approx(experiment.deg_per_step, rel=1e-12)
     json.dumps(plain(held), allow_nan=False)
 
 
@@ -99,8 +99,8 @@ def test_experiments_beyond_the_lens_model_neither_teach_nor_are_asked():
     rows, nothing = np.zeros((4, 4), dtype=int), np.zeros((4, 4, 4))
     selection = Selection(np.arange(4), rows, nothing, np.full(4, 200), np.full(4, "pan"), ())
     angle = np.array([12.0, 12.1, 11.9, np.nan])
-    told = predict_classic(angle, selection, np.array([True, False, False, False]))
-    assert told[0][0] == pytest.approx(12.0) and np.isfinite(told[0][1]) and told[0][2] == 1
+    angles = predict_classic(angle, selection, np.array([True, False, False, False]))
+    assert angles[0][0] == pytest.approx(12.0) and np.isfinite(angles[0][1]) and angles[0][2] == 1
     assert predict_classic(angle, selection, np.array([False, False, False, True])) == {}
 
 
@@ -122,9 +122,9 @@ def test_few_experiments_predict_with_the_width_of_their_own_scatter():
     predictions = []
     for index in range(sets):
         angle = 12.0 + 0.05 * generator.standard_normal(3)
-        ((_, told),) = predict_classic(angle, selection, np.array([True, False, False])).items()
-        assert told[2] == 1
-        predictions.append(Prediction(index, "one", "left", 200, float(angle[0]), *told, 12.0, 0.05))
+        ((_, row),) = predict_classic(angle, selection, np.array([True, False, False])).items()
+        assert row[2] == 1
+        predictions.append(Prediction(index, "one", "left", 200, float(angle[0]), *row, 12.0, 0.05))
     held = judge("steps", predictions, np.array([100, 200]), {})
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], sets, 0.95) / sets
     assert low <= held.classic.coverage <= high

@@ -59,18 +59,18 @@ def unfitted(monkeypatch):
 def test_counters_are_predicted_within_their_u_where_the_model_knows_that_gears_err(worn, whole):
     """Four counters, two sides of which say the same: rms of z below the 99.9 % quantile of four; else beyond it."""
     rig, campaign = worn
-    told = []
-    found = hold_out_positions(whole, progress=told.append)
-    check_forward(told)
-    assert doings(told) == [f"pan {counter}" for counter in PAN]
-    assert {(p.axis, p.position, p.direction) for p in found.positions} == {
+    waits = []
+    held = hold_out_positions(whole, progress=waits.append)
+    check_forward(waits)
+    assert doings(waits) == [f"pan {counter}" for counter in PAN]
+    assert {(p.axis, p.position, p.direction) for p in held.positions} == {
         ("pan", counter, side) for counter in PAN for side in ("left", "right")
     }
-    assert sum(p.n for p in found.positions) == len(ordered_spots(campaign))
-    assert found.warnings == ("tilt is seen at 2 counters: with one left out no line is determined",)
+    assert sum(p.n for p in held.positions) == len(ordered_spots(campaign))
+    assert held.warnings == ("tilt is seen at 2 counters: with one left out no line is determined",)
     limit = np.sqrt(stats.chi2.ppf(0.999, len(PAN)) / len(PAN))
-    assert found.rms_z < limit
-    document = json.loads(json.dumps(hold_out_document(found, "deg"), allow_nan=False))
+    assert held.rms_z < limit
+    document = json.loads(json.dumps(hold_out_document(held, "deg"), allow_nan=False))
     assert document["hold_out"]["by"] == "positions" and document["unit"] == "deg"
     assert set(document["hold_out"]["positions"][0]) == {
         *("axis", "position", "direction", "n", "mean", "predicted", "u"),

@@ -12,12 +12,12 @@ from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CAN
 
 def test_scores_of_predictions_by_hand():
     """Two folds of two: errors of the classic 3, 1, -2, -4 (3 degrees of freedom), of the joint a tenth; all u = 1."""
-    told = []
+    predictions = []
     for e, (fold, direction, error) in enumerate(
         (("a", "left", 3), ("a", "left", 1), ("b", "up", -2), ("b", "up", -4))
     ):
-        told.append(Prediction(e, fold, direction, 100, 6.0 + error, 6.0, 1.0, 3, 6.0 + 0.9 * error, 1.0))
-    held = judge("steps", told, np.array([100, 200]), {})
+        predictions.append(Prediction(e, fold, direction, 100, 6.0 + error, 6.0, 1.0, 3, 6.0 + 0.9 * error, 1.0))
+    held = judge("steps", predictions, np.array([100, 200]), {})
     assert held.classic.rms_deg == pytest.approx(np.sqrt(30 / 4)) and held.joint.rms_deg == pytest.approx(
         np.sqrt(0.075)
     )
@@ -40,11 +40,11 @@ def test_the_better_predictor_is_named(verdict):
     near, far = 6.0 + 0.9 * errors, np.full(8, 6.0)
     if verdict == BETTER_CLASSIC:
         near, far = far, near
-    told = [
+    predictions = [
         Prediction(e, f"fold {e}", "left", 100, 6.0 + error, float(far[e]), 1.0, 3, float(near[e]), 1.0)
         for e, error in enumerate(errors)
     ]
-    held = judge("steps", told, np.array([100, 200]), {})
+    held = judge("steps", predictions, np.array([100, 200]), {})
     assert held.verdict == verdict
     assert held.ratio == pytest.approx(10.0 if verdict == BETTER_JOINT else 0.1)
     # Proportional errors leave no doubt about their ratio; the correlation is 1 but for rounding.

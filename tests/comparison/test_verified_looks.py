@@ -56,10 +56,10 @@ def calibration(mixed_fit):
 )
 def test_every_world_is_named(mounted_rig, mixed_fit, truth, calibration, factors, world):
     """Also where it befell the play alone."""
-    found = verify_looks(mixed_fit, calibration, aimed(mounted_rig, truth, calibration, factors))
-    assert found.world == world and found.worlds[world] > 0.95, found.worlds
-    assert found.verdict == (KEPT if world == APPLIED else BROKEN)
-    assert found.readings == 2 * len(AIMS) and sum(found.worlds.values()) == pytest.approx(1.0)
+    check = verify_looks(mixed_fit, calibration, aimed(mounted_rig, truth, calibration, factors))
+    assert check.world == world and check.worlds[world] > 0.95, check.worlds
+    assert check.verdict == (KEPT if world == APPLIED else BROKEN)
+    assert check.readings == 2 * len(AIMS) and sum(check.worlds.values()) == pytest.approx(1.0)
 
 
 def test_errors_are_those_of_the_mirrors(mounted_rig, mixed_fit, truth, calibration):
@@ -83,25 +83,25 @@ def test_another_machine_is_none_of_the_worlds(mounted_rig, mixed_fit, truth, ca
     parameters = dict(truth.parameters) | {"degrees_per_step.tilt": 1.05 * truth.parameters["degrees_per_step.tilt"]}
     parameters["degrees_per_step.pan"] *= 0.97
     parameters["tilt_zero_deg"] += 0.7
-    found = verify_looks(mixed_fit, calibration, aimed(mounted_rig, replace(truth, parameters=parameters), calibration))
-    assert (found.verdict, found.world) == (BROKEN, OTHER_MACHINE), found.worlds
+    check = verify_looks(mixed_fit, calibration, aimed(mounted_rig, replace(truth, parameters=parameters), calibration))
+    assert (check.verdict, check.world) == (BROKEN, OTHER_MACHINE), check.worlds
 
 
 def test_a_plan_reaches_its_stops_from_their_sides_and_tells(mounted_rig, mixed_fit, truth, calibration):
     """Its looks are a plan that runs; under the calibration in force they are as many as tell."""
-    found = plan_looks(mixed_fit.campaign, calibration)
-    assert found.enough and len(found.stops) >= 6 and found.distance >= 5
+    planned = plan_looks(mixed_fit.campaign, calibration)
+    assert planned.enough and len(planned.stops) >= 6 and planned.distance >= 5
     (low, high), (down, up) = calibration.range_steps
-    for pan, tilt, pan_side, tilt_side in found.stops:
+    for pan, tilt, pan_side, tilt_side in planned.stops:
         assert low <= pan <= high and down <= tilt <= up and {abs(pan_side), abs(tilt_side)} == {1}
-    assert {stop[2] for stop in found.stops} == {stop[3] for stop in found.stops} == {-1, 1}
-    looks = simulate(mounted_rig, found.steps("d1"), 8, truth).campaign
+    assert {stop[2] for stop in planned.stops} == {stop[3] for stop in planned.stops} == {-1, 1}
+    looks = simulate(mounted_rig, planned.steps("d1"), 8, truth).campaign
     rests = {axis: rests_of(looks.moves, axis) for axis in ("pan", "tilt")}
-    for spot, (pan, tilt, pan_side, tilt_side) in zip(looks.spots, found.stops, strict=True):
+    for spot, (pan, tilt, pan_side, tilt_side) in zip(looks.spots, planned.stops, strict=True):
         reached = [(rests[axis][spot.move].steps, rests[axis][spot.move].sign) for axis in ("pan", "tilt")]
         assert reached == [(pan, pan_side), (tilt, tilt_side)]
     assert verify_looks(mixed_fit, calibration, looks).verdict == KEPT
-    assert "standard deviations" in aim_plan_text(found)
+    assert "standard deviations" in aim_plan_text(planned)
     with pytest.raises(NothingToEstimate, match="nominal counters"):
         plan_looks(mixed_fit.campaign, nominal_of(calibration, mounted_rig))
 

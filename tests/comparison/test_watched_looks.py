@@ -63,27 +63,27 @@ def next_day(rig, truth: Truth, seed: int = 11, repeats: int = 1, **changed: flo
 def test_the_departure_is_that_of_a_dense_gaussian(mounted_rig, mixed_fit, truth):
     """Covariance of all residuals spelled out, the second day given the first by the rule of Gaussian conditioning."""
     watched = WatchedLooks(mixed_fit, next_day(mounted_rig, truth))
-    found = watched.departure(mixed_fit.z)
+    departure = watched.departure(mixed_fit.z)
     spots = watched.linear(mixed_fit.z)
     count, size = len(mixed_fit.z), len(spots.residual)
     columns = spots.jacobian.reshape(4 * size, -1)
-    own, shifts = columns[:, :count], columns[:, count:]
-    dense = dense_covariance(spots) + own @ own.T
+    fitted, shifts = columns[:, :count], columns[:, count:]
+    dense = dense_covariance(spots) + fitted @ fitted.T
     # A priori the coordinates are N(0, 1): z of them is taken back to zero.
-    residual = spots.residual.ravel() + own @ np.where(watched.problem.held, 0.0, mixed_fit.z)
+    residual = spots.residual.ravel() + fitted @ np.where(watched.problem.held, 0.0, mixed_fit.z)
     new = np.arange(4 * size) >= 4 * watched.first
     gain = dense[np.ix_(new, ~new)] @ np.linalg.inv(dense[np.ix_(~new, ~new)])
     left = residual[new] - gain @ residual[~new]
     inverse = np.linalg.inv(dense[np.ix_(new, new)] - gain @ dense[np.ix_(~new, new)])
-    asked = shifts[new]
+    tested = shifts[new]
     # Priors of 1e5 sds of the spots: the dense inverse keeps six digits of what is large.
-    assert found.chi2 == pytest.approx(left @ inverse @ left, rel=1e-6)
-    dense_information = asked.T @ inverse @ asked
+    assert departure.chi2 == pytest.approx(left @ inverse @ left, rel=1e-6)
+    dense_information = tested.T @ inverse @ tested
     scale = 1 / np.sqrt(np.diag(dense_information))
     both = np.outer(scale, scale)
-    np.testing.assert_allclose(found.information * both, dense_information * both, atol=1e-5)
-    np.testing.assert_allclose(found.score * scale, asked.T @ inverse @ left * scale, atol=1e-4)
-    assert found.dof == 3 * watched.looks and not shifts[~new].any()
+    np.testing.assert_allclose(departure.information * both, dense_information * both, atol=1e-5)
+    np.testing.assert_allclose(departure.score * scale, tested.T @ inverse @ left * scale, atol=1e-4)
+    assert departure.dof == 3 * watched.looks and not shifts[~new].any()
 
 
 @pytest.mark.parametrize(
@@ -95,10 +95,10 @@ def test_the_departure_is_that_of_a_dense_gaussian(mounted_rig, mixed_fit, truth
     ],
 )
 def test_a_planted_change_is_named(mounted_rig, mixed_fit, truth, changed, what, size):
-    found = watch(mixed_fit, next_day(mounted_rig, truth, **changed, repeats=2))
-    assert found.verdict == MOVED and found.p < FALSE_ALARM_RATE
-    part = found.moved[0]
-    assert part.what == what and len({other.what for other in found.moved}) == len(found.moved)
+    test = watch(mixed_fit, next_day(mounted_rig, truth, **changed, repeats=2))
+    assert test.verdict == MOVED and test.p < FALSE_ALARM_RATE
+    part = test.moved[0]
+    assert part.what == what and len({other.what for other in test.moved}) == len(test.moved)
     # Linear in the change: a tenth of it beside four u.
     assert part.value == pytest.approx(size, abs=4 * part.u + 0.1 * size)
 
@@ -106,9 +106,9 @@ def test_a_planted_change_is_named(mounted_rig, mixed_fit, truth, changed, what,
 def test_nothing_has_moved(mounted_rig, mixed_fit, truth, monkeypatch):
     """The same looks are OK where their power is enough, and tell which change they cannot see where it is not."""
     looks = next_day(mounted_rig, truth)
-    found = watch(mixed_fit, looks)
-    assert found.verdict == CANNOT_TELL and found.p > FALSE_ALARM_RATE and not found.moved and found.same_cameras
-    assert "ratio: pan" in {change.what for change in found.unseen(0.8)}
+    test = watch(mixed_fit, looks)
+    assert test.verdict == CANNOT_TELL and test.p > FALSE_ALARM_RATE and not test.moved and test.same_cameras
+    assert "ratio: pan" in {change.what for change in test.unseen(0.8)}
     monkeypatch.setattr(watched_looks, "POWER_MIN", 0.0)
     assert watch(mixed_fit, looks).verdict == OK
     unseen = replace(looks, spots=tuple(replace(s, status="saturated") for s in looks.spots[3:]) + looks.spots[:3])
@@ -130,8 +130,8 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
     for _ in range(trials):
         noise = generator.standard_normal(40)
         for moved in (False, True):
-            seen = noise + moved * columns[:, shifted] @ [CHANGES[6].size]
-            trial = replace(known, chi2=float(seen @ seen), score=columns.T @ seen)
+            sample = noise + moved * columns[:, shifted] @ [CHANGES[6].size]
+            trial = replace(known, chi2=float(sample @ sample), score=columns.T @ sample)
             logs = watched_looks.log_chances(DrawnDepartures(trial, (trial,), np.ones(1)), [])
             alarms += (not moved) and bool(logs[1:].min() <= null.limit)
             noticed += moved and bool(logs[1 + 6] <= null.limit)

@@ -45,19 +45,19 @@ def test_points_are_those_of_the_law_and_of_the_published_equations():
     one, rows = calibration(), looks(50)
     (block,) = cloud(one, [rows], SIMPLE)
     law = locate_linear(one, rows.settings)
-    seen = np.isfinite(law.value).all(axis=1)
-    np.testing.assert_array_equal(block.xyz_mm, law.value[seen])
-    np.testing.assert_array_equal(block.sd_mm, np.sqrt(np.diagonal(law.covariance[seen], 0, 1, 2)))
-    np.testing.assert_array_equal(block.lines, np.arange(2, 52)[seen])
+    met = np.isfinite(law.value).all(axis=1)
+    np.testing.assert_array_equal(block.xyz_mm, law.value[met])
+    np.testing.assert_array_equal(block.sd_mm, np.sqrt(np.diagonal(law.covariance[met], 0, 1, 2)))
+    np.testing.assert_array_equal(block.lines, np.arange(2, 52)[met])
     assert [each.line for each in block.refused] == [2 + k for k in range(6, 50, 7)]
     assert {each.error.code for each in block.refused} == {"diverging"}
     # What a simple calibration says lies on its beam, and the aperture, 170 mm from the beam's origin, reads the angle.
-    ray = simple_rays(SIMPLE["nominal"], rows.settings.steps[seen])
+    ray = simple_rays(SIMPLE["nominal"], rows.settings.steps[met])
     along = block.simple_xyz_mm["nominal"].T - ray.origin_mm
     np.testing.assert_allclose(np.cross(along, ray.direction, axis=0), 0.0, atol=ROUNDING_MM)
     sight = block.simple_xyz_mm["nominal"] - [0.0, 70.0 - 170.0, 0.0]
     angle = np.degrees(np.arccos(sight[:, 1] / np.linalg.norm(sight, axis=1)))
-    np.testing.assert_allclose(angle, np.array(rows.aperture_deg)[seen], atol=ROUNDING_MM)
+    np.testing.assert_allclose(angle, np.array(rows.aperture_deg)[met], atol=ROUNDING_MM)
 
 
 def test_a_cloud_holds_what_a_robot_is_given_and_no_more():
@@ -97,8 +97,8 @@ def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
     with open(table.cloud, newline="") as stream:
         rows = list(csv.DictReader(stream))
     for name in columns_of(["nominal"]):
-        own = name if name in ("line", "extrapolated") else f"{name}_mm"
-        written = np.array([float(row[own]) for row in rows])
+        column = name if name in ("line", "extrapolated") else f"{name}_mm"
+        written = np.array([float(row[column]) for row in rows])
         # Four digits after the point against single precision.
         np.testing.assert_allclose(vertices[name], written, atol=0.5e-4, rtol=FLOAT32)
     expected = np.concatenate([block.xyz_mm for block in cloud(one, blocks, SIMPLE)])
@@ -172,9 +172,9 @@ def test_memory_does_not_grow_with_the_number_of_points(tmp_path):
         tracemalloc.start()
         stream = (looks(400, first_line=2 + 400 * k) for k in range(blocks))
         write_cloud(cloud(one, EvenSample().of(stream), SIMPLE), tmp_path / "c.ply", ["nominal"])
-        found = tracemalloc.get_traced_memory()[1]
+        peak_bytes = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return found
+        return peak_bytes
 
     peak(1)
     # The refused ones are kept, a seventh of the looks: 200 bytes each.
@@ -198,10 +198,10 @@ def test_the_sample_is_even_whatever_the_blocks(count):
 def test_the_law_is_checked_by_draws():
     sample = EvenSample()
     list(sample.of([looks(28)]))
-    found = checked(calibration(), sample, 600, 0)
-    assert found.points == 24 and 0 < found.held <= 24
+    check = checked(calibration(), sample, 600, 0)
+    assert check.points == 24 and 0 < check.held <= 24
     # Half of the points differ by less than the worst one; none by as much as the ranges themselves.
-    assert 0 < found.off_mm < found.most_off_mm < 1000
+    assert 0 < check.off_mm < check.most_off_mm < 1000
 
 
 def test_files_are_read_in_blocks_with_the_lines_of_the_file(tmp_path):
@@ -209,9 +209,9 @@ def test_files_are_read_in_blocks_with_the_lines_of_the_file(tmp_path):
     file, shares = tmp_path / "looks.csv", []
     rows = ["10,20,left,up,70"] * (BLOCK_ROWS + 5)
     file.write_text("\n".join([",".join(LOOKS.required), *rows]) + "\n")
-    found = list(look_blocks(file, shares.append))
-    assert [len(block.lines) for block in found] == [BLOCK_ROWS, 5]
-    assert (found[0].lines[0], found[1].lines[0], found[1].lines[-1]) == (2, BLOCK_ROWS + 2, BLOCK_ROWS + 6)
+    blocks = list(look_blocks(file, shares.append))
+    assert [len(block.lines) for block in blocks] == [BLOCK_ROWS, 5]
+    assert (blocks[0].lines[0], blocks[1].lines[0], blocks[1].lines[-1]) == (2, BLOCK_ROWS + 2, BLOCK_ROWS + 6)
     assert shares == sorted(shares) and shares[-1] == 1.0
     rows[BLOCK_ROWS + 1] = "10,20,left,up,7O"
     file.write_text("\n".join([",".join(LOOKS.required), *rows]) + "\n")

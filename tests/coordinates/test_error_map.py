@@ -69,11 +69,11 @@ def mapped(one: Calibration, simple: SimpleCalibration, pan=PAN, tilt=TILT, rang
 def test_a_perfect_rig_has_no_error_straight_ahead(azimuth):
     """At pan 0 the beam leaves where published equations think it does; turned, it runs L beside the pan axis."""
     one = calibration(NOMINAL, {}, NO_NOISE_DEG, azimuth=azimuth)
-    found = mapped(one, simple_calibration(), pan=np.array([0.0, 100.0]))
-    assert found.valid.all()
-    assert found.rms_mm["joint"].max() < ROUNDING_MM * 10
-    assert found.rms_mm["nominal"][0].max() < ROUNDING_MM * 10
-    assert found.rms_mm["nominal"][1].min() > 0.1
+    errors = mapped(one, simple_calibration(), pan=np.array([0.0, 100.0]))
+    assert errors.valid.all()
+    assert errors.rms_mm["joint"].max() < ROUNDING_MM * 10
+    assert errors.rms_mm["nominal"][0].max() < ROUNDING_MM * 10
+    assert errors.rms_mm["nominal"][1].min() > 0.1
 
 
 @pytest.mark.parametrize("azimuth", [False, True])
@@ -81,7 +81,7 @@ def test_a_perfect_rig_has_no_error_straight_ahead(azimuth):
 def test_error_of_the_nominal_estimator_is_the_twins(azimuth, approach):
     """A rig without scatter: the whole chain in NumPy, at every pose and range, in the order of the axes."""
     one = calibration(BENT, {}, NO_NOISE_DEG, azimuth=azimuth)
-    found = mapped(one, simple_calibration(), approach=approach)
+    errors = mapped(one, simple_calibration(), approach=approach)
     convention = "azimuth" if azimuth else "in-plane"
     side = ("left" if approach[0] > 0 else "right", "up")
     for i, j, k in np.ndindex(2, 3, 4):
@@ -90,43 +90,43 @@ def test_error_of_the_nominal_estimator_is_the_twins(azimuth, approach):
         reading = aperture_angle_deg(point, BENT["baseline_mm"], convention) + BENT["aperture_zero_deg"]
         az, el = np.radians([0.06 * PAN[i], 0.07 * TILT[j]])
         d = np.array([[np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)]])
-        if not found.valid[i, j, k]:
+        if not errors.valid[i, j, k]:
             angle = aperture_angle_deg(1e7 * d[0], 200.0, convention)
             assert angle < reading + 1e-3, "lines of sight and nominal beam diverge"
             continue
         thought = twin_points(np.array([[0.0, 70.0, 0.0]]), d, 200.0, float(reading), azimuth)[0]
         # The nominal point may be 10 m away: bisection's 1e-13 deg times r^2 / a.
         bound = 10 * ROUNDING_MM * (1 + (np.linalg.norm(thought) / 1000.0) ** 2)
-        assert found.rms_mm["nominal"][i, j, k] == pytest.approx(np.linalg.norm(thought - point), abs=bound)
+        assert errors.rms_mm["nominal"][i, j, k] == pytest.approx(np.linalg.norm(thought - point), abs=bound)
         # Every draw is the same rig.
         np.testing.assert_allclose(
-            found.distance_mm["nominal"][:, i, j, k], np.linalg.norm(thought - point), atol=bound
+            errors.distance_mm["nominal"][:, i, j, k], np.linalg.norm(thought - point), atol=bound
         )
-        assert found.rms_mm["joint"][i, j, k] < 10 * ROUNDING_MM
-    assert found.valid.sum() >= 18
-    np.testing.assert_array_equal(found.pan_steps, PAN)
-    np.testing.assert_array_equal(found.tilt_steps, TILT)
-    np.testing.assert_array_equal(found.range_mm, RANGE_MM)
+        assert errors.rms_mm["joint"][i, j, k] < 10 * ROUNDING_MM
+    assert errors.valid.sum() >= 18
+    np.testing.assert_array_equal(errors.pan_steps, PAN)
+    np.testing.assert_array_equal(errors.tilt_steps, TILT)
+    np.testing.assert_array_equal(errors.range_mm, RANGE_MM)
 
 
 def test_joint_beats_nominal_on_a_biased_rig():
     one = calibration()
-    found = mapped(one, simple_calibration(), ranges=np.array([150.0, 200.0, 300.0, 400.0]))
-    assert found.valid.all()
-    assert np.all(found.rms_mm["joint"] < found.rms_mm["nominal"])
+    errors = mapped(one, simple_calibration(), ranges=np.array([150.0, 200.0, 300.0, 400.0]))
+    assert errors.valid.all()
+    assert np.all(errors.rms_mm["joint"] < errors.rms_mm["nominal"])
     # The joint error is what `locate` says of a look: the trace of its covariance.
     ray = one.ray(PAN[0], TILT[1])
     point = ray.origin_mm + 300.0 * ray.direction
     reading = aperture_angle_deg(point, one.estimates["baseline_mm"], "in-plane")
     law = one.locate(PAN[0], TILT[1], float(reading) + one.estimates["aperture_zero_deg"])
     # The errors' second moment from 500 draws, five standard errors of one dominating direction, 5 % of curvature.
-    ratio = found.rms_mm["joint"][0, 1, 2] / np.sqrt(np.trace(law.covariance_mm2))
+    ratio = errors.rms_mm["joint"][0, 1, 2] / np.sqrt(np.trace(law.covariance_mm2))
     assert abs(ratio - 1) < 5 * np.sqrt(0.5 / 500) + 0.05
 
 
 def test_where_nothing_can_be_located_the_map_is_empty():
     """At 100 m a thousandth of a degree decides whether beam and sight meet; stops scatter by 0.05 deg."""
-    found = mapped(calibration(), simple_calibration(), ranges=np.array([200.0, 300.0, 400.0, 1e5]))
-    assert not found.valid[..., 3].any() and found.valid[..., :3].all()
-    assert np.isnan(found.rms_mm["joint"][..., 3]).all()
-    assert np.isfinite(found.rms_mm["nominal"][..., :3]).all()
+    errors = mapped(calibration(), simple_calibration(), ranges=np.array([200.0, 300.0, 400.0, 1e5]))
+    assert not errors.valid[..., 3].any() and errors.valid[..., :3].all()
+    assert np.isnan(errors.rms_mm["joint"][..., 3]).all()
+    assert np.isfinite(errors.rms_mm["nominal"][..., :3]).all()

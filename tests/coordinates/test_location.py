@@ -83,16 +83,16 @@ def bent(request) -> Calibration:
 
 def test_every_draw_goes_through_the_twins_optics(bent):
     """The unit noises of a draw, put through the twin with its parameters, give that draw of the point."""
-    given = drawn(bent, DRAWS, 4)
-    unit = given.noise
+    sample = drawn(bent, DRAWS, 4)
+    unit = sample.noise
     assert np.abs(unit[:, 2:4]).max() <= 0.5
     for setting in BENT_SETTINGS:
-        found = carry(bent, given, settings_of(*setting[:3], setting[3]))
-        assert np.isfinite(found).all()
+        carried = carry(bent, sample, settings_of(*setting[:3], setting[3]))
+        assert np.isfinite(carried).all()
         stop = unit[:, :2] * stop_sd_deg(bent.noise, setting[3])
         expected = cloud(bent, bent.inputs, stop, unit[:, 4] * bent.noise[:, 4], setting, unit[:, 2:4])
         # Bisection of 1e5 mm: rounding of the angle, 1e-13 deg, times at most 100 mm per degree.
-        np.testing.assert_allclose(found[:, 0], expected, atol=100 * ROUNDING_MM)
+        np.testing.assert_allclose(carried[:, 0], expected, atol=100 * ROUNDING_MM)
 
 
 def test_mean_and_covariance_are_a_monte_carlo_by_the_twin(bent):
@@ -102,17 +102,17 @@ def test_mean_and_covariance_are_a_monte_carlo_by_the_twin(bent):
         place = rng.uniform(-0.5, 0.5, (DRAWS, 2))
         stop = rng.standard_normal((DRAWS, 2)) * stop_sd_deg(bent.noise, setting[3])
         points = cloud(bent, bent.inputs, stop, rng.standard_normal(DRAWS) * bent.noise[:, 4], setting, place)
-        found = locate(bent, *setting, draws=DRAWS)
-        assert found.refused == (None,) and found.draws == DRAWS
+        point = locate(bent, *setting, draws=DRAWS)
+        assert point.refused == (None,) and point.draws == DRAWS
         sd = points.std(axis=0)
         # Five standard errors of the difference of two means, two variances and correlations, of DRAWS each.
-        assert np.abs((found.xyz_mm[0] - points.mean(axis=0)) / sd).max() < 5 * math.sqrt(2 / DRAWS)
-        distance = (found.covariance_mm2[0] - np.cov(points.T)) / np.outer(sd, sd)
+        assert np.abs((point.xyz_mm[0] - points.mean(axis=0)) / sd).max() < 5 * math.sqrt(2 / DRAWS)
+        distance = (point.covariance_mm2[0] - np.cov(points.T)) / np.outer(sd, sd)
         assert np.abs(distance).max() < 5 * math.sqrt(2 * 2 / DRAWS)
         interval = np.quantile(points, (0.025, 0.975), axis=0)
         # The error of an end is sqrt(0.025 0.975 / n) over the density 0.058 / sd there.
-        assert np.abs((found.interval95_mm[0] - interval) / sd).max() < 5 * math.sqrt(2) * 2.67 / math.sqrt(DRAWS)
-        np.testing.assert_allclose(found.u95_mm[0], np.diff(found.interval95_mm[0], axis=0)[0] / 2, rtol=1e-12)
+        assert np.abs((point.interval95_mm[0] - interval) / sd).max() < 5 * math.sqrt(2) * 2.67 / math.sqrt(DRAWS)
+        np.testing.assert_allclose(point.u95_mm[0], np.diff(point.interval95_mm[0], axis=0)[0] / 2, rtol=1e-12)
 
 
 def test_a_point_does_not_depend_on_its_neighbours():
@@ -124,10 +124,10 @@ def test_a_point_does_not_depend_on_its_neighbours():
     reading = rng.uniform(40.0, 65.0, 260)
     approach = [("left", "up"), ("right", "down"), ("unknown", "up"), ("left", "unknown")] * 65
     reading[7] = 150.0
-    told = []
-    many = locate(one, pan, tilt, reading, approach, draws=DRAWS, progress=told.append)
-    check_forward(told)
-    assert told[-1].doing == f"locating: {len(pan)} of {len(pan)} points"
+    waits = []
+    many = locate(one, pan, tilt, reading, approach, draws=DRAWS, progress=waits.append)
+    check_forward(waits)
+    assert waits[-1].doing == f"locating: {len(pan)} of {len(pan)} points"
     assert [i for i, error in enumerate(many.refused) if error is not None] == [7]
     for i in (0, 7, 8, 255, 256, 259):
         single = locate(one, pan[i], tilt[i], reading[i], approach[i], draws=DRAWS)
@@ -162,8 +162,8 @@ def with_diverging(count: int) -> Calibration:
 
 
 def test_the_law_alone_has_no_number_where_there_is_no_point():
-    found = locate_linear(calibration(BENT, SD, NOISE_DEG), settings_of([100.0, 100.0], [20.0, 20.0], [70.0, 150.0]))
-    for field in (found.value, found.jacobian, found.covariance):
+    law = locate_linear(calibration(BENT, SD, NOISE_DEG), settings_of([100.0, 100.0], [20.0, 20.0], [70.0, 150.0]))
+    for field in (law.value, law.jacobian, law.covariance):
         assert np.isfinite(field[0]).all() and np.isnan(field[1]).all()
 
 
@@ -171,12 +171,12 @@ def test_the_law_alone_has_no_number_where_there_is_no_point():
 def test_more_than_a_thousandth_of_diverging_draws_refuses(count, refused):
     """One of 1000 is exactly the allowed share."""
     assert DIVERGING_SHARE == 1 / DRAWS
-    found = locate(with_diverging(count), 0.0, 0.0, 60.0, draws=DRAWS)
-    assert (found.refused[0] is not None) == refused
-    assert found.diverging_share[0] == pytest.approx(count / DRAWS, abs=1e-12)
+    point = locate(with_diverging(count), 0.0, 0.0, 60.0, draws=DRAWS)
+    assert (point.refused[0] is not None) == refused
+    assert point.diverging_share[0] == pytest.approx(count / DRAWS, abs=1e-12)
     if not refused:
         # The point of the others: B = 60, C = 90, x = (a - L) tan 60; an outlier would carry it away.
-        assert found.xyz_mm[0, 0] == pytest.approx(170.0 * math.tan(math.radians(60.0)), abs=0.05)
+        assert point.xyz_mm[0, 0] == pytest.approx(170.0 * math.tan(math.radians(60.0)), abs=0.05)
 
 
 def test_what_cannot_be_asked_is_refused():
@@ -208,9 +208,9 @@ def test_the_law_is_validated_near_and_refuted_far():
     # The law holds the sds of the noises still; here they are.
     small = {name: 0.02 * sd for name, sd in NOISE_DEG.items()}
     near = calibration(spread=0.02, noise_deg=small, noise_spread=0.0)
-    found = locate(near, 130.0, 90.0, 60.0, draws=DRAWS)
-    assert found.validation.validated.all()
-    linear = found.as_json(0)["linear"]
+    point = locate(near, 130.0, 90.0, 60.0, draws=DRAWS)
+    assert point.validation.validated.all()
+    linear = point.as_json(0)["linear"]
     assert linear["validated"] is True and linear["digits"] == 2
     # C is 99 deg here: the point moves out to several metres, where u is a fair part of the range.
     far = locate(calibration(), 130.0, 0.0, 77.5, draws=DRAWS)
@@ -282,11 +282,11 @@ def test_each_cause_alone_has_its_sensitivity(cause):
     np.testing.assert_allclose(law.value[0], published_point(B_DEG, C_DEG, 0.0, A_MM), atol=ROUNDING_MM)
     numpy = one.locate(steps, 0.0, B_DEG, approach).covariance_mm2
     np.testing.assert_allclose(numpy / scale, expected / scale, atol=1e-9)
-    found = locate(one, steps, 0.0, B_DEG, approach, draws=DRAWS)
+    point = locate(one, steps, 0.0, B_DEG, approach, draws=DRAWS)
     # 1.96 of a normal, 0.95 sqrt(3) of a uniform distribution; a half width of n draws errs by 2.67 / sqrt(2 n) sd.
     wide = 0.95 * math.sqrt(3) if cause == "play" else NORMAL_95
     bound = 5 * 2.67 / math.sqrt(2 * DRAWS) * u * np.abs(slope).max()
-    assert np.abs(found.u95_mm[0] - wide * u * np.abs(slope)).max() < bound
+    assert np.abs(point.u95_mm[0] - wide * u * np.abs(slope)).max() < bound
 
 
 def test_readings_and_points_of_the_library_are_the_twins():
