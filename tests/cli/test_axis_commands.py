@@ -118,3 +118,16 @@ def test_a_sampler_without_an_answer_leaves_laplaces_and_says_so(ask, folder, mo
     code, document = ask("fit", folder, "--quick")
     assert (code, document["converged"], document["answer"]) == (0, False, "laplace")
     assert document["estimator"] == "laplace" and document["problems"][0].startswith("LAPLACE: the weights")
+
+
+def test_a_drive_goes_from_its_first_reading_to_its_last(ask, say, tmp_path):
+    """Its moves are only where a stretch begins; commands are no powers of ten."""
+    (tmp_path / "campaign.toml").write_text('format = "tvsbayes-axis/1"\nunit = "arcsec"\nrate = 15.25\n')
+    (tmp_path / "moves.csv").write_text("move,segment,time_s,command,approach\n0,0,10,152.5,forward\n")
+    rows = "".join(f"{k},0,{15.25 * (10 + 5 * k) + 0.1 * (k % 3)},0.1,ok,{10 + 5 * k}\n" for k in range(300))
+    (tmp_path / "readings.csv").write_text(f"reading,move,value,u,status,time_s\n{rows}")
+    code, document = ask("check", tmp_path)
+    low, high = document["range_command"]
+    # The ends are means of a few readings.
+    assert code == 0 and 152.5 <= low < 400 and 22600 < high <= 15.25 * (10 + 5 * 299)
+    assert "e+0" not in say("check", tmp_path)[1]

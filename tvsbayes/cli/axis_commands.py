@@ -56,6 +56,9 @@ def contents(folder: Path) -> dict[str, Any]:
         rows = rows_of(data)
     except NothingToEstimate as error:
         return {**document, "warnings": [f"{error.message}: {error.remedy}"]}
+    if rows.in_motion:
+        # The moves of a drive are only the beginnings of its stretches.
+        document["range_command"] = [float(rows.command.min()), float(rows.command.max())]
     return {**document, "positions": len(rows.positions), "warnings": axis_warnings(data, rows)}
 
 

@@ -98,7 +98,7 @@ def _value_text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(_value_text, value)) or "none"
     if isinstance(value, float):
-        return f"{value:.10g}" if value == round(value) else f"{value:.4g}"
+        return f"{value:.10g}" if value == round(value) else f"{value:.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
     return "not known" if value is None else escaped(str(value), 400)
 
 
