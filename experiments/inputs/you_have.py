@@ -323,7 +323,7 @@ KINDS = (
     ),
     Kind(
         "A dial gauge: runs side by side",
-        "A sheet with a column for each run.",
+        "A sheet with a column for each run. Of deviations from the positions, also in µm: `--deviations`.",
         (Command("import dial.csv --axis --to dial --yes"), answered("fit dial --quick")),
         {"dial.csv": FOREIGN / "wide_forward_backward" / "dial.csv"},
         4,

@@ -12,7 +12,7 @@ from support.compensated import driven, fresh, results, table, to_and_fro, true_
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import plan_verification, stored_compensation, verify_axis, verify_readings
 from tvsbayes.errors import InputError
-from tvsbayes.report.compensation_text import verification_text
+from tvsbayes.report.compensation_text import compensation_section, verification_text
 from tvsbayes.results.compensation_record import (
     APPLIED,
     BROKEN,
@@ -67,6 +67,9 @@ def test_with_one_homing_errors_are_given_without_their_shift_too():
     assert left.rms == pytest.approx(np.std([r.value for r in new.readings] - aim)) and left.rms < 0.5 * found.after.rms
     assert promised < found.promised95
     assert "but for one shift common to all" in verification_text(found)
+    page = compensation_section(structs.replace(table(), homings=1), found)
+    assert "as within one homing, at most: forward" in page.items[-1]
+    assert "one homing" not in " ".join(compensation_section(table(), None).items)
 
 
 def test_another_axis_is_none_of_the_worlds():

@@ -119,15 +119,23 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
         f"largest remaining error: {DRIVE_HELPS.get(largest, HELPS[largest]) if result.in_motion else HELPS[largest]}",
         *(f"the format: {text}" for text in result.unsaid),
     ]
-    if result.homings == 1 and not result.in_motion:
-        lines.append("only one homing was read: the error of the next one is set by its prior, home_sd in [axis]")
-        bounds = [
-            f"{side} {two_digits(p.shift_free95)}" for side, p in result.promise.items() if p.shift_free95 is not None
-        ]
-        if bounds and result.shift_matters:
-            lines.append(f"but for one shift common to all, as within one homing, at most: {', '.join(bounds)} {unit}")
+    lines += _homing_remarks(result)
     lines.append(f"nothing is applied yet; apply it once, in one place, then {result.shown_by}")
     return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
+
+
+def _homing_remarks(result: Compensation) -> list[str]:
+    """What the promise rests on where one homing alone was read, and how small errors are within one."""
+    if result.homings > 1 or result.in_motion:
+        return []
+    remarks = ["only one homing was read: the error of the next one is set by its prior, home_sd in [axis]"]
+    bounds = [
+        f"{side} {two_digits(p.shift_free95)}" for side, p in result.promise.items() if p.shift_free95 is not None
+    ]
+    if bounds and result.shift_matters:
+        listed = f"{', '.join(bounds)} {escaped(result.unit)}"
+        remarks.append(f"but for one shift common to all, as within one homing, at most: {listed}")
+    return remarks
 
 
 def _validity(result: Compensation) -> list[str]:
@@ -193,7 +201,7 @@ def compensation_section(result: Compensation, verification: Verification | None
         "No fresh readings have verified it." if verification is None else _verdict(verification),
     ]
     tables = [promise_table(result), *([] if verification is None else [sizes_table(verification)])]
-    return Section(APPLIED_TITLE, text, result.unsaid, tables)
+    return Section(APPLIED_TITLE, text, [*result.unsaid, *_homing_remarks(result)], tables)
 
 
 def verified_section(verification: Verification) -> Section:

@@ -225,7 +225,8 @@ def identifiability_section(e: Evidence) -> Section:
             )
         )
     summary = e.fit.summary
-    items = [weak.text for weak in summary.weak_directions if not asks_for_looks(weak)]
+    # Two directions of the same parameters may read alike.
+    items = list(dict.fromkeys(weak.text for weak in summary.weak_directions if not asks_for_looks(weak)))
     items = [sentence_in_words(text) for text in (*items, *(entry.text for entry in summary.leverage))]
     sensitive = [
         [

@@ -134,7 +134,7 @@ def detail_lines(summary: FitSummary) -> list[Part]:
             f"prior: with {word} the u of {entry.parameter}, {entry.quantity} moves {entry.shift_sd:+.2f} sd and its "
             f"sd changes by a factor {entry.sd_ratio:.2f}"
         )
-    weak_texts = [weak.text for weak in summary.weak_directions if not weak.of_sums]
+    weak_texts = dict.fromkeys(weak.text for weak in summary.weak_directions if not weak.of_sums)
     lines += [f"weak (set by the priors, not by the data): {text}" for text in weak_texts]
     lines += [f"depends on one stop: {entry.text}" for entry in summary.leverage]
     return lines
