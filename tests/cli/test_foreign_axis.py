@@ -148,6 +148,15 @@ def test_a_workbook_needs_no_format(ask, tmp_path):
     assert found.per_command == pytest.approx(1.001, abs=1e-6) and abs(found.backlash) == pytest.approx(PLAY, abs=1e-6)
 
 
+def test_greek_letters_in_utf_16_are_no_log(ask, tmp_path):
+    """Their high byte is that of the end of a message of Klipper's logger."""
+    file, out = tmp_path / "dial.csv", tmp_path / "out"
+    rows = "".join(f"{10 * k};{10.01 * k:.3f}\n" for k in range(9))
+    file.write_text(f"Position (mm);\u03bb laser (mm)\n{rows}", encoding="utf-16")
+    code, document = ask("import", file, "--axis", "--to", out, "--yes", "--column", "value=\u03bb laser (mm)")
+    assert (code, document["readings"]) == (0, 9)
+
+
 def test_deviations_on_demand(ask, tmp_path):
     """A sheet of target and error alone: positions are target plus error, in their own unit."""
     file, out = tmp_path / "log.csv", tmp_path / "out"
@@ -259,7 +268,8 @@ MISTAKES = {
     "a calibration cut off": ("[angle a]\nstepper: x\ncalibrate = 1.5\n", (), "1 angles", "ANGLE_CALIBRATE"),
     "minutes beyond 60": ("steps;angle\n0;1\u00b061'00\"\n1;2\u00b000'00\"\n", (), 'found "1', "correct the cell"),
     "two notations in a column": ("steps;angle\n0;1 mm\n1;2 deg\n", (), 'found "1 mm"', "correct the cell"),
-    "a guide log without --axis": (night(99), None, "no column", "--axis"),
+    "a guide log without --axis": (night(99), None, "a guide log of PHD2, which is of one axis", "with --axis"),
+    "camonitor without --axis": (WRITTEN["camonitor"], None, "a log of camonitor", "with --axis"),
 }
 
 

@@ -71,6 +71,30 @@ class _ReadFile:
     unit: str | None
 
 
+LOGS = {"phd2": "a guide log of PHD2", "epics": "a log of camonitor", "klipper": "a log of Klipper"}
+"""Logs that are always of one axis, by kind."""
+
+
+def log_kind(data: bytes) -> str:
+    """The kind of a file of one axis: one of `LOGS`, else "csv"."""
+    packed = data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"\x1f\x8b"))
+    text = "" if packed else data.decode("utf-8-sig", errors="replace")
+    recognised = {"phd2": is_guide_log(text), "epics": is_camonitor(text), "klipper": is_klipper(data)}
+    return next((kind for kind, matches in recognised.items() if matches), "csv")
+
+
+def refuse_log(file: Path) -> None:
+    """Refuse a log of one axis where a table of a scanner or a head is meant.
+
+    Raises:
+        InputError: the file is one.
+    """
+    kind = log_kind(read_bytes(file, CSV_BYTES_MAX))
+    if kind in LOGS:
+        message = f"{escaped(file.name)} is {LOGS[kind]}, which is of one axis"
+        raise InputError("usage", message, remedy="import it with --axis, and without --sightings")
+
+
 def import_readings(
     file: Path, to: Path, stated: Mapping[str, str], sheet: str | None, wish: FileOptions, *, yes: bool, as_json: bool
 ) -> Import | None:
@@ -79,12 +103,7 @@ def import_readings(
     Returns None where the runs of a log were listed instead.
     """
     data, name = read_bytes(file, CSV_BYTES_MAX), escaped(file.name)
-    packed = data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"\x1f\x8b"))
-    text = "" if packed else data.decode("utf-8-sig", errors="replace")
-    kind = wish.kind
-    if kind == "auto":
-        recognised = {"phd2": is_guide_log(text), "epics": is_camonitor(text), "klipper": is_klipper(data)}
-        kind = next((kind for kind, matches in recognised.items() if matches), "csv")
+    kind = log_kind(data) if wish.kind == "auto" else wish.kind
     _check_options(kind, wish, stated, sheet)
     if kind == "phd2":
         runs = read_runs(text_of(data, name)[0], name)

@@ -126,6 +126,10 @@ def import_(
     found: Import | None
     kind_of_file = _kind_of_file(file, to, options)
     _refuse_others(kind_of_file, options)
+    if kind_of_file in (SIGHTINGS, LOOKS):
+        from tvsbayes.cli.axis_import import refuse_log
+
+        refuse_log(file)
     if kind_of_file == COPY:
         found = _corrected_campaign(file, to, replace(correction, pixels_from=pixels_from, relative=relative), options)
     elif kind_of_file == URDF:

@@ -65,14 +65,11 @@ def is_camonitor(text: str) -> bool:
 
 def is_klipper(data: bytes) -> bool:
     """Whether a file is a log of Klipper's data logger, compressed or not, or a configuration with an angle sensor."""
-    head = data[:100000]
-    # A workbook is a ZIP archive or an OLE file, whose binary data contains the logger's end of a message, too.
-    if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
-        return False
+    head = data[:100000].lstrip()
+    # The end of a message, 3, alone says nothing: workbooks and Greek letters in UTF-16 contain that byte, too.
     return (
         data.startswith(b"\x1f\x8b")
-        or b"\x03" in head
-        or (head.startswith(b"{") and b'"params"' in head)
+        or (head.startswith(b"{") and (b"\x03" in head or b'"params"' in head))
         or _saved_angles(data[: 2**20]) is not None
     )
 
