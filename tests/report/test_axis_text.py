@@ -71,7 +71,10 @@ def test_a_fit_says_what_goes_into_firmware(clean):
 
     def said(value, low, high):
         play = structs.replace(clean.parameters["backlash"], value=value, sd=0.01, interval95=(low, high))
-        return for_firmware(structs.replace(clean, parameters={**clean.parameters, "backlash": play}))
+        mean = for_firmware(structs.replace(clean, effective_backlash=play))
+        of_one = structs.replace(clean, effective_backlash=None, parameters={**clean.parameters, "backlash": play})
+        assert mean.replace(" on average", "") == for_firmware(of_one) != mean
+        return for_firmware(of_one)
 
     # 1/0.05 = 20, u 0.0005/0.05^2 = 0.2; 0.15/0.05 = 3, u 0.01/0.05 = 0.2.
     begun = f"for your firmware, from 0 to 1250000: -20.00(20) commands per {clean.unit}, "

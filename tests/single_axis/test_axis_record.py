@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from support.axes import drawn, runs
+from support.axes import PLACES, drawn, runs
 
 from tvsbayes.errors import InputError
 from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
@@ -98,3 +98,20 @@ def test_a_damaged_seed_is_refused(kept, seed):
     finally:
         file.write_bytes(whole)
     assert (caught.value.code, caught.value.column) == ("schema", "seed") and caught.value.remedy
+
+
+def test_the_mean_play_of_the_positions_read_holds_the_truth_and_is_surer_than_that_of_all():
+    """Twelve drawn axes whose play varies by position: in 99 % of cases the RMS of twelve z is 0.51 to 1.54."""
+    z, ratio = [], []
+    for seed in range(100, 112):
+        axis = drawn(seed, runs(2))
+        summary = summarise_axis(fit_axis(axis.campaign, sampled=False))
+        mean, read = (
+            summary.effective_backlash,
+            {m.command for m in axis.campaign.moves if abs(m.command) <= PLACES[-1]},
+        )
+        at = np.isin(axis.truth.command, list(read))
+        true = axis.truth.parameters["backlash"] + axis.truth.play_variation[at].mean()
+        z.append((mean.value - true) / mean.sd)
+        ratio.append(mean.sd / summary.parameters["backlash"].sd)
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.55 and np.median(ratio) < 0.9

@@ -75,6 +75,7 @@ METHOD = (
 )
 
 
+MEAN_PLAY = "its mean over the positions read"
 STOPS_ALONE = ("backlash", "ratio_contrast", "offset")
 """Parameters that a drive at constant rate does not show: it has one direction and no zero of its own."""
 
@@ -123,6 +124,8 @@ def parameter_table(summary: AxisSummary) -> TableView:
         if name not in left_out:
             share = "" if estimate.contraction is None else f"{100 * max(estimate.contraction, 0.0):.0f} %"
             rows.append([labels.get(name, name), *_row(name, estimate)[1:], share])
+        if name == "backlash" and summary.effective_backlash is not None:
+            rows.append([MEAN_PLAY, *_row(name, summary.effective_backlash)[1:], ""])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: set by the readings, 0 %: set by the prior"
     return TableView(caption, ["", "value(u)", "95 % interval", "data"], rows)
 
@@ -134,14 +137,16 @@ def for_firmware(summary: AxisSummary) -> str:
     low, high = summary.range_command
     text = f"for your firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
     text += f"{escaped(summary.unit)}, "
-    play = summary.parameters["backlash"]
+    play, where = summary.effective_backlash, " on average"
+    if play is None:
+        play, where = summary.parameters["backlash"], ""
     in_commands = concise(play.value / abs(ratio), play.sd / abs(ratio))
     if play.interval95[0] <= 0 <= play.interval95[1]:
-        return f"{text}play of {in_commands} commands is not significant: its 95 % interval contains 0"
+        return f"{text}play of {in_commands} commands{where} is not significant: its 95 % interval contains 0"
     if play.value < 0:
         overshoot = concise(-play.value / abs(ratio), play.sd / abs(ratio))
-        return f"{text}no play: a reversal overshoots by {overshoot} commands"
-    return f"{text}play of {in_commands} commands"
+        return f"{text}no play: a reversal overshoots by {overshoot} commands{where}"
+    return f"{text}play of {in_commands} commands{where}"
 
 
 def result_lines(summary: AxisSummary) -> list[str]:
@@ -360,6 +365,14 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
     ]
 
 
+def _play_number(summary: AxisSummary) -> Number:
+    """The play for the top of the page."""
+    play, note = summary.effective_backlash, f"{summary.unit}, mean over the positions read"
+    if play is None:
+        play, note = summary.parameters["backlash"], summary.unit
+    return Number("play", concise(play.value, play.sd), note)
+
+
 def _steps(summary: AxisSummary, folder: str) -> list[str]:
     """What to do next, in sentences."""
     if not is_drive(summary):
@@ -374,7 +387,7 @@ def axis_document(results: AxisResults, issue: Issue) -> Document:
     summary, fit = results.summary, results.fit
     origin = plain(provenance(axis_hashes(fit.campaign), fit.seed))
     content = json.dumps([summary.as_json(), origin["inputs"]], sort_keys=True)
-    header, play = fit.campaign.header, summary.parameters["backlash"]
+    header = fit.campaign.header
     verdict = sentence(axis_verdict(summary)) + " No limit was stated." * summary.explained
     figures = [*_error_figures(fit), *_wave_figures(fit)]
     folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
@@ -384,7 +397,7 @@ def axis_document(results: AxisResults, issue: Issue) -> Document:
             name=title_of(header, fit.campaign.path),
             about=about_table(header, str(header.get("created") or ""), issue),
             verdict=Verdict(verdict, "cannot-tell" if summary.explained else "not-met"),
-            numbers=[] if is_drive(summary) else [Number("play", concise(play.value, play.sd), summary.unit)],
+            numbers=[] if is_drive(summary) else [_play_number(summary)],
             answer=period_table(summary) or ratio_table(summary),
             picture=figures[0] if figures else None,
             steps=_steps(summary, folder),

@@ -90,6 +90,8 @@ class AxisSummary(Shown, Record, frozen=True):
         prior_conflicts: priors that the readings contradict, in words.
         answer: source of the intervals: an accepted sample, a rough one, or the Laplace approximation.
         monte_carlo_error: errors of every headline, in its sd.
+        effective_backlash: mean of the play over the positions read; `backlash` is the mean of all positions, read or
+            not; None where no play was read.
     """
 
     unit: str
@@ -115,6 +117,7 @@ class AxisSummary(Shown, Record, frozen=True):
     periods: tuple[PeriodEstimate, ...] = ()
     encoder_periods: tuple[PeriodEstimate, ...] = ()
     periods_in: PeriodClock = "unit"
+    effective_backlash: Estimate | None = None
 
     @property
     def explained(self) -> bool:
@@ -226,7 +229,19 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         periods=tuple(period_estimate(sample) for sample in samples if sample.wave.clock != "encoder"),
         encoder_periods=tuple(period_estimate(sample) for sample in samples if sample.wave.clock == "encoder"),
         periods_in="seconds" if fit.campaign.periods.in_seconds else "unit",
+        effective_backlash=_effective_backlash(fit, diagnoses[""]),
     )
+
+
+def _effective_backlash(fit: AxisFit, diagnosis: tuple[float | None, float | None, float | None]) -> Estimate | None:
+    """Estimate the mean of the play over the positions read; None for a drive, or with stops from one side alone."""
+    rows, model = fit.rows, fit.model
+    if rows.in_motion or not rows.both_sides:
+        return None
+    functional = model.line_terms(backlash=1.0)
+    functional[model.layout["play"]] = model.places.weights(rows.positions).mean(axis=0)
+    drawn = fit.linear.drawn(functional[None], random_stream(fit.seed, AxisStream.EFFECTIVE_BACKLASH))
+    return _estimate(drawn[:, 0], None, diagnosis)
 
 
 def _prior_backlash(fit: AxisFit) -> dict[str, Estimate]:

@@ -59,6 +59,7 @@ class AxisStream(IntEnum):
     HELD_OUT = 5
     HELD_OUT_BY_WEIGHTS = 8
     PERIODS = 9
+    EFFECTIVE_BACKLASH = 10
     PREDICTED_STOPS = 21
 
 
