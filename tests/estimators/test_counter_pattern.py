@@ -63,25 +63,25 @@ def test_counters_of_the_size_of_the_play_are_not_expected_to_show(mounted_rig):
     # Twelve degrees are expected to show: where nothing moved, something is wrong.
     stuck = to_and_fro(mounted_rig, 100, 101).campaign
     moved = tuple(replace(m, pan_steps=200 * (m.pan_steps > 100)) for m in stuck.moves)
-    (found,) = implausible(replace(stuck, moves=moved))
-    assert (found.code, found.certain) == ("counter-lost", False)
+    (finding,) = implausible(replace(stuck, moves=moved))
+    assert (finding.code, finding.certain) == ("counter-lost", False)
 
 
 @pytest.mark.parametrize(("axis", "words"), [("pan", "spots move right"), ("tilt", "spots move down")])
 def test_a_wrong_sign_is_certain_and_mended_by_a_command(grid_twin, axis, words):
-    (found,) = implausible(turned(axis)(grid_twin, RNG))
-    assert (found.code, found.certain, found.file) == ("counter-sign", True, "moves.csv")
-    assert found.message.startswith(words) and "deg" in found.message
-    assert f"--flip {axis}_steps --yes`" in found.remedy and "extrinsics" not in found.remedy
+    (finding,) = implausible(turned(axis)(grid_twin, RNG))
+    assert (finding.code, finding.certain, finding.file) == ("counter-sign", True, "moves.csv")
+    assert finding.message.startswith(words) and "deg" in finding.message
+    assert f"--flip {axis}_steps --yes`" in finding.remedy and "extrinsics" not in finding.remedy
     # Line 1 holds the names, move 0 stands in line 2; the message names both looks.
-    move = grid_twin.moves[(found.line or 0) - 2]
-    assert f"at {-getattr(move, f'{axis}_steps')}:" in found.message
+    move = grid_twin.moves[(finding.line or 0) - 2]
+    assert f"at {-getattr(move, f'{axis}_steps')}:" in finding.message
 
 
 def test_both_signs_may_be_cameras_upside_down(grid_twin):
-    (found,) = implausible(turned("tilt")(turned("pan")(grid_twin, RNG), RNG))
-    assert found.certain and "--flip pan_steps --flip tilt_steps" in found.remedy
-    assert "extrinsics.rotation_rad" in found.remedy
+    (finding,) = implausible(turned("tilt")(turned("pan")(grid_twin, RNG), RNG))
+    assert finding.certain and "--flip pan_steps --flip tilt_steps" in finding.remedy
+    assert "extrinsics.rotation_rad" in finding.remedy
 
 
 def test_cameras_of_unknown_mounting_accuse_no_sign(grid_twin):
@@ -93,17 +93,17 @@ def test_cameras_of_unknown_mounting_accuse_no_sign(grid_twin):
 
 def test_few_stops_are_never_certain(grid_twin):
     wrong = turned("tilt")(turned("pan")(grid_twin, RNG), RNG)
-    said = {looks: [(f.code, f.certain) for f in implausible(cut(wrong, looks))] for looks in (8, 10, 40)}
-    assert said[40] == [("counter-sign", True)]
-    assert all(not certain for looks in (8, 10) for _, certain in said[looks])
+    findings = {looks: [(f.code, f.certain) for f in implausible(cut(wrong, looks))] for looks in (8, 10, 40)}
+    assert findings[40] == [("counter-sign", True)]
+    assert all(not certain for looks in (8, 10) for _, certain in findings[looks])
 
 
 def test_a_sign_that_shifted_rows_would_show_too_names_both(mounted_rig):
     """Looks to and fro between two counters: the row before has the other counter."""
     campaign = to_and_fro(mounted_rig, 0, 200).campaign
-    (found,) = implausible(turned("pan")(campaign, RNG))
-    assert (found.code, found.certain) == ("counter-sign", True)
-    assert "--flip pan_steps" in found.remedy and "--shift-moves 1" in found.remedy
+    (finding,) = implausible(turned("pan")(campaign, RNG))
+    assert (finding.code, finding.certain) == ("counter-sign", True)
+    assert "--flip pan_steps" in finding.remedy and "--shift-moves 1" in finding.remedy
 
 
 def test_shifted_rows_are_certain_and_mended_by_a_command(grid_twin):
@@ -117,8 +117,8 @@ def test_shifted_rows_are_certain_and_mended_by_a_command(grid_twin):
 
 
 def test_steps_of_each_move_are_certain(grid_twin):
-    (found,) = implausible(MISTAKES["relative counters"][0](grid_twin, RNG))
-    assert found.certain and "sum of pan_steps and tilt_steps" in found.message and "--relative" in found.remedy
+    (finding,) = implausible(MISTAKES["relative counters"][0](grid_twin, RNG))
+    assert finding.certain and "sum of pan_steps and tilt_steps" in finding.message and "--relative" in finding.remedy
 
 
 def test_a_sheet_that_stands_askew_hides_no_motion(grid_twin):
@@ -126,8 +126,8 @@ def test_a_sheet_that_stands_askew_hides_no_motion(grid_twin):
     one_sheet = tuple(s for s in grid_twin.spots if s.target == "d1")
     askew = replace(grid_twin, spots=one_sheet)
     assert implausible(askew) == ()
-    (found,) = implausible(turned("pan")(askew, RNG))
-    assert found.code == "counter-sign"
+    (finding,) = implausible(turned("pan")(askew, RNG))
+    assert finding.code == "counter-sign"
 
 
 def test_what_play_and_scatter_hide_follows_the_priors():

@@ -134,9 +134,9 @@ def test_triangulation_inverts_projection(focal_scale: float):
     stereo = make_stereo()
     points = np.column_stack((rng.uniform(170, 500, 400), rng.uniform(-200, 100, 400), rng.uniform(-120, 120, 400)))
     pixels = project(points, stereo, focal_scale)
-    seen = np.isfinite(pixels).all(axis=1)
-    assert seen.sum() > 150
-    assert np.abs(triangulate(stereo, pixels[seen], focal_scale) - points[seen]).max() < ROUNDING_MM
+    inside = np.isfinite(pixels).all(axis=1)
+    assert inside.sum() > 150
+    assert np.abs(triangulate(stereo, pixels[inside], focal_scale) - points[inside]).max() < ROUNDING_MM
 
 
 def test_projection_agrees_with_opencv():
@@ -242,9 +242,9 @@ def test_the_stereo_covariance_counts_with_its_correlations():
     def function(stereo: Stereo, focal_scale: float) -> float:
         return float(slopes @ stereo.vector) + 3.0 * focal_scale
 
-    found = stereo_variance(function, make_stereo(covariance), 0.002)
+    variance = stereo_variance(function, make_stereo(covariance), 0.002)
     # Differences of numbers of order 1000 over steps of 1e-5.
-    assert found == pytest.approx(slopes @ covariance @ slopes + (3.0 * 0.002) ** 2, rel=1e-6)
+    assert variance == pytest.approx(slopes @ covariance @ slopes + (3.0 * 0.002) ** 2, rel=1e-6)
     assert slopes @ covariance @ slopes != pytest.approx(slopes**2 @ np.diag(covariance), rel=0.2)
 
 
@@ -253,9 +253,9 @@ def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
     ideal = replace(make_stereo(), D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))
     pixels = project(four_points(18.5, 30.4, "pan"), ideal).reshape(1, 4, 4)
     ratio = four_point_ratios(pixels, np.array([200]), "pan", ideal, 1.005)[0]
-    seen = np.degrees(np.arctan(np.tan(np.radians([18.5, 30.4])) / 1.005))
+    angles = np.degrees(np.arctan(np.tan(np.radians([18.5, 30.4])) / 1.005))
     # The near and far points share the intercept, which scales with depth and leaves the slope alone.
-    assert ratio == pytest.approx((seen[1] - seen[0]) / 200, abs=ROUNDING_DEG)
+    assert ratio == pytest.approx((angles[1] - angles[0]) / 200, abs=ROUNDING_DEG)
     assert ratio / 0.0595 - 1 == pytest.approx(-0.0033, abs=0.00005)  # two digits
 
 
@@ -268,8 +268,8 @@ def test_slopes_by_pixels_are_those_of_the_closed_form():
     ideal = replace(make_stereo(), D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))
     pixels = project(four_points(18.5, 30.4, "pan"), ideal).reshape(4, 4)
 
-    def ratio(seen: np.ndarray) -> complex:
-        left, right = ((seen[:, k] - m[0, 2]) / m[0, 0] for k, m in ((0, ideal.M1), (2, ideal.M2)))
+    def ratio(spots: np.ndarray) -> complex:
+        left, right = ((spots[:, k] - m[0, 2]) / m[0, 0] for k, m in ((0, ideal.M1), (2, ideal.M2)))
         depth = 85.0 / (left - right)
         across = -left * depth
         after, before = ((across[j] - across[i]) / (depth[j] - depth[i]) for i, j in ((3, 2), (0, 1)))
@@ -279,10 +279,10 @@ def test_slopes_by_pixels_are_those_of_the_closed_form():
     expected = [
         [ratio(pixels + 1j * step * np.eye(16)[4 * p + k].reshape(4, 4)).imag / step for k in (0, 2)] for p in range(4)
     ]
-    found = ratio_slopes(pixels, np.array([200]), "pan", ideal)
-    assert found.ratio[0] == pytest.approx(ratio(pixels).real, abs=ROUNDING_DEG)
+    slopes = ratio_slopes(pixels, np.array([200]), "pan", ideal)
+    assert slopes.ratio[0] == pytest.approx(ratio(pixels).real, abs=ROUNDING_DEG)
     # A difference quotient over 0.01 px of what bends within 10 px: 1e-3 at most.
-    assert found.by_pixel[0][:, [0, 2]] == pytest.approx(np.array(expected), rel=1e-3)
+    assert slopes.by_pixel[0][:, [0, 2]] == pytest.approx(np.array(expected), rel=1e-3)
 
 
 def test_fixed_parameters_are_skipped():

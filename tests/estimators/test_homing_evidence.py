@@ -21,26 +21,26 @@ def independent(sides) -> float:
 
 @pytest.mark.parametrize("axes", [AXES[:1], AXES[1:], AXES])
 def test_probabilities_are_evidence_over_their_sum_most_probable_first(axes):
-    found = weighed(axes, independent)
+    ways = weighed(axes, independent)
     every = {tuple(sorted(sides.items())): np.exp(independent(sides)) for sides in every_way(axes)}
     total = sum(every.values())
-    for way in found:
+    for way in ways:
         # Ways below one in a thousand are left out of the sum: nine of them at most.
         assert way.probability == pytest.approx(every[tuple(sorted(way.sides.items()))] / total, rel=9 * WORTH_A_FIT)
-    chances = [way.probability for way in found]
+    chances = [way.probability for way in ways]
     assert chances == sorted(chances, reverse=True) and sum(chances) == pytest.approx(1.0)
 
 
 def test_no_way_is_fitted_that_cannot_matter_and_few_where_one_axis_was_recorded():
-    asked: Counter[tuple[tuple[str, str], ...]] = Counter()
+    fits: Counter[tuple[tuple[str, str], ...]] = Counter()
 
     def evidence(sides) -> float:
-        asked[tuple(sorted(sides.items()))] += 1
+        fits[tuple(sorted(sides.items()))] += 1
         return independent(sides)
 
-    found = weighed(AXES, evidence)
+    ways = weighed(AXES, evidence)
     # "up" is e^10 less probable than "down": it is asked for alone, never with a side of the other axis.
-    together = [dict(key) for key in asked if ANYWHERE not in dict(key).values()]
+    together = [dict(key) for key in fits if ANYWHERE not in dict(key).values()]
     assert together and all("up" not in sides.values() for sides in together)
-    assert len(asked) < most_fits(AXES) and most_fits(AXES[:1]) == 3 and most_fits(()) == 0
-    assert {tuple(way.sides.values()) for way in found} >= {("left", "down"), ("right", "down")}
+    assert len(fits) < most_fits(AXES) and most_fits(AXES[:1]) == 3 and most_fits(()) == 0
+    assert {tuple(way.sides.values()) for way in ways} >= {("left", "down"), ("right", "down")}

@@ -39,11 +39,11 @@ def simulated(mounted_rig) -> SimulatedCampaign:
 
 @pytest.fixture(scope="module")
 def fitted(simulated):
-    told = []
-    found = fit(simulated.campaign, progress=told.append)
-    check_forward(told)
-    assert doings(told)[-3:] == [SEARCHING, NEWTON, DIAGNOSING]
-    return found
+    waits = []
+    result = fit(simulated.campaign, progress=waits.append)
+    check_forward(waits)
+    assert doings(waits)[-3:] == [SEARCHING, NEWTON, DIAGNOSING]
+    return result
 
 
 def with_priors(campaign: Campaign, **priors: Prior) -> Campaign:
@@ -94,17 +94,17 @@ def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
 @pytest.mark.thorough
 def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, mounted_rig, monkeypatch):
     """Other numbers of spots and of counters: every argument of a compiled function keeps its shape."""
-    made, first = [], Compiled._made
+    compiled, first = [], Compiled._made
 
     def counted(self, *arguments):
-        made.append(self.plain.__name__)
+        compiled.append(self.plain.__name__)
         return first(self, *arguments)
 
     monkeypatch.setattr(Compiled, "_made", counted)
     plan = grid_protocol(pan_steps=(0, 60, 120, 180), tilt_steps=(-90, -30, 30, 90))
     grid = simulate(mounted_rig, plan, seed=22).campaign
     again = fit(replace(grid, spots=grid.spots[: len(simulated.campaign.spots) - 7]))
-    assert again.converged and again.arrays.gears.filled > fitted.arrays.gears.filled and made == []
+    assert again.converged and again.arrays.gears.filled > fitted.arrays.gears.filled and compiled == []
 
 
 @pytest.mark.thorough
@@ -228,8 +228,8 @@ def test_the_mode_is_a_stationary_maximum(fitted):
     """By differences of the density that fits descend, along the axes of the covariance."""
     root = np.linalg.cholesky(fitted.covariance)
     # Scales of repeating errors are where the density is highest with everything else integrated out.
-    own = fitted.free & ~np.isin(NAMES, GEAR_ERROR_NAMES)
-    columns = root.T[own]
+    free = fitted.free & ~np.isin(NAMES, GEAR_ERROR_NAMES)
+    columns = root.T[free]
 
     def density(points):
         still = no_draw(len(points), fitted.arrays)

@@ -90,16 +90,16 @@ def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evalua
         (np.ones(shape, bool), np.full((*shape, 2), 0.5)),
     )
     index, stops = [INDEX[name] for name in LOOK_SCATTER_NAMES], [INDEX[n] for n in NAMES if n.startswith("stop_sd")]
-    found = []
+    logs = []
     for scatter_deg in (1e-9, 0.005, 0.02):
         z = dozen.z.copy()
         z[index] = half_normal_coordinate(np.full(2, scatter_deg / 0.01))
         left = np.sqrt(0.03**2 - scatter_deg**2)
         z[stops] = np.log(left / dozen.space.value[jnp.array(stops)]) / dozen.space.u[jnp.array(stops)]
-        found.append(evaluate(z, dozen.space, once).log_likelihood)
-    assert found[1:] == pytest.approx(found[:1] * 2, abs=FINE_UNIT, rel=1e-12)
+        logs.append(evaluate(z, dozen.space, once).log_likelihood)
+    assert logs[1:] == pytest.approx(logs[:1] * 2, abs=FINE_UNIT, rel=1e-12)
     shared = evaluate(z, dozen.space, dozen.arrays).log_likelihood
-    assert abs(shared - found[0]) > LOG_UNIT, "of stops looked at twice the shares are told"
+    assert abs(shared - logs[0]) > LOG_UNIT, "of stops looked at twice the shares are told"
 
 
 def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
@@ -199,8 +199,8 @@ def far_out():
 
 
 def test_density_is_finite_everywhere(dozen, far_out):
-    found = density.evaluate(far_out, no_draw(len(far_out), dozen.arrays), dozen.space, dozen.arrays)
-    assert np.all(np.isfinite(found.log_density))
+    values = density.evaluate(far_out, no_draw(len(far_out), dozen.arrays), dozen.space, dozen.arrays)
+    assert np.all(np.isfinite(values.log_density))
 
 
 @pytest.mark.slow

@@ -112,11 +112,11 @@ def test_errors_at_places_are_what_the_residuals_leave_of_them(places):
     residual, jacobian = spots.residual.ravel(), spots.jacobian.reshape(-1, PARAMETERS)
     # Covariance of errors and residuals is the errors' own columns.
     gain = np.linalg.solve(dense_covariance(spots), spots.places.reshape(len(residual), places)).T
-    found = stop_information(spots)
-    np.testing.assert_allclose(found.place_mean, gain @ residual, rtol=DENSE, atol=DENSE)
-    np.testing.assert_allclose(found.place_slope, -gain @ jacobian, rtol=DENSE, atol=DENSE)
+    information = stop_information(spots)
+    np.testing.assert_allclose(information.place_mean, gain @ residual, rtol=DENSE, atol=DENSE)
+    np.testing.assert_allclose(information.place_slope, -gain @ jacobian, rtol=DENSE, atol=DENSE)
     left = np.eye(places) - gain @ spots.places.reshape(len(residual), places)
-    np.testing.assert_allclose(found.place_covariance, left, rtol=DENSE, atol=DENSE)
+    np.testing.assert_allclose(information.place_covariance, left, rtol=DENSE, atol=DENSE)
 
 
 def test_leave_one_out_is_the_prediction_by_all_others():
@@ -125,11 +125,11 @@ def test_leave_one_out_is_the_prediction_by_all_others():
     covariance, residual = dense_covariance(spots), spots.residual.ravel()
     expected = []
     for k in range(len(spots.residual)):
-        own = np.arange(4 * k, 4 * k + 4)
-        rest = np.setdiff1d(np.arange(residual.size), own)
-        gain = np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[np.ix_(rest, own)]).T
-        error = residual[own] - gain @ residual[rest]
-        spread = covariance[np.ix_(own, own)] - gain @ covariance[np.ix_(rest, own)]
+        one = np.arange(4 * k, 4 * k + 4)
+        rest = np.setdiff1d(np.arange(residual.size), one)
+        gain = np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[np.ix_(rest, one)]).T
+        error = residual[one] - gain @ residual[rest]
+        spread = covariance[np.ix_(one, one)] - gain @ covariance[np.ix_(rest, one)]
         expected.append(error @ np.linalg.solve(spread, error))
     np.testing.assert_allclose(
         leave_one_out_chi2(stop_information(spots), np.ones(len(expected))), expected, rtol=DENSE
@@ -142,13 +142,13 @@ def test_leave_one_out_of_weighted_spots_is_that_of_full_weight():
     weight = np.random.default_rng(11).uniform(0.2, 1.0, len(spots.residual))
     root = np.sqrt(weight)[:, None]
     weighted = replace(spots, residual=root * spots.residual, load=root[..., None] * spots.load)
-    found = leave_one_out_chi2(stop_information(weighted), weight)
+    chi2 = leave_one_out_chi2(stop_information(weighted), weight)
     for k in range(len(weight)):
         alone = root.copy()
         alone[k] = 1.0
         full = replace(spots, residual=alone * spots.residual, load=alone[..., None] * spots.load)
         expected = leave_one_out_chi2(stop_information(full), np.ones(len(weight)))[k]
-        assert found[k] == pytest.approx(expected, rel=DENSE)
+        assert chi2[k] == pytest.approx(expected, rel=DENSE)
 
 
 def test_standard_deviations_without_a_stop_are_those_of_a_fit_without_it():
@@ -164,9 +164,9 @@ def test_standard_deviations_without_a_stop_are_those_of_a_fit_without_it():
         rest = jacobian[kept].T @ np.linalg.solve(covariance_spots[np.ix_(kept, kept)], jacobian[kept])
         without = np.linalg.inv(rest + np.eye(PARAMETERS))
         expected = np.sqrt(np.einsum("qi,ij,qj->q", gradients, without, gradients))
-        found = standard_deviations_without(group, posterior, gradients)
-        np.testing.assert_allclose(found, expected, rtol=DENSE)
-        assert np.all(found >= np.sqrt(np.einsum("qi,ij,qj->q", gradients, posterior, gradients)))
+        sds = standard_deviations_without(group, posterior, gradients)
+        np.testing.assert_allclose(sds, expected, rtol=DENSE)
+        assert np.all(sds >= np.sqrt(np.einsum("qi,ij,qj->q", gradients, posterior, gradients)))
 
 
 def test_sd_is_infinite_where_nothing_else_informs():
@@ -176,8 +176,8 @@ def test_sd_is_infinite_where_nothing_else_informs():
     jacobian[stop_of_looks(2) == 1] = 1.0
     spots = replace(spots, jacobian=jacobian)
     information = stop_information(spots)
-    found = standard_deviations_without(information.groups[1], np.linalg.inv(information.fisher), np.ones((1, 1)))
-    assert found[0] > 1e6  # infinite up to rounding of the information, 1e-15
+    sds = standard_deviations_without(information.groups[1], np.linalg.inv(information.fisher), np.ones((1, 1)))
+    assert sds[0] > 1e6  # infinite up to rounding of the information, 1e-15
 
 
 @pytest.mark.parametrize("blamed", [0, 1])
@@ -225,8 +225,8 @@ def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen)
     count = int(np.sum(np.asarray(spots.valid)))
     index = np.asarray(spots.move_index)[:count]
     still = no_draw(len(z), dozen.arrays)
-    found = np.asarray(move_log_density(z, still, dozen.space, dozen.arrays))
-    assert found.shape == (len(z), count)
+    logs = np.asarray(move_log_density(z, still, dozen.space, dozen.arrays))
+    assert logs.shape == (len(z), count)
     whole = np.asarray(evaluate(z, still, dozen.space, dozen.arrays).log_density)
     assert len(set(index)) < count
     for move in set(index):
@@ -235,4 +235,4 @@ def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen)
         rest = eqx.tree_at(lambda a: a.spots.valid, dozen.arrays, jnp.asarray(valid))
         lost = whole - np.asarray(evaluate(z, still, dozen.space, rest).log_density)
         # Sums of a few hundred terms of order 100: rounding leaves 1e-9.
-        np.testing.assert_allclose(found[:, index == move].sum(axis=1), lost, atol=1e-7)
+        np.testing.assert_allclose(logs[:, index == move].sum(axis=1), lost, atol=1e-7)

@@ -62,9 +62,9 @@ def test_slopes_are_the_derivatives_by_angles_and_range(both, dozen):
     pose = np.stack([looks.pan_rad, looks.tilt_rad, looks.range_mm])
     with jax.enable_x64(True):
         model = dozen.space.model(jnp.asarray(z))
-        seen = jax.jit(lambda at: observe(model, at, dozen.arrays.azimuth_convention))
+        observed = jax.jit(lambda at: observe(model, at, dozen.arrays.azimuth_convention))
         for axis, (slopes, step) in enumerate(((looks.by_pan, 1e-5), (looks.by_tilt, 1e-5), (looks.by_range, 1e-2))):
             nudge = step * np.eye(3)[axis][:, None]
-            expected = (np.asarray(seen(pose + nudge)) - np.asarray(seen(pose - nudge))) / (2 * step)
-            found = np.stack(slopes)
-            assert np.max(np.abs(found - expected)) < 1e-6 * np.max(np.abs(expected))
+            expected = (np.asarray(observed(pose + nudge)) - np.asarray(observed(pose - nudge))) / (2 * step)
+            jacobian = np.stack(slopes)
+            assert np.max(np.abs(jacobian - expected)) < 1e-6 * np.max(np.abs(expected))

@@ -35,13 +35,13 @@ class Known(Problem):
 
 def test_noise_scales_of_any_width_are_found_in_a_few_steps():
     problem = Known(np.inf)
-    found = problem.noise_scales(np.array([2.0, 1.0, -1.0]))
-    assert np.max(np.abs(found - CENTRE) * np.sqrt(CURVATURE)) < SETTLED_SDS
+    scales = problem.noise_scales(np.array([2.0, 1.0, -1.0]))
+    assert np.max(np.abs(scales - CENTRE) * np.sqrt(CURVATURE)) < SETTLED_SDS
     assert problem.calls <= CALLS_MAX
 
 
 @pytest.mark.parametrize("start", [2.0, 0.9])
 def test_a_start_at_the_end_of_a_density_has_finite_scales(start):
     """The curvature there is no number: its own unit must do."""
-    found = Known(start).noise_scales(np.array([start, 1.0, -1.0]))
-    assert np.all(np.isfinite(found))
+    scales = Known(start).noise_scales(np.array([start, 1.0, -1.0]))
+    assert np.all(np.isfinite(scales))

@@ -21,9 +21,9 @@ SCATTER = [INDEX[name] for name in LOOK_SCATTER_NAMES]
 def dense_density(fit, z: np.ndarray) -> float:
     """Log density of the looks at noise scales, up to a constant: one Gaussian of all their residuals."""
     count, lin = len(fit.linearised.residual), linearised_at(z, fit.space, fit.arrays)
-    own = lin.by_coordinates(fit.held)
-    spots = linear_spots(lin, fit.arrays, own)
-    columns = own.reshape(4 * count, -1)
+    jacobian = lin.by_coordinates(fit.held)
+    spots = linear_spots(lin, fit.arrays, jacobian)
+    columns = jacobian.reshape(4 * count, -1)
     residual = spots.residual.ravel() + columns @ np.where(fit.held, 0.0, z)
     covariance = dense_covariance(spots) + columns @ columns.T
     # Residuals are in units of the pixel noise; of four components of a look its range takes one.
@@ -40,25 +40,25 @@ def dense_density(fit, z: np.ndarray) -> float:
 def test_the_density_is_that_of_a_dense_gaussian(mixed_fit, column):
     other = mixed_fit.z.copy()
     other[column] += 0.4
-    found = np.diff(MarginalScales(mixed_fit)(np.stack([mixed_fit.z, other])))[0]
+    change = np.diff(MarginalScales(mixed_fit)(np.stack([mixed_fit.z, other])))[0]
     # Priors of 1e5 sds of the looks: the dense determinant keeps that many digits.
-    assert found == pytest.approx(dense_density(mixed_fit, other) - dense_density(mixed_fit, mixed_fit.z), abs=1e-4)
+    assert change == pytest.approx(dense_density(mixed_fit, other) - dense_density(mixed_fit, mixed_fit.z), abs=1e-4)
 
 
 def test_what_geometry_took_is_given_back(mixed_fit):
     """The centre is a maximum along every scale, and its pixel noise larger than at the mode of everything."""
-    found, alone = noise_draws(mixed_fit, 32, seed=0), MarginalScales(mixed_fit)
+    draws, alone = noise_draws(mixed_fit, 32, seed=0), MarginalScales(mixed_fit)
     sd = np.sqrt(np.diag(mixed_fit.covariance))
-    assert found.centre[PIXEL] - mixed_fit.z[PIXEL] > 0.3 * sd[PIXEL]
+    assert draws.centre[PIXEL] - mixed_fit.z[PIXEL] > 0.3 * sd[PIXEL]
     columns = [*STOPS, PIXEL]
-    points = np.repeat(found.centre[None], 1 + 2 * len(columns), axis=0)
+    points = np.repeat(draws.centre[None], 1 + 2 * len(columns), axis=0)
     for row, column in enumerate(columns):
         points[1 + 2 * row : 3 + 2 * row, column] += np.array([0.5, -0.5]) * sd[column]
     values = alone(points)
     assert np.all(values[1:] < values[0])
-    assert found.weights.sum() == pytest.approx(1) and effective_draws(found.weights) > 8
+    assert draws.weights.sum() == pytest.approx(1) and effective_draws(draws.weights) > 8
     still = ~np.isin(np.arange(len(sd)), alone.columns)
-    assert np.all(found.z[:, still] == mixed_fit.z[still])
+    assert np.all(draws.z[:, still] == mixed_fit.z[still])
 
 
 @pytest.mark.thorough

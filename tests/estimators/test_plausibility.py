@@ -31,10 +31,10 @@ def warnings_of(campaign: Campaign) -> str:
 
 @pytest.mark.parametrize(("name", "experiments", "readings"), [("paper_twin", 96, 0), ("grid_twin", 0, 144)])
 def test_shipped_twins_have_no_warning(name, experiments, readings):
-    found = check_campaign(read_campaign(shipped_data() / "twins" / name))
-    assert found.warnings == ()
-    assert (found.experiments, found.aperture_readings, found.refused) == (experiments, readings, {})
-    assert found.ok_spots == found.spots
+    check = check_campaign(read_campaign(shipped_data() / "twins" / name))
+    assert check.warnings == ()
+    assert (check.experiments, check.aperture_readings, check.refused) == (experiments, readings, {})
+    assert check.ok_spots == check.spots
 
 
 def test_the_papers_protocol_is_warned_of_on_both_axes(mounted_rig):
@@ -134,17 +134,17 @@ def test_unknown_approach_is_named_with_its_segment(paper_twin):
 def test_incomplete_experiments_and_refused_spots_are_counted(paper_twin):
     spots = list(paper_twin.spots)
     spots[5] = replace(spots[5], status="saturated")
-    found = check_campaign(replace(paper_twin, spots=tuple(spots)))
-    assert found.refused == {"saturated": 1}
-    assert (found.ok_spots, found.experiments) == (383, 95)
-    assert [w for w in found.warnings if w.startswith("experiment 1 is not complete")]
+    check = check_campaign(replace(paper_twin, spots=tuple(spots)))
+    assert check.refused == {"saturated": 1}
+    assert (check.ok_spots, check.experiments) == (383, 95)
+    assert [w for w in check.warnings if w.startswith("experiment 1 is not complete")]
 
 
 def test_swapped_cameras_and_wrong_units_are_certain(paper_twin):
     """Where exchanged pictures put all spots on sheets; where no lens, no pair and no sheet can be meant."""
     swapped = corrected(None, paper_twin.spots, Correction(swapped=True)).spots
-    (found,) = implausible(replace(paper_twin, spots=swapped))
-    assert (found.code, found.certain, found.line) == ("cameras-swapped", True, 2) and "--swap" in found.remedy
+    (finding,) = implausible(replace(paper_twin, spots=swapped))
+    assert (finding.code, finding.certain, finding.line) == ("cameras-swapped", True, 2) and "--swap" in finding.remedy
     in_mm = tuple(replace(s, **{name: 0.003 * getattr(s, name) for name in PIXELS}) for s in paper_twin.spots)
     metres = replace(paper_twin.stereo, T=paper_twin.stereo.T / 1000)
     grid = read_campaign(shipped_data() / "twins" / "grid_twin")
@@ -187,8 +187,8 @@ def test_swapped_pictures_that_contradict_each_other_are_a_doubt(paper_twin):
     """Rows 30 px apart fit no pair, exchanged or not."""
     swapped = corrected(None, paper_twin.spots, Correction(swapped=True)).spots
     apart = tuple(replace(s, v_right_px=s.v_right_px + 30) for s in swapped)
-    (found,) = implausible(replace(paper_twin, spots=apart))
-    assert (found.code, found.certain) == ("cameras-swapped", False)
+    (finding,) = implausible(replace(paper_twin, spots=apart))
+    assert (finding.code, finding.certain) == ("cameras-swapped", False)
 
 
 def test_pixels_that_count_from_one_show_at_the_edge(paper_twin):
@@ -223,6 +223,6 @@ def test_what_explains_a_failed_fit(paper_twin, su_px, scale, code):
 
 def test_a_campaign_without_usable_spots_is_told_once(paper_twin):
     spots = tuple(replace(s, status="too dim", experiment=None, point=None) for s in paper_twin.spots)
-    found = check_campaign(replace(paper_twin, spots=spots))
-    assert found.ok_spots == 0
-    assert found.warnings == ("no spot has status ok: there is nothing to estimate from",)
+    check = check_campaign(replace(paper_twin, spots=spots))
+    assert check.ok_spots == 0
+    assert check.warnings == ("no spot has status ok: there is nothing to estimate from",)

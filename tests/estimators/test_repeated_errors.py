@@ -132,9 +132,9 @@ def dense_places(varying: Varying, values: dict[str, float]) -> tuple[np.ndarray
     covariance, angles = np.zeros((2 * size, 2 * size)), np.zeros((2, len(spots), 2 * size))
     for axis, name in enumerate(SENSES):
         repeated, labels = RepeatedCovariances(values, name), stop_labels(moves, name)
-        own = np.flatnonzero(on_tilt == bool(axis))
-        for i in own:
-            for j in own:
+        at_axis = np.flatnonzero(on_tilt == bool(axis))
+        for i in at_axis:
+            for j in at_axis:
                 covariance[i, j] = np.radians(np.radians(repeated.error(steps[i], steps[j])))
                 covariance[size + i, size + j] = np.radians(np.radians(repeated.play(steps[i], steps[j])))
             for row, spot in enumerate(spots):
@@ -156,8 +156,8 @@ def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varyin
     normals = np.concatenate([np.zeros((1, 2 * filled)), np.eye(2 * filled)])
     points = np.repeat(found.z[None], len(normals), axis=0)
     drawn = likelihood.evaluate(points, normals, varying.space, varying.arrays).place_errors_rad
-    own = np.tile(valid[:filled], 2)
-    mean, moved = drawn[0][own], (drawn[1:] - drawn[0])[:, own]
+    valid_places = np.tile(valid[:filled], 2)
+    mean, moved = drawn[0][valid_places], (drawn[1:] - drawn[0])[:, valid_places]
     scale = np.sqrt(np.diag(prior)) + 1e-12
     np.testing.assert_allclose(mean / scale, gain @ residual.ravel() / scale, atol=ALGEBRA * 100)
     left = prior - gain @ load @ prior
@@ -192,8 +192,8 @@ def test_scales_of_zero_are_perfect_gears(varying, dozen, evaluate):
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
         space = jax.tree.map(jnp.asarray, parameter_space(table, dozen.campaign.stereo))
         none = {n: 0.0 for n in SCALES["rough"] if "length" not in n}
-        here = found_at(evaluate, varying, coordinates_with(varying.space, varying.z, none))
+        at_zero = found_at(evaluate, varying, coordinates_with(varying.space, varying.z, none))
         z = coordinates_of(space, physical_at(varying.z, varying.space).value)
         perfect = evaluate(z, space, arrays).log_likelihood
     # What is left is the floor of 1e-12 rad under every place: with slopes of 1e4 per rad 1e-16 of a variance.
-    assert here.log_likelihood == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)
+    assert at_zero.log_likelihood == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)

@@ -31,8 +31,8 @@ def twins():
 def test_a_mistake_is_called_by_its_name(twins, twin, mistake):
     """And nothing else is accused of it."""
     change, words = MISTAKES[mistake]
-    said = [finding.sentence for finding in implausible(change(twins[twin], np.random.default_rng(2)))]
-    assert said and all(any(word in text for word in words.split("|")) for text in said), said
+    sentences = [finding.sentence for finding in implausible(change(twins[twin], np.random.default_rng(2)))]
+    assert sentences and all(any(word in text for word in words.split("|")) for text in sentences), sentences
 
 
 def test_columns_exchanged(twins):
@@ -41,16 +41,16 @@ def test_columns_exchanged(twins):
 
 
 @pytest.mark.parametrize(
-    ("lag", "begin", "said"), [(-1, 0, "after"), (1, 0, "before"), (1, 60, "before"), (-1, 91, "after")]
+    ("lag", "begin", "side"), [(-1, 0, "after"), (1, 0, "before"), (1, 60, "before"), (-1, 91, "after")]
 )
-def test_rows_that_are_one_apart_are_named_from_where_they_are(twins, lag, begin, said):
+def test_rows_that_are_one_apart_are_named_from_where_they_are(twins, lag, begin, side):
     """A log that counts from 1 shifts all pictures, a missing row all behind it."""
     campaign = twins["grid_twin"]
     last = len(campaign.moves) - 1
     spots = [replace(s, move=min(max(s.move + lag * (s.spot >= begin), 0), last)) for s in campaign.spots]
-    (found,) = (finding.message for finding in implausible(replace(campaign, spots=tuple(spots))))
-    assert f"spots follow the counters of the move {said} theirs" in found
-    assert found.startswith("spots follow" if begin == 0 else f"from spot {begin} on")
+    (message,) = (finding.message for finding in implausible(replace(campaign, spots=tuple(spots))))
+    assert f"spots follow the counters of the move {side} theirs" in message
+    assert message.startswith("spots follow" if begin == 0 else f"from spot {begin} on")
 
 
 def test_counters_that_nothing_follows_are_not_those_of_the_row_beside(twins):
@@ -60,8 +60,8 @@ def test_counters_that_nothing_follows_are_not_those_of_the_row_beside(twins):
         replace(m, pan_steps=campaign.moves[k].pan_steps, tilt_steps=campaign.moves[k].tilt_steps)
         for m, k in zip(campaign.moves, order, strict=True)
     ]
-    found = implausible(replace(campaign, moves=tuple(moves)))
-    assert len(found) == 2 and all("do not follow" in each.message for each in found)
+    findings = implausible(replace(campaign, moves=tuple(moves)))
+    assert len(findings) == 2 and all("do not follow" in each.message for each in findings)
 
 
 @pytest.mark.parametrize("plan", PLANS)

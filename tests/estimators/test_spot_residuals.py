@@ -45,8 +45,8 @@ def test_without_a_direction_a_reflection_is_finite_and_still_one():
         turned = np.stack(reflection.of_many(numbers(vector)))
 
         def total(direction):
-            found = Reflection.of(tuple(direction))
-            return sum(jnp.sum(part) for part in found.of_many(numbers(vector))) + jnp.sum(found.first)
+            mirror = Reflection.of(tuple(direction))
+            return sum(jnp.sum(part) for part in mirror.of_many(numbers(vector))) + jnp.sum(mirror.first)
 
         slope = np.asarray(jax.grad(total)(jnp.zeros((4, 40))))
     np.testing.assert_allclose(np.linalg.norm(turned, axis=0), np.linalg.norm(vector, axis=0), rtol=ROUNDING)
@@ -60,9 +60,9 @@ def test_only_two_components_see_the_mirror_angles():
         turn = ToStates.of(numbers(by_pan), numbers(by_tilt))
         slope = np.asarray(turn.slope)
         pan, tilt, turned = (np.stack(turn.of_many(numbers(v))) for v in (by_pan, by_tilt, residual))
-    for seen, column in ((pan, 0), (tilt, 1)):
-        np.testing.assert_allclose(seen[:2].T, slope[:, :, column], atol=ROUNDING)
-        np.testing.assert_allclose(seen[2:], 0.0, atol=ROUNDING)
+    for part, column in ((pan, 0), (tilt, 1)):
+        np.testing.assert_allclose(part[:2].T, slope[:, :, column], atol=ROUNDING)
+        np.testing.assert_allclose(part[2:], 0.0, atol=ROUNDING)
     # What is left has the length of two components.
     np.testing.assert_allclose(np.sum(turned**2, axis=0), np.sum(residual**2, axis=0), rtol=ROUNDING)
 
@@ -76,9 +76,9 @@ def test_looks_that_scatter_have_unit_noise_in_both_components():
         pan, tilt, turned = (np.stack(turn.of_many(numbers(v))) for v in (by_pan, by_tilt, residual))
         in_place = np.stack(turn.in_place(numbers(residual)))
         slope, log_scale = np.asarray(turn.slope), np.asarray(turn.log_scale)
-    for seen, column in ((pan, 0), (tilt, 1)):
-        np.testing.assert_allclose(seen[:2].T, slope[:, :, column], atol=ROUNDING)
-        np.testing.assert_allclose(seen[2:], 0.0, atol=ROUNDING)
+    for part, column in ((pan, 0), (tilt, 1)):
+        np.testing.assert_allclose(part[:2].T, slope[:, :, column], atol=ROUNDING)
+        np.testing.assert_allclose(part[2:], 0.0, atol=ROUNDING)
     for k in range(40):
         slopes = np.stack([by_pan[:, k], by_tilt[:, k]], axis=1)
         covariance = np.eye(4) + slopes @ np.diag(variance[k]) @ slopes.T
@@ -108,22 +108,22 @@ def test_whitened_differences_have_the_stated_covariance(dozen):
     difference[:4, : len(spots)] = np.random.default_rng(8).standard_normal((4, len(spots)))
     with jax.enable_x64(True):
         unit = jnp.ones(difference.shape[1])
-        found = np.stack(NoiseScales(unit, unit).whitened(numbers(difference), dozen.arrays.spots))
+        whitened = np.stack(NoiseScales(unit, unit).whitened(numbers(difference), dozen.arrays.spots))
     for k, spot in enumerate(spots):
         d = difference[:4, k]
         expected = d @ np.linalg.solve(pixel_covariance(spot), d)
-        assert np.sum(found[:4, k] ** 2) == pytest.approx(expected, rel=1e-12)
+        assert np.sum(whitened[:4, k] ** 2) == pytest.approx(expected, rel=1e-12)
 
 
 def test_what_the_filter_sees_is_smooth_where_a_slope_changes_its_sign():
     """Second differences of the innovations measure the posterior's ridges: a basis that flips would ruin them."""
     by_tilt, residual = drawn(4, 9), drawn(4, 10)
     step = 1e-6
-    seen = []
+    turned = []
     with jax.enable_x64(True):
         for small in (-step, step):
             by_pan = drawn(4, 11)
             by_pan[0] = small
-            seen.append(np.stack(ToStates.of(numbers(by_pan), numbers(by_tilt)).of_many(numbers(residual))))
+            turned.append(np.stack(ToStates.of(numbers(by_pan), numbers(by_tilt)).of_many(numbers(residual))))
     # Ten units of a residual per unit of slope: slopes are of order one here, none is shorter than a tenth.
-    assert np.max(np.abs(seen[1] - seen[0])) < 100 * 2 * step
+    assert np.max(np.abs(turned[1] - turned[0])) < 100 * 2 * step

@@ -71,10 +71,10 @@ def judged():
 
 
 def test_independent_draws_have_converged_and_keep_their_density(judged):
-    found = judged(chain_of(independent()))
-    assert found.convergence.converged, found.convergence.missing
-    assert found.convergence.stuck_walkers == ()
-    points = found.points
+    sample = judged(chain_of(independent()))
+    assert sample.convergence.converged, sample.convergence.missing
+    assert sample.convergence.stuck_walkers == ()
+    points = sample.points
     np.testing.assert_allclose(TwoNormals().log_density(points), log_normal_density(points.parts["z"]), rtol=1e-12)
 
 
@@ -138,42 +138,42 @@ def weighted(shift: float = 0.0) -> Sample:
     worst = NamedValue(NAMES[RATIO], 0.1)
     importance = Importance(True, (), 8, 8000, 0.5, worst, 0.1, worst, 0.001, 0.0, 0.01, 0, "accepted")
     points = Points(draws, np.zeros(8000), {"z": z})
-    found = TwoNormals().quantities(points)
-    return Sample(points, found, weights[None], Reweighted(importance, {}, {}, {}), 0.0)
+    quantities = TwoNormals().quantities(points)
+    return Sample(points, quantities, weights[None], Reweighted(importance, {}, {}, {}), 0.0)
 
 
 def test_a_chain_that_says_the_same_as_importance_sampling_agrees(judged):
-    found = judged(chain_of(independent()), weighted())
-    assert found.convergence.converged and found.convergence.agreement.agrees
-    assert found.convergence.agreement.worst.value < AGREEMENT_LIMIT
-    assert found.convergence.importance.draws == 8000
+    sample = judged(chain_of(independent()), weighted())
+    assert sample.convergence.converged and sample.convergence.agreement.agrees
+    assert sample.convergence.agreement.worst.value < AGREEMENT_LIMIT
+    assert sample.convergence.importance.draws == 8000
 
 
 @pytest.mark.parametrize(("shift", "answer"), [(-0.15, "rough"), (-1.0, "laplace")])
 def test_a_chain_that_says_something_else_is_known_no_better_than_both_agree(judged, shift, answer):
     """The chain's 5000 draws know a mean to 0.014 sd, the weighted 8000, worth 3600, to 0.017: 0.15 is seven errors."""
-    found = judged(chain_of(independent()), weighted(shift))
-    agreement = found.convergence.agreement
-    assert found.convergence.answer == answer and not agreement.agrees
-    error = found.convergence.monte_carlo_error[NAMES[RATIO]]
+    sample = judged(chain_of(independent()), weighted(shift))
+    agreement = sample.convergence.agreement
+    assert sample.convergence.answer == answer and not agreement.agrees
+    error = sample.convergence.monte_carlo_error[NAMES[RATIO]]
     assert error.mean == pytest.approx(abs(shift), abs=5 * 0.022)
     assert agreement.worst.quantity.startswith(NAMES[RATIO]) and agreement.worst.value > AGREEMENT_LIMIT
-    (said,) = found.convergence.missing
+    (message,) = sample.convergence.missing
     words = f"emcee and importance sampling differ on {agreement.worst.quantity} by {agreement.worst.value:.1f} Monte"
-    assert said.startswith(words)
+    assert message.startswith(words)
 
 
 def test_where_every_headline_is_fixed_the_others_must_agree(judged, monkeypatch):
     """A rig whose geometry is stated as known: the campaign teaches its noise."""
     monkeypatch.setattr(TwoNormals, "headlines", ("effective_mirror_offset_mm",))
     assert judged(chain_of(independent()), weighted()).convergence.converged
-    found = judged(chain_of(independent()), weighted(-0.15))
-    assert found.convergence.missing and NAMES[RATIO] in found.convergence.agreement.worst.quantity
+    sample = judged(chain_of(independent()), weighted(-0.15))
+    assert sample.convergence.missing and NAMES[RATIO] in sample.convergence.agreement.worst.quantity
 
 
 def test_groups_are_neighbours_in_order_of_time():
     """Of eight walkers, two each: their draws alternate, the first of both before the second of both."""
     values = 10 * np.arange(2 * GROUPS)[:, None] + np.arange(3)
-    found = grouped(values)
-    assert found.shape == (GROUPS, 6)
-    np.testing.assert_array_equal(found[1], [20, 30, 21, 31, 22, 32])
+    groups = grouped(values)
+    assert groups.shape == (GROUPS, 6)
+    np.testing.assert_array_equal(groups[1], [20, 30, 21, 31, 22, 32])

@@ -46,7 +46,7 @@ def test_the_density_of_a_pair_is_one_and_its_draws_follow_it():
     draws = proposal.draw(200_000, np.random.RandomState(3))
     # Cells of 20 x 20 grid points inside, by chi-square.
     edges = GRID[80:401:20]
-    seen = np.histogram2d(*draws.T, bins=[edges, edges])[0].ravel()
+    counts = np.histogram2d(*draws.T, bins=[edges, edges])[0].ravel()
     weights = np.full(21, 1.0)
     weights[[0, -1]] = 0.5
     expected = [
@@ -57,7 +57,7 @@ def test_the_density_of_a_pair_is_one_and_its_draws_follow_it():
     expected = np.array(expected)
     many = expected > 25
     assert many.sum() > 20
-    chi2 = np.sum((seen[many] - expected[many]) ** 2 / expected[many])
+    chi2 = np.sum((counts[many] - expected[many]) ** 2 / expected[many])
     assert abs(chi2 - many.sum()) < SIGMAS * np.sqrt(2 * many.sum())
 
 
@@ -74,10 +74,10 @@ def test_new_values_of_some_coordinates_leave_a_pair_as_it_is():
     proposal, generator = followed().turned(np.array([[0.0, 0.3], [0.3, 0.0]])), np.random.RandomState(6)
     begun = w = proposal.draw(20_000, generator)
     for _ in range(12):
-        asked, factor = proposal.renewed(w, generator)
+        proposed, factor = proposal.renewed(w, generator)
         with np.errstate(over="ignore"):
-            ratio = np.exp(proposal.log_density(asked) - proposal.log_density(w) + factor)
-        w = np.where((generator.uniform(size=len(w)) < ratio)[:, None], asked, w)
+            ratio = np.exp(proposal.log_density(proposed) - proposal.log_density(w) + factor)
+        w = np.where((generator.uniform(size=len(w)) < ratio)[:, None], proposed, w)
     assert np.mean(w == begun) < 0.1
     for moment in (lambda v: v, lambda v: v**2, lambda v: np.prod(v, axis=1), lambda v: np.abs(v) > 2):
         first, last = moment(np.clip(begun, -6, 6)), moment(np.clip(w, -6, 6))
@@ -160,9 +160,9 @@ def test_fitting_tilts_the_tables_of_followers():
     expected = Tables.normalised(proposal.followers.log_density[0] + turned).log_density
     inside = np.abs(NODES - mean) < 4 * sd
     # The few draws out there are seen at four sds, which turns the regression by a few per cent.
-    found = fitted.followers.log_density[0][:, inside]
-    np.testing.assert_allclose(found, expected[:, inside], atol=0.1)
-    assert np.abs(found - proposal.followers.log_density[0][:, inside]).max() > 0.5
+    tilted = fitted.followers.log_density[0][:, inside]
+    np.testing.assert_allclose(tilted, expected[:, inside], atol=0.1)
+    assert np.abs(tilted - proposal.followers.log_density[0][:, inside]).max() > 0.5
     masses = Tables(fitted.followers.log_density[0]).masses.sum(axis=1)
     np.testing.assert_allclose(masses, 1.0, rtol=1e-9)
 
@@ -172,18 +172,18 @@ def test_between_cuts_a_density_goes_on_as_it_does_at_them():
     parabola, width = -0.5 * ((NODES - 0.3) / 0.9) ** 2, 0.8
     gumbel = -NODES / width - np.exp(-NODES / width)
     cuts = np.isin(NODES, CUT_NODES)
-    found = between_cuts(np.array([parabola, gumbel])[:, cuts])
+    values = between_cuts(np.array([parabola, gumbel])[:, cuts])
     # Rounding of the largest value, some operations long; cuts up to 3 stand 1 apart, and a slope asks two beside.
     rounding = 64 * np.spacing(np.abs(parabola).max())
     near = np.abs(NODES) <= 1
-    np.testing.assert_allclose(found[0, near], parabola[near], atol=rounding)
-    np.testing.assert_allclose(found[0, np.abs(NODES) <= 3], parabola[np.abs(NODES) <= 3], atol=0.02)
-    np.testing.assert_allclose(found[0], parabola, atol=0.2)
-    np.testing.assert_allclose(found[1, cuts], gumbel[cuts], rtol=1e-12)
+    np.testing.assert_allclose(values[0, near], parabola[near], atol=rounding)
+    np.testing.assert_allclose(values[0, np.abs(NODES) <= 3], parabola[np.abs(NODES) <= 3], atol=0.02)
+    np.testing.assert_allclose(values[0], parabola, atol=0.2)
+    np.testing.assert_allclose(values[1, cuts], gumbel[cuts], rtol=1e-12)
     line = np.interp(NODES, CUT_NODES, gumbel[cuts])
     near = ~cuts & (gumbel > gumbel.max() - 8)
     # A thousandth is nothing in a logarithm, and where Gumbel's is nearly a line neither errs by more.
-    assert np.all(np.abs(found[1] - gumbel)[near] <= np.maximum(0.7 * np.abs(line - gumbel)[near], 1e-3))
+    assert np.all(np.abs(values[1] - gumbel)[near] <= np.maximum(0.7 * np.abs(line - gumbel)[near], 1e-3))
     some = between_cuts(np.where(CUT_NODES < 3, parabola[cuts], np.nan))
     np.testing.assert_array_equal(np.isfinite(some), NODES < 2.5)
     assert not np.isfinite(between_cuts(np.full((2, len(CUT_NODES)), -np.inf))).any()
@@ -195,18 +195,18 @@ def test_a_hole_between_cuts_swings_nothing_above_its_neighbours():
     inner, outer = np.flatnonzero(np.isin(CUT_NODES, (2.0, 8.0)))
     for hole in (inner, outer):
         cuts[hole] = -2e5
-    found = between_cuts(cuts)
-    assert found.max() == pytest.approx(0.0, abs=1e-9)
+    values = between_cuts(cuts)
+    assert values.max() == pytest.approx(0.0, abs=1e-9)
     # The inner one, at 2, is filled to the lower of its neighbours, at 3.
     at = np.argmin(np.abs(NODES - CUT_NODES[inner]))
-    assert found[at] == pytest.approx(-0.5 * CUT_NODES[inner + 1] ** 2)
+    assert values[at] == pytest.approx(-0.5 * CUT_NODES[inner + 1] ** 2)
 
 
 def test_a_cliff_far_from_the_mode_leaves_the_density_beside_it_as_it_is():
     """Where the map's steps diverge a target falls by 1e15: Akima's weights must not take all other slopes as equal."""
     cuts = -0.5 * CUT_NODES**2
     cuts[CUT_NODES >= 5] = [-7e2, -3e4, -5e15]
-    found = between_cuts(cuts[None])[0]
+    values = between_cuts(cuts[None])[0]
     # Akima weighs the slope before a node by how far the two after it differ: those of the cliff by 700 against 1.
-    np.testing.assert_allclose(found[NODES < 3], -0.5 * NODES[NODES < 3] ** 2, atol=0.2)
-    assert np.all(found[NODES >= 3] <= cuts[CUT_NODES == 3])
+    np.testing.assert_allclose(values[NODES < 3], -0.5 * NODES[NODES < 3] ** 2, atol=0.2)
+    assert np.all(values[NODES >= 3] <= cuts[CUT_NODES == 3])

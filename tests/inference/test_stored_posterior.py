@@ -56,32 +56,32 @@ def axis(tmp_path_factory):
 def test_a_scanners_draws_and_what_is_carried(tmp_path, place):
     """A draw that stands there three times has three times the weight; moments are those of all rows."""
     draws = scanner(tmp_path)
-    found = load_posterior(tmp_path / place)
-    assert set(found.by_name) == {*draws.names, *draws.derived_names}
-    assert len(found.weights) == 50 and found.weights[0] == pytest.approx(3 / 52) and found.answer == "accepted"
-    assert found.weights.sum() == pytest.approx(1.0)
-    product = found.propagate(lambda p: p["backlash_deg.pan"] * p["effective_mirror_offset_mm"])
+    loaded = load_posterior(tmp_path / place)
+    assert set(loaded.by_name) == {*draws.names, *draws.derived_names}
+    assert len(loaded.weights) == 50 and loaded.weights[0] == pytest.approx(3 / 52) and loaded.answer == "accepted"
+    assert loaded.weights.sum() == pytest.approx(1.0)
+    product = loaded.propagate(lambda p: p["backlash_deg.pan"] * p["effective_mirror_offset_mm"])
     rows = draws.physical[:, 0] * draws.derived[:, 0]
     assert product.mean == pytest.approx(rows.mean(), rel=ROUNDING)
     assert product.sd == pytest.approx(rows.std(), rel=ROUNDING)
     assert product.draws.shape == product.weights.shape == (1, 50)
     assert np.all(product.interval95[0] < product.mean) and product.mcse_mean > 0
     with pytest.raises(ValueError, match="50 draws it was given"):
-        found.propagate(lambda p: p["pixel_scale"].mean())
+        loaded.propagate(lambda p: p["pixel_scale"].mean())
     with pytest.raises(TypeError):
-        found.by_name["pixel_scale"] = None
+        loaded.by_name["pixel_scale"] = None
 
 
 def test_an_axis_draws_are_those_of_its_fit(axis):
     folder, fit = axis
-    found = load_posterior(folder)
-    assert set(found.by_name) == set(fit.draws) and {"per_command.forward", "backlash"} <= set(fit.draws)
-    lost = found.propagate(lambda p: np.minimum(100 * p["per_command.forward"], p["backlash"]))
+    loaded = load_posterior(folder)
+    assert set(loaded.by_name) == set(fit.draws) and {"per_command.forward", "backlash"} <= set(fit.draws)
+    lost = loaded.propagate(lambda p: np.minimum(100 * p["per_command.forward"], p["backlash"]))
     expected = np.minimum(100 * fit.draws["per_command.forward"], fit.draws["backlash"])
     assert lost.mean == pytest.approx(expected.mean(), rel=ROUNDING)
     assert lost.sd == pytest.approx(expected.std(), rel=ROUNDING)
-    assert found.to_dataframe().shape == (len(found.weights), len(fit.draws) + 1)
-    assert str(found).startswith(f"Posterior of {len(found.weights)} stored draws, accepted")
+    assert loaded.to_dataframe().shape == (len(loaded.weights), len(fit.draws) + 1)
+    assert str(loaded).startswith(f"Posterior of {len(loaded.weights)} stored draws, accepted")
 
 
 @pytest.mark.parametrize("answer", ["rough", "laplace"])

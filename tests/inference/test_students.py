@@ -61,12 +61,12 @@ def test_the_density_is_normalised_and_has_the_moments_of_its_draws():
 
 def test_a_bent_target_is_followed_from_a_guess_that_is_far_too_narrow():
     run = weighted_run(Toy(bent, 0.1), 2)
-    found = run.sample.convergence
-    assert found.answer == "accepted", found.missing
+    judged = run.sample.convergence
+    assert judged.answer == "accepted", judged.missing
     second = reweighted(run.sample.quantities["second"][None], run.sample.weights)
     # E x^2 / 2 = 0.5; its variance is 0.5 + 0.25.
     assert abs(second.mean - 0.5) < SIGMAS * second.mcse_mean and abs(second.sd**2 - 0.75) < SIGMAS * 2 * second.mcse_sd
-    evidence = found.importance
+    evidence = judged.importance
     # Integral of the density: 2 pi times 0.5.
     assert evidence.log_evidence == pytest.approx(np.log(np.pi), abs=SIGMAS * evidence.log_evidence_mcse)
 
@@ -94,6 +94,6 @@ def test_a_density_without_values_is_refused_in_words():
 def test_all_weight_in_one_far_corner_is_no_answer():
     far = np.array([40.0, -35.0])
     run = weighted_run(Toy(lambda w: -0.5 * np.sum(((w - far) / 1e-4) ** 2, axis=1), 1e-3), 1, rounds_max=8)
-    found = run.sample.convergence
-    assert found.answer == "laplace" and found.missing and run.sample.weights.sum() == pytest.approx(1)
+    judged = run.sample.convergence
+    assert judged.answer == "laplace" and judged.missing and run.sample.weights.sum() == pytest.approx(1)
     assert np.isfinite(run.proposal.log_density(run.sample.points.w)).all()

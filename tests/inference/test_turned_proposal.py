@@ -77,12 +77,12 @@ def test_only_products_that_tell_something_are_taken():
     generator = np.random.default_rng(12)
     x, dimension = generator.normal(size=(4000, 30)), 30
     log_ratio = 0.3 * x[:, 0] * x[:, 1] + 2.0 * x[:, 4] + 0.1 * x[:, 5] ** 2 + generator.normal(size=4000)
-    found = regression(x, log_ratio)
+    slopes = regression(x, log_ratio)
     # The standard error of every coefficient is 1 / sqrt(4000).
     scatter = 1 / np.sqrt(4000)
-    assert abs(found.cross[0, 1] - 0.3) < SIGMAS * scatter and found.cross[0, 1] == found.cross[1, 0]
-    assert abs(found.slope[4] - 2.0) < SIGMAS * scatter and abs(found.square[5] - 0.1) < SIGMAS * scatter
+    assert abs(slopes.cross[0, 1] - 0.3) < SIGMAS * scatter and slopes.cross[0, 1] == slopes.cross[1, 0]
+    assert abs(slopes.slope[4] - 2.0) < SIGMAS * scatter and abs(slopes.square[5] - 0.1) < SIGMAS * scatter
     # Of the other 434 products 0.6 are expected beyond the limit by chance at each of at most four searches.
-    taken = np.count_nonzero(np.triu(found.cross)) - 1
+    taken = np.count_nonzero(np.triu(slopes.cross)) - 1
     chance = 2 * stats.norm.sf(PAIR_T) * dimension * (dimension - 1) / 2
     assert taken <= stats.poisson.ppf(1 - 1e-6, 4 * chance)

@@ -73,8 +73,8 @@ def test_the_structural_check_sees_damage():
 
 
 def test_ratios_stand_with_expanded_uncertainty_and_backlash_with_its_own():
-    made = certified()
-    root, summary = made.root(), made.fit.summary
+    case = certified()
+    root, summary = case.root(), case.fit.summary
     quantities = root.findall(".//dcc:result/dcc:data/dcc:quantity", {"dcc": "https://ptb.de/dcc"})
     named = {texts(q, "dcc:name/dcc:content")[0]: q for q in quantities}
     assert len(named) == 6
@@ -101,8 +101,8 @@ def test_ratios_stand_with_expanded_uncertainty_and_backlash_with_its_own():
 
 
 def test_a_skewed_quantity_gets_an_interval_and_an_unmoved_one_no_number():
-    made = certified().with_play(0.02, 0.02, (0.001, 0.08))
-    root = made.with_summary(effective={**made.fit.summary.effective, "up": None, "down": None}).root()
+    case = certified().with_play(0.02, 0.02, (0.001, 0.08))
+    root = case.with_summary(effective={**case.fit.summary.effective, "up": None, "down": None}).root()
     assert structure_problems(root) == []
     (box,) = root.findall(".//si:coverageIntervalMU", {"si": "https://ptb.de/si"})
     assert [child.text for child in box] == ["0.020", "0.001", "0.080", "0.95", "normal"]
@@ -179,20 +179,20 @@ def test_dates_run_on_with_the_campaign_or_say_that_they_are_not_known():
 @pytest.mark.parametrize(("first_s", "last_s", "end"), [(1.768e9, 1.768e9 + 86400, 16), (-5.0, 1e12, 15)])
 def test_dates_follow_the_time_that_moves_took(first_s, last_s, end):
     """Times may be those of a clock (seconds since 1970); a span beyond the calendar is no date."""
-    made = certified(created=datetime.datetime(2026, 1, 15, 10, tzinfo=datetime.UTC))
-    moves = made.campaign.moves
+    case = certified(created=datetime.datetime(2026, 1, 15, 10, tzinfo=datetime.UTC))
+    moves = case.campaign.moves
     moves = (*(replace(m, time_s=first_s) for m in moves[:-1]), replace(moves[-1], time_s=last_s))
-    campaign = replace(made.campaign, moves=moves)
-    root = replace(made, campaign=campaign).with_provenance(inputs=input_hashes(campaign)).root()
+    campaign = replace(case.campaign, moves=moves)
+    root = replace(case, campaign=campaign).with_provenance(inputs=input_hashes(campaign)).root()
     assert texts(root, ".//dcc:beginPerformanceDate") == ["2026-01-15"]
     assert texts(root, ".//dcc:endPerformanceDate") == [f"2026-01-{end}"]
 
 
 def test_the_same_inputs_and_date_give_the_same_bytes():
-    made = certified()
-    assert made.certificate() == copy.deepcopy(made).certificate()
+    case = certified()
+    assert case.certificate() == copy.deepcopy(case).certificate()
     names = set()
-    for day, fit in ((1, made), (2, made), (1, made.with_summary(estimator="posterior"))):
+    for day, fit in ((1, case), (2, case), (1, case.with_summary(estimator="posterior"))):
         root = fit.root(issued=datetime.date(2026, 11, day))
         names |= set(texts(root, ".//dcc:uniqueIdentifier"))
     assert len(names) == 3
@@ -237,35 +237,35 @@ def test_text_stays_text(payload):
 
 
 def test_what_must_not_be_certified_is_refused():
-    made = certified()
+    case = certified()
     with pytest.raises(NotConverged):
-        made.with_summary(converged=False).certificate()
+        case.with_summary(converged=False).certificate()
     with pytest.raises(InputError, match="other data"):
-        made.with_provenance(inputs={**made.fit.provenance.inputs, "rig": "0" * 64}).certificate()
+        case.with_provenance(inputs={**case.fit.provenance.inputs, "rig": "0" * 64}).certificate()
     for country in ("de", "DEU", "", "D\n"):
         with pytest.raises(InputError, match="country"):
-            made.certificate(parties=Parties(country=country))
+            case.certificate(parties=Parties(country=country))
         with pytest.raises(InputError, match="country"):
-            made.certificate(parties=Parties(customer_country=country))
-    assert "two letters" in refusal(lambda: made.certificate(parties=Parties(country="Mexico"))).remedy
-    effective = made.fit.summary.effective
+            case.certificate(parties=Parties(customer_country=country))
+    assert "two letters" in refusal(lambda: case.certificate(parties=Parties(country="Mexico"))).remedy
+    effective = case.fit.summary.effective
     bad = structs.replace(effective["left"], value=math.inf)
     with pytest.raises(ValueError, match="finite"):
-        made.with_summary(effective={**effective, "left": bad}).certificate()
+        case.with_summary(effective={**effective, "left": bad}).certificate()
 
 
 def test_each_country_stands_with_its_own_party():
     """The place of the measurement is not where the customer lives."""
-    made, path = certified(), {"dcc": "https://ptb.de/dcc"}
+    case, path = certified(), {"dcc": "https://ptb.de/dcc"}
     for parties, codes, undeclared in (
         (Parties(country="MX"), ("MX", COUNTRY_NOT_STATED), {"country of the customer"}),
         (Parties(country="MX", customer_country="DE"), ("MX", "DE"), set()),
         (Parties(), (COUNTRY_NOT_STATED, COUNTRY_NOT_STATED), {"country", "country of the customer"}),
     ):
-        root = made.root(parties=parties)
+        root = case.root(parties=parties)
         place = "dcc:location/dcc:countryCode"
-        found = [root.findtext(f".//{where}/{place}", None, path) for where in ("dcc:contact", "dcc:customer")]
-        assert tuple(found) == codes and texts(root, ".//dcc:countryCodeISO3166_1") == [codes[0]]
+        places = [root.findtext(f".//{where}/{place}", None, path) for where in ("dcc:contact", "dcc:customer")]
+        assert tuple(places) == codes and texts(root, ".//dcc:countryCodeISO3166_1") == [codes[0]]
         statements = declared(root)
         assert {name for name in statements if name.startswith("country")} == undeclared
         assert all(COUNTRY_NOT_STATED in statements[name][0] for name in undeclared)
@@ -273,14 +273,14 @@ def test_each_country_stands_with_its_own_party():
 
 def test_the_number_of_the_report_is_in_the_certificate_that_carries_it():
     """And another report, customer or country makes another identifier."""
-    made, names = certified(), set()
+    case, names = certified(), set()
     for number, parties in (
         ("A1", Parties()),
         ("B2", Parties()),
         ("A1", Parties("Lab")),
         ("A1", Parties(country="MX")),
     ):
-        root = made.root(report=Embedded(number, b"<html></html>"), parties=parties)
+        root = case.root(report=Embedded(number, b"<html></html>"), parties=parties)
         assert texts(root, ".//dcc:coreData/dcc:identifications/dcc:identification/dcc:value") == [number]
         assert texts(root, ".//dcc:document/dcc:name/dcc:content") == [f"report {number}"]
         names |= set(texts(root, ".//dcc:uniqueIdentifier"))
@@ -288,14 +288,14 @@ def test_the_number_of_the_report_is_in_the_certificate_that_carries_it():
 
 
 def test_development_versions_are_cut_to_a_release():
-    made = certified()
+    case = certified()
     for version, release in (
         ("0.1.0.dev3+g1a2b", "v0.1.0"),
         ("2026.1.0", "v0"),
         ("12", "v12"),
         ("1.2.3.4.5", "v1.2.3.4"),
     ):
-        root = made.with_provenance(versions={**made.fit.provenance.versions, "tvsbayes": version}).root()
+        root = case.with_provenance(versions={**case.fit.provenance.versions, "tvsbayes": version}).root()
         assert structure_problems(root) == [], version
         assert set(texts(root, ".//dcc:release")) == {release}
 
@@ -326,11 +326,11 @@ def test_a_schema_that_the_user_names_is_used(tmp_path, monkeypatch):
     for hidden in (False, True):
         if hidden:
             monkeypatch.setattr(shutil, "which", lambda name: None)
-        found = check_dcc(data, right)
-        if found.tool is None:
-            assert found.valid is None and "install xmllint" in found.messages[0]
+        check = check_dcc(data, right)
+        if check.tool is None:
+            assert check.valid is None and "install xmllint" in check.messages[0]
             continue
-        assert found.valid is True
+        assert check.valid is True
         assert check_dcc(data, wrong).valid is False and check_dcc(data, wrong).messages
         assert check_dcc(data, broken).valid is None
     monkeypatch.setattr(shutil, "which", lambda name: "xmllint")
@@ -352,12 +352,12 @@ def test_a_schema_that_the_user_names_is_used(tmp_path, monkeypatch):
 
     for kind, valid in (("timeout", None), ("valid", True), ("invalid", False), ("schema", None)):
         monkeypatch.setattr(subprocess, "run", answer(kind))
-        found = check_dcc(data, right)
-        assert (found.tool, found.valid) == ("xmllint", valid) and found.messages
+        check = check_dcc(data, right)
+        assert (check.tool, check.valid) == ("xmllint", valid) and check.messages
 
 
 @pytest.mark.skipif("TVSBAYES_DCC_SCHEMA" not in os.environ, reason="TVSBAYES_DCC_SCHEMA names no dcc.xsd")
 def test_ptbs_schema_where_it_is_at_hand():
     data = certified().with_positioning().certificate(report=b"<html/>")
-    found = check_dcc(data, Path(os.environ["TVSBAYES_DCC_SCHEMA"]))
-    assert found.valid is True, found
+    check = check_dcc(data, Path(os.environ["TVSBAYES_DCC_SCHEMA"]))
+    assert check.valid is True, check

@@ -53,15 +53,15 @@ def vector_runs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_figures_of_the_published_readings():
-    found = figures_of(*vector_runs())
+    table = figures_of(*vector_runs())
     assert set(PUBLISHED) == set(FIGURES)
     for name, value in PUBLISHED.items():
-        assert float(getattr(found, name)) == pytest.approx(value, rel=PRINTED), name
-    np.testing.assert_allclose(found.reversal_at_deg, VECTOR[:, 4], atol=ROUNDING * 100)
-    np.testing.assert_allclose(found.sd_up_deg, VECTOR[:, 2], rtol=PRINTED)
+        assert float(getattr(table, name)) == pytest.approx(value, rel=PRINTED), name
+    np.testing.assert_allclose(table.reversal_at_deg, VECTOR[:, 4], atol=ROUNDING * 100)
+    np.testing.assert_allclose(table.sd_up_deg, VECTOR[:, 2], rtol=PRINTED)
     at_each = np.maximum(
-        2 * found.sd_up_deg + 2 * found.sd_down_deg + np.abs(found.reversal_at_deg),
-        4 * np.maximum(found.sd_up_deg, found.sd_down_deg),
+        2 * table.sd_up_deg + 2 * table.sd_down_deg + np.abs(table.reversal_at_deg),
+        4 * np.maximum(table.sd_up_deg, table.sd_down_deg),
     )
     np.testing.assert_allclose(at_each, VECTOR[:, 5], rtol=PRINTED)
 
@@ -79,18 +79,18 @@ def test_figures_of_many_tests_are_those_of_each():
 def test_laws_of_the_figures():
     rng = np.random.default_rng(2)
     up, down = rng.normal(size=(6, 5)), rng.normal(0.5, 2.0, size=(6, 5))
-    found = figures_of(up, down)
+    table = figures_of(up, down)
     # A common offset changes nothing; exchanging the sides exchanges their figures and turns B_i round.
     shifted, turned = figures_of(up + 7.0, down + 7.0), figures_of(down, up)
     for name in FIGURES:
         partner = name.replace("_up_", "_X_").replace("_down_", "_up_").replace("_X_", "_down_")
         sign = -1 if name == "mean_reversal_deg" else 1
-        assert float(getattr(shifted, name)) == pytest.approx(float(getattr(found, name)), rel=1e-12), name
-        assert float(getattr(turned, partner)) == pytest.approx(sign * float(getattr(found, name)), rel=1e-12), name
+        assert float(getattr(shifted, name)) == pytest.approx(float(getattr(table, name)), rel=1e-12), name
+        assert float(getattr(turned, partner)) == pytest.approx(sign * float(getattr(table, name)), rel=1e-12), name
     # What the standard's definitions imply.
-    assert found.systematic_deg >= max(found.systematic_up_deg, found.systematic_down_deg, found.mean_systematic_deg)
-    assert found.accuracy_deg >= max(found.accuracy_up_deg, found.accuracy_down_deg, found.systematic_deg)
-    assert found.repeatability_deg >= max(found.repeatability_up_deg, found.repeatability_down_deg, found.reversal_deg)
+    assert table.systematic_deg >= max(table.systematic_up_deg, table.systematic_down_deg, table.mean_systematic_deg)
+    assert table.accuracy_deg >= max(table.accuracy_up_deg, table.accuracy_down_deg, table.systematic_deg)
+    assert table.repeatability_deg >= max(table.repeatability_up_deg, table.repeatability_down_deg, table.reversal_deg)
 
 
 def test_runs_that_were_not_made_are_left_out():

@@ -38,23 +38,23 @@ def test_coordinate_budgets_by_parameter():
     parts = rng.dirichlet(np.ones(5), 3).T * np.diag(covariance)
     causes = ("pixel noise", "prior of extrinsics", STOP_HERE, PLAY_HERE, APERTURE_HERE)
     share = parts.sum(axis=1) / parts.sum()
-    found = Budget(causes, share, parts, names, contribution, correlation, covariance, (0.0, 0.0))
+    whole = Budget(causes, share, parts, names, contribution, correlation, covariance, (0.0, 0.0))
     for index, component in enumerate("xyz"):
-        table = coordinate_budget(found, one, (1.0, 2.0, 3.0), component)
+        table = coordinate_budget(whole, one, (1.0, 2.0, 3.0), component)
         assert (table.estimate, table.unit) == (float(index + 1), "mm")
         assert table.u == pytest.approx(math.sqrt(covariance[index, index]))
         assert sum(row.share for row in table.rows) == pytest.approx(1.0, abs=1e-9)
         # Two of the parameters are not independent.
         pair = 2 * 0.7 * contribution[0, index] * contribution[2, index] / covariance[index, index]
         assert table.rows[-1].share == pytest.approx(pair, abs=1e-9)
-    rows = {row.quantity: row for row in coordinate_budget(found, one, (1.0, 2.0, 3.0), "x").rows}
+    rows = {row.quantity: row for row in coordinate_budget(whole, one, (1.0, 2.0, 3.0), "x").rows}
     for name, row in rows.items():
         if name in names:
             k = names.index(name)
             assert row.u == pytest.approx(u[k]) and row.sensitivity == pytest.approx(slope[k, 0])
             assert row.kind == ("A, B" if name in INPUT_NAMES else "A" if name.startswith("stop") else "B")
     with pytest.raises(ValueError, match="allowed"):
-        coordinate_budget(found, one, (1.0, 2.0, 3.0), "w")
+        coordinate_budget(whole, one, (1.0, 2.0, 3.0), "w")
 
 
 ALGEBRA = 1e-9
@@ -76,26 +76,26 @@ POINT = (130.0, 90.0, 60.0, ("right", "unknown"))
 
 
 def test_budget_adds_up_to_the_covariance(caused):
-    found = budget(caused, *POINT)
+    whole = budget(caused, *POINT)
     law = locate_linear(caused, settings_of(*POINT))
-    np.testing.assert_allclose(found.covariance_mm2, law.covariance[0], rtol=ALGEBRA)
-    np.testing.assert_allclose(found.variance_mm2.sum(axis=0), np.diag(law.covariance[0]), rtol=ALGEBRA)
-    assert found.causes == ("pixel noise", "stereo calibration", STOP_HERE, PLAY_HERE, APERTURE_HERE)
-    assert found.share.sum() == pytest.approx(1.0, abs=1e-12) and np.all(found.share > 0)
-    np.testing.assert_allclose(found.share, found.variance_mm2.sum(axis=1) / np.trace(law.covariance[0]), rtol=ALGEBRA)
+    np.testing.assert_allclose(whole.covariance_mm2, law.covariance[0], rtol=ALGEBRA)
+    np.testing.assert_allclose(whole.variance_mm2.sum(axis=0), np.diag(law.covariance[0]), rtol=ALGEBRA)
+    assert whole.causes == ("pixel noise", "stereo calibration", STOP_HERE, PLAY_HERE, APERTURE_HERE)
+    assert whole.share.sum() == pytest.approx(1.0, abs=1e-12) and np.all(whole.share > 0)
+    np.testing.assert_allclose(whole.share, whole.variance_mm2.sum(axis=1) / np.trace(law.covariance[0]), rtol=ALGEBRA)
     # By parameter: contributions and correlations give the covariance back, GUM eq. 16.
-    rebuilt = found.contribution_mm.T @ found.correlation @ found.contribution_mm
+    rebuilt = whole.contribution_mm.T @ whole.correlation @ whole.contribution_mm
     np.testing.assert_allclose(rebuilt, law.covariance[0], rtol=ALGEBRA)
-    assert found.parameters[: len(INPUT_NAMES)] == INPUT_NAMES
-    assert found.contribution_mm.shape == (len(found.parameters), 3)
-    document = found.as_json()
-    assert [c["cause"] for c in document["causes"]] == list(found.causes)
-    np.testing.assert_allclose([c["u_mm"] for c in document["causes"]], np.sqrt(found.variance_mm2), rtol=1e-12)
+    assert whole.parameters[: len(INPUT_NAMES)] == INPUT_NAMES
+    assert whole.contribution_mm.shape == (len(whole.parameters), 3)
+    document = whole.as_json()
+    assert [c["cause"] for c in document["causes"]] == list(whole.causes)
+    np.testing.assert_allclose([c["u_mm"] for c in document["causes"]], np.sqrt(whole.variance_mm2), rtol=1e-12)
 
 
 def test_each_cause_of_a_budget_is_its_own_propagation(caused):
     """Without the others, through the law: parts of the calibration and of this look."""
-    found = budget(caused, *POINT)
+    whole = budget(caused, *POINT)
     settled = dict.fromkeys(NOISE_NAMES, 1e-9)
 
     def alone(covariance: np.ndarray, noise_deg: dict[str, float], play: bool = False) -> np.ndarray:
@@ -108,10 +108,10 @@ def test_each_cause_of_a_budget_is_its_own_propagation(caused):
     nothing = np.zeros_like(caused.covariance)
     rms = {name: variance**0.5 for name, variance in caused.noise_variance.items()}
     stops = {name: sd for name, sd in rms.items() if name.startswith("stop")}
-    np.testing.assert_allclose(found.variance_mm2[2], alone(nothing, settled | stops), rtol=1e-6)
-    np.testing.assert_allclose(found.variance_mm2[3], alone(nothing, settled, play=True), rtol=1e-6)
+    np.testing.assert_allclose(whole.variance_mm2[2], alone(nothing, settled | stops), rtol=1e-6)
+    np.testing.assert_allclose(whole.variance_mm2[3], alone(nothing, settled, play=True), rtol=1e-6)
     readings = settled | {"aperture_sd_deg": rms["aperture_sd_deg"]}
-    np.testing.assert_allclose(found.variance_mm2[4], alone(nothing, readings), rtol=1e-6)
+    np.testing.assert_allclose(whole.variance_mm2[4], alone(nothing, readings), rtol=1e-6)
 
 
 def test_budgets_of_gears_that_vary_have_their_rows():
@@ -124,15 +124,15 @@ def test_budgets_of_gears_that_vary_have_their_rows():
     one = replace(one, causes=("pixel noise", "transmission error"), cause_covariance=parts)
     known = []
     for pan, reading in ((130.0, 60.0), (-780.0, 100.0)):
-        found = budget(one, pan, 90.0, reading, ("left", "up"))
+        whole = budget(one, pan, 90.0, reading, ("left", "up"))
         law = one.locate(pan, 90.0, reading, ("left", "up")).covariance_mm2
-        np.testing.assert_allclose(found.variance_mm2.sum(axis=0), np.diag(law), rtol=1e-6)
-        assert found.causes[:2] == ("pixel noise", "transmission error")
-        assert found.parameters[count : count + 4] == GEAR_INPUTS
-        rebuilt = found.contribution_mm.T @ found.correlation @ found.contribution_mm
+        np.testing.assert_allclose(whole.variance_mm2.sum(axis=0), np.diag(law), rtol=1e-6)
+        assert whole.causes[:2] == ("pixel noise", "transmission error")
+        assert whole.parameters[count : count + 4] == GEAR_INPUTS
+        rebuilt = whole.contribution_mm.T @ whole.correlation @ whole.contribution_mm
         np.testing.assert_allclose(rebuilt, law, rtol=1e-6)
         point = one.locate(pan, 90.0, reading).xyz_mm.tolist()
-        rows = {row.quantity: row for row in coordinate_budget(found, one, point, "y").rows}
+        rows = {row.quantity: row for row in coordinate_budget(whole, one, point, "y").rows}
         row = rows["transmission_error_at_deg.pan"]
         assert row.unit == "deg" and row.estimate == one.estimates_at((pan, 90.0))["transmission_error_at_deg.pan"]
         known.append(row.u)

@@ -33,10 +33,10 @@ def test_an_ideal_axis_has_no_error_and_play_is_its_reversal():
 
 
 def test_a_wrong_ratio_is_a_systematic_deviation_over_the_targets():
-    found = positioning(known_calibration(), "tilt", tests=10, deg_per_step=0.069, targets=(-50, 0, 50)).predicted
+    predicted = positioning(known_calibration(), "tilt", tests=10, deg_per_step=0.069, targets=(-50, 0, 50)).predicted
     for name in ("systematic_deg", "mean_systematic_deg", "accuracy_deg", "systematic_up_deg"):
-        assert found[name].median == pytest.approx(0.001 * 100, abs=1e-9), name
-    assert found["reversal_deg"].median == pytest.approx(0.0, abs=1e-9)
+        assert predicted[name].median == pytest.approx(0.001 * 100, abs=1e-9), name
+    assert predicted["reversal_deg"].median == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_predicted_interval_holds_a_test_on_the_true_rig():
@@ -75,16 +75,16 @@ def test_bent_optics_bend_the_beam_not_the_counters():
 def test_whole_turns_are_kept():
     turned = known_calibration()
     turned = replace(turned, range_steps=np.array([[-6000.0, 6000.0], [-10.0, 10.0]]))
-    found = positioning(turned, "pan", tests=3)
-    assert len(found.target_steps) == 8
-    assert found.predicted["accuracy_deg"].median == pytest.approx(0.0, abs=1e-8)
+    table = positioning(turned, "pan", tests=3)
+    assert len(table.target_steps) == 8
+    assert table.predicted["accuracy_deg"].median == pytest.approx(0.0, abs=1e-8)
 
 
 def test_an_axis_that_never_moved_has_no_prediction():
     still = replace(known_calibration(), range_steps=np.array([[-100.0, 300.0], [0.0, 0.0]]))
-    found = positioning(still, "tilt")
-    assert found.predicted is None and found.target_steps == ()
-    assert any("never moved" in note for note in found.notes)
+    table = positioning(still, "tilt")
+    assert table.predicted is None and table.target_steps == ()
+    assert any("never moved" in note for note in table.notes)
     with pytest.raises(ValueError, match="no draws"):
         positioning(replace(still, inputs=np.zeros((0, len(INPUT_NAMES)))), "pan")
 

@@ -59,8 +59,8 @@ def test_a_run_on_a_bent_rig_is_the_twins(period_deg):
             )
         psi, beta = np.radians(angles["pan"]), np.radians(angles["tilt"] + rig["tilt_zero_deg"])
         beam = mirror_chain(psi, beta, rig)[1]
-        seen = np.degrees(np.arctan2(beam[:, 1], beam[:, 0]) if name == "pan" else np.arcsin(beam[:, 2]))
-        deviation = seen - 0.06 * np.array(path)
+        angle = np.degrees(np.arctan2(beam[:, 1], beam[:, 0]) if name == "pan" else np.arcsin(beam[:, 2]))
+        deviation = angle - 0.06 * np.array(path)
         runs = deviation[1:].reshape(2, 12)
         # 1e-9 deg: rounding of angles up to 20 deg through two reflections.
         np.testing.assert_allclose(up[0].T, runs[:, :5], atol=1e-9)

@@ -57,9 +57,9 @@ def test_a_folder_into_which_others_write_is_not_used(folder, capsys):
     folder.chmod(0o777)
     before = jax.config.jax_compilation_cache_dir
     assert use_compilation_cache() and Traces.used is None and jax.config.jax_compilation_cache_dir == before
-    said = []
-    compile_for(said.append)
-    assert len(said) == 1 and "others may write into it" in said[0] and str(folder) in said[0]
+    lines = []
+    compile_for(lines.append)
+    assert len(lines) == 1 and "others may write into it" in lines[0] and str(folder) in lines[0]
     state = cache_state()
     assert not state.used and "not used" in state.found and "chmod go-w" in state.remedy
     assert not list(folder.iterdir())
@@ -82,7 +82,7 @@ def test_what_one_process_leaves_the_next_one_takes(folder, monkeypatch, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("told", "found"),
+    ("outcome", "words"),
     [
         (answer(hits=0), "rejected"),
         (
@@ -95,16 +95,16 @@ def test_what_one_process_leaves_the_next_one_takes(folder, monkeypatch, tmp_pat
         (FileNotFoundError("python"), "could not be tried"),
     ],
 )
-def test_what_does_not_work_is_said_in_words(folder, monkeypatch, told, found):
+def test_what_does_not_work_is_said_in_words(folder, monkeypatch, outcome, words):
     def run(command, **_):
         assert command[0] == sys.executable
-        if isinstance(told, Exception):
-            raise told
-        return told
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
 
     monkeypatch.setattr(subprocess, "run", run)
     state = cache_state()
-    assert not state.used and found in state.found and state.remedy
+    assert not state.used and words in state.found and state.remedy
 
 
 def test_the_doctor_says_it_without_hardware(folder, say, monkeypatch):

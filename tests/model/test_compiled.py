@@ -44,10 +44,10 @@ def pair(count: int = 3) -> Pair:
 @pytest.fixture
 def traces(tmp_path, monkeypatch) -> Traces:
     """A folder of traces for this test; the clock says that no source was written since."""
-    found = Traces(tmp_path / "traced")
-    monkeypatch.setattr(Traces, "used", found)
+    counted = Traces(tmp_path / "traced")
+    monkeypatch.setattr(Traces, "used", counted)
     monkeypatch.setattr(subject, "LOADED_TIME_S", 1e12)
-    return found
+    return counted
 
 
 def same(one: Sums, other: Sums) -> bool:
@@ -102,8 +102,8 @@ def test_its_own_results_as_arguments_are_compiled_for_once(traces):
     function = compiled(Sums)(sums)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        found = function(Pair(np.linspace(0.0, 1.0, 5), np.array(3.0)), 1.0)
-        function(Pair(found.double, found.total), 1.0)
+        result = function(Pair(np.linspace(0.0, 1.0, 5), np.array(3.0)), 1.0)
+        function(Pair(result.double, result.total), 1.0)
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert len(compilations) == 1

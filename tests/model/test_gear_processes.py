@@ -27,7 +27,7 @@ RELATIVE = 1e-9
 
 def scales() -> GearScales:
     """Two points at once: leading axis 2."""
-    given = {
+    values = {
         "error_rad": [[1e-3, 2e-3], [0.0, 1e-9]],
         "length_rad": [[0.1, 0.05], [1.0, 0.2]],
         "play_rad": [[5e-4, 1e-4], [0.0, 3e-3]],
@@ -35,21 +35,21 @@ def scales() -> GearScales:
         "amplitude_rad": [[[1e-3, 2e-4, 0.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 1e-4, 0.0]]],
         "period_rad": [[[0.5, 0.02, 6.28], [6.28, 6.28, 6.28]], [[0.5, 0.02, 6.28], [6.28, 0.3, 6.28]]],
     }
-    return GearScales(**{name: np.asarray(value) for name, value in given.items()})
+    return GearScales(**{name: np.asarray(value) for name, value in values.items()})
 
 
 def by_hand(point: int, i: int, j: int) -> tuple[float, float]:
     """Covariance of transmission errors and of plays at two places, rad^2."""
-    given = scales()
+    known = scales()
     if i == j and not VALID[i]:
         return 0.0, 0.0
     if ON_TILT[i] != ON_TILT[j] or not VALID[i] or not VALID[j]:
         return 0.0, 0.0
     axis, distance = int(ON_TILT[i]), ANGLE_RAD[i] - ANGLE_RAD[j]
-    x = np.sqrt(5) * abs(distance) / given.length_rad[point, axis]
+    x = np.sqrt(5) * abs(distance) / known.length_rad[point, axis]
     near = (1 + x + x**2 / 3) * np.exp(-x)
-    waves = np.cos(2 * np.pi * distance / given.period_rad[point, axis]) * given.amplitude_rad[point, axis] ** 2
-    return given.error_rad[point, axis] ** 2 * near + waves.sum(), given.play_rad[point, axis] ** 2 * near
+    waves = np.cos(2 * np.pi * distance / known.period_rad[point, axis]) * known.amplitude_rad[point, axis] ** 2
+    return known.error_rad[point, axis] ** 2 * near + waves.sum(), known.play_rad[point, axis] ** 2 * near
 
 
 def test_the_factor_is_that_of_the_covariance_of_both_processes():
@@ -108,8 +108,8 @@ def line():
     def slopes(errors_rad, share):
         places = Places(jnp.asarray(steps), jnp.asarray(on_tilt), jnp.ones(4, bool))
         angles = beam_angles(model.optics, *jnp.asarray(pose_rad))
-        seen = SeenLine(pose_rad, places, share)
-        return line_deg_per_step(model, seen, errors_rad, angles), effective_deg_per_step(model.transmission, angles)
+        looks = SeenLine(pose_rad, places, share)
+        return line_deg_per_step(model, looks, errors_rad, angles), effective_deg_per_step(model.transmission, angles)
 
     return SimpleNamespace(model=model, steps=steps, pose_rad=pose_rad, slopes=slopes)
 
@@ -125,7 +125,7 @@ def azimuth(model, pan_rad: float, tilt_rad: float) -> float:
 
 def test_with_two_counters_the_ratio_is_the_secant_of_the_azimuth(line):
     errors_rad = np.array([2e-3, 0.5, -1e-3, 0.4, *[0.3] * 4])
-    found, local = (np.asarray(x) for x in line.slopes(errors_rad, SECANT))
+    slopes, local = (np.asarray(x) for x in line.slopes(errors_rad, SECANT))
     ratio = float(line.model.transmission.ratio_rad_per_step[0])
     ends = [azimuth(line.model, ratio * n + e, line.pose_rad[1]) for n, e in ((-200, 2e-3), (300, -1e-3))]
     secant = (ends[1] - ends[0]) / 500
@@ -134,10 +134,10 @@ def test_with_two_counters_the_ratio_is_the_secant_of_the_azimuth(line):
     mirrors = (still[1] - still[0]) / 500 / ratio
     half = 0.5 * float(line.model.transmission.contrast_rad_per_step[0]) * mirrors
     assert half != 0
-    np.testing.assert_allclose(found[:2], [secant + half, secant - half], rtol=1e-12)
+    np.testing.assert_allclose(slopes[:2], [secant + half, secant - half], rtol=1e-12)
     # One counter of tilt: no line.
-    np.testing.assert_array_equal(found[2:], local[2:])
-    assert abs(found[0] / local[0] - 1) > 1e-3
+    np.testing.assert_array_equal(slopes[2:], local[2:])
+    assert abs(slopes[0] / local[0] - 1) > 1e-3
 
 
 def test_an_error_that_grows_with_the_counter_is_ratio_to_the_line_alone(line):
@@ -165,7 +165,7 @@ def test_turns_of_the_beam_are_unwrapped(line):
     """Beyond half a turn the azimuth begins anew; its line does not."""
     ratio = float(line.model.transmission.ratio_rad_per_step[0])
     beyond = np.array([0.0, 0.0, np.pi - ratio * 300 + 0.05, 0.0, *[0.0] * 4])
-    found = np.asarray(line.slopes(beyond, SECANT)[0])
+    slopes = np.asarray(line.slopes(beyond, SECANT)[0])
     turned = (np.pi + 0.05 + ratio * 200) / 500
     # Slopes of bent mirrors, within some per cent of 1.
-    assert found[:2].mean() == pytest.approx(np.degrees(turned), rel=0.05)
+    assert slopes[:2].mean() == pytest.approx(np.degrees(turned), rel=0.05)

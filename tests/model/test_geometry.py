@@ -156,8 +156,8 @@ def test_projection_is_opencvs(projected, focal_scale):
         matrix = CAMERA_MATRICES[camera].copy()
         matrix[[0, 1], [0, 1]] *= focal_scale
         expected, _ = cv2.projectPoints(in_cv, rotation, translation, matrix, DISTORTIONS[camera])
-        found = pixels[:, 2 * camera : 2 * camera + 2]
-        assert np.abs(found - expected[:, 0]).max() < PIXEL_ROUNDING, f"camera {camera}"
+        of_camera = pixels[:, 2 * camera : 2 * camera + 2]
+        assert np.abs(of_camera - expected[:, 0]).max() < PIXEL_ROUNDING, f"camera {camera}"
 
 
 def test_gradient_against_differences(projected):

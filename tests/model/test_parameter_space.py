@@ -278,8 +278,8 @@ def test_a_full_turn_is_the_wheels_period_and_less_the_pinions(stated, period_de
     # Those of amplitudes: as many as are stated, in their order.
     periods = space.model(jnp.zeros(len(NAMES))).gears.period_rad
     for axis, name in enumerate(("pan", "tilt")):
-        own = stated.get(name, ())
-        np.testing.assert_allclose(periods[axis, : len(own)], np.radians(own), rtol=1e-15)
+        degrees = stated.get(name, ())
+        np.testing.assert_allclose(periods[axis, : len(degrees)], np.radians(degrees), rtol=1e-15)
     assert harmonics.on_wheel.tolist() == on_wheel
 
 
@@ -288,15 +288,15 @@ def test_coordinates_are_the_inverse(physical):
     z = np.random.default_rng(3).uniform(-5.0, 5.0, (200, len(NAMES)))
     space = parameter_space(table(), small_stereo())
     values, _ = physical(z, space)
-    found = coordinates_of(space, values)
+    back = coordinates_of(space, values)
     fixed = np.concatenate([np.asarray(space.u) == 0, np.zeros(24, dtype=bool)])
-    assert np.all(found[:, fixed] == 0)
+    assert np.all(back[:, fixed] == 0)
     # A large half-normal is the tail of a probability near 0, a small one near 1: rounding 1e-16 / phi(5).
     rig = ~fixed[: len(RIG_NAMES)]
-    np.testing.assert_allclose(found[:, : len(RIG_NAMES)][:, rig], z[:, : len(RIG_NAMES)][:, rig], atol=1e-9)
-    again, _ = physical(found, space)
+    np.testing.assert_allclose(back[:, : len(RIG_NAMES)][:, rig], z[:, : len(RIG_NAMES)][:, rig], atol=1e-9)
+    again, _ = physical(back, space)
     np.testing.assert_allclose(again, values, rtol=1e-10, atol=1e-9)
-    np.testing.assert_allclose(coordinates_of(space, values[3]), found[3], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(coordinates_of(space, values[3]), back[3], rtol=1e-12, atol=1e-12)
 
 
 def test_the_spread_of_a_half_normal_is_that_of_its_draws():
@@ -314,8 +314,8 @@ def test_one_point_in_numpy_is_that_of_jax():
     rng = np.random.default_rng(6)
     for scale in (1.0, 4.0, 60.0):
         z = scale * rng.standard_normal(len(NAMES))
-        found = physical_at(z, space)
+        physical = physical_at(z, space)
         # The tails of both inverses of Phi agree to some hundred roundings.
-        np.testing.assert_allclose(found.value, space.physical(jnp.asarray(z)), rtol=1e-12, atol=1e-300)
+        np.testing.assert_allclose(physical.value, space.physical(jnp.asarray(z)), rtol=1e-12, atol=1e-300)
         slope = jax.jit(jax.jacfwd(space.physical))(jnp.asarray(z))
-        np.testing.assert_allclose(found.slope, slope, rtol=1e-11, atol=1e-300)
+        np.testing.assert_allclose(physical.slope, slope, rtol=1e-11, atol=1e-300)

@@ -19,8 +19,8 @@ LIMITS = CounterLimits({"pan": (-500, 1000), "tilt": (-500, 500)})
 
 
 def connected(board: GrblBoard, **changes) -> GrblPositioner:
-    made = GrblSettings(**{"unwatched": True, "limits": LIMITS, **changes})
-    return GrblPositioner(lambda: BoardLink(board), made, board.clock)
+    settings = GrblSettings(**{"unwatched": True, "limits": LIMITS, **changes})
+    return GrblPositioner(lambda: BoardLink(board), settings, board.clock)
 
 
 def test_slow_ramps_are_waited_for():
@@ -80,10 +80,10 @@ def test_light_behind_a_motion_is_cut_as_it_is_told():
     board = GrblBoard()
     positioner = connected(board)
     positioner.home()
-    told = positioner._status_report
+    reported = positioner._status_report
 
     def lit():
-        status = told()
+        status = reported()
         board._execute("M3 S1000", board.clock.monotonic())
         board.out.clear()
         return status
@@ -232,8 +232,8 @@ def test_light_without_a_watchdog_has_to_be_accepted():
         ({"pan_home_steps": 0}, "positioner.pan_home_steps"),
         ({"options.lazer": "M3"}, "positioner.options.lazer"),
         ({"options.laser": "M30"}, "positioner.options.laser"),
-        *(({"options.unwatched_laser": said}, "positioner.options.unwatched_laser") for said in ("false", "no", 2)),
-        *(({"options.laser_power": said}, "positioner.options.laser_power") for said in ("full", -1, float("nan"))),
+        *(({"options.unwatched_laser": entry}, "positioner.options.unwatched_laser") for entry in ("false", "no", 2)),
+        *(({"options.laser_power": entry}, "positioner.options.laser_power") for entry in ("full", -1, float("nan"))),
     ],
 )
 def test_entries_that_a_board_does_not_have_are_refused(entries, column):
@@ -255,7 +255,7 @@ def test_more_power_than_the_board_has_is_refused():
 
 def test_the_options_of_a_board():
     """A switch of a rig file comes as 0 or 1."""
-    assert [GrblSettings.of({"options.unwatched_laser": said}).unwatched for said in (0, 1)] == [False, True]
+    assert [GrblSettings.of({"options.unwatched_laser": entry}).unwatched for entry in (0, 1)] == [False, True]
     assert not GrblSettings.of({}).unwatched and GrblSettings.of({"options.laser_power": 300}).laser_power == 300.0
 
 

@@ -62,21 +62,21 @@ def on_processor(folder: Path, header: str, program: str, lines: list[str]) -> l
 def test_the_table_of_an_axis(tmp_path):
     """On lines of the table, between them and beyond both ends."""
     commands = np.linspace(-25.0, 25.0, 41)
-    asked = [(float(c), side) for c in commands for side in (1, -1)]
+    wishes = [(float(c), side) for c in commands for side in (1, -1)]
     header = FORMATS["header"].write(table("header"), Origin("a fit", "0" * 64))
-    said = on_processor(tmp_path, header, AXIS, [f"{c!r} {side}" for c, side in asked])
-    command, side = np.array(asked).T
+    answers = on_processor(tmp_path, header, AXIS, [f"{c!r} {side}" for c, side in wishes])
+    command, side = np.array(wishes).T
     wanted = Correction.of(table("header")).sent(command, side)
-    np.testing.assert_allclose(np.array(said, dtype=float), wanted, rtol=ROUNDING, atol=ROUNDING)
+    np.testing.assert_allclose(np.array(answers, dtype=float), wanted, rtol=ROUNDING, atol=ROUNDING)
 
 
 def test_the_counters_of_a_scanner(tmp_path):
     """Also with gears that vary: the same whole counters, and those on the way."""
     one = geared(calibration())
     points = [(x, y, z) for x in (300.0, 1000.0) for y in (-100.0, 60.0) for z in (-40.0, 50.0)]
-    asked = [(*point, *sides) for point in points for sides in ((1, 1), (-1, -1), (1, -1))]
-    said = on_processor(tmp_path, calibration_header(one), SCANNER, [" ".join(map(repr, row)) for row in asked])
-    for (x, y, z, left, up), line in zip(asked, said, strict=True):
+    wishes = [(*point, *sides) for point in points for sides in ((1, 1), (-1, -1), (1, -1))]
+    answers = on_processor(tmp_path, calibration_header(one), SCANNER, [" ".join(map(repr, row)) for row in wishes])
+    for (x, y, z, left, up), line in zip(wishes, answers, strict=True):
         s = one.steps_for((x, y, z), approach=("left" if left > 0 else "right", "up" if up > 0 else "down"))
         wanted = [2 if s.extrapolated else 1, s.pan_steps, s.tilt_steps, s.via_pan_steps, s.via_tilt_steps]
         assert list(map(int, line.split())) == wanted

@@ -24,12 +24,12 @@ def draws():
 def test_amplitudes_of_stated_periods_have_a_dimension_of_their_own(draws, count):
     """One period or all: the labels are those of the contract names."""
     varying = AMPLITUDE_NAMES[-count:]
-    found = _dataset(_variables(draws, set(varying), SHAPE))["harmonic_amplitude_deg"]
-    dim = found.dims[-1]
-    assert found.sizes == {"chain": 2, "draw": 3, dim: count}
-    assert [f"harmonic_amplitude_deg.{label}" for label in found[dim].values] == list(varying)
-    for label, name in zip(found[dim].values, varying, strict=True):
-        np.testing.assert_array_equal(found.sel({dim: label}), draws.physical[..., INDEX[name]])
+    variable = _dataset(_variables(draws, set(varying), SHAPE))["harmonic_amplitude_deg"]
+    dim = variable.dims[-1]
+    assert variable.sizes == {"chain": 2, "draw": 3, dim: count}
+    assert [f"harmonic_amplitude_deg.{label}" for label in variable[dim].values] == list(varying)
+    for label, name in zip(variable[dim].values, varying, strict=True):
+        np.testing.assert_array_equal(variable.sel({dim: label}), draws.physical[..., INDEX[name]])
 
 
 def test_every_variable_of_several_names_has_a_dimension_with_as_many_labels(draws):

@@ -85,9 +85,9 @@ def fitted(dozen) -> SimpleNamespace:
 
 @pytest.fixture(scope="module")
 def path(fitted) -> Transport:
-    found = transport(fitted)
-    assert found.noise > 10 and found.narrow and found.linear.places.shape[1] == 2 * len(found.place_on_tilt) > 0
-    return found
+    chart = transport(fitted)
+    assert chart.noise > 10 and chart.narrow and chart.linear.places.shape[1] == 2 * len(chart.place_on_tilt) > 0
+    return chart
 
 
 @pytest.fixture(scope="module")
@@ -138,9 +138,9 @@ def check_dense(fitted: SimpleNamespace, path: Transport, least: float) -> None:
     for w in 1.5 * np.random.default_rng(13).standard_normal((4, count)):
         z = path.from_whitened(np.concatenate([w, np.zeros(path.dimension - count)])[None])[0]
         precision, score = dense_density(fitted, path, z)
-        found = path.conditional(w[None])
+        conditional = path.conditional(w[None])
         # From the narrowest on, in the map.
-        factor, shift = found.own[0], found.shift[0]
+        factor, shift = conditional.own[0], conditional.shift[0]
         largest = np.abs(precision).max()
         # Weights of spots span eight decades, and errors at places have a floor of 1e-10 of their variance.
         np.testing.assert_allclose((factor @ factor.T)[::-1, ::-1], precision, rtol=0, atol=1e-5 * largest)
@@ -206,9 +206,9 @@ def test_products_of_a_creep_are_those_of_the_covariance_of_all_others(dozen):
         columns = (linear.columns.reshape(*load.shape[:2], -1) + moved).reshape(len(linear.columns), -1)
         weight = np.eye(4) - load @ k @ np.swapaxes(load, 1, 2)
         weighted = (weight @ columns.reshape(*load.shape[:2], -1)).reshape(columns.shape)
-        for found, rows in ((products.gram[one], columns), (products.by_states[one], linear.states.load)):
+        for product, rows in ((products.gram[one], columns), (products.by_states[one], linear.states.load)):
             bound = ROUNDING * len(columns) * np.abs(rows).T @ np.abs(weighted)
-            assert (np.abs(found - rows.T @ weighted) <= bound).all()
+            assert (np.abs(product - rows.T @ weighted) <= bound).all()
 
 
 def test_to_w_undoes_the_map(fitted, path):
@@ -227,7 +227,7 @@ def test_the_jacobian_of_the_map_is_what_it_says(path):
         slopes = (path.mapped(w + steps).z - path.mapped(w - steps).z)[:, path.free].T / (2 * step)
         straight = np.linalg.solve(path.root, slopes)
         sign, log_volume = np.linalg.slogdet(straight)
-        found = path.mapped(w[None]).log_jacobian[0]
+        log_jacobian = path.mapped(w[None]).log_jacobian[0]
         # Central differences are good to step^2 of the third derivatives, a few units each.
-        assert sign == 1 and log_volume == pytest.approx(found, abs=1e-3)
-        assert abs(found) > 1e-2, "nothing is wider than at the mode"
+        assert sign == 1 and log_volume == pytest.approx(log_jacobian, abs=1e-3)
+        assert abs(log_jacobian) > 1e-2, "nothing is wider than at the mode"

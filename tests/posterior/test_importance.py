@@ -81,23 +81,23 @@ def test_weights_are_the_target_over_the_mixture_of_all_proposals():
     densities = np.exp([q.log_density(w) for q in (one, other)])
     expected = np.exp(np.arange(6.0)) / (densities[0] * 2 / 6 + densities[1] * 4 / 6)
     np.testing.assert_allclose(np.exp(pool.log_weights), expected, rtol=1e-12)
-    own = np.exp(np.arange(6.0)) / np.where(np.arange(6) < 2, *densities)
-    assert np.abs(np.log(own / expected)).max() > 0.1
+    weights = np.exp(np.arange(6.0)) / np.where(np.arange(6) < 2, *densities)
+    assert np.abs(np.log(weights / expected)).max() > 0.1
 
 
 def test_moments_ends_and_mass_of_a_skewed_target():
     pool = skewed_pool()
-    found = weighted_summary(pool.drawn.w, smoothed_weights(pool.log_weights).weights)
+    summary = weighted_summary(pool.drawn.w, smoothed_weights(pool.log_weights).weights)
     first = stats.gumbel_r
     exact_mean = [first.mean(), 0.3 * first.mean(), 0.2, 0.2, 0.2]
     # E exp(0.1 w) of Gumbel's is the gamma function at 0.9.
     second = 0.09 * first.var() + gamma(0.9)
     exact_sd = [first.std(), np.sqrt(second), 1.1, 1.1, 1.1]
-    np.testing.assert_array_less(np.abs(found.mean - exact_mean), SIGMAS * found.mcse_mean)
-    np.testing.assert_array_less(np.abs(found.sd - exact_sd), SIGMAS * found.mcse_sd)
+    np.testing.assert_array_less(np.abs(summary.mean - exact_mean), SIGMAS * summary.mcse_mean)
+    np.testing.assert_array_less(np.abs(summary.sd - exact_sd), SIGMAS * summary.mcse_sd)
     ends = first.ppf([0.025, 0.975])
-    np.testing.assert_array_less(np.abs(found.interval95[:, 0] - ends), SIGMAS * found.mcse_interval95[:, 0])
-    assert found.mcse_mean.max() < 0.04 and found.mcse_interval95[:, 0].max() < 0.2, "no error would be seen"
+    np.testing.assert_array_less(np.abs(summary.interval95[:, 0] - ends), SIGMAS * summary.mcse_interval95[:, 0])
+    assert summary.mcse_mean.max() < 0.04 and summary.mcse_interval95[:, 0].max() < 0.2, "no error would be seen"
     weights = np.exp(pool.log_weights)
     assert np.log(weights.mean()) == pytest.approx(
         1.7, abs=SIGMAS * weights.std() / weights.mean() / np.sqrt(len(weights))
@@ -130,12 +130,12 @@ def test_the_evidence_of_a_normal_posterior_is_laplaces(normal_fit):
     pool = Pool.empty(target.first_proposal())
     for number in range(4):
         pool = pool.extended(target, generator, fitted=number < 3)
-    found = Weighing(target, pool).importance
+    judged = Weighing(target, pool).importance
     free = np.flatnonzero(fitted.free)
     log_volume = 0.5 * np.linalg.slogdet(fitted.covariance[np.ix_(free, free)])[1]
     expected = fitted.log_density + log_volume + spot_constants(fitted.campaign).sum()
-    assert found.log_evidence_mcse < 0.05, "no error would be seen"
-    assert found.log_evidence == pytest.approx(expected, abs=SIGMAS * found.log_evidence_mcse)
+    assert judged.log_evidence_mcse < 0.05, "no error would be seen"
+    assert judged.log_evidence == pytest.approx(expected, abs=SIGMAS * judged.log_evidence_mcse)
 
 
 @pytest.fixture(scope="module")
@@ -150,14 +150,14 @@ def sampled():
 
 def test_a_campaign_is_sampled_in_few_rounds_and_accepted(sampled):
     fitted, run, posterior = sampled
-    found = posterior.convergence.importance
-    assert found.accepted and found.missing == () and posterior.tier == "importance"
+    judged = posterior.convergence.importance
+    assert judged.accepted and judged.missing == () and posterior.tier == "importance"
     every = posterior.convergence.monte_carlo_error
     assert set(every) == set(headline_names(fitted)) and all(error.within(0.1, 0.2) for error in every.values())
-    assert found.draws == importance.ROUND * found.rounds and found.rounds <= 2 * importance.ROUNDS_LEAST
-    assert found.effective_share > 0.3 and found.pareto_k < 0.6 and found.heaviest_share < 0.01
+    assert judged.draws == importance.ROUND * judged.rounds and judged.rounds <= 2 * importance.ROUNDS_LEAST
+    assert judged.effective_share > 0.3 and judged.pareto_k < 0.6 and judged.heaviest_share < 0.01
     weights = posterior.weights
-    assert weights.shape == posterior.z.shape[:2] == (1, found.draws)
+    assert weights.shape == posterior.z.shape[:2] == (1, judged.draws)
     assert weights.sum() == pytest.approx(1.0, rel=1e-12)
     # The stored density is that of the stored draws.
     path, z = run.density.path, posterior.z[0, :64]
@@ -225,13 +225,13 @@ def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monke
     monkeypatch.setattr(Pool, "empty", empty)
     run = importance_run(too_narrow, SEED)
     posterior = run.density.posterior(run.sample, SEED)
-    found, other = posterior.convergence, sampled[2].convergence
-    assert found.answer == "accepted" and found.missing == ()
+    judged, other = posterior.convergence, sampled[2].convergence
+    assert judged.answer == "accepted" and judged.missing == ()
     # After the narrowed one come proposals fitted anew.
     assert len(begun) > 1 and run.pool.proposals == (begun[-1],)
-    assert run.pool.counts == (found.importance.draws,), "draws of the narrow proposal are in the answer"
+    assert run.pool.counts == (judged.importance.draws,), "draws of the narrow proposal are in the answer"
     # Fitted to draws of a bad proposal it is worth less than a good one, but no tenth of it.
-    assert found.importance.effective_share > 0.1 * other.importance.effective_share
+    assert judged.importance.effective_share > 0.1 * other.importance.effective_share
     name = other.importance.least_ess.quantity
     one, two = (each.propagate(lambda p: p[name]) for each in (posterior, sampled[2]))
     assert abs(one.mean - two.mean) < SIGMAS * np.hypot(one.mcse_mean, two.mcse_mean)
@@ -259,11 +259,11 @@ def test_a_heavy_tail_is_answered_by_another_proposal(sampled, monkeypatch):
 def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
     """Rounds of the narrow proposal: none is left for another."""
     run = importance_run(too_narrow, SEED, rounds_max=importance.ROUNDS_LEAST)
-    posterior, found = run.density.posterior(run.sample, SEED), run.sample.convergence.importance
-    assert found.rounds == importance.ROUNDS_LEAST and found.answer == "laplace" and not posterior.converged
-    assert found.pareto_k > importance.K_MAX
-    said = "; ".join(posterior.convergence.missing)
-    assert f"Pareto k {found.pareto_k:.2f}, wanted below 0.70" in said
+    posterior, judged = run.density.posterior(run.sample, SEED), run.sample.convergence.importance
+    assert judged.rounds == importance.ROUNDS_LEAST and judged.answer == "laplace" and not posterior.converged
+    assert judged.pareto_k > importance.K_MAX
+    missing = "; ".join(posterior.convergence.missing)
+    assert f"Pareto k {judged.pareto_k:.2f}, wanted below 0.70" in missing
     # What is said of it is Laplace's, and that it is, with what is missing; commands end with 0.
     summary = summarise(too_narrow, posterior)
     assert (summary.estimator, summary.answer, summary.converged) == ("laplace", "laplace", False)
@@ -280,12 +280,12 @@ def test_few_draws_of_a_good_proposal_are_a_rough_answer(sampled, monkeypatch):
     monkeypatch.setattr(importance, "ROUND", 512)
     run = importance_run(fitted, SEED, rounds_max=1)
     posterior = run.density.posterior(run.sample, SEED)
-    found = posterior.convergence
-    assert (found.importance.draws, found.answer, posterior.converged) == (512, "rough", True), found.missing
-    assert all(error.within(0.3, 0.6) for error in found.monte_carlo_error.values())
+    judged = posterior.convergence
+    assert (judged.importance.draws, judged.answer, posterior.converged) == (512, "rough", True), judged.missing
+    assert all(error.within(0.3, 0.6) for error in judged.monte_carlo_error.values())
     summary = summarise(fitted, posterior)
     assert (summary.estimator, summary.answer, summary.converged) == ("posterior", "rough", True)
-    assert summary.monte_carlo_error == found.monte_carlo_error and summary.problems[0].startswith("ROUGH: ")
+    assert summary.monte_carlo_error == judged.monte_carlo_error and summary.problems[0].startswith("ROUGH: ")
     assert unusable(summary) is None
 
 
@@ -361,11 +361,11 @@ def test_the_paper_twin_against_nuts(monkeypatch):
     posterior = sample(perfect, "importance")
     assert posterior.converged
     columns = posterior.by_name
-    found = posterior.summarised(np.stack([columns[name] for name in reference], axis=-1)[None])
+    summary = posterior.summarised(np.stack([columns[name] for name in reference], axis=-1)[None])
     there = {key: np.array([row[key] for row in reference.values()]) for key in ("mean", "sd", "sd_mcse")}
     # Both know a mean to some 0.02 sd, an sd to 2 %; of 61 quantities one may lie three of these out.
-    np.testing.assert_array_less(np.abs(found.mean - there["mean"]), 0.1 * there["sd"])
-    np.testing.assert_array_less(np.abs(found.sd / there["sd"] - 1), 0.06)
+    np.testing.assert_array_less(np.abs(summary.mean - there["mean"]), 0.1 * there["sd"])
+    np.testing.assert_array_less(np.abs(summary.sd / there["sd"] - 1), 0.06)
     # All together they scatter as their errors say.
-    z = (found.sd - there["sd"]) / np.hypot(found.mcse_sd, there["sd_mcse"])
+    z = (summary.sd - there["sd"]) / np.hypot(summary.mcse_sd, there["sd_mcse"])
     assert np.mean(z**2) < 2.0

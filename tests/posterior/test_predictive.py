@@ -150,13 +150,13 @@ def posterior_of_two_ways() -> Posterior:
     )
     ways = tuple(Alternative(each.sides, 0.5, each) for each in (one, other))
     worst = NamedValue("none", 500.0)
-    found = Reweighted(Importance(True, (), 1, count, 1.0, worst, 0.1, worst, 0.02, 0.0, 0.0, 0), {}, {}, {})
+    reweighted = Reweighted(Importance(True, (), 1, count, 1.0, worst, 0.1, worst, 0.02, 0.0, 0.0, 0), {}, {}, {})
     parts = []
     for number, fit in enumerate((replace(one, alternatives=ways), other)):
         z = np.full((1, count, 1), float(number))
         draws = drawn_quantities(1, count)
         weights = np.full((1, count), 1 / count)
-        parts.append(Posterior(fit, z, z[..., 0], draws, weights, found, 0, 0.0))
+        parts.append(Posterior(fit, z, z[..., 0], draws, weights, reweighted, 0, 0.0))
     return mixed(parts, np.array([0.5, 0.5]))
 
 

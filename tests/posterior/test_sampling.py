@@ -85,16 +85,16 @@ def stored(file):
 @pytest.mark.thorough
 def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, monkeypatch):
     limits(monkeypatch, SHORT)
-    whole_wait, told = [], []
+    whole_wait, stages = [], []
     unbroken = sample(fitted, seed=SEED, checkpoint=tmp_path / "unbroken.npz", progress=whole_wait.append)
     assert unbroken.convergence.steps == SHORT
     check_forward(whole_wait)
     assert doings(whole_wait) == [DRAWING, walking(CHAIN)] and len(whole_wait) > SHORT // BLOCK
 
     def interrupt(state):
-        told.append(state.doing)
+        stages.append(state.doing)
         # Told of once when the chain begins, then after every block.
-        if told.count(walking(CHAIN)) == 2:
+        if stages.count(walking(CHAIN)) == 2:
             raise KeyboardInterrupt
 
     broken = tmp_path / "broken.npz"
@@ -133,8 +133,8 @@ def test_ctrl_c_in_the_middle_of_a_step_is_quiet_and_loses_no_step(fitted, tmp_p
         with pytest.raises(KeyboardInterrupt):
             sample(fitted, seed=SEED, checkpoint=broken)
     assert 0 < len(stored(broken)["w"]) < SHORT
-    said = capfd.readouterr()
-    assert said.out == said.err == ""
+    printed = capfd.readouterr()
+    assert printed.out == printed.err == ""
     only_when_long(monkeypatch)
     resumed = sample(fitted, seed=SEED, checkpoint=broken, resume=True)
     np.testing.assert_array_equal(resumed.z, unbroken.z)
@@ -179,9 +179,9 @@ def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
         monkeypatch.setattr(f"tvsbayes.inference.importance.{limit}", -1.0)
     result = sample(fitted, max_minutes=1e-9, seed=SEED)
     assert result.convergence.answer != "accepted" and result.convergence.steps == BLOCK
-    said = "; ".join(result.convergence.missing)
+    missing = "; ".join(result.convergence.missing)
     for word in ("R-hat", "autocorrelation times"):
-        assert word in said
+        assert word in missing
 
 
 @pytest.mark.thorough

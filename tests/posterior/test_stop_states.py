@@ -34,20 +34,20 @@ def test_the_elimination_is_the_dense_cholesky_factor(seed):
     assert filled > 0, "nothing is filled in"
     assert sum(map(len, states.later)) < count * (count - 1) / 2, "nothing is left out"
     products = states.load.T @ generator.normal(size=(4 * SPOTS, 3))
-    found = Elimination.of(states, sd, states.gram[None, *states.overlapping])
+    elimination = Elimination.of(states, sd, states.gram[None, *states.overlapping])
     for point in range(POINTS):
         scaled = states.load * sd[point]
         dense = np.linalg.cholesky(np.eye(count) + scaled.T @ scaled)
         rounding = 4 * SPOTS * count * ROUNDING * np.linalg.cond(dense)
-        mine = np.diag(found.pivot[point])
+        mine = np.diag(elimination.pivot[point])
         for i, later in enumerate(states.later):
-            mine[list(later), i] = found.below[i][point]
+            mine[list(later), i] = elimination.below[i][point]
         np.testing.assert_allclose(mine, dense, rtol=0, atol=rounding * np.abs(dense).max())
         whitened = np.linalg.solve(dense, sd[point][:, None] * products)
         atol = rounding * np.abs(whitened).max()
-        np.testing.assert_allclose(found.whitened(products)[point], whitened, rtol=0, atol=atol)
-        own = found.whitened(np.repeat(products[None], POINTS, axis=0))[point]
-        np.testing.assert_allclose(own, whitened, rtol=0, atol=atol)
+        np.testing.assert_allclose(elimination.whitened(products)[point], whitened, rtol=0, atol=atol)
+        of_point = elimination.whitened(np.repeat(products[None], POINTS, axis=0))[point]
+        np.testing.assert_allclose(of_point, whitened, rtol=0, atol=atol)
 
 
 def test_what_states_leave_of_residuals_is_woodburys():
@@ -60,15 +60,15 @@ def test_what_states_leave_of_residuals_is_woodburys():
     scaled = states.load * sd[0]
     covariance = np.eye(4 * SPOTS) + scaled @ scaled.T
     dense = columns.T @ np.linalg.solve(covariance, columns)
-    found = columns.T @ columns - white.T @ white
+    left = columns.T @ columns - white.T @ white
     rounding = 4 * SPOTS * ROUNDING * np.linalg.cond(covariance)
-    np.testing.assert_allclose(found, dense, rtol=0, atol=rounding * np.abs(columns.T @ columns).max())
+    np.testing.assert_allclose(left, dense, rtol=0, atol=rounding * np.abs(columns.T @ columns).max())
 
 
 def test_no_states_take_nothing():
     nothing = StopStates(np.zeros((8, 0)), np.zeros((0, 4)), np.zeros(0))
-    found = Elimination.of(nothing, np.zeros((3, 0)), np.zeros((3, 0)))
-    assert found.whitened(np.zeros((0, 2))).shape == (3, 0, 2)
+    elimination = Elimination.of(nothing, np.zeros((3, 0)), np.zeros((3, 0)))
+    assert elimination.whitened(np.zeros((0, 2))).shape == (3, 0, 2)
 
 
 def test_states_of_a_campaign_give_the_covariance_of_its_filter():
@@ -78,7 +78,7 @@ def test_states_of_a_campaign_give_the_covariance_of_its_filter():
     states = stop_states(fitted, linear)
     spots = len(linear.residual)
     variance = states.variance.sum(axis=1) + states.constant
-    found = (states.load * variance) @ states.load.T
+    total = (states.load * variance) @ states.load.T
     expected = np.zeros((spots, 4, spots, 4))
     covariance = np.zeros((6, 6))
     for spot in range(spots):
@@ -93,5 +93,5 @@ def test_states_of_a_campaign_give_the_covariance_of_its_filter():
             expected[spot, :, later], expected[later, :, spot] = shared, shared.T
     expected = expected.reshape(4 * spots, 4 * spots)
     assert not linear.variance[:, 2:4][~linear.renewed[:, 2:4]].any(), "a drift has no column"
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(total, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
     assert np.all(np.diff([np.flatnonzero(column)[-1] // 4 for column in states.load.T]) >= 0), "in order of their ends"

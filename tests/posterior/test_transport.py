@@ -104,15 +104,15 @@ def test_the_jacobian_of_the_map_is_what_it_says():
         steps = step * np.eye(path.dimension)
         with jax.enable_x64(True):
             slopes = (path.mapped(w + steps).z - path.mapped(w - steps).z)[:, path.free].T / (2 * step)
-            found = path.mapped(w[None]).log_jacobian[0]
+            log_jacobian = path.mapped(w[None]).log_jacobian[0]
         straight = np.linalg.solve(path.root, slopes)
         assert np.abs(straight - np.eye(path.dimension)).max() > 0.1, "nothing is bent"
         sign, log_volume = np.linalg.slogdet(straight)
         # Central differences are good to step^2 / 6 of third derivatives, and rounding amplified by the solve.
         error = (step**2 + ROUNDING / step * np.linalg.cond(path.root)) * np.abs(straight).sum()
         assert error < 1e-2
-        assert sign == 1 and abs(log_volume - found) < error
-        assert abs(found) > 10 * error, "nothing is wider than at the mode"
+        assert sign == 1 and abs(log_volume - log_jacobian) < error
+        assert abs(log_jacobian) > 10 * error, "nothing is wider than at the mode"
 
 
 def test_centring_makes_a_curved_ridge_normal():
@@ -120,17 +120,17 @@ def test_centring_makes_a_curved_ridge_normal():
     path = ridge()
     assert path.bend[0, 0, 0] == pytest.approx(TURN, rel=1e-3) and abs(path.bend[1, 0, 0]) < 1e-6
     w = np.random.default_rng(10).normal(size=(400, 2))
-    seen, centre = path.mapped(w), path.mapped(w * [1.0, 0.0])
+    points, centre = path.mapped(w), path.mapped(w * [1.0, 0.0])
     wide = np.abs(w[:, 0])
     # Of z_1 alone: the map keeps the wide coordinate.
-    np.testing.assert_array_equal(seen.z[:, path.free[0]], w[:, 0])
-    along = ridge_density(seen.z) + seen.log_jacobian - (ridge_density(centre.z) + centre.log_jacobian)
+    np.testing.assert_array_equal(points.z[:, path.free[0]], w[:, 0])
+    along = ridge_density(points.z) + points.log_jacobian - (ridge_density(centre.z) + centre.log_jacobian)
     # The prior's pull on the narrow one is taken at the mode's slope: off by z_2 sd / slope^2 standard deviations.
     pull = CURVE * wide**2 * NARROW_SD / (1 - TURN * wide) ** 2
     np.testing.assert_array_less(np.abs(along + 0.5 * w[:, 1] ** 2), (1 + np.abs(w[:, 1])) * pull + 1e-3)
     apart = uncentred(path).mapped(w)
     assert np.std(ridge_density(apart.z) + apart.log_jacobian) > 100, "the ridge would be none"
-    np.testing.assert_allclose(path.to_w(seen.z), w, atol=FLOOR)
+    np.testing.assert_allclose(path.to_w(points.z), w, atol=FLOOR)
 
 
 def test_a_kink_at_the_mode_turns_no_slope_over():
@@ -139,9 +139,9 @@ def test_a_kink_at_the_mode_turns_no_slope_over():
     sd = path.root[1, 1]
 
     def kinked(z: np.ndarray) -> np.ndarray:
-        found = ridge_residual(z)
-        found[:, 0] -= kink * np.abs(z[:, path.free[0]] - z[:, path.free[1]] / sd)
-        return found
+        residual = ridge_residual(z)
+        residual[:, 0] -= kink * np.abs(z[:, path.free[0]] - z[:, path.free[1]] / sd)
+        return residual
 
     # The slope along the narrow coordinate is 0.6 on one side of the kink and 1.4 on the other: never below zero.
     assert np.abs(curvatures(replace(path, residuals=kinked))[0, 1, 1] - TURN) * 2 < 1
@@ -182,8 +182,8 @@ def test_the_precision_at_other_noise_scales_is_the_smoothers():
         expected = wide.T @ (np.diag(play_priors(path)[0]) + fisher) @ wide
         factor = path.conditional(w[None]).own[0]
         # The map has the narrowest coordinate first. The information spans ten decades in z; in y it is of order 1.
-        found = (factor @ factor.T)[::-1, ::-1]
-        np.testing.assert_allclose(found, expected, rtol=0, atol=PRECISION * np.abs(expected).max())
+        precision = (factor @ factor.T)[::-1, ::-1]
+        np.testing.assert_allclose(precision, expected, rtol=0, atol=PRECISION * np.abs(expected).max())
         assert np.abs(expected - np.eye(len(others))).max() > 0.1, "the scales are those of the mode"
 
 
@@ -195,13 +195,13 @@ def test_w_keeps_the_curvature_far_from_the_mode():
     for which in np.flatnonzero(np.char.startswith(names, "stop_sd_deg")):
         w = np.zeros((1, count))
         w[:, which] = 4.0
-        found = plain.conditional(w)
+        conditional = plain.conditional(w)
         # Along the direction of y that this stop sd widens most.
-        factor = found.own[0][::-1, ::-1]
+        factor = conditional.own[0][::-1, ::-1]
         values, vectors = np.linalg.eigh(factor @ factor.T)
         assert values[0] < 0.3
         aside, curvature = 0.25 * vectors[:, 0], []
-        centre = found.solved(found.shift)[0][::-1]
+        centre = conditional.solved(conditional.shift)[0][::-1]
         y = np.concatenate([np.repeat(w, 3, axis=0), centre + np.outer([-1, 0, 1], aside)], axis=1)
         with jax.enable_x64(True):
             inside = plain.to_w(plain.from_whitened(y))
@@ -254,12 +254,12 @@ def test_the_map_of_a_play_near_zero_is_exact():
     path = play_near_zero()
     w = np.random.default_rng(17).normal(size=(400, 2))
     w[:4, 0] = -5.0, -4.0, 4.0, 5.0
-    seen = path.mapped(w)
+    points = path.mapped(w)
     assert stats.norm.cdf(path.mode[BACKLASH]) < 0.1, "the play is not near zero"
-    density = play_density(seen.z) + seen.log_jacobian + 0.5 * np.sum(w**2, axis=1)
+    density = play_density(points.z) + points.log_jacobian + 0.5 * np.sum(w**2, axis=1)
     # The mode is good to 1e-7, with slopes of 1 / sd = 12; laws of tails to 1e-9.
     assert np.ptp(density) < 1e-5, np.ptp(density)
-    np.testing.assert_allclose(path.to_w(seen.z), w, atol=1e-7)
+    np.testing.assert_allclose(path.to_w(points.z), w, atol=1e-7)
 
 
 @pytest.mark.parametrize("bound", [-40.0, -1.0, 0.0, 5.0, 30.0])

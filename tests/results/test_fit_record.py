@@ -72,9 +72,9 @@ def test_both_tiers_obey_the_schema(tmp_path):
         rough=True,
     )
     assert weighted.answer == chain.answer == "accepted"
-    for tier, found in (("importance", weighted), ("emcee", chain)):
-        answer = {"answer": found.answer, "monte_carlo_error": found.monte_carlo_error}
-        summary = structs.replace(whole_summary(), estimator="posterior", tier=tier, sampling=found.sampling, **answer)
+    for tier, draws in (("importance", weighted), ("emcee", chain)):
+        answer = {"answer": draws.answer, "monte_carlo_error": draws.monte_carlo_error}
+        summary = structs.replace(whole_summary(), estimator="posterior", tier=tier, sampling=draws.sampling, **answer)
         (tmp_path / "fit.json").write_text(json.dumps(small_record(summary, seed=3).as_json()))
         document = json.loads((tmp_path / "fit.json").read_text())
         assert problems(document, schema_of(document)) == []
@@ -97,14 +97,14 @@ def test_what_a_chain_lacks_leaves_a_rough_answer_or_none():
     worst = NamedValue("backlash_deg.tilt", 0.41)
     importance = Importance(False, ("few",), 4, 4096, 0.7, worst, 0.33, worst, 0.003, -1189.2, 0.01, 0, "rough")
     effective = {"backlash_deg.tilt": 210.0}
-    found = {}
+    answers = {}
     for rough in (True, False):
         chain = Convergence(
             *(200, 20, 2, 3.1, {"backlash_deg.tilt": 1.02}, effective, effective, np.array([0.5]), (), 0, ("short",)),
             *(importance, None, {}, rough),
         )
-        found[rough] = chain.answer, chain.converged
-    assert found == {True: ("rough", True), False: ("laplace", False)}
+        answers[rough] = chain.answer, chain.converged
+    assert answers == {True: ("rough", True), False: ("laplace", False)}
     # Documents of 0.2.0 do not say: their weights were accepted or not.
     assert Reweighted(replace(importance, answer=None), effective, effective, {}).answer == "laplace"
 

@@ -55,10 +55,10 @@ def test_results_with_a_calibration_are_read_back(tmp_path):
         noise=np.ones((5, len(NOISE_NAMES))),
     )
     write_results(tmp_path, small_record(), small_draws(), calibration, small_mode())
-    found = load_calibration(tmp_path)
-    assert (found.estimator, found.overshoot_steps["tilt"]) == ("posterior", 4)
-    np.testing.assert_array_equal(found.mean, calibration.mean)
-    np.testing.assert_array_equal(found.inputs, calibration.inputs)
+    loaded = load_calibration(tmp_path)
+    assert (loaded.estimator, loaded.overshoot_steps["tilt"]) == ("posterior", 4)
+    np.testing.assert_array_equal(loaded.mean, calibration.mean)
+    np.testing.assert_array_equal(loaded.inputs, calibration.inputs)
     with np.load(tmp_path / "draws.npz", allow_pickle=False) as draws:
         assert draws["physical"].shape == (50, 3)
         assert str(draws["estimator"]) == "posterior"

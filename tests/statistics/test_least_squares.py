@@ -67,11 +67,11 @@ def test_perfect_fit_is_converged():
 def test_covariance_is_the_inverse_of_the_normal_matrix():
     """For columns of very different size; in units of the resulting standard deviations."""
     jacobian = np.random.default_rng(3).standard_normal((30, 4)) * np.array([1e-6, 1.0, 1e4, 1e9])
-    found = least_squares_covariance(jacobian)
+    covariance = least_squares_covariance(jacobian)
     scale = np.linalg.norm(jacobian, axis=0)
     exact = np.linalg.inv((jacobian / scale).T @ (jacobian / scale)) / np.outer(scale, scale)
     sd = np.sqrt(np.diag(exact))
-    assert np.abs((found - exact) / np.outer(sd, sd)).max() < 1e-13  # a condition number of order one
+    assert np.abs((covariance - exact) / np.outer(sd, sd)).max() < 1e-13  # a condition number of order one
 
 
 def test_no_covariance_without_full_rank():
@@ -90,10 +90,10 @@ def test_a_mode_on_a_kink_is_reached():
         return 0.5 * (points[:, 0] - 0.15) ** 2 + 0.5 * points[:, 1] ** 2 + 0.3 * np.abs(points[:, 0])
 
     free = np.ones(2, dtype=bool)
-    found = newton_mode(objective, np.array([0.4, -0.3]), free, np.eye(2))
-    assert found.problems == ()
+    mode = newton_mode(objective, np.array([0.4, -0.3]), free, np.eye(2))
+    assert mode.problems == ()
     # A kink is found to the step of differences.
-    np.testing.assert_allclose(found.z, 0.0, atol=0.05)
+    np.testing.assert_allclose(mode.z, 0.0, atol=0.05)
 
 
 @pytest.mark.parametrize("seed", [29, 31, 32, 34])
@@ -106,13 +106,13 @@ def test_steps_to_and_fro_about_two_kinks_end(seed):
     def objective(points):
         return 2400 + 0.5 * np.sum(points**2, axis=1) + jump * np.abs(points @ along.T - at).sum(axis=1)
 
-    found = newton_mode(objective, 0.5 * generator.normal(size=8), np.ones(8, dtype=bool), np.eye(8))
-    assert found.problems == ()
+    mode = newton_mode(objective, 0.5 * generator.normal(size=8), np.ones(8, dtype=bool), np.eye(8))
+    assert mode.problems == ()
     # Its dual: the pull of each kink is at most its jump.
     pull = optimize.minimize(
         lambda u: 0.5 * np.sum((u @ along) ** 2) + u @ at, np.zeros(2), bounds=[(-jump, jump)] * 2, tol=1e-12
     ).x
     # Falls below `KINK_FALL` are left.
-    np.testing.assert_allclose(found.z, -pull @ along, atol=2 * np.sqrt(2 * KINK_FALL))
-    sd = np.sqrt(np.diag(found.covariance))
+    np.testing.assert_allclose(mode.z, -pull @ along, atol=2 * np.sqrt(2 * KINK_FALL))
+    sd = np.sqrt(np.diag(mode.covariance))
     assert np.all((sd > 0.5) & (sd < 1.1)), "second differences straddle a kink"

@@ -20,5 +20,5 @@ def test_purposes_of_one_seed_are_independent_and_repeat():
 
 def test_no_module_but_the_twin_numbers_its_streams():
     numbered = re.compile(r"default_rng\(\[[^\]]*, \d+\]\)")
-    found = [name for name, path in MODULES.items() if numbered.search(path.read_text(encoding="utf-8"))]
-    assert [name for name in found if not name.startswith("twin.")] == []
+    names = [name for name, path in MODULES.items() if numbered.search(path.read_text(encoding="utf-8"))]
+    assert [name for name in names if not name.startswith("twin.")] == []

@@ -28,18 +28,18 @@ SIGMAS = 5.0
 def test_equal_weights_are_none(count):
     values = np.random.default_rng(1).normal(3.0, 2.0, (count, 4))
     weights = np.full(count, 1 / count)
-    found = weighted_summary(values, weights)
+    summary = weighted_summary(values, weights)
     # Sums of n terms of order 10 in another order; a quantile divides by the spacing 1 / n.
     allowed = 10 * count * ROUNDING
-    np.testing.assert_allclose(found.mean, values.mean(axis=0), rtol=0, atol=allowed)
-    np.testing.assert_allclose(found.sd, values.std(axis=0), rtol=0, atol=allowed)
+    np.testing.assert_allclose(summary.mean, values.mean(axis=0), rtol=0, atol=allowed)
+    np.testing.assert_allclose(summary.sd, values.std(axis=0), rtol=0, atol=allowed)
     probabilities = (0.0, 0.025, 0.5, 0.975, 1.0)
     expected = np.quantile(values, probabilities, axis=0)
     np.testing.assert_allclose(
         weighted_quantiles(values, weights, probabilities), expected, rtol=0, atol=count * allowed
     )
-    np.testing.assert_allclose(found.ess_mean, count, rtol=allowed)
-    np.testing.assert_allclose(found.mcse_mean, values.std(axis=0) / np.sqrt(count), rtol=allowed)
+    np.testing.assert_allclose(summary.ess_mean, count, rtol=allowed)
+    np.testing.assert_allclose(summary.mcse_mean, values.std(axis=0) / np.sqrt(count), rtol=allowed)
 
 
 def test_effective_draws_are_kishs_whatever_the_weights_sum_to():
@@ -48,36 +48,36 @@ def test_effective_draws_are_kishs_whatever_the_weights_sum_to():
 
 def test_quantiles_by_hand():
     """Half weights reach 0.25, 0.65 and 0.9 at the draws 1, 2 and 3: stretched to 0, 8/13 and 1."""
-    found = weighted_quantiles(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.5, 0.3]), (0.0, 0.5, 1.0))
-    np.testing.assert_allclose(found, [1.0, 1 + 0.5 * 13 / 8, 3.0], rtol=4 * ROUNDING)
+    quantiles = weighted_quantiles(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.5, 0.3]), (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(quantiles, [1.0, 1 + 0.5 * 13 / 8, 3.0], rtol=4 * ROUNDING)
 
 
 def test_ends_of_intervals_have_the_effective_draws_of_their_probability():
     """Of 2000 equal draws all count; 51 of them, not 50, lie below an end at most: 2 % of t (1 - t)."""
-    found = weighted_summary(np.random.default_rng(8).standard_normal(2000), np.full(2000, 1 / 2000))
-    np.testing.assert_allclose(found.ess_interval95, 2000, rtol=0.02)
+    summary = weighted_summary(np.random.default_rng(8).standard_normal(2000), np.full(2000, 1 / 2000))
+    np.testing.assert_allclose(summary.ess_interval95, 2000, rtol=0.02)
 
 
 def test_a_quantity_that_moves_says_nothing_of_one_that_does_not():
     """Both keep their shape, and what is ten times as wide has ten times the errors."""
     generator = np.random.default_rng(9)
     weights, moving = generator.dirichlet(np.ones(300)), generator.standard_normal((300, 1, 2))
-    found = weighted_summary(np.concatenate([moving, 10 * moving, np.full((300, 1, 2), 3.0)], axis=1), weights)
+    summary = weighted_summary(np.concatenate([moving, 10 * moving, np.full((300, 1, 2), 3.0)], axis=1), weights)
     for name in ("mean", "sd", "mcse_mean", "mcse_sd", "ess_mean", "ess_sd"):
-        value = getattr(found, name)
+        value = getattr(summary, name)
         assert value.shape == (3, 2), name
         if name.startswith("ess"):
             np.testing.assert_allclose(value[2], effective_draws(weights), rtol=1e-12)
         else:
             np.testing.assert_allclose(value[1], 10 * value[0], rtol=1e-12, err_msg=name)
-    assert np.all(found.mcse_mean[2] == 0) and np.all(found.mcse_sd[2] == 0)
+    assert np.all(summary.mcse_mean[2] == 0) and np.all(summary.mcse_sd[2] == 0)
 
 
 def test_one_draw_of_all_weight_is_every_quantile():
     """The others' densities may lie beyond the smallest number."""
     weights = smoothed_weights(np.where(np.arange(1000) == 3, 0.0, -800.0)).weights
-    found = weighted_summary(np.arange(1000.0), weights)
-    assert found.mean == 3.0 and found.interval95.tolist() == [3.0, 3.0] and found.ess_least == 1.0
+    summary = weighted_summary(np.arange(1000.0), weights)
+    assert summary.mean == 3.0 and summary.interval95.tolist() == [3.0, 3.0] and summary.ess_least == 1.0
 
 
 def test_quantiles_count_a_draw_by_its_weight():
@@ -86,8 +86,8 @@ def test_quantiles_count_a_draw_by_its_weight():
     twice = np.arange(2000) < 700
     weights = np.where(twice, 2.0, 1.0)
     repeated = np.concatenate([values, values[twice]])
-    found = weighted_quantiles(values, weights / weights.sum(), (0.2, 0.5, 0.9))
-    np.testing.assert_allclose(found, np.quantile(repeated, (0.2, 0.5, 0.9)), atol=0.01)
+    quantiles = weighted_quantiles(values, weights / weights.sum(), (0.2, 0.5, 0.9))
+    np.testing.assert_allclose(quantiles, np.quantile(repeated, (0.2, 0.5, 0.9)), atol=0.01)
     assert np.abs(np.quantile(values[twice], 0.9) - np.quantile(values, 0.9)) > 0.02, "the weights make no difference"
 
 
@@ -116,9 +116,9 @@ def test_errors_are_the_scatter_of_runs_repeated():
 
 def test_a_constant_has_no_error_and_all_draws():
     weights = np.random.default_rng(4).dirichlet(np.ones(50))
-    found = weighted_summary(np.full((50, 1), 2.5), weights)
-    assert found.mean == 2.5 and found.sd == found.mcse_mean == found.mcse_sd == 0
-    assert np.all(found.mcse_interval95 == 0) and found.ess_least == pytest.approx(effective_draws(weights))
+    summary = weighted_summary(np.full((50, 1), 2.5), weights)
+    assert summary.mean == 2.5 and summary.sd == summary.mcse_mean == summary.mcse_sd == 0
+    assert np.all(summary.mcse_interval95 == 0) and summary.ess_least == pytest.approx(effective_draws(weights))
     assert weighted_mean(np.full(50, 0.1), weights) == 0.1
 
 
@@ -127,9 +127,9 @@ def test_pareto_smoothing_is_that_of_arviz(count, sd):
     log_ratios = sd * np.random.default_rng(5).standard_normal(count)
     # ArviZ takes the negative of the log weights, as `loo` hands them over.
     log_weights, k = array_stats.psislw(-log_ratios)
-    found = smoothed_weights(log_ratios)
-    assert found.pareto_k == pytest.approx(float(k), abs=1e-9)
-    np.testing.assert_allclose(found.weights, np.exp(log_weights), rtol=1e-9)
+    smoothed = smoothed_weights(log_ratios)
+    assert smoothed.pareto_k == pytest.approx(float(k), abs=1e-9)
+    np.testing.assert_allclose(smoothed.weights, np.exp(log_weights), rtol=1e-9)
     expected = array_stats.pareto_khat(np.exp(log_ratios)[None], r_eff=1, tail="right")
     assert pareto_k(np.exp(log_ratios)) == pytest.approx(float(expected), abs=1e-9)
 
@@ -153,8 +153,8 @@ def test_a_tail_is_fitted_where_its_first_quarter_exceeds_the_rest():
 def test_a_constant_factor_of_the_weights_changes_nothing():
     """Also one beyond the largest number."""
     log_ratios = np.random.default_rng(11).standard_normal(500)
-    found, moved = smoothed_weights(log_ratios), smoothed_weights(log_ratios + 800.0)
-    np.testing.assert_allclose(moved.weights, found.weights, rtol=1e-11)
+    smoothed, moved = smoothed_weights(log_ratios), smoothed_weights(log_ratios + 800.0)
+    np.testing.assert_allclose(moved.weights, smoothed.weights, rtol=1e-11)
 
 
 def test_the_tail_index_is_that_of_the_tail():
@@ -165,9 +165,9 @@ def test_the_tail_index_is_that_of_the_tail():
 
 
 def test_weights_without_a_tail_are_left_alone():
-    found = smoothed_weights(np.append(np.zeros(99), -np.inf))
-    np.testing.assert_allclose(found.weights, np.append(np.full(99, 1 / 99), 0.0), rtol=1e-12)
-    assert found.pareto_k == 0 and pareto_k(np.ones(99)) == 0
+    smoothed = smoothed_weights(np.append(np.zeros(99), -np.inf))
+    np.testing.assert_allclose(smoothed.weights, np.append(np.full(99, 1 / 99), 0.0), rtol=1e-12)
+    assert smoothed.pareto_k == 0 and pareto_k(np.ones(99)) == 0
 
 
 def test_systematic_resampling_takes_every_draw_by_its_weight():

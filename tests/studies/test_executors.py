@@ -62,8 +62,8 @@ def pool_of(engine: str, lost: BaseException, monkeypatch) -> Pool:
         def submit(self, *order, **options):
             return pool.submit(*order)
 
-    given = {"Client": Client, "LocalCluster": nullcontext, "KilledWorker": KilledWorker, "as_completed": iter}
-    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(**given))
+    members = {"Client": Client, "LocalCluster": nullcontext, "KilledWorker": KilledWorker, "as_completed": iter}
+    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(**members))
     monkeypatch.setitem(sys.modules, "distributed.comm", SimpleNamespace(CommClosedError=CommClosedError))
     return pool
 

@@ -20,10 +20,10 @@ from tvsbayes.studies.study import study, study_result
 def test_a_study_goes_on_where_it_was_killed(job, quick, tmp_path):
     """The last row is torn, as a kill in the middle of a write leaves it: it is made again, the others are not."""
     path = tmp_path / "rows.jsonl"
-    told = []
-    whole = study(job, 9, StudyRows(path), progress=told.append)
-    check_forward(told)
-    assert [state.doing for state in told[:-1]] == [f"campaigns: {n} of 9" for n in range(10)]
+    waits = []
+    whole = study(job, 9, StudyRows(path), progress=waits.append)
+    check_forward(waits)
+    assert [state.doing for state in waits[:-1]] == [f"campaigns: {n} of 9" for n in range(10)]
     data = path.read_bytes()
     assert data.count(b"\n") == 9
     cut = data[: data.rfind(b"\n", 0, -1) + 40]
@@ -31,8 +31,8 @@ def test_a_study_goes_on_where_it_was_killed(job, quick, tmp_path):
     quick.clear()
     again = StudyRows(path)
     assert again.torn == 39
-    assert study(job, 9, again, progress=told.append) == whole
-    assert [state.doing for state in told[11:]] == [f"campaigns: {n} of 9" for n in (8, 9, 9)]
+    assert study(job, 9, again, progress=waits.append) == whole
+    assert [state.doing for state in waits[11:]] == [f"campaigns: {n} of 9" for n in (8, 9, 9)]
     assert quick == [8]
     assert path.read_bytes() == data
     quick.clear()

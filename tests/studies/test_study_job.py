@@ -35,10 +35,10 @@ def test_estimates_of_a_posterior_go_by_its_weights():
     posterior = Posterior(None, z, np.zeros((1, 3)), draws, weights, None, 0, 0.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Posterior, "joined", joined)
-        found = sampled_estimates(posterior)
-    np.testing.assert_allclose(found.z, [1.0, 2.0], rtol=1e-15)
-    np.testing.assert_allclose(found.covariance, [[1.0, 1.0], [1.0, 3.0]], rtol=1e-14)
-    left, right, *_, pan_contrast, tilt_contrast, pan_play, tilt_play, _ = found.value
+        estimates = sampled_estimates(posterior)
+    np.testing.assert_allclose(estimates.z, [1.0, 2.0], rtol=1e-15)
+    np.testing.assert_allclose(estimates.covariance, [[1.0, 1.0], [1.0, 3.0]], rtol=1e-14)
+    left, right, *_, pan_contrast, tilt_contrast, pan_play, tilt_play, _ = estimates.value
     assert (left, right, pan_contrast) == pytest.approx((0.0675, 0.06, 0.0075), rel=1e-12)
     assert (tilt_contrast, pan_play, tilt_play) == pytest.approx((0.0, 0.25, 0.0), rel=1e-12)
 
@@ -48,17 +48,17 @@ def test_a_chain_answers_where_weights_are_not_sound(sound):
     """And nowhere else: it costs several times as much."""
     from tvsbayes.studies import study_job
 
-    asked = []
+    calls = []
 
     def sampled(result, tier, *, seed):
-        asked.append((result, tier, seed))
+        calls.append((result, tier, seed))
         return SimpleNamespace(tier=tier, converged=sound or tier == "emcee")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study_job, "sample", sampled)
-        found = study_job.posterior_of("a fit", 3)
-    assert found.converged and asked[-1] == ("a fit", found.tier, 3)
-    assert [tier for _, tier, _ in asked] == ["importance", "emcee"][: 1 if sound else 2]
+        posterior = study_job.posterior_of("a fit", 3)
+    assert posterior.converged and calls[-1] == ("a fit", posterior.tier, 3)
+    assert [tier for _, tier, _ in calls] == ["importance", "emcee"][: 1 if sound else 2]
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_the_planner_predicts_what_a_fit_of_real_gears_reports(mounted_rig):
     row = study_row(StudyJob(mounted_rig, plan, target, seed=7, estimator="laplace"), 2)
     assert row.converged
     for direction in DIRECTIONS:
-        told = row.headlines[direction]
-        assert told.sd == pytest.approx(told.predicted_sd, rel=0.15)
-        assert abs(told.value - told.truth) < 4 * told.sd
+        headline = row.headlines[direction]
+        assert headline.sd == pytest.approx(headline.predicted_sd, rel=0.15)
+        assert abs(headline.value - headline.truth) < 4 * headline.sd
     assert row.target == pytest.approx(max(row.headlines[direction].sd for direction in DIRECTIONS))

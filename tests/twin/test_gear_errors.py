@@ -71,11 +71,11 @@ def test_errors_are_draws_of_a_matern_process():
     four_se = 4 / np.sqrt(count)
     assert np.abs(draws.mean(axis=0)).max() < four_se
     assert draws.std(axis=0) == pytest.approx(1.0, abs=four_se / np.sqrt(2))
-    found = np.corrcoef(draws.T)
+    correlation = np.corrcoef(draws.T)
     for one, other in ((0, 1), (0, 2), (1, 2)):
         expected = float(matern52(places[other] - places[one], 8.0))
         # The standard error of a correlation coefficient of normals is (1 - rho^2) / sqrt(N).
-        assert found[one, other] == pytest.approx(expected, abs=four_se * (1 - expected**2))
+        assert correlation[one, other] == pytest.approx(expected, abs=four_se * (1 - expected**2))
     assert np.mean(np.abs(draws) < 1.96) == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / count))
 
 
@@ -133,8 +133,8 @@ def test_errors_are_functions_of_the_position_alone(mounted_rig):
     place = k * np.array([0.0, 100.0, 200.0, 60.0, 100.0, 200.0])
     side = np.array([1, 1, 1, -1, 1, 1])
     expected = errors.error_deg(place) - side * errors.play_deg(place) / 2
-    found = angles[:, 0] - np.array(smooth.mirror_angles_deg)[:, 0]
-    assert found == pytest.approx(expected, abs=1e-12) and np.ptp(expected) > 0.01
+    turned = angles[:, 0] - np.array(smooth.mirror_angles_deg)[:, 0]
+    assert turned == pytest.approx(expected, abs=1e-12) and np.ptp(expected) > 0.01
 
 
 def test_drift_grows_with_the_root_of_time_and_restarts_at_a_homing():
@@ -160,7 +160,7 @@ def test_drift_turns_the_mirrors_and_stands_in_the_truth(mounted_rig):
     rig = geared(mounted_rig, transmission_error_deg=0.0, play_variation_deg=0.0, drift_deg_per_root_hour=2.0)
     truth = draw_truth(rig, np.random.default_rng(10))
     still = replace(truth, parameters={**truth.parameters, **{f"drift_deg_per_root_hour.{a}": 0.0 for a in AXES}})
-    one, other = (simulate(rig, sweep(), 3, given).truth for given in (truth, still))
+    one, other = (simulate(rig, sweep(), 3, drawn).truth for drawn in (truth, still))
     moved = np.subtract(one.mirror_angles_deg, other.mirror_angles_deg)
     assert moved == pytest.approx(np.array(one.drift_deg), abs=1e-12) and np.abs(moved[1:]).min() > 0
     assert not np.any(other.drift_deg) and not np.any(one.drift_deg[0])
@@ -225,7 +225,7 @@ def test_the_headline_is_the_line_through_the_looks(mounted_rig):
     step = AxisErrors(error_deg=lambda angle: 0.1 * (np.asarray(angle) > 3.0))
     errors = {"pan": step, "tilt": AxisErrors()}
     two = simulate(mounted_rig, sweep((100, 0, 100)), 1, replace(truth, gear_errors=errors)).campaign
-    plain, bent = (effective_deg_per_step(p, given, two) for given in (PERFECT, errors))
+    plain, bent = (effective_deg_per_step(p, gears, two) for gears in (PERFECT, errors))
     slope = local_deg_per_step(p, (3.0, p["tilt_zero_deg"]))["left"] / p["degrees_per_step.left"]
     # 0.1 deg over 100 steps, by the slope of the mirrors, which changes by less than 1e-3 over 6 deg.
     assert bent["left"] - plain["left"] == pytest.approx(1e-3 * slope, rel=1e-3)
@@ -237,10 +237,10 @@ def test_the_headline_is_the_line_through_the_looks(mounted_rig):
     tilt_deg = p["degrees_per_step.tilt"] * counters.mean() / 2 + p["tilt_zero_deg"]
     direction = mirror_chain(np.radians(p["degrees_per_step.pan"] * counters), np.radians(tilt_deg), p)[1]
     line = np.polyfit(counters, np.degrees(np.arctan2(direction[:, 1], direction[:, 0])), 1)[0]
-    found = effective_deg_per_step(p, PERFECT, many)
-    assert (found["left"] + found["right"]) / 2 == pytest.approx(line, rel=1e-9)
+    slopes = effective_deg_per_step(p, PERFECT, many)
+    assert (slopes["left"] + slopes["right"]) / 2 == pytest.approx(line, rel=1e-9)
     contrast = p["ratio_contrast_deg_per_step.pan"] * slope
-    assert found["left"] - found["right"] == pytest.approx(contrast, rel=1e-3)
+    assert slopes["left"] - slopes["right"] == pytest.approx(contrast, rel=1e-3)
     ramp = np.polyfit(counters, 0.1 * (p["degrees_per_step.pan"] * counters > 3.0), 1)[0]
     rise = effective_deg_per_step(p, errors, many)["left"] - effective_deg_per_step(p, PERFECT, many)["left"]
     assert rise == pytest.approx(ramp * slope, rel=2e-3)
@@ -255,14 +255,14 @@ def test_homing_sides_that_nobody_recorded(mounted_rig):
     truth = quiet(draw_truth(mounted_rig, np.random.default_rng(13)).with_gears(), **{"backlash_deg.pan": 1.0})
     plan = tuple(PlanStep(number, "home", 0, 0) for number in range(30))
     for side, angle_deg in (("left", -0.5), ("right", 0.5)):
-        told, untold = (
+        known, hidden = (
             simulate(mounted_rig, plan, 2, truth, home_approach=(side, "up"), sides_recorded=recorded)
             for recorded in (True, False)
         )
-        assert told.truth == untold.truth
-        assert {move.pan_approach for move in told.campaign.moves} == {side}
-        assert {(move.pan_approach, move.tilt_approach) for move in untold.campaign.moves} == {("unknown", "unknown")}
-        at = np.array(untold.truth.mirror_angles_deg)[:, 0] - np.array(untold.truth.home_offsets_deg)[:, 0]
+        assert known.truth == hidden.truth
+        assert {move.pan_approach for move in known.campaign.moves} == {side}
+        assert {(move.pan_approach, move.tilt_approach) for move in hidden.campaign.moves} == {("unknown", "unknown")}
+        at = np.array(hidden.truth.mirror_angles_deg)[:, 0] - np.array(hidden.truth.home_offsets_deg)[:, 0]
         assert at == pytest.approx(angle_deg, abs=1e-12) and HOME_SD_DEG > 0
     drawn = simulate(mounted_rig, plan, 3, truth, home_approach=None, sides_recorded=False)
     assert drawn.truth.homing_side is not None

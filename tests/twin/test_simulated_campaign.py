@@ -113,8 +113,8 @@ def test_homing_ends_on_the_side_that_it_states():
     known |= {"backlash_deg.pan": 1.0, "backlash_deg.tilt": 0.6, "tilt_zero_deg": 0.25}
     truth = replace(truth, parameters=truth.parameters | known)
     for sides, angles_deg in ((("left", "up"), (-0.5, -0.05)), (("right", "down"), (0.5, 0.55))):
-        found = simulate(rig, [PlanStep(0, "home", 0, 0)], 1, truth, home_approach=sides).truth
-        assert found.mirror_angles_deg[0] == pytest.approx(angles_deg, abs=1e-12)
+        homed = simulate(rig, [PlanStep(0, "home", 0, 0)], 1, truth, home_approach=sides).truth
+        assert homed.mirror_angles_deg[0] == pytest.approx(angles_deg, abs=1e-12)
 
 
 def test_unknown_approach_is_uniform_in_the_band():
@@ -227,9 +227,9 @@ def test_looks_scatter_also_where_an_axis_stands():
     ahead = [mirror_chain(psi + a, beta + b, p)[1] for a, b in ((0.0, 0.0), (1e-6, 0.0), (0.0, 1e-6))]
     for axis, by_angle in zip(("pan", "tilt"), (ahead[1] - ahead[0], ahead[2] - ahead[0]), strict=True):
         shaking = replace(still, parameters={**p, f"look_scatter_deg.{axis}": 0.05})
-        found = simulate(rig, plan.steps, 5, shaking)
-        assert found.truth.mirror_angles_deg == without.truth.mirror_angles_deg
-        sideways = np.linalg.norm(found.light.directions - without.light.directions, axis=1)
+        shaken = simulate(rig, plan.steps, 5, shaking)
+        assert shaken.truth.mirror_angles_deg == without.truth.mirror_angles_deg
+        sideways = np.linalg.norm(shaken.light.directions - without.light.directions, axis=1)
         expected = np.radians(0.05) * np.linalg.norm(by_angle) / 1e-6
         # Of n normal numbers; neighbours are independent: each is another draw.
         assert np.sqrt(np.mean(sideways**2)) == pytest.approx(expected, rel=4 / np.sqrt(2 * count))
@@ -270,9 +270,9 @@ def test_streams_are_independent():
     stripped = tuple(replace(spot, aperture_deg=None) for spot in with_readings.campaign.spots)
     assert stripped == without.campaign.spots
     assert all(spot.aperture_deg is not None for spot in with_readings.campaign.spots if spot.status == "ok")
-    given = draw_truth(rig, np.random.default_rng(1))
-    assert simulate(rig, plan, 8, given).campaign.spots == without.campaign.spots, "u = 0: any draw is the same rig"
-    noisier = simulate(rig, plan, 8, given, spot_sd_px=0.16)
+    truth = draw_truth(rig, np.random.default_rng(1))
+    assert simulate(rig, plan, 8, truth).campaign.spots == without.campaign.spots, "u = 0: any draw is the same rig"
+    noisier = simulate(rig, plan, 8, truth, spot_sd_px=0.16)
     assert noisier.truth.stop_errors_deg == without.truth.stop_errors_deg
 
 
@@ -286,9 +286,9 @@ def test_spots_lie_on_beam_and_sheet():
     truth, p = simulated.truth, simulated.truth.parameters
     rotation = rotation_matrix(np.array([p[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
     translation = np.array([p[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
-    seen = [spot for spot in simulated.campaign.spots if spot.status == "ok"]
-    assert len(seen) == len(simulated.campaign.spots)
-    for spot in seen:
+    usable = [spot for spot in simulated.campaign.spots if spot.status == "ok"]
+    assert len(usable) == len(simulated.campaign.spots)
+    for spot in usable:
         pixels = np.array([spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px])
         point = triangulate(truth.stereo, pixels, p["focal_scale"])[0]
         origin, direction = mirror_chain(*np.radians(truth.mirror_angles_deg[spot.move]), p)
@@ -306,18 +306,18 @@ def test_aperture_reads_the_spot_with_its_zero(convention: str):
 
     rig = make_rig(truth_u=0.0)
     rig = replace(rig, table=replace(rig.table, aperture_convention=convention))
-    given = {
+    changed = {
         "aperture_zero_deg": 1.5,
         "baseline_mm": 201.0,
         "pan_zero_emission_deg": 92.0,
         "aperture_sd_deg": 0.02,
     }
     truth = draw_truth(rig, np.random.default_rng(0))
-    truth = replace(truth, parameters=truth.parameters | given)
+    truth = replace(truth, parameters=truth.parameters | changed)
     plan = grid_protocol(("d1", "d2"), pan_steps=(-60, 0, 60), tilt_steps=(-60, 0, 60))
     simulated = simulate(rig, plan, 5, truth, spot_sd_px=1e-9, aperture=True)
-    p, seen = simulated.truth.parameters, simulated.campaign.spots
-    pixels = np.array([[s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px] for s in seen])
+    p, spots = simulated.truth.parameters, simulated.campaign.spots
+    pixels = np.array([[s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px] for s in spots])
     points_S = triangulate(truth.stereo, pixels, p["focal_scale"])
     rotation = rotation_matrix(np.array([p[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
     points_P = (points_S - [p[f"extrinsics.translation_mm.{a}"] for a in "xyz"]) @ rotation
@@ -327,7 +327,7 @@ def test_aperture_reads_the_spot_with_its_zero(convention: str):
     z = points_P[:, 2]
     cone = np.degrees(np.arccos(y / np.sqrt(x**2 + y**2 + z**2)))
     plane = np.degrees(np.arccos(y / np.hypot(x, y)))
-    error = np.array([s.aperture_deg for s in seen]) - (cone if convention == "in-plane" else plane) - 1.5
+    error = np.array([s.aperture_deg for s in spots]) - (cone if convention == "in-plane" else plane) - 1.5
     # 36 readings: mean within four standard errors, sd within four of its own (1/sqrt(70) = 12 %).
     assert np.mean(error) == pytest.approx(0.0, abs=4 * 0.02 / 6)
     assert np.std(error, ddof=1) == pytest.approx(0.02, rel=4 * 0.12)
@@ -437,9 +437,9 @@ def test_zeros_creep_from_switching_on_and_shift_with_the_temperature():
 
     plain, times_s, _ = angles(still)
     for header, minutes in ((None, times_s / 60), (early, times_s / 60 + 3)):
-        found, _, _ = angles(moving, header)
+        crept_deg, _, _ = angles(moving, header)
         crept = (1 - np.exp(-minutes / 5))[:, None] * [0.1, -0.03]
-        np.testing.assert_allclose(found - plain, crept, atol=ROUNDING_DEG)
+        np.testing.assert_allclose(crept_deg - plain, crept, atol=ROUNDING_DEG)
     warmed, _, campaign = angles(moving, temperature=lambda t: 20 + t / 100)
     crept = (1 - np.exp(-times_s / 300))[:, None] * [0.1, -0.03]
     np.testing.assert_allclose(warmed - plain - crept, np.outer(times_s / 100, [0.02, 0.0]), atol=ROUNDING_DEG)

@@ -75,10 +75,10 @@ def test_footprint_is_the_push_forward_of_the_beam(twin):
     draws = 20_000
     starts = point - 50 * beam + 0.05 * rng.standard_normal((draws, 3))
     hits = starts + ((point - starts) @ normal / (beam @ normal))[:, None] * beam
-    seen = cameras.right.project(np.column_stack((-hits[:, 1], -hits[:, 2], hits[:, 0])))
+    pixels = cameras.right.project(np.column_stack((-hits[:, 1], -hits[:, 2], hits[:, 0])))
     # Sampling error of a variance is sqrt(2 / n) of it: 1 %; five of them.
     scale = np.sqrt(np.outer(np.diag(spot.covariance_px2), np.diag(spot.covariance_px2)))
-    assert np.abs((np.cov(seen.T) - spot.covariance_px2) / scale).max() < 0.05
+    assert np.abs((np.cov(pixels.T) - spot.covariance_px2) / scale).max() < 0.05
     assert spot.peak_dn == pytest.approx(Scene().peak_dn * abs(beam @ normal) / np.linalg.norm(normal))
 
 
@@ -137,8 +137,8 @@ def test_opencv_finds_the_corners_where_the_optics_put_them(mounted_rig):
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
     for number, camera in enumerate((cameras.left, cameras.right)):
         grey = cv2.cvtColor(render_board(camera, pose, board, Sensor(), (5, 1, number)), cv2.COLOR_BGR2GRAY)
-        found, corners = cv2.findChessboardCorners(grey, (board.columns, board.rows))
-        assert found
+        complete, corners = cv2.findChessboardCorners(grey, (board.columns, board.rows))
+        assert complete
         true = camera.project(board.corners_mm() @ pose.rotation.T + pose.translation_mm)
         corners = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2), (5, 5), (-1, -1), stop).reshape(-1, 2)
         order = np.argmin(np.linalg.norm(corners[None] - true[:, None], axis=2), axis=1)
@@ -203,9 +203,9 @@ def test_simulate_writes_frames_that_detect_reads(mounted_rig, tmp_path, capsys,
     true = project(twin.light.points_mm, twin.truth.stereo, twin.truth.parameters["focal_scale"])
     assert run(["detect", str(tmp_path / "c"), "--speckle-contrast", "0.4"]) == 0
     for spot, where in zip(read_campaign(tmp_path / "c").spots, true, strict=True):
-        found = [spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px]
+        pixels = [spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px]
         stated = [spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px]
-        assert np.abs((found - where) / stated).max() < 5
+        assert np.abs((pixels - where) / stated).max() < 5
         assert 0.02 < min(stated) < max(stated) < 0.12
 
 
@@ -213,8 +213,8 @@ def test_boards_are_wholly_inside_both_images(mounted_rig):
     cameras, board = cameras_of(mounted_rig.stereo), Board()
     for pose in board_poses(cameras, board, 20, 1):
         for camera in (cameras.left, cameras.right):
-            seen = camera.project(board.corners_mm() @ pose.rotation.T + pose.translation_mm)
-            assert ((seen > 0) & (seen < [WIDTH - 1, HEIGHT - 1])).all()
+            pixels = camera.project(board.corners_mm() @ pose.rotation.T + pose.translation_mm)
+            assert ((pixels > 0) & (pixels < [WIDTH - 1, HEIGHT - 1])).all()
     with pytest.raises(InputError, match="fits into both images 0 of 2 times"):
         board_poses(cameras, Board(pitch_mm=100.0), 2, 1)
 

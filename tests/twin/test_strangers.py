@@ -48,7 +48,7 @@ def printed() -> Head:
 
 
 def test_the_beam_of_the_published_vector(printed):
-    on, ahead = (found[0] for found in printed.beams(np.array([10.0]), np.array([5.0])))
+    on, ahead = (part[0] for part in printed.beams(np.array([10.0]), np.array([5.0])))
     # The design rounded from these digits: half a unit of the last one and no more.
     assert np.abs(ahead - [0.981182562588, 0.177188586189, 0.076713648059]).max() <= LAST_12 * 1.01
     origin = np.array([5.371658918, -29.176887333, -0.940368833])
@@ -109,9 +109,9 @@ def test_noiseless_spots_triangulate_onto_their_beams(drawn):
         points = (flat[:3] / flat[3]).T
         on, ahead = rig.head.beams(*stage)
         local = (points - rig.shift_mm) @ rig.rotation
-        seen = rig.seen(spots)[1]
+        inside = rig.seen(spots)[1]
         # 1e-10 of the focal length at a parallax of 0.1 and 1 m.
-        assert np.linalg.norm(np.cross(local - on, ahead), axis=1)[seen].max(initial=0.0) < 1e-5
+        assert np.linalg.norm(np.cross(local - on, ahead), axis=1)[inside].max(initial=0.0) < 1e-5
 
 
 def perfect(ratio: float, play: float = 0.0) -> Gear:
@@ -120,25 +120,25 @@ def perfect(ratio: float, play: float = 0.0) -> Gear:
 
 def test_slopes_of_a_perfect_rig_are_its_ratios():
     counters = np.random.default_rng(3).integers(-150, 150, (50, 2))
-    found = true_values(Head(25.0), [perfect(0.06, 0.2), perfect(0.07, 0.1)], counters)
-    assert found["effective_deg_per_step"] == pytest.approx({"pan": 0.06, "tilt": 0.07}, abs=1e-12)
-    assert found["backlash_deg"] == pytest.approx({"pan": 0.2, "tilt": 0.1})
-    assert found["mirror_offset_mm"] == pytest.approx(25.0, abs=ROUNDING)
+    values = true_values(Head(25.0), [perfect(0.06, 0.2), perfect(0.07, 0.1)], counters)
+    assert values["effective_deg_per_step"] == pytest.approx({"pan": 0.06, "tilt": 0.07}, abs=1e-12)
+    assert values["backlash_deg"] == pytest.approx({"pan": 0.2, "tilt": 0.1})
+    assert values["mirror_offset_mm"] == pytest.approx(25.0, abs=ROUNDING)
 
 
 def test_a_transmission_error_along_a_line_adds_to_the_slope():
     counters = np.arange(-100, 101, 10)[:, None] * [1, -1]
     gears = [replace(perfect(0.06), error_deg=lambda place: 0.01 * place), perfect(0.07)]
-    found = true_values(Head(25.0), gears, counters)["effective_deg_per_step"]
-    assert found == pytest.approx({"pan": 0.06 * 1.01, "tilt": 0.07}, abs=1e-12)
+    slopes = true_values(Head(25.0), gears, counters)["effective_deg_per_step"]
+    assert slopes == pytest.approx({"pan": 0.06 * 1.01, "tilt": 0.07}, abs=1e-12)
 
 
 def test_play_of_the_published_sequence():
     """B 0.3, y = -0.15 after a move to higher counters, one ratio: the wheel waits until the play is used up."""
     counters = np.cumsum([0, 200, -200, 3, -2, 100])
     first = np.arange(6) == 0
-    found = perfect(0.06, 0.3).driven(counters, first, np.zeros(6), 1, np.random.default_rng(0))
-    np.testing.assert_allclose(found, [-0.15, 11.85, 0.15, 0.15, 0.15, 5.91], atol=1e-12)
+    angles = perfect(0.06, 0.3).driven(counters, first, np.zeros(6), 1, np.random.default_rng(0))
+    np.testing.assert_allclose(angles, [-0.15, 11.85, 0.15, 0.15, 0.15, 5.91], atol=1e-12)
 
 
 def test_a_stop_error_stays_while_its_axis_stands_and_a_look_error_does_not():
@@ -146,9 +146,9 @@ def test_a_stop_error_stays_while_its_axis_stands_and_a_look_error_does_not():
     rng = np.random.default_rng(5)
     kept = replace(perfect(0.06), stop_sd_deg=0.03).driven(counters, first, np.zeros(600), 1, rng)
     assert {len(set(part)) for part in np.split(kept, 3)} == {1} and kept[0] != kept[-1]
-    anew = replace(perfect(0.06), look_sd_deg=0.02).driven(counters, first, np.zeros(600), 1, rng)
+    scattered = replace(perfect(0.06), look_sd_deg=0.02).driven(counters, first, np.zeros(600), 1, rng)
     # Standard error of an sd of 600: 3 %; five of them.
-    assert np.std(anew - 0.06 * counters) == pytest.approx(0.02, rel=0.15)
+    assert np.std(scattered - 0.06 * counters) == pytest.approx(0.02, rel=0.15)
 
 
 def test_benches_follow_from_seed_and_number(drawn, tmp_path):
@@ -190,8 +190,8 @@ def test_commands_take_a_bench_as_its_owner_has_it(drawn, tmp_path):
     assert pair.assumed and np.allclose(pair.T, one.calibration.found["T"].ravel())
 
 
-def answer(**given: object) -> str:
-    return strangers.answer_of({"estimator": "laplace", "converged": False, "sampling": None, **given})["answer"]
+def answer(**entries: object) -> str:
+    return strangers.answer_of({"estimator": "laplace", "converged": False, "sampling": None, **entries})["answer"]
 
 
 def test_answers_of_old_and_new_releases():
@@ -210,8 +210,8 @@ def test_headlines_stand_beside_their_truths():
         "parameters": {"backlash_deg.pan": entry, "effective_mirror_offset_mm": entry},
     }
     truth = {strangers.RATIO: {"pan": 0.06, "tilt": 0.07}, "backlash_deg": {"pan": 0.1, "tilt": 0.2}}
-    found = strangers.headlines_of(document, truth | {"mirror_offset_mm": 30.0})
-    assert {name: e["truth"] for name, e in found.items()} == {
+    headlines = strangers.headlines_of(document, truth | {"mirror_offset_mm": 30.0})
+    assert {name: e["truth"] for name, e in headlines.items()} == {
         f"{strangers.RATIO}.left": 0.06,
         f"{strangers.RATIO}.right": 0.06,
         f"{strangers.RATIO}.up": 0.07,
@@ -219,8 +219,8 @@ def test_headlines_stand_beside_their_truths():
         "backlash_deg.pan": 0.1,
         "effective_mirror_offset_mm": 30.0,
     }
-    found["backlash_deg.pan"]["below_truth"] = stats.norm.cdf(-1.8)
-    z, held, _ = strangers.judged([{"headlines": found}, {}], "backlash_deg.pan")
+    headlines["backlash_deg.pan"]["below_truth"] = stats.norm.cdf(-1.8)
+    z, held, _ = strangers.judged([{"headlines": headlines}, {}], "backlash_deg.pan")
     assert z == pytest.approx([1.8]) and held.tolist() == [1.0]
 
 

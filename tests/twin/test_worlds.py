@@ -33,18 +33,18 @@ def test_a_world_errs_by_its_size_and_leaves_all_else(mounted_rig, world):
         place = run.truth.parameters[f"degrees_per_step.{name}"] * np.array(
             [getattr(move, f"{name}_steps") for move in run.campaign.moves], float
         )
-        found = shift[:, axis]
+        error = shift[:, axis]
         if world == "step":
-            assert found == pytest.approx(0.1 * (place > STEP_AT_DEG[name]), abs=1e-12) and np.ptp(found) > 0.09
+            assert error == pytest.approx(0.1 * (place > STEP_AT_DEG[name]), abs=1e-12) and np.ptp(error) > 0.09
         elif world == "warm-up":
             hours = np.array([move.time_s for move in run.campaign.moves]) / 3600
             # One segment: the zero is that of the homing at its begin, 0 hours.
-            assert found == pytest.approx(0.1 * (1 - np.exp(-hours / WARM_UP_HOURS)), abs=1e-12)
+            assert error == pytest.approx(0.1 * (1 - np.exp(-hours / WARM_UP_HOURS)), abs=1e-12)
         else:
             wave = np.exp(2j * np.pi * place / PERIOD_DEG[world])
-            parts = np.linalg.lstsq(np.column_stack([wave.real, wave.imag]), found, rcond=None)[0]
+            parts = np.linalg.lstsq(np.column_stack([wave.real, wave.imag]), error, rcond=None)[0]
             assert np.hypot(*parts) == pytest.approx(0.1, abs=1e-9)
-            assert found == pytest.approx(parts[0] * wave.real + parts[1] * wave.imag, abs=1e-12)
+            assert error == pytest.approx(parts[0] * wave.real + parts[1] * wave.imag, abs=1e-12)
 
 
 def test_worlds_repeat_by_seed_and_replace_what_the_rig_would_draw(mounted_rig):

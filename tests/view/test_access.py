@@ -74,10 +74,10 @@ def test_no_two_pages_share_a_token(access):
 
 @pytest.mark.parametrize("host", ["127.0.0.1:4711", "localhost:4711"])
 def test_own_page_may_ask(access, host):
-    own = {"Host": host}
-    assert access.stranger(own) is None
-    assert access.stranger({**own, "Origin": f"http://{host}", "Sec-Fetch-Site": "same-origin"}) is None
-    assert access.stranger({**own, "Sec-Fetch-Site": "none"}) is None
+    headers = {"Host": host}
+    assert access.stranger(headers) is None
+    assert access.stranger({**headers, "Origin": f"http://{host}", "Sec-Fetch-Site": "same-origin"}) is None
+    assert access.stranger({**headers, "Sec-Fetch-Site": "none"}) is None
 
 
 @pytest.mark.parametrize(

@@ -49,14 +49,14 @@ class Gated(TwinObserver):
     def observe(self, positioner, spot):
         positioner.laser(True)
         self.gate.reached(spot)
-        seen = super().observe(positioner, spot)
-        u_left, v_left, u_right, v_right = seen.sighting.pixels_px
+        observation = super().observe(positioner, spot)
+        u_left, v_left, u_right, v_right = observation.sighting.pixels_px
         pictures = {}
         for camera, (u, v) in (("left", (u_left, v_left)), ("right", (u_right, v_right))):
             image = np.full((720, 1280), 20, np.uint8)
             image[round(v) - 2 : round(v) + 3, round(u) - 2 : round(u) + 3] = 240
             pictures[frame_name(spot, camera)] = png_bytes(image)
-        return Observation(seen.sighting, pictures)
+        return Observation(observation.sighting, pictures)
 
 
 class Gate:
@@ -193,8 +193,8 @@ def test_every_button_is_acknowledged_by_the_device(going, browsed, tmp_path):
     browsed.until(f"{ENABLED} === ''")
     assert "interrupted" in text(browsed, "notes")
     assert going.finish().reason == "interrupted"
-    asked = [r.data["what"] for r in read_journal(tmp_path / "c").records if r.event == "asked"]
-    assert asked == ["laser off", "resume", "pause", "stop"]
+    requests = [r.data["what"] for r in read_journal(tmp_path / "c").records if r.event == "asked"]
+    assert requests == ["laser off", "resume", "pause", "stop"]
     assert browsed.complaints() == []
 
 
@@ -234,8 +234,8 @@ def test_control_comes_to_who_is_there_once_the_other_browser_is_gone(going, bro
     told(browsed, "requests", "control passed on")
     assert "Closing this page changes nothing" in browsed.js("return document.querySelector('header').textContent")
     assert going.finish().ok == 8
-    asked = [r.data["what"] for r in read_journal(going.run.engine.journal.folder).records if r.event == "asked"]
-    assert asked == ["control passed on"]
+    requests = [r.data["what"] for r in read_journal(going.run.engine.journal.folder).records if r.event == "asked"]
+    assert requests == ["control passed on"]
 
 
 def test_another_origin_asks_for_nothing(going, browsed):
@@ -260,9 +260,9 @@ def test_another_origin_asks_for_nothing(going, browsed):
     with foreign_page() as foreign:
         assert browsed.opened(foreign) == "foreign"
         browsed.driver.set_script_timeout(SECONDS_MAX)
-        own = going.link.partition("#")[0]
-        assert browsed.driver.execute_async_script(tried, own) == ["refused"] * 3
-        browsed.driver.get(own.replace("127.0.0.1", "localhost."))
+        address = going.link.partition("#")[0]
+        assert browsed.driver.execute_async_script(tried, address) == ["refused"] * 3
+        browsed.driver.get(address.replace("127.0.0.1", "localhost."))
         assert "403" in browsed.driver.page_source
     assert browsed.opened(going.link) == "running"
     assert going.live.requests.recent() == ()

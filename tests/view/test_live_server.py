@@ -172,8 +172,8 @@ def test_wrong_token_gets_no_key(asker, body):
 
 
 def test_preflight_of_another_origin_is_refused(asker):
-    asked = {"Origin": "http://evil.example", "Access_Control_Request_Headers": KEY_HEADER}
-    assert asker.answer("/live", "OPTIONS", **asked)[0] == 403
+    headers = {"Origin": "http://evil.example", "Access_Control_Request_Headers": KEY_HEADER}
+    assert asker.answer("/live", "OPTIONS", **headers)[0] == 403
 
 
 def test_large_request_is_cut_off(asker):

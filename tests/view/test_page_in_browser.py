@@ -93,20 +93,20 @@ def test_every_switch_of_the_rig(page):
     def path(name: str) -> str:
         return page.js(PATH, "rig", name)
 
-    seen = set()
+    paths = set()
     for view in ("from-above", "from-side", "from-behind"):
         page.click(view)
-        seen.add(path("spots 0"))
+        paths.add(path("spots 0"))
     before = path("ellipsoids 0")
     Select(page.one("ellipsoid-scale")).select_by_visible_text("100")
     assert path("ellipsoids 0") != before
     chart = page.driver.find_element(By.CSS_SELECTOR, "#rig svg")
     webdriver.ActionChains(page.driver).drag_and_drop_by_offset(chart, 80, 30).perform()
-    seen.add(path("spots 0"))
+    paths.add(path("spots 0"))
     for button in ("larger-rig", "smaller-rig"):
         page.click(button)
-        seen.add(path("spots 0"))
-    assert len(seen) >= 5
+        paths.add(path("spots 0"))
+    assert len(paths) >= 5
 
 
 def test_looks_are_walked_by_number(page):
@@ -160,19 +160,19 @@ def dragged(page: Browsed, plot: str, *way: tuple[float, float]) -> None:
 
 
 def test_what_is_framed_or_clicked_in_one_plot_is_selected_in_all(page):
-    seen = 2 * 383
+    count = 2 * 383
     dragged(page, "residuals", (0.01, 0.01), (0.5, 0.5), (0.99, 0.99))
-    assert page.chosen() == seen and page.marks("stops") == page.marks("residuals") == [seen, seen]
-    assert page.one("chosen").text == f"{seen} looks are selected"
-    assert page.layers("rig", "chosen")[0] == seen
+    assert page.chosen() == count and page.marks("stops") == page.marks("residuals") == [count, count]
+    assert page.one("chosen").text == f"{count} looks are selected"
+    assert page.layers("rig", "chosen")[0] == count
     # Nothing lies in this corner, so the selection stays.
     dragged(page, "residuals", (0.01, 0.9), (0.02, 0.98))
-    assert page.chosen() == seen
+    assert page.chosen() == count
     # The left half: counters of one side.
     Select(page.one("mode-stops")).select_by_value("lasso")
     dragged(page, "stops", (0.01, 0.01), (0.01, 0.99), (0.55, 0.99), (0.55, 0.01))
     half = page.chosen()
-    assert 0 < half < seen and page.marks("residuals") == [half, half]
+    assert 0 < half < count and page.marks("residuals") == [half, half]
     Select(page.one("mode-stops")).select_by_value("move")
     before = page.js("return document.page.plots.stops.panels[0].box.xs")
     dragged(page, "stops", (0.4, 0.4), (0.5, 0.5))
@@ -254,9 +254,9 @@ def test_folder_without_results_and_one_without_spots(viewed, browsed, tmp_path)
     campaign = read_campaign(viewed.bare)
     blind = replace(campaign, spots=tuple(with_pixels(spot, "undetected") for spot in campaign.spots))
     browsed.complaints()
-    for looked, seen in ((look_at(viewed.bare), 383), (Looked((scene(blind),)), 0)):
-        assert browsed.opened(page_of(tmp_path / f"{seen}.html", looked, viewed.bare)) == "ready"
-        assert browsed.layers("rig", "spots") == [seen] and len(browsed.layers("rig", "cameras")) == 1
+    for looked, count in ((look_at(viewed.bare), 383), (Looked((scene(blind),)), 0)):
+        assert browsed.opened(page_of(tmp_path / f"{count}.html", looked, viewed.bare)) == "ready"
+        assert browsed.layers("rig", "spots") == [count] and len(browsed.layers("rig", "cameras")) == 1
         assert browsed.one("residuals-remark").text.startswith("No residuals without a fit")
         assert not browsed.one("correlation-figure").is_displayed()
         assert not browsed.one("changes-figure").is_displayed()

@@ -57,11 +57,11 @@ def test_unlikely_looks_come_first_and_the_limit_holds(looks, tmp_path):
     wanted = replace(with_kept(looks, *kept), suspect=suspect)
     all_of_them = look_pictures(tmp_path, wanted)
     assert sorted(all_of_them) == kept
-    size = sum(picture.size for own in all_of_them.values() for picture in own.values())
+    size = sum(picture.size for of_look in all_of_them.values() for picture in of_look.values())
     shares = []
     some = look_pictures(tmp_path, wanted, size // 4, shares.append)
     assert next(iter(some)) == 51 and shares == sorted(shares)
-    assert sum(picture.size for own in some.values() for picture in own.values()) <= size // 4
+    assert sum(picture.size for of_look in some.values() for picture in of_look.values()) <= size // 4
     # A quarter of equal pictures, evenly chosen: no gap is wider than three even ones.
     assert len(some) in (9, 10) and max(np.diff(sorted([20, *some, 59]))) <= 3 * 4
 
@@ -73,8 +73,8 @@ def test_damaged_pictures_and_links_that_leave_the_folder_are_left_out(looks, tm
     write(folder, 4, "right", np.full((72, 128), 40, np.uint8))
     (folder / frame_name(3, "left")).symlink_to(tmp_path / frame_name(3, "left"))
     (folder / frame_name(3, "right")).write_bytes(b"no picture")
-    found = look_pictures(folder, with_kept(looks, 3, 4, 5))
-    assert list(found) == [4] and list(found[4]) == ["right"]
+    pictures = look_pictures(folder, with_kept(looks, 3, 4, 5))
+    assert list(pictures) == [4] and list(pictures[4]) == ["right"]
     # The spot lies beyond this small picture.
-    assert found[4]["right"].spot is None and found[4]["right"].corner_px is None
+    assert pictures[4]["right"].spot is None and pictures[4]["right"].corner_px is None
     assert look_pictures(None, with_kept(looks, 3)) == {}

@@ -34,8 +34,8 @@ def test_spots_expected_are_those_of_the_fit(found, shown):
     fit = found.fitted.fit
     turned = turned_by(fit.arrays, np.asarray(fit.mode.place_errors_rad)[None])
     expected = looks(fit, fit.z[None], turned)[0]
-    seen = [spot.spot for spot in ordered_spots(found.campaign)]
-    rows = [shown.looks.spot.tolist().index(spot) for spot in seen]
+    numbers = [spot.spot for spot in ordered_spots(found.campaign)]
+    rows = [shown.looks.spot.tolist().index(spot) for spot in numbers]
     # Rounding of pixels of a thousand.
     np.testing.assert_allclose(shown.looks.predicted_px[rows], expected, atol=1e-8)
     assert shown.fitted and shown.notes == ()
@@ -85,9 +85,9 @@ def test_stops_stand_at_their_looks(found, shown):
 
 def test_parameters_and_correlations_are_those_of_the_record(found, shown):
     record = found.fitted.record
-    told = {row.name: row for row in shown.parameters}
-    assert told["mirror_offset_mm"].value == record.summary.parameters["mirror_offset_mm"].value
-    assert told["effective_deg_per_step.left"].unit == "deg/step"
+    rows = {row.name: row for row in shown.parameters}
+    assert rows["mirror_offset_mm"].value == record.summary.parameters["mirror_offset_mm"].value
+    assert rows["effective_deg_per_step.left"].unit == "deg/step"
     assert not [name for name in shown.correlated if name.startswith("stereo.")]
     np.testing.assert_allclose(np.diag(shown.correlation), 1.0, atol=1e-12)
     a, b = (record.covariance.names.index(name) for name in shown.correlated[:2])
@@ -132,8 +132,8 @@ def test_campaign_without_a_usable_spot(viewed):
     blind = replace(campaign, spots=tuple(with_pixels(spot, "undetected") for spot in campaign.spots))
     shown = scene(blind)
     assert np.isnan(shown.origin_mm).all() and shown.sheets == () and len(shown.cameras) == 2
-    told = json.loads(document(Looked((shown,))))
-    assert told["scenes"][0]["rig"]["origin_mm"] is None
+    page = json.loads(document(Looked((shown,))))
+    assert page["scenes"][0]["rig"]["origin_mm"] is None
 
 
 def test_unknown_approaches_and_correlated_pixels():
@@ -149,9 +149,9 @@ def unpacked(sent) -> np.ndarray:
 
 
 def test_document_carries_every_column(shown):
-    told = json.loads(document(Looked((shown,))))
-    (one,) = told["scenes"]
-    assert told["changes"] is None and one["fitted"] is True
+    page = json.loads(document(Looked((shown,))))
+    (one,) = page["scenes"]
+    assert page["changes"] is None and one["fitted"] is True
     looks = one["looks"]
     assert {sent["type"] for sent in looks.values() if isinstance(sent, dict)} == set(KINDS.values())
     np.testing.assert_array_equal(unpacked(looks["spot"]), shown.looks.spot)
@@ -167,6 +167,6 @@ def test_document_carries_every_column(shown):
 def test_two_campaigns_with_what_has_changed(viewed):
     looked = look_at(viewed.folder, viewed.folder)
     assert len(looked.scenes) == 2 and looked.changes.verdict == "no significant change"
-    told = json.loads(document(looked))
-    assert [change["significant"] for change in told["changes"]["changes"]] == [False] * 6
+    page = json.loads(document(looked))
+    assert [change["significant"] for change in page["changes"]["changes"]] == [False] * 6
     assert look_at(viewed.folder, viewed.bare).changes is None

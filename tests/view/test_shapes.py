@@ -19,8 +19,8 @@ def test_pyramids_end_in_the_corners_of_the_images():
     edges = np.array([(-0.5, -0.5), (1279.5, -0.5), (1279.5, 719.5), (-0.5, 719.5)])
     # Undistortion is checked to 1e-9 px; the pinhole stands in where it does not reach.
     for pyramid, columns in ((left, slice(0, 2)), (right, slice(2, 4))):
-        seen = project_pair(stereo, pyramid.corners_mm[1:])[:, columns]
-        np.testing.assert_allclose(seen, edges, atol=1e-6)
+        pixels_px = project_pair(stereo, pyramid.corners_mm[1:])[:, columns]
+        np.testing.assert_allclose(pixels_px, edges, atol=1e-6)
     assert np.linalg.norm(right.corners_mm[0]) == np.linalg.norm(small_stereo().T)
     # To the right of the left one: negative Y.
     assert right.corners_mm[0, 1] < -80
@@ -48,20 +48,20 @@ def test_ellipsoid_holds_95_percent_of_triangulated_points():
     covariance = np.diag([0.1, 0.2, 0.1, 0.15]) ** 2
     covariance[0, 1] = covariance[1, 0] = 0.3 * 0.1 * 0.2
     pixels = project_pair(stereo, POINTS_MM)
-    found = point_covariance_mm2(stereo, POINTS_MM, np.broadcast_to(covariance, (2, 4, 4)))
-    axes = ellipsoid_axes_mm(found)
-    for k, own in enumerate(pixels):
-        noisy = triangulate(stereo, own + generator.multivariate_normal(np.zeros(4), covariance, 4000))
+    covariances = point_covariance_mm2(stereo, POINTS_MM, np.broadcast_to(covariance, (2, 4, 4)))
+    axes = ellipsoid_axes_mm(covariances)
+    for k, pixel in enumerate(pixels):
+        noisy = triangulate(stereo, pixel + generator.multivariate_normal(np.zeros(4), covariance, 4000))
         inside = np.linalg.norm((noisy - POINTS_MM[k]) @ np.linalg.inv(axes[k]), axis=1) < 1
         # 4000 draws: standard error 0.0034; linear triangulation weighs the pixels a little otherwise.
         assert abs(inside.mean() - 0.95) < 5 * 0.0034
         np.testing.assert_allclose(axes[k] @ axes[k].T, np.diag(np.sum(axes[k] ** 2, axis=1)), atol=1e-9)
-    assert stats.chi2.cdf(np.trace(axes[0] @ np.linalg.inv(found[0]) @ axes[0].T) / 3, 3) > 0.9499
+    assert stats.chi2.cdf(np.trace(axes[0] @ np.linalg.inv(covariances[0]) @ axes[0].T) / 3, 3) > 0.9499
 
 
 def test_unknown_points_have_no_shape():
     points = np.array([POINTS_MM[0], [np.nan] * 3])
-    found = point_covariance_mm2(small_stereo(), points, np.broadcast_to(0.01 * np.eye(4), (2, 4, 4)))
-    assert np.isfinite(found[0]).all() and np.isnan(found[1]).all()
-    assert np.isnan(ellipsoid_axes_mm(found)[1]).all()
+    covariances = point_covariance_mm2(small_stereo(), points, np.broadcast_to(0.01 * np.eye(4), (2, 4, 4)))
+    assert np.isfinite(covariances[0]).all() and np.isnan(covariances[1]).all()
+    assert np.isnan(ellipsoid_axes_mm(covariances)[1]).all()
     assert sheets(["d1"] * 2, points) == ()
