@@ -25,11 +25,11 @@ from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
 from tvsbayes.single_axis.waves import WavePeriods
 
 
-@pytest.mark.parametrize(("after", "said"), [(0.99, True), (0.96, True), (0.94, False), (0.3, False)])
-def test_a_plan_that_hardly_helps_says_so(after, said):
+@pytest.mark.parametrize(("after", "remark"), [(0.99, True), (0.96, True), (0.94, False), (0.3, False)])
+def test_a_plan_that_hardly_helps_says_so(after, remark):
     stop = NextStop(1_250_000.0, "forward", None, after, 1.0 - after, 0.1)
     text = axis_plan_text(AxisPlan("per_command", 1.0, (stop,), 0.5), "mm")
-    assert ("these stops have little effect: u falls by" in text) is said
+    assert ("these stops have little effect: u falls by" in text) is remark
     assert "1250000 " in text, "a counter is no power of ten"
 
 
@@ -52,16 +52,16 @@ def clean():
 
 
 @pytest.mark.parametrize(
-    ("warnings", "said"),
+    ("warnings", "verdict"),
     [
         ((), "usable"),
         (("segment 2 reads 16 times what others read",), "usable; see the warning"),
         (("reading 5 lies 9 sds off", "all moves have the same time"), "usable; see the 2 warnings"),
     ],
 )
-def test_the_verdict_alone_says_that_warnings_stand_beside_it(clean, warnings, said):
+def test_the_verdict_alone_says_that_warnings_stand_beside_it(clean, warnings, verdict):
     text = axis_fit_text(structs.replace(clean, warnings=warnings))
-    assert text.splitlines()[-1] == f"verdict: {said}"
+    assert text.splitlines()[-1] == f"verdict: {verdict}"
     assert text.count("warning: ") == len(warnings)
 
 
@@ -69,7 +69,7 @@ def test_a_fit_says_what_goes_into_firmware(clean):
     sides = {name: structs.replace(of, value=-0.05, sd=0.0005) for name, of in clean.effective_per_command.items()}
     clean = structs.replace(clean, effective_per_command=sides, range_command=(0.0, 1250000.0))
 
-    def said(value, low, high):
+    def text(value, low, high):
         play = structs.replace(clean.parameters["backlash"], value=value, sd=0.01, interval95=(low, high))
         mean = for_firmware(structs.replace(clean, effective_backlash=play))
         of_one = structs.replace(clean, effective_backlash=None, parameters={**clean.parameters, "backlash": play})
@@ -78,10 +78,10 @@ def test_a_fit_says_what_goes_into_firmware(clean):
 
     # 1/0.05 = 20, u 0.0005/0.05^2 = 0.2; 0.15/0.05 = 3, u 0.01/0.05 = 0.2.
     begun = f"for your firmware, from 0 to 1250000: -20.00(20) commands per {clean.unit}, "
-    assert said(0.15, 0.13, 0.17) == f"{begun}play of 3.00(20) commands"
-    assert said(-0.15, -0.17, -0.13) == f"{begun}no play: a reversal overshoots by 3.00(20) commands"
+    assert text(0.15, 0.13, 0.17) == f"{begun}play of 3.00(20) commands"
+    assert text(-0.15, -0.17, -0.13) == f"{begun}no play: a reversal overshoots by 3.00(20) commands"
     assert (
-        said(0.015, -0.01, 0.04) == f"{begun}play of 0.30(20) commands is not significant: its 95 % interval contains 0"
+        text(0.015, -0.01, 0.04) == f"{begun}play of 0.30(20) commands is not significant: its 95 % interval contains 0"
     )
 
 
@@ -91,10 +91,10 @@ def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(c
         PositionDeviation(1250000.0, -0.05, 0.01, (-0.07, -0.03)),
         PositionDeviation(2500000.0, 0.03, 0.01, (0.01, 0.05)),
     )
-    said = worst_place(structs.replace(clean, deviations=deviations))
+    sentence = worst_place(structs.replace(clean, deviations=deviations))
     assert (
         f"at command 1250000: -0.050(10) {clean.unit} off the line; it is the sum of the errors of gears and encoder"
-        in said
+        in sentence
     )
     assert "contains 0; it is" in worst_place(structs.replace(clean, deviations=deviations[:1]))
 
@@ -113,8 +113,8 @@ def test_a_drive_has_neither_play_nor_directions_nor_stops_to_read():
     readings = tuple(
         Reading(k, 0, float(v), 0.3, time_s=float(t)) for k, (v, t) in enumerate(zip(value, time_s, strict=True))
     )
-    asked = WavePeriods(stated=(200.0,), in_seconds=True)
-    campaign = AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, {}, {"rate": rate}, asked)
+    periods = WavePeriods(stated=(200.0,), in_seconds=True)
+    campaign = AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, {}, {"rate": rate}, periods)
     results = results_for(campaign)
     document = axis_document(results, Issue.today())
     text = axis_fit_text(results.summary)

@@ -19,7 +19,7 @@ COMMON = {"stop errors of the campaign": 0.80, "play variation": 0.37, "prior of
 """Shares of the variance."""
 
 
-def made(quantity: str, shares: dict[str, float], u: float = 0.017, estimate: float = 0.029) -> BudgetTable:
+def entry(quantity: str, shares: dict[str, float], u: float = 0.017, estimate: float = 0.029) -> BudgetTable:
     sources = [
         Source(name, "deg", 0.0, u * math.sqrt(share), "B" if name.startswith("prior") else "A", "normal", 40.0, 1.0)
         for name, share in shares.items()
@@ -27,8 +27,8 @@ def made(quantity: str, shares: dict[str, float], u: float = 0.017, estimate: fl
     return budget_table(quantity, "deg", estimate, u, sources)
 
 
-PAN = made("backlash_deg.pan", {**COMMON, "prior of backlash_deg.pan": 0.0012, "prior of tilt_zero_deg": 5e-4})
-TILT = made("backlash_deg.tilt", {**COMMON, "stop errors of the campaign": 0.75, "prior of backlash_deg.tilt": 0.096})
+PAN = entry("backlash_deg.pan", {**COMMON, "prior of backlash_deg.pan": 0.0012, "prior of tilt_zero_deg": 5e-4})
+TILT = entry("backlash_deg.tilt", {**COMMON, "stop errors of the campaign": 0.75, "prior of backlash_deg.tilt": 0.096})
 
 
 def section(*budgets: BudgetTable, **intervals: tuple[float, float]):
@@ -67,8 +67,8 @@ def test_an_input_of_one_quantity_alone_has_its_row(budgets):
     table = section(*budgets).tables[0]
     rows = {row[0]: row for row in table.rows}
     of_tilt = table.columns.index("share %, tilt"), table.columns.index("share %, pan")
-    own = rows["prior of the backlash, tilt, deg"]
-    assert (own[of_tilt[0]], own[of_tilt[1]]) == ("9.6", "")
+    cells = rows["prior of the backlash, tilt, deg"]
+    assert (cells[of_tilt[0]], cells[of_tilt[1]]) == ("9.6", "")
     others = rows["others, each below 0.5 %"]
     # Of pan: 0.3 of the laser's direction, 0.12 and 0.05 of its own.
     assert (others[of_tilt[0]], others[of_tilt[1]]) == ("0.3", "0.5")
@@ -79,7 +79,7 @@ def test_what_both_quantities_do_not_share_is_told_of_either():
     """Stop errors are those of the quantity: no number stands for another's."""
     rows = {row[0]: row for row in section(PAN, TILT).tables[0].rows}
     assert rows["stop errors of the campaign, deg"][2] == "0.015" and rows["play variation, deg"][2] == "0.010"
-    wider = made("backlash_deg.tilt", COMMON, u=0.034)
+    wider = entry("backlash_deg.tilt", COMMON, u=0.034)
     rows = {row[0]: row for row in section(PAN, wider).tables[0].rows}
     assert rows["stop errors of the campaign, deg"][2] == "0.015; 0.030"
 
@@ -95,8 +95,8 @@ def test_every_row_with_a_u_names_its_unit():
 
 
 def test_the_result_that_counts_is_named_once():
-    (told,) = (text for text in section(PAN, TILT).text if "first page" in text)
-    assert "JCGM 100:2008, clause 5" in told and "at the mode" in told and "where uncertainty comes from" in told
+    (note,) = (text for text in section(PAN, TILT).text if "first page" in text)
+    assert "JCGM 100:2008, clause 5" in note and "at the mode" in note and "where uncertainty comes from" in note
 
 
 @pytest.mark.parametrize(

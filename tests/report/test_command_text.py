@@ -31,10 +31,10 @@ def test_points_say_where_their_distance_is_a_statement(aperture_read):
     assert ("no aperture readings: distances rest on baseline" in text) is not aperture_read
 
 
-@pytest.mark.parametrize("held, points, said", ((25, 156, "do not rely on the sds"), (149, 156, "may be relied on")))
-def test_a_cloud_says_whether_its_sds_may_be_relied_on(held, points, said):
+@pytest.mark.parametrize("held, points, advice", ((25, 156, "do not rely on the sds"), (149, 156, "may be relied on")))
+def test_a_cloud_says_whether_its_sds_may_be_relied_on(held, points, advice):
     """A user's 25 of 156; 149 of 156 is above 95 %."""
     cloud = CloudFile("out.ply", ("x", "y"), 1000, 0, 0, None, {})
     text = cloud_text(cloud, LawChecked(points, held, 5.7, 2700.0), SimpleNamespace())
-    assert said in text and f"at {held}" in text
+    assert advice in text and f"at {held}" in text
     assert ("--points without --cloud" in text) == (held < 100)

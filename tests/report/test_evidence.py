@@ -90,14 +90,14 @@ def test_a_verification_of_this_calibration_is_reported_with_millimetres(reporte
     mm = {"distance_mm": 1000.0, "before": {"rms": 37.7, "worst": 60.2}, "after": {"rms": 1.83, "worst": 4.1}}
     mm["promised95"] = 5.18
     worlds = dict.fromkeys(WORLDS, 0.01) | {APPLIED: 0.96}
-    made = {"verdict": KEPT, "p": 0.4, "worlds": worlds, "before": size, "after": size, "promised95": 0.05}
-    made |= {"readings": 12, "millimetres": mm, "format": VERIFICATION_FORMAT, "inputs": evidence.fit.provenance.inputs}
+    file = {"verdict": KEPT, "p": 0.4, "worlds": worlds, "before": size, "after": size, "promised95": 0.05}
+    file |= {"readings": 12, "millimetres": mm, "format": VERIFICATION_FORMAT, "inputs": evidence.fit.provenance.inputs}
     path = reported / "results" / "verification.json"
     table = content_sha256(calibration_json(load_calibration(reported)))
     try:
-        path.write_text(json.dumps({**made, "table": table}))
+        path.write_text(json.dumps({**file, "table": table}))
         [section] = [s for s in report_document(evidence_of(reported)).sections if s.title.startswith("Applied")]
-        path.write_text(json.dumps({**made, "table": "0" * 64}))
+        path.write_text(json.dumps({**file, "table": "0" * 64}))
         assert evidence_of(reported).verified is None
     finally:
         path.unlink()

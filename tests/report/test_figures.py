@@ -74,7 +74,7 @@ def test_spots_are_triangulated_once_for_classic_and_figures(evidence, monkeypat
     """A copy of a campaign has not been triangulated yet; what it then holds nobody can change."""
     calls = []
     monkeypatch.setattr(
-        "tvsbayes.instrument.campaign.triangulate", lambda *told: calls.append(told) or triangulate(*told)
+        "tvsbayes.instrument.campaign.triangulate", lambda *args: calls.append(args) or triangulate(*args)
     )
     campaign = replace(evidence.campaign)
     number = classic(campaign).experiments[0].experiment
@@ -88,8 +88,8 @@ def test_spots_are_triangulated_once_for_classic_and_figures(evidence, monkeypat
 
 
 def test_a_prompt_completes_figures_alone():
-    own = [name for name, value in vars(figures).items() if getattr(value, "__module__", "") == figures.__name__]
-    assert dir(figures) == sorted(name for name in own if not name.startswith("_")) and len(dir(figures)) > 10
+    names = [name for name, value in vars(figures).items() if getattr(value, "__module__", "") == figures.__name__]
+    assert dir(figures) == sorted(name for name in names if not name.startswith("_")) and len(dir(figures)) > 10
 
 
 def test_no_text_of_the_ratios_is_cut_or_lies_on_the_points(evidence):

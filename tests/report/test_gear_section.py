@@ -75,9 +75,9 @@ def test_the_section_states_scales_range_and_both_ratios(geared_evidence, eviden
         "transmission error sd, tilt, deg",
     ]
     assert scales.rows[0][1] == "0.0310(42)"
-    told = {row[0]: row[1] for row in ratios.rows}
-    assert told["left, local, deg/step"] == "0.06010(10)" and "left, line, deg/step" in told
-    assert told["right, local, deg/step"] == "never moved"
+    cells = {row[0]: row[1] for row in ratios.rows}
+    assert cells["left, local, deg/step"] == "0.06010(10)" and "left, line, deg/step" in cells
+    assert cells["right, local, deg/step"] == "never moved"
 
 
 def test_the_text_of_a_fit_is_short_of_it(geared_evidence):

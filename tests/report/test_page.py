@@ -129,14 +129,14 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
 def test_the_first_page_has_the_answer_and_who_asked(page, evidence, no_pictures):
     """Before the contents: ratios, backlashes, millimetres, what to do next, day, laboratory, customer."""
     issued = report_html(evidence, Issue(datetime.date(2026, 1, 15), "Optics Lab", "Robotics group"))
-    for source, told in (
+    for source, phrase in (
         (issued, "issued 2026-01-15"),
         (issued, "laboratory Optics Lab customer Robotics group"),
         (page, "measured 2026-01-15 instrument not recorded serial number not recorded operator not recorded"),
         (page, "laboratory not stated customer not stated"),
     ):
         first = " ".join(" ".join(Nodes(source.split(b"<nav")[0] + b"</header></body></html>").text).split())
-        assert told in first and "What to do next" in first
+        assert phrase in first and "What to do next" in first
         for row in (*(f"{d}, deg/step" for d in DIRECTIONS), "backlash pan, deg", "backlash tilt, deg"):
             assert row in first
         assert [first.count(f"{name} calibration") for name in ("nominal", "classic", "joint")] == [1, 1, 1]
@@ -161,12 +161,12 @@ def test_millimetres_without_aperture_readings_say_what_they_rest_on(evidence, n
 
 def test_a_step_is_given_in_millimetres(evidence, no_pictures):
     """Degrees per step times the range, with both directions of an axis."""
-    (said,) = step_sizes(evidence)
+    (sentence,) = step_sizes(evidence)
     for axis, (one, other) in SENSES.items():
         ratios = [evidence.fit.summary.effective[side].value for side in (one, other)]
-        mm = float(re.search(rf"(\S+)\(\d[\d.]*\) mm in {axis}", said)[1])
+        mm = float(re.search(rf"(\S+)\(\d[\d.]*\) mm in {axis}", sentence)[1])
         assert mm == pytest.approx(evidence.range_mm * math.radians(sum(ratios) / 2), rel=1e-2)
-    assert said in " ".join(" ".join(Nodes(report_html(evidence)).text).split())
+    assert sentence in " ".join(" ".join(Nodes(report_html(evidence)).text).split())
 
 
 def test_a_long_cell_wraps_and_is_not_cut(evidence, no_pictures):
@@ -211,9 +211,9 @@ def test_half_an_interval_is_left_out_where_its_ends_lie_unlike_far():
 
 def test_causes_and_parameters_are_called_by_words():
     """Every prior and every parameter but the cameras'; budgets say the part and the unit as well."""
-    told = {cause: cause_in_words(cause) for cause in TWO_MIRROR.prior_groups if cause.startswith("prior of ")}
-    assert all(words != cause for cause, words in told.items())
-    tables = [share_in_words(cause) for cause in told] + [source_in_words(f"prior of {name}") for name in RIG_NAMES]
+    labels = {cause: cause_in_words(cause) for cause in TWO_MIRROR.prior_groups if cause.startswith("prior of ")}
+    assert all(words != cause for cause, words in labels.items())
+    tables = [share_in_words(cause) for cause in labels] + [source_in_words(f"prior of {name}") for name in RIG_NAMES]
     tables += [name_in_words(name) for name in RIG_NAMES]
     assert not any("_" in words for words in tables), tables
     assert len(set(tables[-len(RIG_NAMES) :])) == len(RIG_NAMES)
@@ -222,7 +222,7 @@ def test_causes_and_parameters_are_called_by_words():
     assert source_in_words("prior of something else") == "prior of something else"
     assert source_in_words("prior of ln stop_sd_deg.up") == "prior of ln scatter of stops, up, deg"
     assert source_in_words("pixel noise") == share_in_words("pixel noise") == "pixel noise"
-    assert told["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand"
+    assert labels["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand"
     assert cause_in_words("stereo calibration") == "stereo calibration"
     together = "laser_tilt_deg.x, extrinsics.rotation_rad.y move together; see `fit --without laser_tilt_deg`"
     assert sentence_in_words(together) == (
@@ -278,8 +278,8 @@ def test_commands_are_code_and_what_strangers_write_is_not():
 
 def test_no_paragraph_stands_twice_and_details_are_folded(page):
     html = page.decode()
-    told = [re.sub(r"<.*?>", "", part) for part in re.findall(r"<(?:p|li)\b.*?</(?:p|li)>", html, flags=re.DOTALL)]
-    long = [text for text in told if len(text) > 60]
+    texts = [re.sub(r"<.*?>", "", part) for part in re.findall(r"<(?:p|li)\b.*?</(?:p|li)>", html, flags=re.DOTALL)]
+    long = [text for text in texts if len(text) > 60]
     assert len(long) > 15 and len(long) == len(set(long))
     nodes = Nodes(page)
     assert len(nodes.of("details")) == len(nodes.of("section")) > 8
@@ -312,9 +312,9 @@ def test_traceability_is_what_the_certificate_says(evidence, no_pictures):
     ):
         campaign = replace(evidence.campaign, header=header | more)
         text = " ".join(" ".join(Nodes(report_html(replace(evidence, campaign=campaign))).text).split())
-        said = traceability(campaign)
-        assert said.declared is declared and said.statement.startswith(begin)
-        assert said.statement in text and ("As declared by the user" in text) == declared
+        trace = traceability(campaign)
+        assert trace.declared is declared and trace.statement.startswith(begin)
+        assert trace.statement in text and ("As declared by the user" in text) == declared
 
 
 def test_axes_are_judged_with_the_fitted_contrast(reported, evidence):
@@ -323,12 +323,12 @@ def test_axes_are_judged_with_the_fitted_contrast(reported, evidence):
         names, physical = stored["names"].tolist(), stored["physical"]
         contrasts = {a: physical[:, names.index(f"ratio_contrast_deg_per_step.{a}")] for a in ("pan", "tilt")}
     for axis, table in zip(contrasts, evidence.fit.evidence.positioning, strict=True):
-        told, untold = (
+        with_contrast, untold = (
             positioning(load_calibration(reported), axis, contrast_deg_per_step=c).predicted
             for c in (contrasts[axis], None)
         )
         for name, figure in table.predicted.items():
-            assert figure.median == pytest.approx(told[name].median, rel=1e-9), (axis, name)
+            assert figure.median == pytest.approx(with_contrast[name].median, rel=1e-9), (axis, name)
         # 1e-6 deg: thousands of times the rounding above; this campaign leaves little room for unequal ratios.
         assert abs(table.predicted["accuracy_deg"].median - untold["accuracy_deg"].median) > 1e-6
 
@@ -375,8 +375,8 @@ def test_what_strangers_write_stays_text(reported, page, shift, tmp_path, no_pic
     shutil.copytree(reported / "results", place / "results")
     hostile = evidence_of(place)
     summary = structs.replace(hostile.fit.summary, prior_conflicts=payloads)
-    made = structs.replace(hostile.fit.provenance, command=payloads[7])
-    hostile = replace(hostile, fit=replace(hostile.fit, summary=summary, provenance=made))
+    provenance = structs.replace(hostile.fit.provenance, command=payloads[7])
+    hostile = replace(hostile, fit=replace(hostile.fit, summary=summary, provenance=provenance))
     nodes, plain = Nodes(report_html(hostile)), Nodes(page)
     assert {tag for tag, _ in nodes.elements} <= KNOWN
     for tag in ("img", "style", "meta"):
@@ -455,10 +455,10 @@ def test_chromium_shows_the_page_without_overflow_or_complaint(reported, tmp_pat
     done = subprocess.run(
         [browser, *flags, "--dump-dom", target], capture_output=True, text=True, timeout=120, check=True
     )
-    found = json.loads(re.search(r"<title>(.*?)</title>", done.stdout)[1])
-    assert found["wide"] <= width and found["broken"] == 0 and found["scripts"] == 0
-    assert found["cut"] == 0, "the table of the answer scrolls sideways"
-    assert found["images"] == len(Nodes((tmp_path / "report.html").read_bytes()).of("img"))
+    layout = json.loads(re.search(r"<title>(.*?)</title>", done.stdout)[1])
+    assert layout["wide"] <= width and layout["broken"] == 0 and layout["scripts"] == 0
+    assert layout["cut"] == 0, "the table of the answer scrolls sideways"
+    assert layout["images"] == len(Nodes((tmp_path / "report.html").read_bytes()).of("img"))
     assert "CONSOLE" not in done.stderr
 
 
@@ -502,6 +502,6 @@ def test_no_heading_stands_at_the_foot_of_a_printed_page(tmp_path):
 
 def test_the_table_of_parameters_repeats_no_ratio(reported):
     """Ratios by direction are results of their own: all four or none belong there."""
-    told = {row[-1] for row in _parameters(evidence_of(reported)).rows}
-    assert {"degrees_per_step.pan", "degrees_per_step.tilt"} < told
-    assert not told & {f"degrees_per_step.{direction}" for direction in DIRECTIONS}
+    names = {row[-1] for row in _parameters(evidence_of(reported)).rows}
+    assert {"degrees_per_step.pan", "degrees_per_step.tilt"} < names
+    assert not names & {f"degrees_per_step.{direction}" for direction in DIRECTIONS}

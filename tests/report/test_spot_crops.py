@@ -13,7 +13,7 @@ from tvsbayes.instrument.campaign import CAMERAS, frame_name, read_campaign, wri
 from tvsbayes.report.spot_pictures import HALF_PX, LOOKS_SHOWN, spot_crops, spot_gallery
 
 
-def seen(campaign):
+def usable_spots(campaign):
     return [spot for spot in campaign.spots if spot.status == "ok"]
 
 
@@ -23,7 +23,7 @@ def pictured(tmp_path):
     write_campaign(small_campaign(), tmp_path / "mine")
     campaign = read_campaign(tmp_path / "mine")
     (tmp_path / "mine" / "frames").mkdir()
-    for spot in seen(campaign):
+    for spot in usable_spots(campaign):
         for camera in CAMERAS:
             picture = np.zeros((campaign.stereo.image_height, campaign.stereo.image_width, 3), np.uint8)
             u, v = getattr(spot, f"u_{camera}_px"), getattr(spot, f"v_{camera}_px")
@@ -33,9 +33,9 @@ def pictured(tmp_path):
 
 
 def test_cut_outs_show_the_spot_under_its_cross(pictured):
-    suspect = seen(pictured)[-1].spot
+    suspect = usable_spots(pictured)[-1].spot
     crops = spot_crops(pictured, (suspect,))
-    assert [crop.camera for crop in crops] == list(CAMERAS) * min(LOOKS_SHOWN, len(seen(pictured)))
+    assert [crop.camera for crop in crops] == list(CAMERAS) * min(LOOKS_SHOWN, len(usable_spots(pictured)))
     assert crops[0].spot == suspect
     for crop in crops:
         assert max(crop.grey.shape) <= 2 * HALF_PX + 1
@@ -48,7 +48,7 @@ def test_cut_outs_show_the_spot_under_its_cross(pictured):
 
 def test_a_centre_far_outside_the_picture_has_no_cut_out(pictured):
     """The reader takes a centre up to a tenth of the picture outside of it."""
-    first = seen(pictured)[0]
+    first = usable_spots(pictured)[0]
     outside = replace(first, v_left_px=-HALF_PX - 10.0, u_right_px=-HALF_PX - 10.0)
     crops = spot_crops(replace(pictured, spots=(outside,)), ())
     assert crops == ()
@@ -57,9 +57,9 @@ def test_a_centre_far_outside_the_picture_has_no_cut_out(pictured):
 
 
 def test_damaged_and_missing_pictures_cost_nobody_the_report(pictured):
-    first = pictured.path / frame_name(seen(pictured)[0].spot, "left")
+    first = pictured.path / frame_name(usable_spots(pictured)[0].spot, "left")
     first.write_bytes(b"no picture")
-    crops = spot_crops(pictured, (seen(pictured)[0].spot,))
-    assert (crops[0].spot, crops[0].camera) == (seen(pictured)[0].spot, "right")
+    crops = spot_crops(pictured, (usable_spots(pictured)[0].spot,))
+    assert (crops[0].spot, crops[0].camera) == (usable_spots(pictured)[0].spot, "right")
     assert spot_crops(replace(pictured, path=None), ()) == ()
     assert spot_crops(small_campaign(), ()) == ()
