@@ -44,8 +44,8 @@ def test_fit_and_what_goes_on_from_it(ask, say, folder, tmp_path):
     code, planned = ask("plan", "--given", folder, "-o", tmp_path / "plan.csv", "--minutes", "1")
     assert code == 0 and planned["next"] and planned["next"][0]["actions"][-1] == "read"
     assert (tmp_path / "plan.csv").read_text().startswith("step,command,direction,read")
-    code, told, _ = say("plan", "--given", folder, "-o", tmp_path / "none.csv", "--minutes", "0.1")
-    assert code == 0 and "nothing written to" in told and not (tmp_path / "none.csv").exists()
+    code, output, _ = say("plan", "--given", folder, "-o", tmp_path / "none.csv", "--minutes", "0.1")
+    assert code == 0 and "nothing written to" in output and not (tmp_path / "none.csv").exists()
     code, _, err = say("report", folder)
     assert code == 0 and "fitting first" not in err
     page = (folder / "results" / "report.html").read_text()

@@ -64,9 +64,9 @@ def test_pictures_become_looks_that_detect_finds(ask, say, two_looks, tmp_path):
     assert f"seen after move {first.move} at pan {first.pan_steps}, tilt {first.tilt_steps} steps" in text
     code, document = ask("detect", out)
     assert (code, document["ok"], document["missing"]) == (0, 2, 0)
-    found = pixels_of(read_campaign(out).spots)
+    pixels = pixels_of(read_campaign(out).spots)
     # Both scatter by 0.1 px or less; five of those.
-    np.testing.assert_allclose(found, pixels_of(campaign.spots), rtol=0, atol=0.5)
+    np.testing.assert_allclose(pixels, pixels_of(campaign.spots), rtol=0, atol=0.5)
     code, document = ask("new", out, "--pictures", pictures)
     assert code == 2 and "none waits" in assert_error(document, "occupied")["message"]
 
@@ -104,8 +104,8 @@ def test_commands_that_are_told_can_be_typed_as_they_stand(say, tmp_path):
     drawn(tmp_path / "pictures", *pairs("0"))
     out = tmp_path / "Anna's $laser 2"
     _, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
-    told = re.findall(r"`(tvsbayes (?:detect|check) .*?)`", text)
-    assert [shlex.split(each) for each in told] == [["tvsbayes", each, str(out)] for each in ("detect", "check")]
+    commands = re.findall(r"`(tvsbayes (?:detect|check) .*?)`", text)
+    assert [shlex.split(each) for each in commands] == [["tvsbayes", each, str(out)] for each in ("detect", "check")]
 
 
 def test_moves_that_are_numbered_anew_are_told(say, tmp_path):

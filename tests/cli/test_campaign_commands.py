@@ -130,8 +130,8 @@ def demonstrated(own_compilation_cache) -> SimpleNamespace:
     """What `demo` ends with: its document, its text, and the summary of its fit."""
     fitted, ended = [], []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(campaign_commands, "_sampled", lambda *given: fitted.append(_sampled(*given)) or fitted[0])
-        patch.setattr(campaign_commands, "finish", lambda *given: ended.append(given))
+        patch.setattr(campaign_commands, "_sampled", lambda *args: fitted.append(_sampled(*args)) or fitted[0])
+        patch.setattr(campaign_commands, "finish", lambda *args: ended.append(args))
         assert run(["demo"]) == 0
     ((document, text, as_json, error),) = ended
     assert not as_json and error is None

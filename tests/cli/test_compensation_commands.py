@@ -33,9 +33,9 @@ def schema(name: str):
 
 def drive(folder, place, factors):
     """Fresh readings under the table in a folder's results."""
-    asked, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
+    commands, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
     by = Correction.of(stored_compensation(read_axis(folder)))
-    write_axis(driven(true_axis(), asked, read, 7, by=by, factors=factors), place)
+    write_axis(driven(true_axis(), commands, read, 7, by=by, factors=factors), place)
     return place
 
 
@@ -54,16 +54,16 @@ def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path, no_picture
         and (tmp_path / "plan.csv").read_text().startswith("step,command,direction,read")
     )
 
-    code, told = ask("verify", folder, drive(folder, tmp_path / "kept", (1.0, 1.0)))
-    jsonschema.validate(told, schema("verification"))
-    assert set(told) == {"verdict", "p", "worlds", "before", "after", "promised95", "readings"}
-    assert (code, told["verdict"]) == (0, "KEPT")
+    code, document = ask("verify", folder, drive(folder, tmp_path / "kept", (1.0, 1.0)))
+    jsonschema.validate(document, schema("verification"))
+    assert set(document) == {"verdict", "p", "worlds", "before", "after", "promised95", "readings"}
+    assert (code, document["verdict"]) == (0, "KEPT")
     code, _, _ = say("report", folder)
     shown = (folder / "results" / "report.html").read_text()
     assert "Applied correction and remaining error" in shown and "KEPT: 12 fresh readings" in shown
 
-    code, told, _ = say("verify", folder, drive(folder, tmp_path / "turned", (-1.0, -1.0)))
-    assert code == 1 and told.startswith("BROKEN: wrong sign") and "what to do" in told
+    code, text, _ = say("verify", folder, drive(folder, tmp_path / "turned", (-1.0, -1.0)))
+    assert code == 1 and text.startswith("BROKEN: wrong sign") and "what to do" in text
     ask("compensate", folder, "--to", "csv", "-o", tmp_path / "stage.csv")
     say("report", folder)
     assert "No fresh readings have verified it" in (folder / "results" / "report.html").read_text()
@@ -76,8 +76,8 @@ def test_a_second_file_stands_beside_the_first(ask, folder, tmp_path):
 
 
 def test_without_a_file_nothing_is_written(say, folder):
-    code, told, _ = say("compensate", folder, "--to", "csv")
-    assert code == 0 and "nothing written" in told and "command,forward,backward" in told
+    code, text, _ = say("compensate", folder, "--to", "csv")
+    assert code == 0 and "nothing written" in text and "command,forward,backward" in text
     assert not (folder / "results" / "compensation.json").exists()
     code, _, err = say("verify", folder, folder)
     assert code == 2 and "tvsbayes compensate" in err

@@ -125,9 +125,9 @@ def test_fit_for_people_names_value_interval_and_origin(say, grid_folder, tmp_pa
     out = tmp_path / "elsewhere"
     out.mkdir()
     (out / "posterior.nc").write_bytes(b"of an earlier fit")
-    code, text, told = say("fit", grid_folder, "--no-sample", "--out", out)
+    code, text, log = say("fit", grid_folder, "--no-sample", "--out", out)
     assert code == 0
-    assert not (out / "posterior.nc").exists() and "posterior.nc of an earlier fit is removed" in told
+    assert not (out / "posterior.nc").exists() and "posterior.nc of an earlier fit is removed" in log
     row = next(line for line in text.splitlines() if line.startswith("effective left"))
     assert row.split()[-1] == "data"
     assert str(out / "fit.json") in text
@@ -311,11 +311,11 @@ def test_a_spot_beyond_the_lens_and_one_twice_cost_themselves_only(ask, mounted_
 
 @pytest.mark.thorough
 def test_looks_at_one_stop_have_nothing_to_tell(ask, grid_campaign, tmp_path):
-    seen = grid_campaign.moves[grid_campaign.spots[0].move]
-    only = replace(grid_campaign.moves[0], pan_steps=seen.pan_steps, tilt_steps=seen.tilt_steps)
-    here = replace(grid_campaign, moves=(only,), spots=tuple(s for s in grid_campaign.spots if s.move == seen.move))
-    repeated = [replace(s, spot=k, move=0, u_left_px=s.u_left_px + 0.02 * k) for k, s in enumerate(here.spots * 12)]
-    write_campaign(replace(here, spots=tuple(repeated)), tmp_path / "c")
+    stop = grid_campaign.moves[grid_campaign.spots[0].move]
+    only = replace(grid_campaign.moves[0], pan_steps=stop.pan_steps, tilt_steps=stop.tilt_steps)
+    campaign = replace(grid_campaign, moves=(only,), spots=tuple(s for s in grid_campaign.spots if s.move == stop.move))
+    repeated = [replace(s, spot=k, move=0, u_left_px=s.u_left_px + 0.02 * k) for k, s in enumerate(campaign.spots * 12)]
+    write_campaign(replace(campaign, spots=tuple(repeated)), tmp_path / "c")
     code, document = ask("fit", tmp_path / "c", "--no-sample")
     assert (code, document["error"]["code"]) == (3, "uninformed")
 

@@ -23,11 +23,11 @@ RATIO, PLAY = 0.0125, 0.05
 
 def readings(runs: int = 2, stops: int = 9, every: int = 400) -> list[tuple[int, float, int]]:
     """Command, reading and side of runs up and down; no stop is read twice in a row."""
-    found = []
+    rows = []
     for _ in range(runs):
-        found += [(every * k, RATIO * every * k, 1) for k in range(stops)]
-        found += [(every * k, RATIO * every * k + PLAY, -1) for k in range(stops - 2, -2, -1)]
-    return found
+        rows += [(every * k, RATIO * every * k, 1) for k in range(stops)]
+        rows += [(every * k, RATIO * every * k + PLAY, -1) for k in range(stops - 2, -2, -1)]
+    return rows
 
 
 def dms(degrees: float) -> str:
@@ -80,12 +80,12 @@ def test_every_notation_gives_the_same_axis(ask, tmp_path, name):
     file.write_text(WRITTEN[name], encoding="utf-8")
     code, document = ask("import", file, "--axis", "--to", out, "--yes")
     assert code == 0 and document["ok"] == len(readings()) and document["next"] == f"tvsbayes calibrate {out}"
-    found = classic_axis(rows_of(read_axis(out)))
+    line = classic_axis(rows_of(read_axis(out)))
     # A second of arc or 1e-4 is the last digit that is written; of the first stop without a word the side is unknown.
     without = ("serial", "clock", "camonitor", "commas in a serial monitor")
     loose = PLAY / 3200 if name in without else 1e-4 / 3200
-    assert found.per_command == pytest.approx(RATIO, abs=loose)
-    assert abs(found.backlash) == pytest.approx(PLAY, abs=2e-3)
+    assert line.per_command == pytest.approx(RATIO, abs=loose)
+    assert abs(line.backlash) == pytest.approx(PLAY, abs=2e-3)
     unit = {**dict.fromkeys(("dms", "minutes with decimals", *without), "deg"), "inch": "inch"}
     assert read_axis(out).unit == unit.get(name, "mm")
     times = [move.time_s for move in read_axis(out).moves if move.command == 3200]
@@ -93,7 +93,7 @@ def test_every_notation_gives_the_same_axis(ask, tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("file", "ratio", "play", "unit", "said"),
+    ("file", "ratio", "play", "unit", "remark"),
     [
         # Truths and the scatter of stops of each file: its README in the layouts' collection.
         ("counts_wrap/log.csv", 1.024, 5.7, "counts", "whole turns 8 times, which are added: 4096 counts each"),
@@ -103,16 +103,16 @@ def test_every_notation_gives_the_same_axis(ask, tmp_path, name):
         ("wide_forward_backward/dial.csv", 1.0012, 0.035, "mm", "runs: 4 columns"),
     ],
 )
-def test_files_that_people_have(ask, tmp_path, file, ratio, play, unit, said):
+def test_files_that_people_have(ask, tmp_path, file, ratio, play, unit, remark):
     out = tmp_path / "out"
     code, document = ask("import", FOREIGN / file, "--axis", "--to", out, "--yes")
     campaign = read_axis(out)
     rows = rows_of(campaign)
-    found = classic_axis(rows)
-    assert code == 0 and campaign.unit == unit and any(said in text for text in document["assumed"])
+    line = classic_axis(rows)
+    assert code == 0 and campaign.unit == unit and any(remark in text for text in document["assumed"])
     if ratio is not None:
-        assert abs(found.per_command - ratio) < 4 * found.u_per_command
-        assert abs(abs(found.backlash) - play) < 4 * found.u_backlash
+        assert abs(line.per_command - ratio) < 4 * line.u_per_command
+        assert abs(abs(line.backlash) - play) < 4 * line.u_backlash
     assert rows.both_sides and {reading.u for reading in campaign.readings} == {0.0}
 
 
@@ -127,12 +127,12 @@ SILENT = {
 
 @pytest.mark.parametrize("name", SILENT)
 def test_what_would_be_a_wrong_answer_in_silence(ask, tmp_path, name):
-    content, said, last = SILENT[name]
+    content, remark, last = SILENT[name]
     file, out = tmp_path / "log.csv", tmp_path / "out"
     file.write_text(content)
     code, document = ask("import", file, "--axis", "--to", out, "--yes")
     reading = read_axis(out).readings[-1]
-    assert code == 0 and any(said in text for text in document["assumed"]) and (reading.value, reading.u) == last
+    assert code == 0 and any(remark in text for text in document["assumed"]) and (reading.value, reading.u) == last
 
 
 def test_a_workbook_needs_no_format(ask, tmp_path):
@@ -144,8 +144,8 @@ def test_a_workbook_needs_no_format(ask, tmp_path):
     book.save(file)
     code, document = ask("import", file, "--axis", "--to", out, "--yes")
     assert (code, document["readings"]) == (0, 10)
-    found = classic_axis(rows_of(read_axis(out)))
-    assert found.per_command == pytest.approx(1.001, abs=1e-6) and abs(found.backlash) == pytest.approx(PLAY, abs=1e-6)
+    line = classic_axis(rows_of(read_axis(out)))
+    assert line.per_command == pytest.approx(1.001, abs=1e-6) and abs(line.backlash) == pytest.approx(PLAY, abs=1e-6)
 
 
 def test_greek_letters_in_utf_16_are_no_log(ask, tmp_path):
@@ -166,9 +166,9 @@ def test_deviations_on_demand(ask, tmp_path):
     code, document = ask("import", file, "--axis", "--to", out, "--yes")
     assert code == 2 and "--deviations" in assert_error(document, "deviations")["remedy"]
     code, document = ask("import", file, "--axis", "--to", out, "--yes", *stated, "--deviations")
-    found = classic_axis(rows_of(read_axis(out)))
+    line = classic_axis(rows_of(read_axis(out)))
     assert code == 0 and read_axis(out).unit == "mm"
-    assert found.per_command == pytest.approx(1.0002, abs=1e-6) and abs(found.backlash) == pytest.approx(0.05, abs=2e-4)
+    assert line.per_command == pytest.approx(1.0002, abs=1e-6) and abs(line.backlash) == pytest.approx(0.05, abs=2e-4)
 
 
 GUIDE = """Guiding Begins at 2026-01-02 21:00:00
@@ -198,8 +198,8 @@ def test_a_guide_log_is_listed_and_one_run_taken(ask, say, tmp_path):
     assert code == 2 and "--run 2" in assert_error(document, "usage")["remedy"] and not out.exists()
     code, document = ask("import", file, "--axis", "--to", out, "--yes", "--run", 2)
     assert (code, document["readings"], document["moves"]) == (0, 299, 1)
-    said = (out / "campaign.toml").read_text()
-    assert "period_between = [60.0, 298.0]" in said and 'periods_in = "seconds"' in said and "rate = 15.04" in said
+    toml = (out / "campaign.toml").read_text()
+    assert "period_between = [60.0, 298.0]" in toml and 'periods_in = "seconds"' in toml and "rate = 15.04" in toml
     assert any("[60, 298] s" in text for text in document["assumed"])
 
 
@@ -276,11 +276,11 @@ MISTAKES = {
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_are_refused_in_one_sentence_with_the_mend(ask, tmp_path, name):
     """Nothing is written, and the message is one line."""
-    content, options, found, remedy = MISTAKES[name]
+    content, options, message, remedy = MISTAKES[name]
     file, out = tmp_path / "log.txt", tmp_path / "out"
     file.write_text(content, encoding="utf-8")
     code, document = ask("import", file, "--to", out, "--yes", *(("--axis", *options) if options is not None else ()))
     error = document["error"]
     assert code == 2 and not out.exists()
-    assert found in error["message"] and remedy in error["remedy"]
+    assert message in error["message"] and remedy in error["remedy"]
     assert "\n" not in error["message"] and len(error["message"]) < 600

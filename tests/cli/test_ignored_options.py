@@ -48,11 +48,11 @@ IGNORED = [
 ]
 
 
-@pytest.mark.parametrize(("line", "said"), IGNORED, ids=[line for line, _ in IGNORED])
-def test_what_would_be_ignored_is_refused(ask, line, said):
+@pytest.mark.parametrize(("line", "message"), IGNORED, ids=[line for line, _ in IGNORED])
+def test_what_would_be_ignored_is_refused(ask, line, message):
     code, document = ask(*line.split())
     assert (code, document["error"]["code"]) == (2, "usage")
-    assert document["error"]["message"].startswith(said) and document["error"]["remedy"]
+    assert document["error"]["message"].startswith(message) and document["error"]["remedy"]
 
 
 def test_a_unit_is_for_files_that_state_none(ask, tmp_path):
@@ -91,8 +91,8 @@ AXIS = [
 ]
 
 
-@pytest.mark.parametrize(("options", "said"), AXIS, ids=[options for options, _ in AXIS])
-def test_an_axis_is_planned_with_its_own_options(ask, tmp_path, options, said):
+@pytest.mark.parametrize(("options", "message"), AXIS, ids=[options for options, _ in AXIS])
+def test_an_axis_is_planned_with_its_own_options(ask, tmp_path, options, message):
     (tmp_path / "campaign.toml").write_text('format = "tvsbayes-axis/1"\n')
     code, document = ask("plan", "--given", tmp_path, *options.split())
-    assert (code, document["error"]["code"]) == (2, "usage") and document["error"]["message"].startswith(said)
+    assert (code, document["error"]["code"]) == (2, "usage") and document["error"]["message"].startswith(message)

@@ -79,15 +79,15 @@ def test_a_counter_with_the_wrong_sign_stops_and_is_mended_as_said(ask, say, gri
     moves = tuple(replace(m, tilt_steps=-m.tilt_steps) for m in grid_campaign.moves)
     write_campaign(replace(grid_campaign, moves=moves), tmp_path / "wrong")
     code, document = ask("check", tmp_path / "wrong")
-    (found,) = document["findings"]
-    assert code == 0 and found["certain"] and found["code"] == "counter-sign"
+    (finding,) = document["findings"]
+    assert code == 0 and finding["certain"] and finding["code"] == "counter-sign"
     assert "certain: 1 of them" in say("check", tmp_path / "wrong")[1]
     for command in ("fit", "calibrate"):
         code, document = ask(command, tmp_path / "wrong", "--quick")
         error = assert_error(document, "counter-sign")
-        assert (code, error["file"], error["line"]) == (2, "moves.csv", found["line"])
-        assert found["remedy"] in error["remedy"] and "--anyway" in error["remedy"]
-    words = shlex.split(found["remedy"].split("`")[1])
+        assert (code, error["file"], error["line"]) == (2, "moves.csv", finding["line"])
+        assert finding["remedy"] in error["remedy"] and "--anyway" in error["remedy"]
+    words = shlex.split(finding["remedy"].split("`")[1])
     code, document = ask(*words[1:])
     assert code == 0 and document["files"] and "approaches stay" in document["assumed"][0]
     mended, sound = read_campaign(tmp_path / "wrong-mended"), grid_campaign
@@ -130,8 +130,8 @@ def test_looks_go_to_the_moves_of_a_campaign(ask, grid_campaign, tmp_path):
 
 def test_values_are_shown_where_rows_without_a_look_come_first(ask, say, table, tmp_path):
     table.write_text("pan;tilt;XL;YL;XR;YR\n0;0;;;;\n9;0;;;;\n9;5;;;;\n20;5;640,5;360;500;360\n")
-    told = ask("import", table, "--to", tmp_path / "mine")[1]["columns"]["u_left_px"]
-    assert told == {"column": "XL", "first": ["640.5"], "empty": 3}
+    column = ask("import", table, "--to", tmp_path / "mine")[1]["columns"]["u_left_px"]
+    assert column == {"column": "XL", "first": ["640.5"], "empty": 3}
     assert "640.5 (3 of 4 empty)" in say("import", table, "--to", tmp_path / "mine")[1]
 
 
@@ -169,7 +169,7 @@ def test_with_a_closed_standard_input_nobody_is_asked(say, table, tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--angles", "gon"), "deg, rad"),
         (("--column", "XL"), "u_left_px=XL"),
@@ -179,10 +179,10 @@ def test_with_a_closed_standard_input_nobody_is_asked(say, table, tmp_path, monk
         (("--sheet", "one"), "no sheets"),
     ],
 )
-def test_options_that_say_nothing_usable_are_refused(say, table, tmp_path, options, said):
+def test_options_that_say_nothing_usable_are_refused(say, table, tmp_path, options, message):
     code, _, log = say("import", table, "--to", tmp_path / "mine", *options)
     assert code == 2
-    assert any(part in log for part in said.split("|")), log
+    assert any(part in log for part in message.split("|")), log
 
 
 def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path):
@@ -202,8 +202,8 @@ def test_words_that_leave_looks_out_are_told_and_good_ones_of_other_languages_kn
     assert [line.rpartition(",")[2] for line in spots] == ["ok", "ok", "ok", "fine", "refused: mal", "ok", "fine"]
     log = tmp_path / "log.csv"
     log.write_text("steps,deg,quality\n0,0.1,bien\n9,0.2,hit\n18,0.3,\n")
-    told = ask("import", log, "--to", tmp_path / "axis", "--axis")[1]["assumed"]
-    assert "status: 1 reading left out by column quality: hit 1" in told
+    remarks = ask("import", log, "--to", tmp_path / "axis", "--axis")[1]["assumed"]
+    assert "status: 1 reading left out by column quality: hit 1" in remarks
 
 
 def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
@@ -241,17 +241,17 @@ def test_readings_are_reported_in_the_unit_of_their_column(ask, say, tmp_path, c
     log.write_text(f"steps;{column}\n" + "".join(f"{n};{0.0005 * n:.4f}\n" for n in turns))
     code, document = ask("import", log, "--to", out, "--axis", "--yes")
     assert code == 0 and ask("check", out)[1]["unit"] == unit
-    said = f"unit: {unit}, as the file says" if column != "encoder" else "campaign.toml says, deg until you change it"
-    assert any(said in text for text in document["assumed"])
+    remark = f"unit: {unit}, as the file says" if column != "encoder" else "campaign.toml says, deg until you change it"
+    assert any(remark in text for text in document["assumed"])
     assert "0, 40000" in say("check", out)[1], "counters are no powers of ten"
 
 
-@pytest.mark.parametrize(("first", "said"), [("Leadscrew test,,", True), ("steps,foo,bar", False)])
-def test_a_title_where_names_should_stand_is_called_one(ask, tmp_path, first, said):
+@pytest.mark.parametrize(("first", "titled"), [("Leadscrew test,,", True), ("steps,foo,bar", False)])
+def test_a_title_where_names_should_stand_is_called_one(ask, tmp_path, first, titled):
     log = tmp_path / "log.csv"
     log.write_text(f"{first}\n0,0,1\n5,1,1\n")
     code, document = ask("import", log, "--axis", "--to", tmp_path / "mine")
-    assert code == 2 and ("is a title" in assert_error(document, "missing-column")["remedy"]) is said
+    assert code == 2 and ("is a title" in assert_error(document, "missing-column")["remedy"]) is titled
 
 
 def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_path):
@@ -261,10 +261,10 @@ def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_p
     assert code == 0 and "nothing written" in text and "position of tilt's joint falls" in text
     code, document = ask(*words, tmp_path / "head", "--yes")
     assert (code, document["joints"]) == (0, {"pan": "pan_joint", "tilt": "tilt_joint"})
-    found = read_campaign(tmp_path / "head")
-    assert found.rig.mechanism.sightings and found.header["urdf"]["steps_per_turn"] == 400.0
-    assert found.rig.priors["degrees_per_step.tilt"].value == 360 / 400 / 20
-    assert found.rig.priors["azimuth_zero_deg"].value == pytest.approx(document["nominal"]["azimuth_zero_deg"])
+    head = read_campaign(tmp_path / "head")
+    assert head.rig.mechanism.sightings and head.header["urdf"]["steps_per_turn"] == 400.0
+    assert head.rig.priors["degrees_per_step.tilt"].value == 360 / 400 / 20
+    assert head.rig.priors["azimuth_zero_deg"].value == pytest.approx(document["nominal"]["azimuth_zero_deg"])
     rig = read_rig(tmp_path / "head" / "rig.toml")
     assert rig.limits.steps["tilt"] == (round(math.degrees(-0.5) / 0.045), round(math.degrees(1.2) / 0.045))
     assert ask("check", tmp_path / "head")[0] == 0
@@ -289,14 +289,14 @@ def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
     assert code == 0 and "nothing written" in printed and not (tmp_path / "mount").exists()
     code, document = ask(*words, tmp_path / "mount", "--yes", "--assume", "u_deg=0.002")
     assert (code, document["moves"], document["ok"]) == (0, 12, 12)
-    found = read_campaign(tmp_path / "mount")
-    assert found.rig.priors["degrees_per_step.pan"].value == pytest.approx(0.045)
+    mount = read_campaign(tmp_path / "mount")
+    assert mount.rig.priors["degrees_per_step.pan"].value == pytest.approx(0.045)
     code, printed, _ = say("check", tmp_path / "mount")
     assert code == 0 and "usable sightings" in printed and "aperture" not in printed
     assert ask(*words, tmp_path / "mount", "--yes")[0] == 2, "nothing is overwritten"
     assert ask("import", tmp_path / "mount", "--to", tmp_path / "copy", "--flip", "tilt_steps", "--yes")[0] == 0
     copy = read_campaign(tmp_path / "copy")
-    assert [m.tilt_steps for m in copy.moves] == [-m.tilt_steps for m in found.moves] and copy.spots == found.spots
+    assert [m.tilt_steps for m in copy.moves] == [-m.tilt_steps for m in mount.moves] and copy.spots == mount.spots
     assert ask("import", tmp_path / "mount", "--to", tmp_path / "other", "--swap", "--yes")[0] == 2
     assert ask("new", tmp_path / "new", "--mechanism", "pan-tilt", "--sightings")[0] == 0
     header = (tmp_path / "new" / "campaign.toml").read_bytes()

@@ -210,12 +210,12 @@ def test_a_slow_computers_user_is_not_sent_to_the_authors_of_xla(monkeypatch):
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
 
 
-@pytest.mark.parametrize("given", ["0,0004", "-1,5", ",5"])
-def test_a_decimal_comma_is_told_its_point(ask, say, given):
-    code, document = ask("report", PAPER_TWIN, "--limit-mm", given)
-    wanted = f"write a decimal point: {given.replace(',', '.')}"
+@pytest.mark.parametrize("number", ["0,0004", "-1,5", ",5"])
+def test_a_decimal_comma_is_told_its_point(ask, say, number):
+    code, document = ask("report", PAPER_TWIN, "--limit-mm", number)
+    wanted = f"write a decimal point: {number.replace(',', '.')}"
     assert code == 2 and assert_error(document, "usage")["remedy"] == wanted
-    assert wanted in say("report", PAPER_TWIN, "--limit-mm", given)[2]
+    assert wanted in say("report", PAPER_TWIN, "--limit-mm", number)[2]
     assert ask("report", PAPER_TWIN, "--limit-mm", "many")[1]["error"]["remedy"] == "see tvsbayes --help"
 
 

@@ -51,14 +51,14 @@ def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
 
 def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
     """Nobody should look for a mistake of theirs where a version changed."""
-    told = []
+    messages = []
     monkeypatch.setattr("tvsbayes.pipeline.compile_for", lambda _: None)
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
 
     def why() -> str:
-        told.clear()
-        _ = StoredOrFitted(read_campaign(grid_folder), told.append).fit
-        return told[0].removesuffix(": fitting first (Laplace approximation) ...")
+        messages.clear()
+        _ = StoredOrFitted(read_campaign(grid_folder), messages.append).fit
+        return messages[0].removesuffix(": fitting first (Laplace approximation) ...")
 
     assert why() == "there are no results/ yet"
     (grid_folder / "results").mkdir()
@@ -66,16 +66,16 @@ def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
     assert why() == "results/ hold only an interrupted chain (`tvsbayes fit --resume`)"
     (grid_folder / "results" / "chain.npz").unlink()
     path, campaign = grid_folder / "results" / "fit.json", read_campaign(grid_folder)
-    own = small_record(whole_summary(), seed=3)
+    record = small_record(whole_summary(), seed=3)
 
     def keep(converged: bool, version: str, **others: str) -> None:
-        given = structs.replace(own.provenance, inputs=input_hashes(campaign) | others)
-        given = structs.replace(given, versions=given.versions | {"tvsbayes": version})
+        provenance = structs.replace(record.provenance, inputs=input_hashes(campaign) | others)
+        provenance = structs.replace(provenance, versions=provenance.versions | {"tvsbayes": version})
         summary = structs.replace(whole_summary(), converged=converged)
-        path.write_text(json.dumps(replace(own, summary=summary, provenance=given).as_json()))
+        path.write_text(json.dumps(replace(record, summary=summary, provenance=provenance).as_json()))
 
-    now = own.provenance.versions["tvsbayes"]
-    for made, said in (
+    now = record.provenance.versions["tvsbayes"]
+    for case, reason in (
         ((True, now, {"moves": "0" * 64, "rig": "0" * 64}), "results/ are of other moves.csv, [rig]"),
         ((True, now, {"rig": "0" * 64}), "results/ are of other [rig]"),
         (
@@ -85,8 +85,8 @@ def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
         ((False, now, {}), "results/ are of a fit that did not converge"),
         ((True, now, {}), "results/ lack what this command needs"),
     ):
-        keep(made[0], made[1], **made[2])
-        assert why() == said
+        keep(case[0], case[1], **case[2])
+        assert why() == reason
 
 
 def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monkeypatch):
@@ -113,10 +113,10 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
     """The same document and draws, but for the command that made them; without a folder nothing is written."""
     assert ask("fit", grid_folder, "--no-sample", "--seed", 4)[0] == 0
     campaign = read_campaign(grid_folder)
-    told = []
-    results = tvsbayes.calibrate(campaign, str(tmp_path / "mine"), sampled=False, seed=4, progress=told.append)
-    check_forward(told)
-    assert doings(told) == [FITTING, SUMMARISING]
+    states = []
+    results = tvsbayes.calibrate(campaign, str(tmp_path / "mine"), sampled=False, seed=4, progress=states.append)
+    check_forward(states)
+    assert doings(states) == [FITTING, SUMMARISING]
     assert set(results.files) == {"draws", "fit"} and results.error is None
     by_command, mine = (tvsbayes.read_fit(f / "fit.json") for f in (grid_folder / "results", tmp_path / "mine"))
     assert {**by_command.as_json(), "command": ""} == {**mine.as_json(), "command": ""}
@@ -132,24 +132,24 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
 @pytest.mark.thorough
 def test_no_sample_of_another_fit_stays_beside_a_record(grid_folder):
     """A report that fits first replaces fit.json: the sample of the fit before it would not be that of fit.json."""
-    results, told = grid_folder / "results", []
+    results, messages = grid_folder / "results", []
     results.mkdir()
     (results / "posterior.nc").write_bytes(b"of an earlier fit")
-    record = StoredOrFitted(read_campaign(grid_folder), told.append).record
+    record = StoredOrFitted(read_campaign(grid_folder), messages.append).record
     assert record.summary.estimator == "laplace" and (results / "fit.json").is_file()
     assert not (results / "posterior.nc").exists()
-    assert any("posterior.nc of an earlier fit is removed" in line for line in told)
+    assert any("posterior.nc of an earlier fit is removed" in line for line in messages)
 
 
 @pytest.mark.parametrize(
-    "made",
+    "call",
     [lambda c: calibrate(c, c.path / "results"), lambda c: StoredOrFitted(c).record],
     ids=["calibrate", "record"],
 )
-def test_a_place_that_takes_no_results_is_refused_before_the_fit(grid_folder, monkeypatch, made):
+def test_a_place_that_takes_no_results_is_refused_before_the_fit(grid_folder, monkeypatch, call):
     """As an immutable folder or a read-only disk are."""
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", None)
     (grid_folder / "results").touch()
     with pytest.raises(InputError) as refused:
-        made(read_campaign(grid_folder))
+        call(read_campaign(grid_folder))
     assert refused.value.code == "write"

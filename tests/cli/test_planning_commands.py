@@ -28,22 +28,22 @@ def test_a_plan_does_not_replace_the_rig_file_that_it_is_made_for(ask, tmp_path,
 
 @pytest.mark.thorough
 def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, say, tmp_path, monkeypatch):
-    whole, made = planner.plan, []
+    whole, plans = planner.plan, []
     small = ("--draws", 20, "--minutes", 3, "-o", tmp_path / "plan.csv")
-    monkeypatch.setattr(planner, "plan", lambda *given, **options: made.append(whole(*given, **options)) or made[0])
+    monkeypatch.setattr(planner, "plan", lambda *args, **options: plans.append(whole(*args, **options)) or plans[0])
     code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 1e-7 deg/step", *small)
     assert code == 1 and not document["met"] and document["n80"] is None
     assert document["limited_by"]["reachable"] is False and document["limited_by"]["needed"]
     assert sum(s.action == "look" for s in read_plan(tmp_path / "plan.csv")) == document["looks"]
-    assert document["minutes"] <= 3 and made[0].draws == 20
-    monkeypatch.setattr(planner, "plan", lambda *_, **__: made[0])
+    assert document["minutes"] <= 3 and plans[0].draws == 20
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: plans[0])
     code, document = ask("plan", MOUNTED / "rig.toml", *small)
     assert code == 0 and not document["met"], "the default target is nobody's demand"
-    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(made[0], met=True))
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(plans[0], met=True))
     code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 5e-3 deg/step", *small)
     assert code == 0 and document["met"]
     # Nothing is left to measure.
-    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(made[0], steps=()))
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(plans[0], steps=()))
     place = tmp_path / "none.csv"
     code, text, _ = say("plan", MOUNTED / "rig.toml", "-o", place)
     assert code == 0 and not place.exists() and f"nothing written to {place}" in text

@@ -91,17 +91,17 @@ def on_terminal(code: str, *arguments: str) -> Seen:
 
 @needs_pseudo_terminals
 def test_a_wait_at_a_terminal_shows_what_how_far_and_goes_away():
-    seen = on_terminal(SCRIPT, AT_ONCE)
-    assert (seen.code, seen.stdout) == (0, "bar\nresult\n")
-    assert "thinking: 2 of 4" in seen.terminal and "100%" in seen.terminal
-    assert seen.terminal.endswith("\x1b[2K"), "the line is erased at last"
+    result = on_terminal(SCRIPT, AT_ONCE)
+    assert (result.code, result.stdout) == (0, "bar\nresult\n")
+    assert "thinking: 2 of 4" in result.terminal and "100%" in result.terminal
+    assert result.terminal.endswith("\x1b[2K"), "the line is erased at last"
 
 
 @needs_pseudo_terminals
 def test_the_bar_comes_also_while_nothing_is_told():
     """As in the first compilation, which says nothing for half a minute."""
-    seen = on_terminal(SCRIPT, AT_ONCE, "silent")
-    assert (seen.code, seen.stdout) == (0, "bar\nresult\n") and "%" in seen.terminal
+    result = on_terminal(SCRIPT, AT_ONCE, "silent")
+    assert (result.code, result.stdout) == (0, "bar\nresult\n") and "%" in result.terminal
 
 
 @needs_pseudo_terminals
@@ -121,11 +121,11 @@ def test_a_command_keeps_its_document_apart_from_the_bar(tmp_path):
         "step,action,pan_steps,tilt_steps,target,experiment,point\n0,home,0,0,,,\n1,place,,,d1,,\n2,look,,,,,\n"
     )
     rig = str(MOUNTED / "rig.toml")
-    seen = on_terminal(RENDERING, "simulate", rig, str(plan), str(tmp_path / "c"), "--frames", "--json")
-    document = json.loads(seen.stdout)
-    assert seen.code == 0 and document["pictures"] > 2
+    result = on_terminal(RENDERING, "simulate", rig, str(plan), str(tmp_path / "c"), "--frames", "--json")
+    document = json.loads(result.stdout)
+    assert result.code == 0 and document["pictures"] > 2
     pairs = document["pictures"] // 2
-    assert f"rendering: {pairs} of {pairs} pairs" in seen.terminal
+    assert f"rendering: {pairs} of {pairs} pairs" in result.terminal
 
 
 @pytest.mark.parametrize(
@@ -136,11 +136,11 @@ def test_time_left_in_words(seconds, text):
     assert time_left(seconds) == text
 
 
-@pytest.mark.parametrize(("blocks", "said"), [(0, False), (1, False), (3, True)])
-def test_an_interrupted_fit_says_that_its_chain_is_kept_where_there_is_one(capsys, blocks, said):
+@pytest.mark.parametrize(("blocks", "hint"), [(0, False), (1, False), (3, True)])
+def test_an_interrupted_fit_says_that_its_chain_is_kept_where_there_is_one(capsys, blocks, hint):
     with pytest.raises(KeyboardInterrupt), chain_progress("go on with --resume") as show:
         show(Progress(FITTING, 0.5, 1.0, None))
         for _ in range(blocks):
             show(Progress(f"{SAMPLING}: {walking(CHAIN)}", 0.7, 2.0, None))
         raise KeyboardInterrupt
-    assert ("chain.npz; go on with --resume" in capsys.readouterr().err) == said
+    assert ("chain.npz; go on with --resume" in capsys.readouterr().err) == hint

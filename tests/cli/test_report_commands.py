@@ -19,11 +19,11 @@ def no_page(monkeypatch):
     monkeypatch.setattr("tvsbayes.report.evidence.gather", lambda *_, **__: SimpleNamespace(criteria=()))
     page = SimpleNamespace(number="N1")
 
-    def told(evidence, issue):
+    def document(evidence, issue):
         page.text = f"by {issue.laboratory}"
         return page
 
-    monkeypatch.setattr("tvsbayes.report.scanner_document.report_document", told)
+    monkeypatch.setattr("tvsbayes.report.scanner_document.report_document", document)
     monkeypatch.setattr("tvsbayes.report.page.page_html", lambda page: page.text.encode())
 
 
@@ -39,8 +39,8 @@ def test_a_campaign_becomes_a_report_in_one_go(ask, say, grid_folder, no_page):
     stale = [grid_folder / "results" / name for name in ("report.pdf", "dcc.xml")]
     for each in stale:
         each.write_bytes(b"of an earlier page")
-    code, _, told = say("report", grid_folder, "--laboratory", "Another")
-    assert code == 0 and "removed: report.pdf, dcc.xml" in told and not any(each.exists() for each in stale)
+    code, _, log = say("report", grid_folder, "--laboratory", "Another")
+    assert code == 0 and "removed: report.pdf, dcc.xml" in log and not any(each.exists() for each in stale)
 
 
 def test_calibrating_for_a_browser_that_is_not_there_ends_before_the_work(ask, grid_folder, tmp_path, monkeypatch):

@@ -56,9 +56,9 @@ def test_what_makes_a_removed_file_again_is_what_there_is(capsys):
     """`calibrate` has no --dcc, and an axis no certificate."""
     page = WrittenPage("N1", b"", Path("r/report.html"), {"report": "r/report.html"}, ["report.pdf", "dcc.xml"])
     page.report_removed(certificates=True)
-    assert "removed: report.pdf, dcc.xml" in (told := capsys.readouterr().err)
-    assert "`tvsbayes report --pdf` or `--dcc`" in told
+    assert "removed: report.pdf, dcc.xml" in (log := capsys.readouterr().err)
+    assert "`tvsbayes report --pdf` or `--dcc`" in log
     page.report_removed()
-    assert "`tvsbayes report --pdf`" in (told := capsys.readouterr().err) and "--dcc" not in told
+    assert "`tvsbayes report --pdf`" in (log := capsys.readouterr().err) and "--dcc" not in log
     WrittenPage("N1", b"", page.path, {"pdf": "r/report.pdf"}, ["report.pdf"]).report_removed()
     assert not capsys.readouterr().err

@@ -34,8 +34,8 @@ def test_a_terminal_gets_sentences_folded_between_words_and_tables_as_they_are(m
     assert styled(f"{sentence}\n{row}", Terminal(True)) == f"one sentence of more words\n  than fit\n{row}"
     assert styled(sentence, Terminal(False)) == sentence
     monkeypatch.setenv("COLUMNS", "40")
-    told = 'fault    port: no such port as this; write port = "..." there'
-    assert styled(told, Terminal(True)) == (
+    message = 'fault    port: no such port as this; write port = "..." there'
+    assert styled(message, Terminal(True)) == (
         'fault    port: no such port as this;\n         write port = "..." there'
     ), "a sentence behind cells goes on below itself"
     monkeypatch.setenv("COLUMNS", "60")

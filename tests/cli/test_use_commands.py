@@ -35,9 +35,9 @@ def drawn_calibration(campaign) -> Calibration:
         sd = RELATIVE_SD * abs(value) if name.startswith(("degrees", "mirror", "laser", "backlash")) else 0.0
         columns.append(value + sd * generator.standard_normal(600))
     causes = ("pixel noise", "stereo calibration")
-    found = calibration_of_draws(NAMES, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
-    parts = np.stack([0.25 * found.covariance, 0.75 * found.covariance])
-    return replace(found, causes=causes, cause_covariance=parts)
+    calibration = calibration_of_draws(NAMES, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
+    parts = np.stack([0.25 * calibration.covariance, 0.75 * calibration.covariance])
+    return replace(calibration, causes=causes, cause_covariance=parts)
 
 
 @pytest.fixture
@@ -94,17 +94,17 @@ def test_counters_that_no_look_reached_are_told(ask, folder, tmp_path, capsys):
     entries = ask("locate", folder, "--points", points)[1]["points"]
     assert [entry["extrapolated"] for entry in entries] == [True, True, False, False, False, False]
     assert "refused" in entries[1] and entries[0]["xyz_mm"]
-    for direction, told in ((0.0, False), (-40.0, True)):
-        asked = ("steps-for", folder, "--azimuth-deg", direction, "--elevation-deg", 1.0)
-        assert ask(*asked)[1]["extrapolated"] is told
-        assert run([*map(str, asked)]) == 0
-        assert ("EXTRAPOLATED" in capsys.readouterr().out) is told
-    for options, told in ((POINT, 0), (far, 2)):
+    for direction, flagged in ((0.0, False), (-40.0, True)):
+        command = ("steps-for", folder, "--azimuth-deg", direction, "--elevation-deg", 1.0)
+        assert ask(*command)[1]["extrapolated"] is flagged
+        assert run([*map(str, command)]) == 0
+        assert ("EXTRAPOLATED" in capsys.readouterr().out) is flagged
+    for options, count in ((POINT, 0), (far, 2)):
         assert run([*map(str, ("locate", folder, *options))]) == 0
         text = capsys.readouterr().out
-        assert text.count("EXTRAPOLATED") == told
+        assert text.count("EXTRAPOLATED") == count
         # Which axis, and what looks reached.
-        assert (f"pan {high + 1} lies outside {low} to {high}" in text) is bool(told) and "tilt 20 lies" not in text
+        assert (f"pan {high + 1} lies outside {low} to {high}" in text) is bool(count) and "tilt 20 lies" not in text
     assert entries[0]["unseen"] == f"pan {low - 1} lies outside {low} to {high}" and entries[2]["unseen"] == ""
 
 
@@ -148,13 +148,13 @@ def test_points_of_a_spreadsheet_are_read(ask, folder, tmp_path, cloud):
     ours, theirs = tmp_path / "ours.csv", tmp_path / "theirs.csv"
     ours.write_text("\n".join(",".join(row) for row in rows) + "\n")
     theirs.write_text("\n".join(";".join(row).replace(".", ",") for row in rows) + "\n")
-    found = []
+    outputs = []
     for file in (ours, theirs):
         out = ("--cloud", tmp_path / f"{file.stem}.ply") if cloud else ()
         code, document = ask("locate", folder, "--points", file, *out)
         assert code == 0
-        found.append((tmp_path / f"{file.stem}.ply").read_bytes() if cloud else document)
-    assert found[0] == found[1]
+        outputs.append((tmp_path / f"{file.stem}.ply").read_bytes() if cloud else document)
+    assert outputs[0] == outputs[1]
     theirs.write_text(theirs.read_text().replace("aperture_deg", "B"))
     code, document = ask("locate", folder, "--points", theirs)
     assert code == 2 and document["error"]["column"] == "B" and "import" not in document["error"]["remedy"]
@@ -230,21 +230,21 @@ def test_budget_adds_up(ask, folder):
 
 def test_steps_for_a_point_leads_back_to_it(ask, folder):
     wanted = (700.0, 20.0, 40.0)
-    code, found = ask("steps-for", folder, *(x for k, v in zip("xyz", wanted, strict=True) for x in (f"--{k}-mm", v)))
+    code, answer = ask("steps-for", folder, *(x for k, v in zip("xyz", wanted, strict=True) for x in (f"--{k}-mm", v)))
     assert code == 0
     again = ask(
         "locate",
         folder,
-        *("--pan-steps", found["pan_steps"], "--tilt-steps", found["tilt_steps"]),
-        *("--aperture-deg", found["aperture_deg"]),
+        *("--pan-steps", answer["pan_steps"], "--tilt-steps", answer["tilt_steps"]),
+        *("--aperture-deg", answer["aperture_deg"]),
     )[1]["linear"]["xyz_mm"]
-    np.testing.assert_allclose(again, found["xyz_mm"], atol=1e-6)
+    np.testing.assert_allclose(again, answer["xyz_mm"], atol=1e-6)
     # Half a step on each axis, as seen from the positioner.
-    reach = np.linalg.norm(np.subtract(wanted, found["ray"]["origin_mm"]))
+    reach = np.linalg.norm(np.subtract(wanted, answer["ray"]["origin_mm"]))
     half_step_mm = reach * np.radians(0.5 * np.hypot(0.06, 0.07)) * 1.05
     assert np.linalg.norm(np.subtract(again, wanted)) < half_step_mm
-    assert found["via_pan_steps"] < found["pan_steps"]
-    assert found["via_tilt_steps"] < found["tilt_steps"]
+    assert answer["via_pan_steps"] < answer["pan_steps"]
+    assert answer["via_tilt_steps"] < answer["tilt_steps"]
 
 
 def test_limits_of_a_rig_are_kept(ask, folder, tmp_path):
@@ -277,10 +277,10 @@ def test_exports_are_read_back(folder, ask, capsys, tmp_path):
     assert json.loads(path.read_text())["format"] == CALIBRATION_FORMAT
     stored, exported = load_calibration(folder), load_calibration(path)
     point = (600.0, 10.0, 30.0)
-    there, here = (each.steps_for(point) for each in (stored, exported))
-    assert (there.pan_steps, there.tilt_steps) == (here.pan_steps, here.tilt_steps)
+    expected, answer = (each.steps_for(point) for each in (stored, exported))
+    assert (expected.pan_steps, expected.tilt_steps) == (answer.pan_steps, answer.tilt_steps)
     # Fifteen digits of every number.
-    np.testing.assert_allclose(there.u95_mm, here.u95_mm, rtol=1e-12)
+    np.testing.assert_allclose(expected.u95_mm, answer.u95_mm, rtol=1e-12)
     assert run(["steps-for", str(folder), "--export", "header"]) == 0
     header = capsys.readouterr().out
     assert "Expected error (posterior, 95 %)" in header
@@ -301,17 +301,17 @@ def test_exports_are_read_back(folder, ask, capsys, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--export", "header", "--x-mm", 1, "--y-mm", 2, "--z-mm", 3), "--x-mm and --y-mm and --z-mm are"),
         (("--export", "json", "--azimuth-deg", 3), "--azimuth-deg is"),
         (("--x-mm", 700, "--y-mm", 2, "--z-mm", 3, "--out", "c.h"), "--out is"),
     ],
 )
-def test_an_export_has_no_target_and_a_target_no_file(ask, folder, options, said):
+def test_an_export_has_no_target_and_a_target_no_file(ask, folder, options, message):
     code, document = ask("steps-for", folder, *options)
     assert (code, document["error"]["code"]) == (2, "usage")
-    assert document["error"]["message"].startswith(said) and "--export" in document["error"]["remedy"]
+    assert document["error"]["message"].startswith(message) and "--export" in document["error"]["remedy"]
 
 
 @pytest.mark.parametrize("arguments", [(), ("--x-mm", 1, "--y-mm", 2), ("--azimuth-deg", 1), ("--export", "xml")])
@@ -337,11 +337,11 @@ def test_a_file_of_points_becomes_a_cloud(ask, folder, tmp_path, capsys, ending)
     code, document = ask("locate", folder, "--points", points, "--cloud", out)
     assert code == 0 and out.exists() and document["cloud"] == str(out)
     entries = ask("locate", folder, "--points", points)[1]["points"]
-    seen = [entry["xyz_mm"] is not None for entry in entries]
-    assert (document["written"], document["refused"]) == (sum(seen), 4 - sum(seen))
+    valid = [entry["xyz_mm"] is not None for entry in entries]
+    assert (document["written"], document["refused"]) == (sum(valid), 4 - sum(valid))
     assert document["refused_file"] == str(tmp_path / "cloud.refused.csv") and 0 < document["checked"]["points"] <= 4
     assert {"x", "sd_x", "nominal_x"} <= set(document["columns"])
-    assert document["extrapolated"] == sum(e["extrapolated"] for e, good in zip(entries, seen, strict=True) if good)
+    assert document["extrapolated"] == sum(e["extrapolated"] for e, good in zip(entries, valid, strict=True) if good)
     assert run([*map(str, ("locate", folder, "--points", points, "--cloud", out))]) == 0
     assert "cloud.refused.csv" in capsys.readouterr().out
     before = points.read_bytes()
@@ -349,15 +349,15 @@ def test_a_file_of_points_becomes_a_cloud(ask, folder, tmp_path, capsys, ending)
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "said"),
+    ("options", "code", "remedy"),
     [
         ((*POINT, "--cloud", "c.ply"), "usage", "--points"),
         (("--points", "looks.csv", "--cloud", "c.xyz"), "usage", ".ply"),
     ],
 )
-def test_clouds_that_cannot_be_written_say_what_to_do(ask, folder, options, code, said):
+def test_clouds_that_cannot_be_written_say_what_to_do(ask, folder, options, code, remedy):
     exit_code, document = ask("locate", folder, *options)
-    assert exit_code == 2 and document["error"]["code"] == code and said in document["error"]["remedy"]
+    assert exit_code == 2 and document["error"]["code"] == code and remedy in document["error"]["remedy"]
 
 
 @pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("view",)])
