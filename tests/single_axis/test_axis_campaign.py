@@ -24,18 +24,18 @@ def folder(path, toml=TOML, moves=MOVES, readings=READINGS):
 
 def test_what_is_written_is_read_back(tmp_path):
     moves = runs(1)
-    made = campaign(moves, [0.01 * m.command + 0.1 for m in moves], 0.002, per_command=AxisPrior(0.01, 0.001))
-    write_axis(made, tmp_path / "a")
-    found = read_axis(tmp_path / "a")
-    assert (found.moves, found.readings, found.stated, found.unit) == (made.moves, made.readings, made.stated, "deg")
-    assert axis_hashes(found) == axis_hashes(made)
+    axis = campaign(moves, [0.01 * m.command + 0.1 for m in moves], 0.002, per_command=AxisPrior(0.01, 0.001))
+    write_axis(axis, tmp_path / "a")
+    copy = read_axis(tmp_path / "a")
+    assert (copy.moves, copy.readings, copy.stated, copy.unit) == (axis.moves, axis.readings, axis.stated, "deg")
+    assert axis_hashes(copy) == axis_hashes(axis)
     assert mechanism_key(tmp_path / "a") == "axis"
 
 
 def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):
-    found = read_axis(folder(tmp_path / "a", "\ufeff" + TOML, MOVES.replace("\n", "\r\n")))
-    assert found.moves[1].command == 10.5
-    assert [(r.value, r.u, r.status) for r in found.readings] == [(0.1, 0.01, "ok"), (None, 0.0, "lost")]
+    axis = read_axis(folder(tmp_path / "a", "\ufeff" + TOML, MOVES.replace("\n", "\r\n")))
+    assert axis.moves[1].command == 10.5
+    assert [(r.value, r.u, r.status) for r in axis.readings] == [(0.1, 0.01, "ok"), (None, 0.0, "lost")]
 
 
 @pytest.mark.parametrize(

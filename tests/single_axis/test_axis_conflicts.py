@@ -29,30 +29,30 @@ def played(ratio: float = RATIO, **stated: AxisPrior) -> AxisCampaign:
 
 
 @pytest.mark.parametrize(
-    ("name", "prior", "said"),
+    ("name", "prior", "value"),
     [
         ("backlash", AxisPrior(0.0, 0.005), PLAY),
         ("backlash", AxisPrior(0.0, 0.0), PLAY),
         ("per_command", AxisPrior(0.0099, 1e-6), RATIO),
     ],
 )
-def test_a_prior_that_the_readings_contradict_is_named(name, prior, said):
+def test_a_prior_that_the_readings_contradict_is_named(name, prior, value):
     """The error and the play by position stretch to bear a wrong prior, so the posterior alone shows nothing."""
     summary = summarise_axis(fit_axis(played(**{name: prior}), tier="importance"))
-    [told] = [text for text in summary.prior_conflicts if text.startswith(f"{name} = ")]
-    assert float(told.split(" = ")[1].split("(")[0]) == pytest.approx(said, rel=0.1)
-    assert f"{prior.value:g}" in told and "from its prior's centre" in told and "[axis]" in told
+    [conflict] = [text for text in summary.prior_conflicts if text.startswith(f"{name} = ")]
+    assert float(conflict.split(" = ")[1].split("(")[0]) == pytest.approx(value, rel=0.1)
+    assert f"{prior.value:g}" in conflict and "from its prior's centre" in conflict and "[axis]" in conflict
     text = axis_fit_text(summary)
-    assert f"prior conflict: {told}" in text
+    assert f"prior conflict: {conflict}" in text
     assert "verdict: usable\n" not in text + "\n"
 
 
 def test_a_fit_that_a_prior_keeps_from_converging_names_it():
     """The ratio stated per full step, commands counted in microsteps."""
-    found = fit_axis(played(per_command=AxisPrior(16 * RATIO, 0.001), creep=AxisPrior(0.0, 0.0)), tier="importance")
-    assert found.error is not None
-    assert "per_command = 0.0100" in found.error.remedy and "value = 0.16" in found.error.remedy
-    assert "microsteps" in found.error.remedy and "--quick" not in found.error.remedy
+    fit = fit_axis(played(per_command=AxisPrior(16 * RATIO, 0.001), creep=AxisPrior(0.0, 0.0)), tier="importance")
+    assert fit.error is not None
+    assert "per_command = 0.0100" in fit.error.remedy and "value = 0.16" in fit.error.remedy
+    assert "microsteps" in fit.error.remedy and "--quick" not in fit.error.remedy
 
 
 def test_scales_far_beyond_their_priors_are_named():
@@ -70,5 +70,5 @@ def test_honest_priors_are_not_accused(seed):
     """More seeds were tried by hand; a wrong alarm comes once in thousands of honest axes."""
     moves = (runs(2), random_moves(seed, 40, 2))[seed % 2]
     tight = {"per_command": AxisPrior(0.01, 1e-6), "backlash": AxisPrior(0.1, 0.005)}
-    made = drawn(seed, moves, **tight).campaign
-    assert fit_axis(made, sampled=False).conflicts == ()
+    axis = drawn(seed, moves, **tight).campaign
+    assert fit_axis(axis, sampled=False).conflicts == ()

@@ -45,12 +45,12 @@ def test_draws_of_the_line_have_the_moments_that_it_has_given_the_scales():
     w = np.random.default_rng(2).standard_normal((6, len(model.coordinates.names)))
     functionals = headline_functionals(model, w)
     mean, sd = model.linear(w).of(functionals)
-    seen = model.posterior(w, functionals)
+    posterior = model.posterior(w, functionals)
     # Solved with other right-hand sides beside it the same number comes out in another order of sums.
-    np.testing.assert_allclose(seen.log_density, model.log_density(w), atol=1e-8)
+    np.testing.assert_allclose(posterior.log_density, model.log_density(w), atol=1e-8)
     # Of numbers of some 1e3 the differences of the two ways round in the seventh digit of an sd.
-    np.testing.assert_allclose(seen.linear.mean, mean, atol=1e-6 * float(sd.max()))
-    np.testing.assert_allclose(np.sqrt(np.diagonal(seen.linear.covariance, axis1=1, axis2=2)), sd, rtol=1e-6)
+    np.testing.assert_allclose(posterior.linear.mean, mean, atol=1e-6 * float(sd.max()))
+    np.testing.assert_allclose(np.sqrt(np.diagonal(posterior.linear.covariance, axis1=1, axis2=2)), sd, rtol=1e-6)
     far = AxisDensity(model, find_mode(model)).valued(np.full_like(w, 20.0), np.random.default_rng(1))
     assert np.all(far.log_target == -np.inf) and np.isfinite(far.parts["linear"]).all()
 
@@ -58,16 +58,16 @@ def test_draws_of_the_line_have_the_moments_that_it_has_given_the_scales():
 @pytest.mark.thorough
 def test_both_answers_of_a_short_time_are_given_and_said():
     """A chain without time is no answer, and the weighted draws before it are; of a single round they are rough."""
-    made = drawn(1).campaign
-    found = fit_axis(made, max_minutes=1e-9)
-    assert found.error is None and found.tier == "importance" and found.answer in ("accepted", "rough")
-    assert set(found.sample.convergence.monte_carlo_error) >= {"backlash", "per_command.forward"}
+    axis = drawn(1).campaign
+    fit = fit_axis(axis, max_minutes=1e-9)
+    assert fit.error is None and fit.tier == "importance" and fit.answer in ("accepted", "rough")
+    assert set(fit.sample.convergence.monte_carlo_error) >= {"backlash", "per_command.forward"}
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("tier", ["importance", "emcee"])
 def test_errors_of_the_headlines_are_within_what_is_accepted(tier):
-    found = fit_axis(drawn(3, random_moves(5, 60)).campaign, tier=tier, seed=2)
-    assert found.answer == "accepted" and found.tier == tier and found.missing == ()
-    errors = found.sample.convergence.monte_carlo_error
+    fit = fit_axis(drawn(3, random_moves(5, 60)).campaign, tier=tier, seed=2)
+    assert fit.answer == "accepted" and fit.tier == tier and fit.missing == ()
+    errors = fit.sample.convergence.monte_carlo_error
     assert all(error.within(0.1, 0.2) for error in errors.values())

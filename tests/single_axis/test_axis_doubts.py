@@ -33,7 +33,7 @@ def logged(**stated: AxisPrior) -> AxisCampaign:
     return AxisCampaign("mm", tuple(moves), tuple(readings), stated)
 
 
-def said(campaign: AxisCampaign) -> list[str]:
+def doubts(campaign: AxisCampaign) -> list[str]:
     return axis_warnings(campaign, rows_of(campaign))
 
 
@@ -42,16 +42,16 @@ def test_a_segment_counted_in_other_steps_is_named():
     mixed = replace(
         whole, moves=tuple(replace(m, command=m.command / 16) if m.segment == 2 else m for m in whole.moves)
     )
-    [told] = [text for text in said(mixed) if text.startswith("segment")]
-    assert told.startswith("segment 2 ") and "16 times" in told and "moves.csv" in told and "(0.012499)" in told
-    assert said(whole) == []
+    [doubt] = [text for text in doubts(mixed) if text.startswith("segment")]
+    assert doubt.startswith("segment 2 ") and "16 times" in doubt and "moves.csv" in doubt and "(0.012499)" in doubt
+    assert doubts(whole) == []
 
 
 @pytest.mark.parametrize("value", [16 * RATIO, -RATIO])
 def test_a_stated_ratio_that_the_readings_do_not_have_is_named(value):
-    [told] = said(logged(per_command=AxisPrior(value, 0.001)))
-    assert f"per_command = {value:g}" in told and "0.012499" in told and "campaign.toml" in told
-    assert said(logged(per_command=AxisPrior(RATIO, 1e-5))) == []
+    [doubt] = doubts(logged(per_command=AxisPrior(value, 0.001)))
+    assert f"per_command = {value:g}" in doubt and "0.012499" in doubt and "campaign.toml" in doubt
+    assert doubts(logged(per_command=AxisPrior(RATIO, 1e-5))) == []
 
 
 @pytest.mark.parametrize("stated", [True, False], ids=["u stated", "u unknown"])
@@ -60,10 +60,10 @@ def test_wild_readings_are_named_and_their_neighbours_not(stated):
     readings = [r if stated else replace(r, u=0.0) for r in whole.readings]
     for at in (31, 60):
         readings[at] = replace(readings[at], value=readings[at].value + 1.5)
-    told = said(replace(whole, readings=tuple(readings)))
-    told = [text for text in told if "stated u" not in text]
-    assert len(told) == 2
-    for at, text in zip((31, 60), told, strict=True):
+    remarks = doubts(replace(whole, readings=tuple(readings)))
+    remarks = [text for text in remarks if "stated u" not in text]
+    assert len(remarks) == 2
+    for at, text in zip((31, 60), remarks, strict=True):
         move = whole.readings[at].move
         assert text.startswith(f"reading {at} (move {move}, command {whole.moves[move].command:g}) ")
         assert "readings.csv" in text and "1.5" in text and "status" in text
@@ -76,8 +76,8 @@ def test_a_single_wild_stop_is_named_where_each_was_read_once():
     log = campaign(moves, stands)
     assert data_doubts(log, rows_of(log)) == []
     wild = campaign(moves, [v + 200.0 * (k == 8) for k, v in enumerate(stands)])
-    [told] = data_doubts(wild, rows_of(wild))
-    assert told.startswith("reading 8 (move 8, command 2) lies +2") and "readings.csv" in told and "status" in told
+    [doubt] = data_doubts(wild, rows_of(wild))
+    assert doubt.startswith("reading 8 (move 8, command 2) lies +2") and "readings.csv" in doubt and "status" in doubt
     loose = [250.0 * m.command - (300.0 if k > 6 else 50.0 if k == 6 else 0.0) for k, m in enumerate(moves)]
     held = campaign(moves, loose)
     assert data_doubts(held, rows_of(held)) == []
@@ -86,5 +86,5 @@ def test_a_single_wild_stop_is_named_where_each_was_read_once():
 @pytest.mark.parametrize("seed", range(8))
 def test_drawn_axes_raise_no_doubt(seed):
     moves = random_moves(seed, 40, 4) if seed % 2 else runs(2)
-    made = drawn(seed, moves, per_command=AxisPrior(0.01, 1e-6), backlash=AxisPrior(0.0, 1.0)).campaign
-    assert data_doubts(made, rows_of(made)) == []
+    axis = drawn(seed, moves, per_command=AxisPrior(0.01, 1e-6), backlash=AxisPrior(0.0, 1.0)).campaign
+    assert data_doubts(axis, rows_of(axis)) == []

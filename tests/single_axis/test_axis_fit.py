@@ -22,13 +22,13 @@ def test_truths_lie_where_the_fit_says():
     z = []
     for seed in range(3):
         for moves in (runs(3), random_moves(seed, 40, 2)):
-            made = drawn(seed, moves, backlash=AxisPrior(0.0, 0.1))
-            found = fit_axis(made.campaign, tier="importance", seed=seed)
-            assert found.error is None
+            simulated = drawn(seed, moves, backlash=AxisPrior(0.0, 0.1))
+            fit = fit_axis(simulated.campaign, tier="importance", seed=seed)
+            assert fit.error is None
             z += [
-                (draws.mean() - made.truth.parameters[name]) / draws.std()
+                (draws.mean() - simulated.truth.parameters[name]) / draws.std()
                 for name in ("per_command", "backlash")
-                for draws in [found.draws[name]]
+                for draws in [fit.draws[name]]
             ]
     # 12 numbers: chi-square at 1e-4 is 39.1, at 1 - 1e-4 1.4.
     assert 1.4 < np.sum(np.square(z)) < 39.1
@@ -36,12 +36,12 @@ def test_truths_lie_where_the_fit_says():
 
 @pytest.mark.thorough
 def test_both_tiers_agree_and_a_seed_gives_the_same():
-    made = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
-    one = fit_axis(made, seed=1)
+    axis = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
+    one = fit_axis(axis, seed=1)
     assert one.tier == "emcee" and one.error is None
     agreement = one.sample.convergence.agreement
     assert agreement is not None and agreement.agrees
-    quick, again = (fit_axis(made, tier="importance", seed=1) for _ in range(2))
+    quick, again = (fit_axis(axis, tier="importance", seed=1) for _ in range(2))
     np.testing.assert_array_equal(quick.draws["backlash"], again.draws["backlash"])
     json.dumps(summarise_axis(one).as_json(), allow_nan=False)
 
@@ -56,8 +56,8 @@ class OtherRun(ensemble.Run):
 def test_another_tier_is_an_entry_of_runs(monkeypatch):
     monkeypatch.setitem(RUNS, OtherRun.tier, "ensemble:OtherRun")
     monkeypatch.setattr(ensemble, "OtherRun", OtherRun, raising=False)
-    made = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
-    one, other = (fit_axis(made, tier=tier, seed=1) for tier in (CHAIN, OtherRun.tier))
+    axis = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
+    one, other = (fit_axis(axis, tier=tier, seed=1) for tier in (CHAIN, OtherRun.tier))
     assert (one.tier, other.tier) == (CHAIN, OtherRun.tier)
     np.testing.assert_array_equal(one.draws["backlash"], other.draws["backlash"])
 
@@ -66,9 +66,9 @@ def test_nothing_left_to_sample():
     moves = runs(2)
     fixed = campaign(moves, [0.01 * m.command + 0.002 * (k % 3) for k, m in enumerate(moves)], **FIRST_EDITION)
     for way in ({"tier": "emcee"}, {"tier": "importance"}, {"sampled": False}):
-        found = fit_axis(fixed, **way)
-        assert found.free == () and found.error is None
-        assert summarise_axis(found).per_command["forward"].value == pytest.approx(0.01, rel=1e-3)
+        fit = fit_axis(fixed, **way)
+        assert fit.free == () and fit.error is None
+        assert summarise_axis(fit).per_command["forward"].value == pytest.approx(0.01, rel=1e-3)
 
 
 def test_play_swallows_short_legs():
@@ -80,9 +80,9 @@ def test_play_swallows_short_legs():
     for c in commands:
         y = min(max(y, c - 2.5), c + 2.5)
         values.append(y + 0.05 * rng.standard_normal())
-    found = fit_axis(campaign(moves, values, backlash=AxisPrior(0.0, 10.0)), tier="importance")
-    assert found.model.play_is_sampled
-    draws = found.draws["backlash"]
+    fit = fit_axis(campaign(moves, values, backlash=AxisPrior(0.0, 10.0)), tier="importance")
+    assert fit.model.play_is_sampled
+    draws = fit.draws["backlash"]
     # Scatter 0.05 over ten stops on either side would give 0.02; play and error vary by position besides.
     assert draws.mean() == pytest.approx(5.0, abs=3 * draws.std())
     assert draws.std() < 0.2
@@ -97,11 +97,11 @@ def test_a_search_that_lost_its_way_is_not_converged():
     for c in commands:
         y = min(max(y, c - 1.5), c + 1.5)
         values.append(y + 0.05 * rng.standard_normal())
-    found = fit_axis(campaign(moves, values, backlash=AxisPrior(0.0, 10.0)), sampled=False)
+    fit = fit_axis(campaign(moves, values, backlash=AxisPrior(0.0, 10.0)), sampled=False)
     # Whichever way it goes: an approximation that passes for converged holds the truth.
-    ratio = found.draws["per_command"]
-    assert found.error is not None or abs(ratio.mean() - 1.0) < 4 * ratio.std()
-    assert found.mode.missing == found.missing == summarise_axis(found).problems
+    ratio = fit.draws["per_command"]
+    assert fit.error is not None or abs(ratio.mean() - 1.0) < 4 * ratio.std()
+    assert fit.mode.missing == fit.missing == summarise_axis(fit).problems
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -110,16 +110,16 @@ def test_readings_without_a_density_are_not_converged(scales):
     """A scale of readings of zero, which no folder may state."""
     moves = runs(2)
     values = [0.01 * m.command + 0.002 * (k % 3) for k, m in enumerate(moves)]
-    found = fit_axis(campaign(moves, values, 0.001, **{**scales, "reading_scale": AxisPrior(0.0, 0.0)}), sampled=False)
-    assert found.error is not None and found.error.exit_code == 4 and found.error.remedy
-    assert "no density" in found.error.message and not summarise_axis(found).converged
+    fit = fit_axis(campaign(moves, values, 0.001, **{**scales, "reading_scale": AxisPrior(0.0, 0.0)}), sampled=False)
+    assert fit.error is not None and fit.error.exit_code == 4 and fit.error.remedy
+    assert "no density" in fit.error.message and not summarise_axis(fit).converged
 
 
 def test_what_the_data_cannot_tell_is_said():
     moves = [AxisMove(k, 0, 60.0 * k, 100.0 * k, "" if k else "forward") for k in range(4)]
     summary = summarise_axis(fit_axis(campaign(moves, [0.0, 1.0, 2.1, 3.0]), tier="importance"))
-    said = " ".join(summary.weak_directions)
-    assert "one side" in said and "4 positions" in said and "twice" in said
+    text = " ".join(summary.weak_directions)
+    assert "one side" in text and "4 positions" in text and "twice" in text
     assert summary.parameters["backlash"].contraction == pytest.approx(0.0, abs=0.15)
     assert summary.classic.backlash is None and summary.classic.iso230 is None
 
@@ -136,10 +136,10 @@ def test_a_reversal_of_the_wrong_sign_is_said():
 
 @pytest.mark.parametrize("name, value", [("per_command", 0.01), ("ratio_contrast", 2e-6)])
 def test_a_constant_is_held(name, value):
-    made = drawn(2, None, **{name: AxisPrior(value, 0.0)}).campaign
-    found = fit_axis(AxisCampaign("deg", made.moves, made.readings, made.stated), tier="importance")
+    axis = drawn(2, None, **{name: AxisPrior(value, 0.0)}).campaign
+    fit = fit_axis(AxisCampaign("deg", axis.moves, axis.readings, axis.stated), tier="importance")
     # What rounding leaves of a variance that is zero.
-    np.testing.assert_allclose(found.draws[name], value, atol=1e-10)
+    np.testing.assert_allclose(fit.draws[name], value, atol=1e-10)
 
 
 def test_places_read_one_after_the_other_are_weak():

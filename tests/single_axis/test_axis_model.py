@@ -60,13 +60,13 @@ def dense(model, w):
 def test_the_filter_is_the_dense_gaussian(seed):
     model = model_of(a_campaign(seed))
     w = 0.4 * np.random.default_rng(seed).standard_normal((4, len(model.coordinates.names)))
-    found = model.log_likelihood(w)
+    values = model.log_likelihood(w)
     for k in range(4):
         total, residual = dense(model, w[k : k + 1])
         sign, log_det = np.linalg.slogdet(2 * np.pi * total)
         wanted = -0.5 * (log_det + residual @ np.linalg.solve(total, residual))
         # 36 rows of condition 1e10: differences of the two ways of solving.
-        assert sign > 0 and found[k] == pytest.approx(wanted, rel=1e-8, abs=1e-5)
+        assert sign > 0 and values[k] == pytest.approx(wanted, rel=1e-8, abs=1e-5)
 
 
 def test_rows_left_out_are_the_conditional_of_the_dense_gaussian():
@@ -85,27 +85,27 @@ def test_rows_left_out_are_the_conditional_of_the_dense_gaussian():
 
 def test_places_that_no_row_depends_on_are_predicted_from_those_that_rows_do():
     """Against the conditional of the process, given the posterior at the places of the rows."""
-    asked = np.array([-1500.0, 37.0, 1200.0])
-    plain, model = model_of(a_campaign()), model_of(a_campaign(), asked)
+    commands = np.array([-1500.0, 37.0, 1200.0])
+    plain, model = model_of(a_campaign()), model_of(a_campaign(), commands)
     w = 0.4 * np.random.default_rng(4).standard_normal((3, len(model.coordinates.names)))
-    seen, found = plain.linear(w), model.linear(w)
+    line, wider_line = plain.linear(w), model.linear(w)
     count, slope = len(plain.places.command), abs(plain.rows.line[1])
-    assert len(model.informed) == plain.columns < model.columns == plain.columns + 2 * len(asked)
-    both = np.concatenate((plain.places.command, asked))
+    assert len(model.informed) == plain.columns < model.columns == plain.columns + 2 * len(commands)
+    both = np.concatenate((plain.places.command, commands))
     for k, length in enumerate(model.coordinates.values(w)["transmission_error_length"]):
         scale = model.coordinates.values(w)["transmission_error"][k] ** 2
         prior = scale * (matern52(slope * (both[:, None] - both), length) + JITTER * np.eye(len(both)))
-        own = slice(plain.processes, plain.processes + count)
+        block = slice(plain.processes, plain.processes + count)
         by = np.linalg.solve(prior[:count, :count], prior[:count, count:]).T
-        mean = by @ seen.mean[k, own]
+        mean = by @ line.mean[k, block]
         left = prior[count:, count:] - by @ prior[:count, count:]
-        sd = np.sqrt(np.diag(left + by @ seen.covariance[k, own, own] @ by.T))
-        values, spread = found.of(model.functional(asked))
+        sd = np.sqrt(np.diag(left + by @ line.covariance[k, block, block] @ by.T))
+        values, spread = wider_line.of(model.functional(commands))
         # The nearest places make the prior's matrix nearly singular: its condition is 1 over the jitter at most.
         np.testing.assert_allclose(values[k], mean, atol=1e-6 * sd.max())
         np.testing.assert_allclose(spread[k], sd, rtol=1e-6)
-        across = found.covariance[k][: plain.processes, : plain.processes]
-        np.testing.assert_allclose(across, seen.covariance[k][: plain.processes, : plain.processes], rtol=1e-6)
+        across = wider_line.covariance[k][: plain.processes, : plain.processes]
+        np.testing.assert_allclose(across, line.covariance[k][: plain.processes, : plain.processes], rtol=1e-6)
 
 
 def test_without_processes_it_is_the_least_squares_line():
@@ -123,25 +123,25 @@ def test_without_processes_it_is_the_least_squares_line():
     sd = 0.004 * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
     # The priors of a travel and of the ratio still pull, by less than a hundredth of an sd.
     np.testing.assert_allclose(linear.mean[0, columns], solved, atol=float(0.01 * sd.max()), rtol=1e-6)
-    found = np.sqrt(np.diag(linear.covariance[0])[columns])
-    np.testing.assert_allclose(found, sd, rtol=0.01)
+    u = np.sqrt(np.diag(linear.covariance[0])[columns])
+    np.testing.assert_allclose(u, sd, rtol=0.01)
 
 
 def test_nodes_do_what_all_positions_do(monkeypatch):
-    made = drawn(5).campaign
-    exact = model_of(made)
+    axis = drawn(5).campaign
+    exact = model_of(axis)
     w = np.zeros((1, len(exact.coordinates.names)))
     monkeypatch.setattr(process_places, "PLACES_MAX", 3)
-    rough = model_of(made)
+    rough = model_of(axis)
     assert exact.places.exact and not rough.places.exact
     # 41 nodes over a travel of five lengths: 0.3 of 4296, where the scatter is held far too small.
     assert rough.log_likelihood(w)[0] == pytest.approx(exact.log_likelihood(w)[0], rel=2e-4)
 
 
 def test_a_turned_reading_turns_the_answer():
-    made = drawn(6).campaign
-    turned = campaign(made.moves, [-float(r.value or 0.0) for r in made.readings], made.readings[0].u)
-    straight = campaign(made.moves, [float(r.value or 0.0) for r in made.readings], made.readings[0].u)
+    axis = drawn(6).campaign
+    turned = campaign(axis.moves, [-float(r.value or 0.0) for r in axis.readings], axis.readings[0].u)
+    straight = campaign(axis.moves, [float(r.value or 0.0) for r in axis.readings], axis.readings[0].u)
     one, other = model_of(straight), model_of(turned)
     w = np.zeros((1, len(one.coordinates.names)))
     assert one.log_likelihood(w)[0] == pytest.approx(other.log_likelihood(w)[0], abs=1e-6)

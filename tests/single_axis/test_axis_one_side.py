@@ -42,8 +42,8 @@ def test_shares_told_lie_between_zero_and_one_hundred(summary):
 
 
 def test_weak_directions_are_counted_in_words(summary):
-    for count, said in ((1, "1 weak direction\n"), (2, "2 weak directions\n")):
-        assert f": {said}" in axis_fit_text(structs.replace(summary, weak_directions=("so",) * count))
+    for count, phrase in ((1, "1 weak direction\n"), (2, "2 weak directions\n")):
+        assert f": {phrase}" in axis_fit_text(structs.replace(summary, weak_directions=("so",) * count))
 
 
 @pytest.mark.parametrize(

@@ -35,10 +35,10 @@ def kept(tmp_path_factory):
 
 def test_what_was_kept_is_taken_up(kept):
     folder, fit = kept
-    told = []
-    found = results_for(read_axis(folder), notify=told.append)
-    assert not told and found.fit.seed == fit.seed
-    np.testing.assert_array_equal(found.fit.w, fit.w)
+    messages = []
+    results = results_for(read_axis(folder), notify=messages.append)
+    assert not messages and results.fit.seed == fit.seed
+    np.testing.assert_array_equal(results.fit.w, fit.w)
 
 
 def test_strata_have_the_band_of_all_draws(kept):

@@ -23,17 +23,17 @@ def test_play_is_the_clip_of_the_definition():
     moves = random_moves(3, 60)
     rows = rows_of(campaign(moves, line([m.command for m in moves])))
     for backlash in (0.0, 3.0, 9.0, 25.0):
-        found = play_places(rows, np.array([backlash]))
+        places = play_places(rows, np.array([backlash]))
         y, q = 0.0, 0.0
         for k, move in enumerate(moves):
             q = rows.line[1] * move.command
             if move.approach:
                 y = q - 0.5 * backlash
             y = min(max(y, q - 0.5 * backlash), q + 0.5 * backlash)
-            anchored = rows.line[1] * found.anchor[0, k] + 0.5 * backlash * found.side[0, k]
+            anchored = rows.line[1] * places.anchor[0, k] + 0.5 * backlash * places.side[0, k]
             # Sums of a few numbers of size 20.
             assert anchored == pytest.approx(y, abs=1e-12)
-            assert q + 0.5 * backlash * found.share[0, k] == pytest.approx(y, abs=1e-12)
+            assert q + 0.5 * backlash * places.share[0, k] == pytest.approx(y, abs=1e-12)
 
 
 @pytest.mark.parametrize("k", [0.01, -4.0])
@@ -41,13 +41,13 @@ def test_play_of_many_backlashes_is_that_of_each_and_keeps_the_way_to_its_anchor
     moves = random_moves(4, 40)
     rows = rows_of(campaign(moves, line([m.command for m in moves], k)))
     backlashes = np.array([0.0, 0.3, 12.0, 26.0]) * abs(k) * 100
-    found = play_places(rows, backlashes)
+    places = play_places(rows, backlashes)
     travelled = np.cumsum(np.abs(rows.legs.step))
     travelled -= np.where(np.arange(40) < 20, 0.0, travelled[20])
     for row, backlash in enumerate(backlashes):
         alone, last, y = play_places(rows, backlash[None]), 0, 0.0
         for name in ("anchor", "path", "side", "share", "spread"):
-            np.testing.assert_array_equal(getattr(found, name)[row], getattr(alone, name)[0], err_msg=name)
+            np.testing.assert_array_equal(getattr(places, name)[row], getattr(alone, name)[0], err_msg=name)
         for at, move in enumerate(moves):
             stood, q = y, rows.line[1] * move.command
             sign = 0.5 * np.sign(k) * backlash
@@ -61,16 +61,16 @@ def test_long_legs_have_one_place_whatever_the_play_and_a_negative_play_none():
     rows = rows_of(campaign(moves, line([m.command for m in moves])))
     assert play_places(rows, np.array([0.5, 1.0, 2.0])).anchor.shape == (1, len(moves))
     short = [AxisMove(k, 0, 0.0, c, "" if k else "forward") for k, c in enumerate((0.0, 1.0, 2.0, 1.0, 0.0))]
-    found = play_places(rows_of(campaign(short, line([m.command for m in short]))), np.array([-3.0]))
-    assert found.anchor[0].tolist() == [m.command for m in short] and not found.spread.any()
-    assert found.share[0].tolist() == [-1.0, -1.0, -1.0, 1.0, 1.0]
+    places = play_places(rows_of(campaign(short, line([m.command for m in short]))), np.array([-3.0]))
+    assert places.anchor[0].tolist() == [m.command for m in short] and not places.spread.any()
+    assert places.share[0].tolist() == [-1.0, -1.0, -1.0, 1.0, 1.0]
 
 
 def test_an_unknown_side_is_known_after_a_long_leg():
     moves = [AxisMove(k, 0, 0.0, c, "" if k else "unknown") for k, c in enumerate((0.0, 50.0, 1000.0, 0.0))]
     rows = rows_of(campaign(moves, line([m.command for m in moves])))
-    found = play_places(rows, np.array([2.0]))
-    np.testing.assert_allclose(found.spread[0], [1.0, 0.75, 0.0, 0.0], atol=1e-12)
+    places = play_places(rows, np.array([2.0]))
+    np.testing.assert_allclose(places.spread[0], [1.0, 0.75, 0.0, 0.0], atol=1e-12)
     # Also of plays that every known leg would take up.
     np.testing.assert_allclose(play_places(rows, np.array([0.1, 0.2])).spread[:, 0], [0.05, 0.1], atol=1e-12)
 
@@ -201,9 +201,9 @@ def test_rows_left_out_keep_times_and_stops():
     out[[0, 7, 8, 20, 21]] = True
     kept = tuple(r for k, r in enumerate(campaign(moves, line([m.command for m in moves]), 0.1).readings) if not out[k])
     wanted = rows_of(AxisCampaign("deg", moves, kept))
-    found = rows.without(out)
+    remaining = rows.without(out)
     for name in ("hours", "redrawn", "path", "side", "command", "value"):
-        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(getattr(remaining, name), getattr(wanted, name), atol=1e-12, err_msg=name)
 
 
 def test_repeats_at_one_stop_share_its_error():
@@ -219,11 +219,11 @@ def test_figures_of_the_whole_axis_have_the_words_of_the_standard():
     moves = runs(3)
     side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
     values = [0.01 * m.command - 0.1 * s for m, s in zip(moves, side, strict=True)]
-    found = iso230_figures(rows_of(campaign(moves, values)))
-    assert list(found) == [
+    figures = iso230_figures(rows_of(campaign(moves, values)))
+    assert list(figures) == [
         *("reversal", "mean_reversal", "repeatability_forward", "repeatability_backward", "repeatability"),
         *("systematic_forward", "systematic_backward", "systematic", "mean_systematic"),
         *("accuracy_forward", "accuracy_backward", "accuracy"),
     ]
     # Rounding of positions of 20.
-    assert found["reversal"] == pytest.approx(0.2, abs=1e-9) and found["repeatability_forward"] < 1e-9
+    assert figures["reversal"] == pytest.approx(0.2, abs=1e-9) and figures["repeatability_forward"] < 1e-9

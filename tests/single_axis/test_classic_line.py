@@ -27,8 +27,8 @@ def test_the_line_is_that_of_least_squares():
     solved, square, _, _ = np.linalg.lstsq(design, rows.value, rcond=None)
     scatter = float(np.sqrt(square[0] / (len(rows.value) - 3)))
     u = scatter * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-    found = classic_axis(rows)
-    stated = [found.per_command, found.u_per_command, found.backlash, found.u_backlash, found.residual_sd]
+    classic = classic_axis(rows)
+    stated = [classic.per_command, classic.u_per_command, classic.backlash, classic.u_backlash, classic.residual_sd]
     np.testing.assert_allclose(stated, [solved[1], u[1], solved[2], u[2], scatter], rtol=1e-9)
 
 
@@ -50,17 +50,17 @@ def test_runs_are_deviations_from_the_line_by_position_and_side():
     left_out[np.flatnonzero((rows.command == 500.0) & (rows.side > 0))[0]] = True
     rows = rows.without(left_out)
     off = rows.value - (rows.line[0] + rows.line[1] * rows.command)
-    found = position_runs(rows)
-    assert found.position.tolist() == [0.0, 500.0, 1400.0]
-    assert found.forward.shape == found.backward.shape == (3, 3)
-    for row, position in enumerate(found.position):
-        for table, side in ((found.forward, 1), (found.backward, -1)):
+    deviations = position_runs(rows)
+    assert deviations.position.tolist() == [0.0, 500.0, 1400.0]
+    assert deviations.forward.shape == deviations.backward.shape == (3, 3)
+    for row, position in enumerate(deviations.position):
+        for table, side in ((deviations.forward, 1), (deviations.backward, -1)):
             wanted = off[(rows.command == position) & (rows.side == side)]
             np.testing.assert_allclose(table[row][~np.isnan(table[row])], wanted, atol=1e-12)
-    assert np.isnan(found.forward).sum() == 1 and not np.isnan(found.backward).any()
+    assert np.isnan(deviations.forward).sum() == 1 and not np.isnan(deviations.backward).any()
     figures = positioning_of(rows)
     assert figures is not None
-    assert figures.accuracy_deg == pytest.approx(figures_of(found.forward, found.backward).accuracy_deg)
+    assert figures.accuracy_deg == pytest.approx(figures_of(deviations.forward, deviations.backward).accuracy_deg)
 
 
 def test_two_runs_from_either_side_are_enough_and_one_is_not():

@@ -42,11 +42,11 @@ def test_runs_side_by_side_follow_each_other():
     )
     wide.columns["Backward 1 (mm)"] = ("5", "6")
     rows = long_table(wide, {})
-    found, (told,) = rows.table, rows.remarks
-    assert found.columns["reading (mm)"] == ("2", "1", "5", "6", "4", "3")
-    assert found.columns["Position"] == ("0", "10", "10", "0", "0", "10")
-    assert found.columns["direction"] == ("forward",) * 2 + ("backward",) * 2 + ("forward",) * 2
-    assert found.lines == (3, 2, 2, 3, 3, 2) and "3 columns" in told
+    joined, (remark,) = rows.table, rows.remarks
+    assert joined.columns["reading (mm)"] == ("2", "1", "5", "6", "4", "3")
+    assert joined.columns["Position"] == ("0", "10", "10", "0", "0", "10")
+    assert joined.columns["direction"] == ("forward",) * 2 + ("backward",) * 2 + ("forward",) * 2
+    assert joined.lines == (3, 2, 2, 3, 3, 2) and "3 columns" in remark
     assert rows.stated == {"command": "Position"}
     assert long_table(wide, {"value": "Forward 1 (mm)"}).table is wide
 

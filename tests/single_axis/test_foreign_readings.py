@@ -27,8 +27,8 @@ NAMES = [
 
 @pytest.mark.parametrize("names", NAMES, ids=[names[0] for names in NAMES])
 def test_commands_and_readings_by_any_name(names):
-    found = map_axis_columns(names[::-1])
-    assert (found.columns["command"], found.columns["value"]) == names and not found.ambiguous
+    mapping = map_axis_columns(names[::-1])
+    assert (mapping.columns["command"], mapping.columns["value"]) == names and not mapping.ambiguous
 
 
 def test_dates_in_utc_are_times():
@@ -54,21 +54,21 @@ def test_whole_turns_that_an_encoder_leaves_out_are_added(unit, turn):
     moves = tuple(AxisMove(k, 0, float(k), float(c), "" if k else "forward") for k, c in enumerate(commands))
     read = tuple(Reading(k, k, angle % turn) for k, angle in enumerate(angles))
     read = (*read[:9], replace(read[9], status="wild"), *read[10:])
-    found = unwrapped(ForeignReadings(moves, read, ("before",)), unit)
-    kept = [(r.value, angle) for r, angle in zip(found.readings, angles, strict=True) if r.status == "ok"]
+    series = unwrapped(ForeignReadings(moves, read, ("before",)), unit)
+    kept = [(r.value, angle) for r, angle in zip(series.readings, angles, strict=True) if r.status == "ok"]
     assert [value for value, _ in kept] == pytest.approx([angle for _, angle in kept], rel=1e-12)
-    assert found.readings[9] == read[9] and found.assumed[0] == "before"
+    assert series.readings[9] == read[9] and series.assumed[0] == "before"
     assert (
-        found.assumed[1].startswith("value: jumps by whole turns 8 times")
-        and "each; --counts-per-turn" in found.assumed[1]
+        series.assumed[1].startswith("value: jumps by whole turns 8 times")
+        and "each; --counts-per-turn" in series.assumed[1]
     )
     wild = replace(
-        found, readings=tuple(replace(r, value=r.value + 1.2 * turn * (k == 30)) for k, r in enumerate(read))
+        series, readings=tuple(replace(r, value=r.value + 1.2 * turn * (k == 30)) for k, r in enumerate(read))
     )
     assert unwrapped(wild, unit) is wild
     for same in (ForeignReadings(moves, read, ()), ForeignReadings(moves[:3], read[:3], ())):
         assert unwrapped(same, "mm") is same
-    assert unwrapped(replace(found, assumed=()), unit) == replace(found, assumed=())
+    assert unwrapped(replace(series, assumed=()), unit) == replace(series, assumed=())
 
 
 def table(tmp_path, *lines):
@@ -80,7 +80,7 @@ def table(tmp_path, *lines):
 
 def test_stops_are_read_again_passed_and_homed(tmp_path):
     """A repeated command is the same stop, a row without a value a move, another home number another segment."""
-    found = readings_of(
+    series = readings_of(
         *table(
             tmp_path,
             "t (min);home;steps;encoder;from;sd;ok",
@@ -92,21 +92,21 @@ def test_stops_are_read_again_passed_and_homed(tmp_path):
             "5;2;100;1,7;backward;0,2;ja",
         )
     )
-    assert [(m.move, m.segment, m.time_s, m.command, m.approach) for m in found.moves] == [
+    assert [(m.move, m.segment, m.time_s, m.command, m.approach) for m in series.moves] == [
         *((0, 0, 0.0, 0.0, "forward"), (1, 0, 60.0, 100.0, ""), (2, 0, 180.0, 200.0, "")),
         *((3, 0, 240.0, 100.0, ""), (4, 1, 300.0, 100.0, "backward")),
     ]
-    assert [(r.move, r.value, r.u, r.status) for r in found.readings] == [
+    assert [(r.move, r.value, r.u, r.status) for r in series.readings] == [
         *((0, 0.5, 0.1, "ok"), (1, 1.5, 0.1, "ok"), (1, 1.6, 0.1, "ok")),
         *((3, 1.4, 0.0, "refused: no"), (4, 1.7, 0.2, "ok")),
     ]
-    assert any("1 row at the command before" in text for text in found.assumed)
+    assert any("1 row at the command before" in text for text in series.assumed)
 
 
 def test_a_mark_of_homings_is_no_number_of_a_segment(tmp_path):
-    found = readings_of(*table(tmp_path, "home,steps,encoder", "1,0,0.1", "0,10,1.1", "0,20,2.1", "1,0,0.2"))
-    assert [m.segment for m in found.moves] == [0, 0, 0, 1]
-    assert any("1 homing after the first row, by column home at each 1" in text for text in found.assumed)
+    series = readings_of(*table(tmp_path, "home,steps,encoder", "1,0,0.1", "0,10,1.1", "0,20,2.1", "1,0,0.2"))
+    assert [m.segment for m in series.moves] == [0, 0, 0, 1]
+    assert any("1 homing after the first row, by column home at each 1" in text for text in series.assumed)
 
 
 def test_a_german_date_beside_german_names(tmp_path):
@@ -138,10 +138,10 @@ def test_a_negative_uncertainty_is_refused_as_check_does(tmp_path):
 
 
 def test_statuses_are_such_as_our_own_reader_takes(tmp_path):
-    found = readings_of(*table(tmp_path, "steps;encoder;ok", "0;0,5;1", "100;1,5;-", "200;;+ slipped"))
-    assert [reading.status for reading in found.readings] == ["ok", "refused: -", "refused: + slipped"]
-    assert "status: 2 readings left out by column ok: - 1, + slipped 1" in found.assumed
-    assert parse_readings(readings_bytes(found.readings), 3) == found.readings
+    series = readings_of(*table(tmp_path, "steps;encoder;ok", "0;0,5;1", "100;1,5;-", "200;;+ slipped"))
+    assert [reading.status for reading in series.readings] == ["ok", "refused: -", "refused: + slipped"]
+    assert "status: 2 readings left out by column ok: - 1, + slipped 1" in series.assumed
+    assert parse_readings(readings_bytes(series.readings), 3) == series.readings
 
 
 @pytest.mark.parametrize(
@@ -150,10 +150,10 @@ def test_statuses_are_such_as_our_own_reader_takes(tmp_path):
 def test_temperatures_are_those_of_the_moves(tmp_path, name, cells):
     """Of the row that ends a move, none where a cell is empty or a move is put in; deg C whatever the column says."""
     rows = (f"0,0.1,{cells[0]},below", "10,1.1,,below", f"10,1.0,{cells[1]},above")
-    found = readings_of(*table(tmp_path, f"command,value,{name},direction", *rows))
-    assert [move.command for move in found.moves] == [0.0, 10.0, 10.5, 10.0]
-    warm = [move.temperature_degC for move in found.moves]
+    series = readings_of(*table(tmp_path, f"command,value,{name},direction", *rows))
+    assert [move.command for move in series.moves] == [0.0, 10.0, 10.5, 10.0]
+    warm = [move.temperature_degC for move in series.moves]
     assert warm[1] is warm[2] is None
     # Rounding of a difference of numbers of some hundreds.
     np.testing.assert_allclose([warm[0], warm[3]], [20.0, 21.5], atol=1e-12 * 300)
-    assert any("turned into deg C" in said for said in found.assumed) == (name != "Temperature")
+    assert any("turned into deg C" in text for text in series.assumed) == (name != "Temperature")

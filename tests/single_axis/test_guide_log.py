@@ -48,9 +48,9 @@ def night(frames: int = 300, events: dict[int, list[str]] | None = None, pulse_r
     return "\n".join([*lines, "Guiding Ends at 2026-01-02 21:30:00", ""])
 
 
-def motions(found):
+def motions(series):
     """Driven angle less the axis' of the readings that are ok, arcsec, and their times."""
-    ok = [reading for reading in found.readings if reading.status == "ok"]
+    ok = [reading for reading in series.readings if reading.status == "ok"]
     times = np.array([reading.time_s for reading in ok])
     return times, SIDEREAL_ARCSEC_PER_S * times - np.array([reading.value for reading in ok])
 
@@ -63,15 +63,15 @@ ROUNDED = 0.5e-4 * PIXEL / COSINE + 0.5e-4 + 1e-6
 def test_the_uncorrected_motion_is_that_of_the_mount(ends):
     """Pulses act after their frame, at a rate that is of the calibration's declination; distances are on the sky."""
     (run,) = read_runs("\n \n" + night().replace("\n", ends), "log.txt")
-    found = readings_of_run(run, "log.txt", {})
-    times, motion = motions(found)
+    series = readings_of_run(run, "log.txt", {})
+    times, motion = motions(series)
     assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
-    assert (found.unit, found.drive.rate, len(found.moves)) == ("arcsec", SIDEREAL_ARCSEC_PER_S, 1)
-    assert found.moves[0].command == pytest.approx(SIDEREAL_ARCSEC_PER_S * found.moves[0].time_s, abs=1e-6)
-    assert found.drive.period_between == (60.0, round((times[-1] - times[0]) / 3))
-    assert found.drive.header["created"].isoformat() == "2026-01-02T21:00:00"
-    assert any("calibration's declination of 10 deg" in text for text in found.assumed)
-    assert any("1 frame with a saturated star" in text for text in found.notes)
+    assert (series.unit, series.drive.rate, len(series.moves)) == ("arcsec", SIDEREAL_ARCSEC_PER_S, 1)
+    assert series.moves[0].command == pytest.approx(SIDEREAL_ARCSEC_PER_S * series.moves[0].time_s, abs=1e-6)
+    assert series.drive.period_between == (60.0, round((times[-1] - times[0]) / 3))
+    assert series.drive.header["created"].isoformat() == "2026-01-02T21:00:00"
+    assert any("calibration's declination of 10 deg" in text for text in series.assumed)
+    assert any("1 frame with a saturated star" in text for text in series.notes)
 
 
 def test_a_rate_at_the_declination_of_the_run_is_recognised():
@@ -79,10 +79,10 @@ def test_a_rate_at_the_declination_of_the_run_is_recognised():
     scaled = RATE_PX * PIXEL / COSINE
     norm = f'Norm rates RA = {scaled:.1f}"/s @ dec 0, Dec = 7.3"/s; ortho.err. = 8.7 deg\n'
     (run,) = read_runs(night(pulse_rate=scaled, norm=norm), "log.txt")
-    found = readings_of_run(run, "log.txt", {})
-    times, motion = motions(found)
+    series = readings_of_run(run, "log.txt", {})
+    times, motion = motions(series)
     assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
-    assert any("at the run's declination" in text and "guide speed is 6.1, -22 %" in text for text in found.assumed)
+    assert any("at the run's declination" in text and "guide speed is 6.1, -22 %" in text for text in series.assumed)
 
 
 def test_what_is_stated_counts_before_the_log():
@@ -108,22 +108,22 @@ EVENTS = {
 def test_dithers_settling_drops_and_pauses_are_left_out_and_no_jump_is_bridged():
     """Each stretch has a zero of its own; within it the motion is that of the mount."""
     (run,) = read_runs(night(events=EVENTS), "log.txt")
-    found = readings_of_run(run, "log.txt", {})
-    assert [move.segment for move in found.moves] == [0, 1, 2]
+    series = readings_of_run(run, "log.txt", {})
+    assert [move.segment for move in series.moves] == [0, 1, 2]
     counts = {"ok": 292, "settling": 5, "dropped": 1}
-    assert {status: sum(r.status == status for r in found.readings) for status in counts} == counts
-    assert found.notes[0] == (
+    assert {status: sum(r.status == status for r in series.readings) for status in counts} == counts
+    assert series.notes[0] == (
         "frames: 292 used of 301 (8 while settling, 1 dropped, 1 damaged row, 1 rows of AO left out); "
         "3 stretches with a zero of its own each (1 dither, 1 pause)"
     )
-    times, motion = motions(found)
-    part = np.array([r.move for r in found.readings if r.status == "ok"])
+    times, motion = motions(series)
+    part = np.array([r.move for r in series.readings if r.status == "ok"])
     off = motion - np.array([motion_of(t) for t in times])
     for stretch in range(3):
         assert np.ptp(off[part == stretch]) < 2 * ROUNDED
     assert abs(off[part == 1][0] - off[part == 0][0]) > 1.0, "the dither's jump is a zero, no motion"
-    begins = [move.time_s for move in found.moves]
-    assert all(begins[r.move] <= r.time_s for r in found.readings)
+    begins = [move.time_s for move in series.moves]
+    assert all(begins[r.move] <= r.time_s for r in series.readings)
 
 
 def test_several_runs_calibrations_and_empty_logs():
@@ -134,13 +134,13 @@ def test_several_runs_calibrations_and_empty_logs():
     assert is_guide_log(log)
     runs = read_runs(log, "log.txt")
     assert [(row["run"], row["frames"], row["pier"]) for row in run_rows(runs)] == [(1, 50, "West"), (2, 19, "West")]
-    found = [readings_of_run(run, "log.txt", {}) for run in runs]
-    assert "1 calibration step" in found[0].notes[0] and found[0].drive.period_between is None
-    assert any("may be cut off" in text for text in found[1].notes)
+    series = [readings_of_run(run, "log.txt", {}) for run in runs]
+    assert "1 calibration step" in series[0].notes[0] and series[0].drive.period_between is None
+    assert any("may be cut off" in text for text in series[1].notes)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "found", "remedy"),
+    ("old", "new", "message", "remedy"),
     [
         ("Dec = 40.0 deg", "Dec = Unknown", "does not state the declination", "--assume declination_deg=NUMBER"),
         ("Pixel scale = 2.0", "Pixel scale = ?", "does not state the pixel scale", "--assume pixel_arcsec=NUMBER"),
@@ -148,21 +148,21 @@ def test_several_runs_calibrations_and_empty_logs():
         ("Dec = 40.0 deg", "Dec = 89.3 deg", "a declination of 89.3 deg", "nearer to the equator"),
     ],
 )
-def test_what_the_log_does_not_state_is_asked_for(old, new, found, remedy):
+def test_what_the_log_does_not_state_is_asked_for(old, new, message, remedy):
     (run,) = read_runs(night(20).replace(old, new), "log.txt")
-    with pytest.raises(InputError, match=found) as refused:
+    with pytest.raises(InputError, match=message) as refused:
         readings_of_run(run, "log.txt", {})
     assert remedy in refused.value.remedy
 
 
 @pytest.mark.parametrize(
-    ("log", "found"),
+    ("log", "message"),
     [
         ("PHD2 version 2\n", "no run with frames"),
         (night(9).replace("RADuration", "Duration"), "no column RADuration"),
         (night(2), "2 frames"),
     ],
 )
-def test_logs_without_frames_are_refused(log, found):
-    with pytest.raises(InputError, match=found):
+def test_logs_without_frames_are_refused(log, message):
+    with pytest.raises(InputError, match=message):
         readings_of_run(read_runs(log, "log.txt")[0], "log.txt", {})

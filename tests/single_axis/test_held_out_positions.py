@@ -24,15 +24,15 @@ def test_positions_are_predicted_and_the_first_edition_is_too_sure():
     }
     z, classic = [], []
     for seed in range(2):
-        made = drawn(seed, runs(3), **stated).campaign
-        blind = campaign(made.moves, [float(r.value or 0.0) for r in made.readings], made.readings[0].u)
+        axis = drawn(seed, runs(3), **stated).campaign
+        blind = campaign(axis.moves, [float(r.value or 0.0) for r in axis.readings], axis.readings[0].u)
         kept = [r for r in blind.readings if abs(blind.moves[r.move].command) <= 2000]
-        found = hold_out_positions(type(blind)("deg", blind.moves, tuple(kept)))
-        assert {p.position for p in found.positions} == set(PLACES)
-        assert {p.direction for p in found.positions} == {"forward", "backward"}
-        assert all(p.n == 3 and p.u > 0 for p in found.positions)
-        z.append(found.rms_z)
-        classic.append(found.classic_rms_z)
+        hold_out = hold_out_positions(type(blind)("deg", blind.moves, tuple(kept)))
+        assert {p.position for p in hold_out.positions} == set(PLACES)
+        assert {p.direction for p in hold_out.positions} == {"forward", "backward"}
+        assert all(p.n == 3 and p.u > 0 for p in hold_out.positions)
+        z.append(hold_out.rms_z)
+        classic.append(hold_out.classic_rms_z)
     # Of 28 means in correlated pairs.
     assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.5
     assert np.sqrt(np.mean(np.square(classic))) > 1.7
@@ -45,10 +45,10 @@ def test_two_positions_leave_no_line():
 
 
 def test_weighted_draws_of_one_fit_say_what_fits_without_a_position_say(monkeypatch):
-    made = drawn(11, runs(3), backlash=AxisPrior(0.0, 0.1)).campaign
-    refitted = hold_out_positions(made).positions
+    axis = drawn(11, runs(3), backlash=AxisPrior(0.0, 0.1)).campaign
+    refitted = hold_out_positions(axis).positions
     monkeypatch.setattr(held_out_positions, "REFITTED_MAX", 0)
-    weighted = hold_out_positions(made).positions
+    weighted = hold_out_positions(axis).positions
     for one, other in zip(refitted, weighted, strict=True):
         # A hundred effective draws where an end is weighted out: means to a tenth of u, four of them, u to a quarter.
         assert one.predicted == pytest.approx(other.predicted, abs=0.4 * one.u)
@@ -57,5 +57,5 @@ def test_weighted_draws_of_one_fit_say_what_fits_without_a_position_say(monkeypa
 
 def test_many_positions_are_thinned_in_words(monkeypatch):
     monkeypatch.setattr(held_out_positions, "POSITIONS_MAX", 4)
-    found = hold_out_positions(drawn(11, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign)
-    assert len({p.position for p in found.positions}) == 4 and "evenly" in found.warnings[0]
+    hold_out = hold_out_positions(drawn(11, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign)
+    assert len({p.position for p in hold_out.positions}) == 4 and "evenly" in hold_out.warnings[0]

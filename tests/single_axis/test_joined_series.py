@@ -54,8 +54,8 @@ def test_a_command_that_stands_is_held():
     """Between two motions, 59 s apart, nothing changed: half way is no half of the way."""
     times = np.array([0.0, 0.1, 0.2, 0.3, 60.0, 60.1])
     commands = Series(times, np.array([0.0, 1.0, 2.0, 3.0, 3.0, 9.0]))
-    found, interpolated = command_at(commands, np.array([0.15, 30.0, 60.05, 60.1, 0.1]))
-    assert found == pytest.approx([1.5, 3.0, 6.0, 9.0, 1.0], abs=1e-12) and interpolated == 2
+    values, interpolated = command_at(commands, np.array([0.15, 30.0, 60.05, 60.1, 0.1]))
+    assert values == pytest.approx([1.5, 3.0, 6.0, 9.0, 1.0], abs=1e-12) and interpolated == 2
     jump = Series(np.array([0.0, 0.1, 0.2, 60.0]), np.array([0.0, 1.0, 2.0, 50.0]))
     assert command_at(jump, np.array([30.0]))[0] == pytest.approx([2.0])
 
@@ -117,7 +117,7 @@ def test_what_angle_calibrate_saves():
 
 
 @pytest.mark.parametrize(
-    ("data", "found"),
+    ("data", "message"),
     [
         # Without a time: both processes of pytest must collect the same tests.
         (gzip.compress(b"x" * 1000, mtime=0)[:40], "series none"),
@@ -135,8 +135,8 @@ def test_what_angle_calibrate_saves():
         (json.dumps({"q": "stepq:x", "params": {"data": 3}}).encode(), "a queue of steps of another form"),
     ],
 )
-def test_broken_logs_of_klipper_are_refused(data, found):
-    with pytest.raises(InputError, match=found):
+def test_broken_logs_of_klipper_are_refused(data, message):
+    with pytest.raises(InputError, match=message):
         klipper_table(data, "log")
 
 
@@ -144,6 +144,6 @@ def test_a_command_logged_once_a_move_stands_until_the_next():
     """Every 10 s a setpoint, the axis read 5 s later: nothing moved meanwhile."""
     times = np.arange(0.0, 50.0, 10.0)
     commands = Series(times, np.array([0.0, 10.0, 20.0, 10.0, 0.0]))
-    found, interpolated = command_at(commands, times + 5.0)
-    np.testing.assert_array_equal(found, commands.values)
+    values, interpolated = command_at(commands, times + 5.0)
+    np.testing.assert_array_equal(values, commands.values)
     assert interpolated == 0

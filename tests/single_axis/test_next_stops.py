@@ -26,37 +26,37 @@ def fitted():
 
 
 def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
-    found = plan_next(fitted, "position", count=3)
-    u = [found.u_now, *(stop.u for stop in found.next)]
-    assert len(found.next) == 3 and all(after < before for before, after in pairwise(u))
-    for stop in found.next:
+    plan = plan_next(fitted, "position", count=3)
+    u = [plan.u_now, *(stop.u for stop in plan.next)]
+    assert len(plan.next) == 3 and all(after < before for before, after in pairwise(u))
+    for stop in plan.next:
         for command in (stop.command, stop.via):
             assert command is None or -2300 <= command <= 2300
-    assert found.plan_bytes().startswith(b"step,command,direction,read\n0,")
-    json.dumps(found.as_json(), allow_nan=False)
+    assert plan.plan_bytes().startswith(b"step,command,direction,read\n0,")
+    json.dumps(plan.as_json(), allow_nan=False)
 
 
 @pytest.mark.parametrize("target", ["per_command", "effective_per_command", "backlash"])
 def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
     """Not at that given the scales, which is less: their means differ. Places between the rows change neither."""
     mean, sd = fitted.linear.of(headline_functionals(fitted.model, fitted.w)[[HEADLINE_DRAWS.index(target)]])
-    given = np.sqrt(np.mean(sd**2))
-    found = plan_next(fitted, target, count=1)
-    assert found.u_now == pytest.approx(np.hypot(given, mean.std()), rel=1e-6)
-    assert found.u_now > 1.001 * given and found.next[0].u < found.u_now
+    u_fit = np.sqrt(np.mean(sd**2))
+    plan = plan_next(fitted, target, count=1)
+    assert plan.u_now == pytest.approx(np.hypot(u_fit, mean.std()), rel=1e-6)
+    assert plan.u_now > 1.001 * u_fit and plan.next[0].u < plan.u_now
 
 
 @pytest.mark.thorough
 def test_stops_lower_a_play_that_is_sampled_and_none_that_is_held():
     """Where moves may be shorter than the play it is no linear quantity."""
-    made = drawn(4, runs(1)).campaign
-    found = fit_axis(made, tier="importance")
-    assert found.model.play_is_sampled
-    plan = plan_next(found, "backlash", count=2)
+    axis = drawn(4, runs(1)).campaign
+    fit = fit_axis(axis, tier="importance")
+    assert fit.model.play_is_sampled
+    plan = plan_next(fit, "backlash", count=2)
     u = [plan.u_now, *(stop.u for stop in plan.next)]
-    assert u[0] == pytest.approx(found.draws["backlash"].std(), rel=0.05)
+    assert u[0] == pytest.approx(fit.draws["backlash"].std(), rel=0.05)
     assert u[0] > u[1] > u[2] > 0
-    held = fit_axis(replace(made, stated=made.stated | {"backlash": AxisPrior(0.1, 0.0)}), sampled=False)
+    held = fit_axis(replace(axis, stated=axis.stated | {"backlash": AxisPrior(0.1, 0.0)}), sampled=False)
     with pytest.raises(NothingToEstimate, match="held"):
         plan_next(held, "backlash", count=1)
 
@@ -83,15 +83,15 @@ def turned():
 
 
 def test_a_stop_to_be_read_is_no_jump_by_a_turn(turned):
-    found = plan_next(fit_axis(turned, sampled=False), count=1)
-    assert found.next[0].gain > 0
+    plan = plan_next(fit_axis(turned, sampled=False), count=1)
+    assert plan.next[0].gain > 0
 
 
 def test_a_last_reading_of_no_use_takes_nothing_from_the_gains(turned):
     lost = Reading(len(turned.readings), len(turned.moves) - 1, None, 0.0, "no light")
-    asked = fit_axis(replace(turned, readings=(*turned.readings, lost)), sampled=False)
-    found, whole = plan_next(asked, count=1), plan_next(fit_axis(turned, sampled=False), count=1)
-    assert found == whole and found.next[0].gain > 0
+    fit = fit_axis(replace(turned, readings=(*turned.readings, lost)), sampled=False)
+    plan, whole = plan_next(fit, count=1), plan_next(fit_axis(turned, sampled=False), count=1)
+    assert plan == whole and plan.next[0].gain > 0
 
 
 @pytest.mark.parametrize("direction", ["forward", "backward"])
@@ -123,9 +123,9 @@ def test_an_axis_without_a_ratio_is_refused():
 
 def test_a_reading_of_zero_says_how_far_a_command_goes():
     moves = runs(1, (0.0, 100.0), 0.0)
-    made = simulate_axis(campaign(moves, [0.02 * m.command for m in moves]))
+    simulated = simulate_axis(campaign(moves, [0.02 * m.command for m in moves]))
     # A line through points that lie on it.
-    assert made.truth.parameters["per_command"] == pytest.approx(0.02, rel=1e-9)
+    assert simulated.truth.parameters["per_command"] == pytest.approx(0.02, rel=1e-9)
 
 
 def test_true_play_has_the_stated_mean_and_is_never_negative():
@@ -145,8 +145,8 @@ def test_without_errors_the_stops_are_the_play_operator():
         name: AxisPrior(0.0, 0.0)
         for name in ("transmission_error", "play_variation", "drift_per_root_hour", "stop_sd", "home_sd", "backlash")
     }
-    made = drawn(1, runs(1), reading_scale=AxisPrior(0.0, 0.0), **still)
-    values = np.array([r.value for r in made.campaign.readings])
-    commands = np.array([m.command for m in made.campaign.moves])
+    simulated = drawn(1, runs(1), reading_scale=AxisPrior(0.0, 0.0), **still)
+    values = np.array([r.value for r in simulated.campaign.readings])
+    commands = np.array([m.command for m in simulated.campaign.moves])
     # Without play or any error only the contrast is left, 1e-4 of the path.
     np.testing.assert_allclose(values, 0.01 * commands, atol=0.05)

@@ -14,12 +14,12 @@ from tvsbayes.single_axis.predicted_stops import DRAWS, predicted_stops
 
 def test_further_readings_lie_where_they_are_predicted():
     fit = results().fit
-    asked, read = to_and_fro(np.linspace(-17.3, 17.3, 6))
-    found = predicted_stops(fit, asked, read, np.full(len(read), 0.002))
-    mean, covariance = found.pooled()
+    commands, read = to_and_fro(np.linspace(-17.3, 17.3, 6))
+    prediction = predicted_stops(fit, commands, read, np.full(len(read), 0.002))
+    mean, covariance = prediction.pooled()
     squares = []
     for seed in range(20):
-        value = np.array([r.value for r in driven(true_axis(), asked, read, seed).readings])
+        value = np.array([r.value for r in driven(true_axis(), commands, read, seed).readings])
         off = value - mean
         squares.append(off @ np.linalg.solve(covariance, off) / len(off))
     # Twenty runs share the errors of one table: about 1, within a factor of two.
@@ -29,17 +29,17 @@ def test_further_readings_lie_where_they_are_predicted():
 
 def test_draws_have_the_moments_of_the_mixture_and_its_density():
     fit = results().fit
-    asked, read = to_and_fro(np.array([-5.0, 5.0]))
-    found = predicted_stops(fit, asked, read, np.full(4, 0.002))
-    mean, covariance = found.pooled()
-    drawn = found.drawn(16000, np.random.default_rng(0))
+    commands, read = to_and_fro(np.array([-5.0, 5.0]))
+    prediction = predicted_stops(fit, commands, read, np.full(4, 0.002))
+    mean, covariance = prediction.pooled()
+    drawn = prediction.drawn(16000, np.random.default_rng(0))
     sd = np.sqrt(np.diag(covariance))
     # Means of 16000 to a few hundredths of their sd, standard deviations to a few per cent.
     np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=0.04 * sd.min())
     np.testing.assert_allclose(drawn.std(axis=0), sd, rtol=0.05)
-    assert found.log_density(mean) > found.log_density(mean + 3 * sd)
+    assert prediction.log_density(mean) > prediction.log_density(mean + 3 * sd)
     flat = 1e4 * np.ones((4, 4))
-    shifts = found.log_density(mean, flat) - found.log_density(mean + 1.0, flat)
+    shifts = prediction.log_density(mean, flat) - prediction.log_density(mean + 1.0, flat)
     assert shifts == pytest.approx(0.0, abs=1e-3)
 
 
@@ -49,7 +49,7 @@ def test_the_scatter_of_homings_is_spread_evenly():
     prior, at = once.model.priors["home_sd"], (np.arange(DRAWS) + 0.5) / DRAWS
     of_prior = prior.value * np.exp(prior.u * ndtri(at))
     of_fit = np.sort(known.draws["home_sd"])[(at * len(known.w)).astype(int)]
-    asked, read = to_and_fro(np.array([-5.0, 5.0]))
+    commands, read = to_and_fro(np.array([-5.0, 5.0]))
     for fit, even in ((known, of_fit), (once, of_prior)):
-        scales = predicted_stops(fit, asked, read, np.full(4, 0.002)).scales
+        scales = predicted_stops(fit, commands, read, np.full(4, 0.002)).scales
         np.testing.assert_allclose(np.sort(scales["home_sd"]), even, rtol=1e-9)

@@ -31,7 +31,7 @@ from tvsbayes.single_axis.waves import (
 RATE, PERIOD, AMPLITUDE = 15.0, 240.0, 3.0
 
 
-def drive(seed: int, amplitude: float, asked: WavePeriods, count: int = 160, span: float = 1600.0) -> AxisCampaign:
+def drive(seed: int, amplitude: float, periods: WavePeriods, count: int = 160, span: float = 1600.0) -> AxisCampaign:
     """A drive that was read for a while, with noise of sd 1 and a wave."""
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(0.0, span, count))
@@ -40,7 +40,7 @@ def drive(seed: int, amplitude: float, asked: WavePeriods, count: int = 160, spa
         Reading(k, 0, float(v), 1.0, "ok", float(t)) for k, (t, v) in enumerate(zip(times, values, strict=True))
     )
     stated = {"per_command": AxisPrior(1.0, 1e-3), "transmission_error": AxisPrior(0.0, 10.0)}
-    return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, asked)
+    return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, periods)
 
 
 def a_table(seed: int = 0) -> TabulatedDensity:
@@ -68,14 +68,14 @@ def test_the_prior_of_a_wave_is_the_prior_whatever_its_tables():
     wave = replace(Wave.fixed("position", low, 0.4), high=high, log_period=table, absent=0.2)
     count = 200_000
     w = np.random.default_rng(1).standard_normal((2, count))
-    found = wave_draws(wave, *w)
-    weights = np.exp(found.log_prior) / count
+    draws = wave_draws(wave, *w)
+    weights = np.exp(draws.log_prior) / count
     error = 4 * np.sqrt(np.sum(weights**2))
-    there = found.scale > 0
+    there = draws.scale > 0
     assert np.sum(weights) == pytest.approx(1.0, abs=error)
     assert np.sum(weights[there]) == pytest.approx(0.5, abs=error)
-    assert np.sum((weights * (found.scale < 0.4 * 0.67449))[there]) == pytest.approx(0.25, abs=error)
-    assert np.sum((weights * (np.log(found.period) < np.log(low) + 0.6))[there]) == pytest.approx(0.15, abs=error)
+    assert np.sum((weights * (draws.scale < 0.4 * 0.67449))[there]) == pytest.approx(0.25, abs=error)
+    assert np.sum((weights * (np.log(draws.period) < np.log(low) + 0.6))[there]) == pytest.approx(0.15, abs=error)
 
 
 def test_waves_that_share_a_range_are_counted_once():
@@ -105,11 +105,11 @@ def test_columns_are_averaged_over_their_width():
 
 def test_a_drive_is_the_dense_gaussian():
     """Drift, seeing between readings, noise, offset, ratio, creep, one wave: term by term."""
-    made = drive(3, 2.0, WavePeriods((PERIOD,), (), True), 40)
-    model = model_of(made)
+    axis = drive(3, 2.0, WavePeriods((PERIOD,), (), True), 40)
+    model = model_of(axis)
     rng = np.random.default_rng(5)
     w = 0.3 * rng.standard_normal((3, len(model.coordinates.names))) + 0.4
-    rows, found = model.rows, model.log_likelihood(w)
+    rows, density = model.rows, model.log_likelihood(w)
     values, [wave] = model.coordinates.values(w), model.coordinates.wave_draws(w)
     t = rows.time_s
     apart = np.abs(t[:, None] - t)
@@ -134,45 +134,45 @@ def test_a_drive_is_the_dense_gaussian():
         _, log_det = np.linalg.slogdet(2 * np.pi * total)
         wanted = -0.5 * (log_det + residual @ np.linalg.solve(total, residual))
         # 40 rows of condition 1e10: differences of the two ways of solving.
-        assert found[k] == pytest.approx(wanted, rel=1e-6, abs=1e-3)
+        assert density[k] == pytest.approx(wanted, rel=1e-6, abs=1e-3)
 
 
 @pytest.mark.thorough
 def test_readings_in_motion_are_averaged_without_losing_the_wave():
     """4000 readings become few rows, and say of period and amplitude what they should."""
-    made = drive(4, AMPLITUDE, WavePeriods((), ((100.0, 800.0),), True), 4000, 4000.0)
-    summary = summarise_axis(fit_axis(made, tier="importance"))
+    axis = drive(4, AMPLITUDE, WavePeriods((), ((100.0, 800.0),), True), 4000, 4000.0)
+    summary = summarise_axis(fit_axis(axis, tier="importance"))
     assert not summary.problems
     assert summary.readings == 4000 and summary.moves < 250
-    [found] = summary.periods
-    assert found.source == "inferred" and found.probability > 0.99
+    [estimate] = summary.periods
+    assert estimate.source == "inferred" and estimate.probability > 0.99
     # Least squares: sd of the period sqrt(6 / n) s P^2 / (pi A span), of the amplitude s sqrt(2 / n); besides, a phase
     # that may wander by a tenth of s at both ends, and s is 2 / 3 of the amplitude or so.
     sd_period = (np.sqrt(6 / 4000) / AMPLITUDE + WANDER) * PERIOD**2 / (np.pi * 4000)
-    assert abs(found.period.value - PERIOD) < 5 * sd_period and found.period.sd < 3 * sd_period
-    assert abs(found.amplitude.value - AMPLITUDE) < 5 * np.sqrt(2 / 4000)
+    assert abs(estimate.period.value - PERIOD) < 5 * sd_period and estimate.period.sd < 3 * sd_period
+    assert abs(estimate.amplitude.value - AMPLITUDE) < 5 * np.sqrt(2 / 4000)
 
 
 @pytest.mark.thorough
 def test_no_wave_is_claimed_of_noise():
-    found = fit_axis(drive(6, 0.0, WavePeriods((), ((100.0, 800.0),), True)), tier="importance")
-    [estimate] = summarise_axis(found).periods
-    assert not found.missing and estimate.probability < 0.5
+    fit = fit_axis(drive(6, 0.0, WavePeriods((), ((100.0, 800.0),), True)), tier="importance")
+    [estimate] = summarise_axis(fit).periods
+    assert not fit.missing and estimate.probability < 0.5
 
 
 @pytest.mark.thorough
 def test_a_range_holds_more_waves_than_were_asked_for():
     """Three waves, two in one range: the strongest of every range first, in the order of the ranges, then the third."""
-    made, waves = drive(4, AMPLITUDE, WavePeriods((), ((60.0, 120.0), (120.0, 700.0)), True), 400, 4000.0), {97.0: 1.0}
+    axis, waves = drive(4, AMPLITUDE, WavePeriods((), ((60.0, 120.0), (120.0, 700.0)), True), 400, 4000.0), {97.0: 1.0}
     waves |= {PERIOD: AMPLITUDE, 410.0: 2.0}
     values = [
         r.value + sum(waves[period] * np.cos(2 * np.pi * r.time_s / period + 0.4) for period in (97.0, 410.0))
-        for r in made.readings
+        for r in axis.readings
     ]
-    readings = tuple(replace(r, value=float(v)) for r, v in zip(made.readings, values, strict=True))
-    found = fit_axis(replace(made, readings=readings), tier="importance")
-    periods = summarise_axis(found).periods
-    assert not found.missing
+    readings = tuple(replace(r, value=float(v)) for r, v in zip(axis.readings, values, strict=True))
+    fit = fit_axis(replace(axis, readings=readings), tier="importance")
+    periods = summarise_axis(fit).periods
+    assert not fit.missing
     for estimate, (period, amplitude) in zip(periods, waves.items(), strict=True):
         assert estimate.probability > 0.95
         assert abs(estimate.period.value - period) < 4 * estimate.period.sd
@@ -184,13 +184,13 @@ def test_a_stated_period_of_position():
     """A wave of 8 deg on an axis with play, from both sides, at places that are not even."""
     rng = np.random.default_rng(3)
     places = tuple(np.sort(rng.uniform(-2000, 2000, 24)).round())
-    made = drawn(7, runs(1, places)).campaign
-    command = {m.move: m.command for m in made.moves}
+    axis = drawn(7, runs(1, places)).campaign
+    command = {m.move: m.command for m in axis.moves}
     wave = {move: 0.12 * np.cos(2 * np.pi * 0.01 * c / 8.0 - 2.0) for move, c in command.items()}
-    readings = tuple(replace(r, value=float(r.value or 0.0) + wave[r.move]) for r in made.readings)
-    found = fit_axis(replace(made, readings=readings, periods=WavePeriods((8.0,))), tier="importance")
-    [estimate] = summarise_axis(found).periods
-    assert not found.missing and estimate.source == "stated" and estimate.probability > 0.95
+    readings = tuple(replace(r, value=float(r.value or 0.0) + wave[r.move]) for r in axis.readings)
+    fit = fit_axis(replace(axis, readings=readings, periods=WavePeriods((8.0,))), tier="importance")
+    [estimate] = summarise_axis(fit).periods
+    assert not fit.missing and estimate.source == "stated" and estimate.probability > 0.95
     assert estimate.period.value == 8.0 and estimate.period.sd == 0.0
     assert estimate.amplitude.interval95[0] < 0.12 < estimate.amplitude.interval95[1]
     assert estimate.phase_deg.interval95[0] < np.degrees(2.0) < estimate.phase_deg.interval95[1]
@@ -199,17 +199,17 @@ def test_a_stated_period_of_position():
 def test_what_is_not_asked_for_changes_nothing():
     """Without times no creep; without periods no wave: the coordinates are those of before."""
     moves = [replace(move, time_s=0.0) for move in random_moves(1)]
-    made = campaign(moves, [0.01 * m.command for m in moves], 0.001)
-    model = model_of(made)
+    axis = campaign(moves, [0.01 * m.command for m in moves], 0.001)
+    model = model_of(axis)
     assert model.shifts == () and model.coordinates.waves == ()
     assert not {"creep_minutes", "seeing_s", "drift_per_root_hour"} & set(model.coordinates.names)
 
 
 def test_periods_that_lie_apart_are_named():
     period = np.concatenate([np.full(70, 3.7), np.full(30, 12.4)])
-    found = separate_periods(period)
-    assert [(group.mean, group.share) for group in found] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
-    assert found[1].between == (12.4, 12.4)
+    groups = separate_periods(period)
+    assert [(group.mean, group.share) for group in groups] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
+    assert groups[1].between == (12.4, 12.4)
 
 
 def test_periods_of_the_grid_differ_by_more_than_rounding():
@@ -235,9 +235,9 @@ def test_a_second_harmonic_that_is_stronger_than_the_first_is_named():
 def test_a_period_at_the_end_of_its_range_is_doubted():
     """A wave of 240 s asked for below 228 s is given there, and said to lie at the end; one inside is not."""
     for high, doubted in ((0.95 * PERIOD, True), (700.0, False)):
-        asked = WavePeriods(between=((60.0, high),), in_seconds=True)
-        found = summarise_axis(fit_axis(drive(4, 5.0, asked), tier="importance"))
-        assert any("lies at the end of the range" in text for text in found.warnings) == doubted, (high, found.periods)
+        periods = WavePeriods(between=((60.0, high),), in_seconds=True)
+        summary = summarise_axis(fit_axis(drive(4, 5.0, periods), tier="importance"))
+        assert any("lies at the end of the range" in t for t in summary.warnings) == doubted, (high, summary.periods)
 
 
 def test_a_search_that_gets_lost_begins_anew_within_bounds(monkeypatch):
@@ -246,10 +246,10 @@ def test_a_search_that_gets_lost_begins_anew_within_bounds(monkeypatch):
     there, search = find_mode(model), axis_mode._search
 
     def lost(*arguments, bounded=False):
-        found = search(*arguments, bounded=bounded)
-        return found if bounded else replace(found, missing=("lost",), log_density=-1e9)
+        mode = search(*arguments, bounded=bounded)
+        return mode if bounded else replace(mode, missing=("lost",), log_density=-1e9)
 
     monkeypatch.setattr(axis_mode, "_search", lost)
-    found = find_mode(model)
+    mode = find_mode(model)
     # Both end where the slope is small: within a tenth of a sd.
-    assert not there.missing and not found.missing and found.log_density == pytest.approx(there.log_density, abs=0.01)
+    assert not there.missing and not mode.missing and mode.log_density == pytest.approx(there.log_density, abs=0.01)
