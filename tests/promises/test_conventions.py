@@ -159,16 +159,16 @@ def test_observation_is_the_chain_of_transforms(nominal, looks):
         **{f"extrinsics.translation_mm.{a}": t for a, t in zip("xyz", (5.0, -90.0, 7.0), strict=True)},
         aperture_zero_deg=0.7,
     )
-    origin, direction, seen = looks(values, [[PAN_RAD, TILT_RAD, RANGE_MM]])
+    origin, direction, look = looks(values, [[PAN_RAD, TILT_RAD, RANGE_MM]])
     point_p = origin[0] + RANGE_MM * direction[0]
     rotation = np.asarray(rotation_matrix(jnp.asarray([0.1, -0.2, 0.3])))
     point_s = rotation @ point_p + [5.0, -90.0, 7.0]
     model = model_of(jnp.asarray(values))
     np.testing.assert_allclose(
-        seen[0, :4], np.asarray(project(model.cameras, jnp.asarray(point_s)[:, None]))[:, 0], atol=1e3 * ROUNDING
+        look[0, :4], np.asarray(project(model.cameras, jnp.asarray(point_s)[:, None]))[:, 0], atol=1e3 * ROUNDING
     )
     angle = aperture_angle(model.receiver, Vectors.of(jnp.asarray(point_p)), jnp.asarray(False))
-    assert seen[0, 4] == pytest.approx(float(angle) + np.radians(0.7), abs=ROUNDING)
+    assert look[0, 4] == pytest.approx(float(angle) + np.radians(0.7), abs=ROUNDING)
 
 
 def test_frame_s_looks_along_x(mounted_rig):

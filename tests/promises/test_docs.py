@@ -40,8 +40,8 @@ def read(page: str) -> str:
 def section(text: str, title: str, level: int = 2) -> str:
     """Text between a heading and the next of its level or above."""
     mark = "#" * level
-    found = text.split(f"\n{mark} {title}\n")[1]
-    return re.split(rf"^#{{1,{level}}} ", found, flags=re.MULTILINE)[0]
+    body = text.split(f"\n{mark} {title}\n")[1]
+    return re.split(rf"^#{{1,{level}}} ", body, flags=re.MULTILINE)[0]
 
 
 def first_column(text: str) -> list[str]:
@@ -74,8 +74,8 @@ def test_links_lead_to_a_file_and_a_heading(page):
     for target, anchor in links(page):
         there = ((ROOT / page).parent / target).resolve() if target else ROOT / page
         # Tables of experiments are written by the command in their own row.
-        made = any(f"> experiments/{target}" in line for line in read(page).splitlines())
-        assert made or there.exists(), target
+        is_output = any(f"> experiments/{target}" in line for line in read(page).splitlines())
+        assert is_output or there.exists(), target
         if anchor:
             assert anchor in slugs(there.read_text(encoding="utf-8")), (target, anchor)
 
@@ -90,8 +90,8 @@ def test_every_document_is_reached_from_the_readme():
 @pytest.mark.parametrize("page", PAGES)
 def test_scripts_and_documents_named_in_the_text_exist(page):
     for path in re.findall(r"(?:experiments|tests|data/docs)/[\w/]+\.(?:py|md)", read(page)):
-        made = any(f"> {path}" in line for line in read(page).splitlines())
-        assert made or (ROOT / path).is_file(), path
+        is_output = any(f"> {path}" in line for line in read(page).splitlines())
+        assert is_output or (ROOT / path).is_file(), path
 
 
 def test_commands_are_those_that_exist():
@@ -196,7 +196,7 @@ def expanded(cell: str) -> list[str]:
 
 def test_table_of_parameters_is_the_registry():
     table = section(read("data/docs/conventions.md"), "Parameters").split("\n\n")[1]
-    found = []
+    all_names = []
     for row in table.splitlines()[2:]:
         names, unit, prior, _ = (cell.strip() for cell in row.strip("|").split("|"))
         for name in expanded(names):
@@ -205,8 +205,8 @@ def test_table_of_parameters_is_the_registry():
             values = [stated.u] if stated.distribution == "half-normal" else [stated.value, stated.u]
             assert number(prior) == values, name
             assert (stated.distribution == "normal") != prior.startswith(stated.distribution), name
-            found.append(name)
-    assert sorted(found) == sorted(RIG_PRIORS)
+            all_names.append(name)
+    assert sorted(all_names) == sorted(RIG_PRIORS)
 
 
 def test_map_lists_every_module_once_in_the_order_of_imports():
@@ -238,8 +238,8 @@ def test_sections_that_comments_point_to_exist():
     paths = [path for folder in ("tvsbayes", "tests", "experiments") for path in (ROOT / folder).rglob("*.py")]
     for path in paths:
         text = path.read_text(encoding="utf-8")
-        for found in re.findall(r"\bformulation (\d+(?:\.\d+)?(?:(?:, | and )\d+(?:\.\d+)?)*)", text):
-            assert set(re.findall(r"\d+(?:\.\d+)?", found)) <= numbers, (path, found)
+        for reference in re.findall(r"\bformulation (\d+(?:\.\d+)?(?:(?:, | and )\d+(?:\.\d+)?)*)", text):
+            assert set(re.findall(r"\d+(?:\.\d+)?", reference)) <= numbers, (path, reference)
 
 
 OUTSIDE = re.compile(r"\bDESIGN\b|\bresearch/|\bpaper\.txt|newcomer|\.\./shared|\b[Ii]ssue'?s? (?:#?\d|bound|asks)")
@@ -252,13 +252,13 @@ def test_nothing_points_outside_the_repository():
         path for folder in folders for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".md", ".toml")
     ]
     paths = [path for path in paths if path != Path(__file__) and "output" not in path.parts]
-    found = [
+    lines = [
         (path.relative_to(ROOT).as_posix(), line.strip())
         for path in [*paths, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
         for line in path.read_text(encoding="utf-8").splitlines()
         if OUTSIDE.search(line)
     ]
-    assert not found
+    assert not lines
 
 
 def examples(page: str, language: str) -> str:
@@ -269,10 +269,10 @@ def examples(page: str, language: str) -> str:
 def followed() -> dict[str, object]:
     """Names that the page's examples leave behind, and how many of them failed to print what stands there."""
     fit, fitted = tvsbayes.fit, []
-    here = Path.cwd()
+    cwd = Path.cwd()
     os.chdir(ROOT)
     patch = pytest.MonkeyPatch()
-    patch.setattr(tvsbayes, "fit", lambda *given, **options: fitted.append(fit(*given, **options)) or fitted[-1])
+    patch.setattr(tvsbayes, "fit", lambda *args, **options: fitted.append(fit(*args, **options)) or fitted[-1])
     # `calibrate` takes the page's first fit, which is of the same campaign.
     patch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: fitted[0])
     try:
@@ -280,7 +280,7 @@ def followed() -> dict[str, object]:
         report: list[str] = []
         results = doctest.DocTestRunner(verbose=False).run(example, out=report.append, clear_globs=False)
     finally:
-        os.chdir(here)
+        os.chdir(cwd)
         patch.undo()
     return {"globals": example.globs, "results": results, "report": "".join(report)}
 

@@ -35,21 +35,21 @@ def tree_of(name: str) -> ast.Module:
 
 def imported(name: str) -> set[str]:
     """Modules that a module imports, at the top or in functions."""
-    found = set()
+    names = set()
     for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "relative imports hide what a module needs"
-            found |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
+            names |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return names
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_a_question_imports_only_itself_and_what_is_common(name):
-    own = name.split(".")[1]
+    question = name.split(".")[1]
     questions = {module.split(".")[1] for module in imported(name) if module.startswith("experiments.")}
-    assert questions <= {own, "common"}
+    assert questions <= {question, "common"}
     assert not {module.split(".")[0] for module in imported(name)} & {"tests", "conftest"}
 
 
@@ -107,8 +107,8 @@ def test_commands_on_pages_are_scripts(page):
 
 def test_figures_have_one_style():
     """All but the drawing of the instrument, which is no plot."""
-    own = {name for name in MODULES if "matplotlib.figure" in imported(name)}
-    assert own == {"experiments.common.figures", "experiments.inputs.draw_rig"}
+    modules = {name for name in MODULES if "matplotlib.figure" in imported(name)}
+    assert modules == {"experiments.common.figures", "experiments.inputs.draw_rig"}
 
 
 def test_every_picture_stands_on_a_page():
@@ -127,8 +127,8 @@ def test_a_page_begins_with_its_figure(name):
     picture = page.parent / shown[2]
     assert picture.is_file()
     figures = importlib.import_module("experiments.common.figures")
-    made = figures.title_and_figure(str(MODULES[name]), title.removeprefix("# "), picture, shown[1])
-    assert page.read_text(encoding="utf-8").startswith(made)
+    head = figures.title_and_figure(str(MODULES[name]), title.removeprefix("# "), picture, shown[1])
+    assert page.read_text(encoding="utf-8").startswith(head)
     assert title.removeprefix("# ") in MODULES[name].read_text(encoding="utf-8")
 
 

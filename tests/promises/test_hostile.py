@@ -322,8 +322,8 @@ def test_crafted_folders_are_refused_by_the_commands(good, tmp_path, capsys, nam
     for command in LIGHT[name].commands:
         if command.startswith(("check", "classic")):
             code = run(shlex.split(command.replace("@", str(folder))))
-            said = capsys.readouterr()
-            assert code == 2 and "Traceback" not in said.err and "\x1b" not in said.out + said.err
+            output = capsys.readouterr()
+            assert code == 2 and "Traceback" not in output.err and "\x1b" not in output.out + output.err
     assert outside(tmp_path) == before
 
 

@@ -67,14 +67,14 @@ def test_parser_sees_every_way_to_import():
         'if TYPE_CHECKING:\n import a\ndef f():\n from tvsbayes import b\n from tvsbayes.c import d\n "tvsbayes.g"\n'
         ' return "import sys, tvsbayes.h.i; tvsbayes.toml"'
     )
-    found = imported(ast.parse(code), frozenset({"b", "g", "h.i"}))
-    assert found == {"a", "tvsbayes.b", "tvsbayes.c", "tvsbayes.h.i"}
-    assert imported(running(ast.parse(code)), frozenset({"b", "g", "h.i"})) == found - {"a"}
+    modules = imported(ast.parse(code), frozenset({"b", "g", "h.i"}))
+    assert modules == {"a", "tvsbayes.b", "tvsbayes.c", "tvsbayes.h.i"}
+    assert imported(running(ast.parse(code)), frozenset({"b", "g", "h.i"})) == modules - {"a"}
 
 
 def test_tests_of_a_module_are_those_that_import_it():
-    found = files_importing("head.chain", "tests/head")
-    assert "tests/head/test_chain.py" in found and "tests/head/test_pointing_table.py" not in found
+    files = files_importing("head.chain", "tests/head")
+    assert "tests/head/test_chain.py" in files and "tests/head/test_pointing_table.py" not in files
 
 
 def test_every_module_has_its_room():
@@ -106,11 +106,11 @@ def test_traces_belong_to_all_that_a_module_imports(inner):
     from tvsbayes.model.compiled import sources_of
 
     for name in ("estimators.likelihood", "estimators.annealed_stage", "model.headlines", "planning.looks"):
-        found = {
+        modules = {
             path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".")
             for path in sources_of(f"tvsbayes.{name}", PACKAGE)
         }
-        assert found == {name} | reachable(inner, name) and len(found) < len(MODULES) / 2
+        assert modules == {name} | reachable(inner, name) and len(modules) < len(MODULES) / 2
 
 
 def test_hardware_is_imported_by_those_who_drive_it(inner):

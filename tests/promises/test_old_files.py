@@ -29,11 +29,11 @@ XYZ_MM, VARIANCES_MM2 = (472.08922526253093, 72.1765596120374, 10.95684578052224
 def test_a_campaign_is_what_it_was():
     """Its text in the hashes too: digests of 0.1.0 stay those of the same moves, looks and cameras."""
     campaign = read_campaign(OLD / "campaign")
-    told = read_fit(OLD / "campaign" / "results" / "fit.json").provenance
+    provenance = read_fit(OLD / "campaign" / "results" / "fit.json").provenance
     now = input_hashes(campaign)
     assert (len(campaign.moves), len(campaign.spots)) == (18, 28)
-    assert {name for name in now if told.inputs[name] == now[name]} == {"moves", "spots", "stereo"}
-    assert told.versions["tvsbayes"] == "0.1.0"
+    assert {name for name in now if provenance.inputs[name] == now[name]} == {"moves", "spots", "stereo"}
+    assert provenance.versions["tvsbayes"] == "0.1.0"
     truth = read_truth(OLD / "campaign" / "truth.json", campaign.stereo)
     assert truth.parameters["backlash_deg.pan"] > 0
 
@@ -41,9 +41,9 @@ def test_a_campaign_is_what_it_was():
 @pytest.mark.parametrize("name", ["campaign", "calibration.json"])
 def test_a_calibration_points_where_it_did(name):
     calibration = tvsbayes.load_calibration(OLD / name)
-    found = calibration.locate(20, 5, 70.0)
-    np.testing.assert_allclose(found.xyz_mm, XYZ_MM, rtol=AS_PRINTED)
-    np.testing.assert_allclose(np.diag(found.covariance_mm2), VARIANCES_MM2, rtol=1e-5)
+    point = calibration.locate(20, 5, 70.0)
+    np.testing.assert_allclose(point.xyz_mm, XYZ_MM, rtol=AS_PRINTED)
+    np.testing.assert_allclose(np.diag(point.covariance_mm2), VARIANCES_MM2, rtol=1e-5)
     steps = calibration.steps_for([600.0, 60.0, 10.0])
     assert (steps.pan_steps, steps.tilt_steps, steps.via_pan_steps, steps.via_tilt_steps) == (1, 0, -13, -19)
     assert not calibration.gears.size, "0.1.0 knew no errors of the gears"
@@ -53,30 +53,30 @@ def test_results_are_read_and_a_new_fit_says_why(monkeypatch):
     monkeypatch.setattr("tvsbayes.results.fit_record.version", lambda _: "0.2.0")
     monkeypatch.setattr("tvsbayes.pipeline.compile_for", lambda _: None)
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
-    told: list[str] = []
-    assert StoredOrFitted(read_campaign(OLD / "campaign"), told.append).fit.converged
-    assert "results/ are of tvsbayes 0.1.0, which modelled less of the rig" in told[0]
+    messages: list[str] = []
+    assert StoredOrFitted(read_campaign(OLD / "campaign"), messages.append).fit.converged
+    assert "results/ are of tvsbayes 0.1.0, which modelled less of the rig" in messages[0]
     record = read_fit(OLD / "campaign" / "results" / "fit.json")
     assert record.summary.converged and record.summary.effective["left"].value == pytest.approx(0.0642, abs=1e-4)
 
 
 def test_a_comparison_belongs_to_its_fit():
     campaign = read_campaign(OLD / "campaign")
-    told = read_fit(OLD / "campaign" / "results" / "fit.json").provenance.inputs
-    assert stored_hold_out(campaign, told) is not None
+    inputs = read_fit(OLD / "campaign" / "results" / "fit.json").provenance.inputs
+    assert stored_hold_out(campaign, inputs) is not None
     assert stored_hold_out(campaign, input_hashes(campaign)) is None
 
 
 def test_a_chain_is_refused_by_its_format():
-    told = refusal(lambda: stored_chain(OLD / "chain.npz", None, 1))
-    assert "another version of tvsbayes: tvsbayes-chain/4" in told.message and "run without --resume" in told.remedy
+    error = refusal(lambda: stored_chain(OLD / "chain.npz", None, 1))
+    assert "another version of tvsbayes: tvsbayes-chain/4" in error.message and "run without --resume" in error.remedy
 
 
 def test_an_interrupted_run_goes_on(tmp_path, say):
     """The journal of 0.1.0 knows its rig by one SHA-256, of a text without the errors of the gears."""
     run = shutil.copytree(OLD / "run", tmp_path / "run")
-    found = verify(run)
-    assert found.records == 61 and found.stopped is None
+    verification = verify(run)
+    assert verification.records == 61 and verification.stopped is None
     options = ("--simulate", "--seed", "3", "--centroids", "--resume")
     code, _, err = say("acquire", OLD / "rig.toml", OLD / "plan.csv", run, *options)
     assert code == 0, err

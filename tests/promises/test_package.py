@@ -48,18 +48,18 @@ def built(tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("package")
     python = environment(folder / "builder")
     backend = PROJECT["build-system"]["requires"]
-    asked = subprocess.run(
+    install = subprocess.run(
         [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *backend], capture_output=True
     )
-    if asked.returncode:
+    if install.returncode:
         pytest.skip(f"no package index gives {', '.join(backend)}")
     run(python, "-m", "hatchling", "build", "-d", folder / "dist", cwd=ROOT)
-    made = {path.suffix: path for path in (folder / "dist").iterdir()}
-    assert set(made) == {".whl", ".gz"}
+    archives = {path.suffix: path for path in (folder / "dist").iterdir()}
+    assert set(archives) == {".whl", ".gz"}
     from_source = folder / "again"
     pip = (python, "-m", "pip", "--disable-pip-version-check", "wheel", "--quiet", "--no-deps", "--no-build-isolation")
-    run(*pip, "-w", from_source, made[".gz"], cwd=folder)
-    return {**made, "again": next(from_source.glob("*.whl"))}
+    run(*pip, "-w", from_source, archives[".gz"], cwd=folder)
+    return {**archives, "again": next(from_source.glob("*.whl"))}
 
 
 def test_distributions_hold_what_belongs_in_them(built):
@@ -102,8 +102,8 @@ def test_installed_package_works_away_from_the_tree(kind, built, tmp_path):
     """Dependencies are this interpreter's, by a path file; the package itself is the installed one."""
     python = environment(tmp_path / "venv")
     run(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", built[kind])
-    own = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
-    (own / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    site = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
     command = python.parent / "tvsbayes"
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     options = {"cwd": tmp_path, "env": {**clean, "TVSBAYES_CACHE": str(tmp_path / "cache")}}

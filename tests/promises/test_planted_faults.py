@@ -64,15 +64,15 @@ def test_a_change_goes_where_its_names_stand(sources, tmp_path, place, change, b
 
 
 @pytest.mark.parametrize(
-    ("place", "change", "said"),
+    ("place", "change", "message"),
     [
         ("angle", changes.Returns("0"), "stands for 0 definitions"),
         ("slope", changes.Reads("b.size", "0"), "holds nothing for Reads"),
         ("Core::loop", changes.Uncalled("halt"), "calls halt"),
     ],
 )
-def test_a_change_without_a_place_is_refused(sources, place, change, said):
-    with pytest.raises(changes.NoPlace, match=said):
+def test_a_change_without_a_place_is_refused(sources, place, change, message):
+    with pytest.raises(changes.NoPlace, match=message):
         change.planted(sources, place)
 
 

@@ -29,15 +29,15 @@ def test_published_point_is_where_the_rays_meet(beta_deg):
     pairs = [(B, C) for B in (5.0, 45.0, 80.0, 90.0, 95.0, 140.0) for C in (10.0, 60.0, 90.0, 100.0) if B + C < 175]
     assert any(B > 90 for B, _ in pairs) and any(C > 90 for _, C in pairs)
     B, C = np.array(pairs).T
-    found = published_point(B, C, beta_deg, A_MM)
-    assert found.shape == (3, len(pairs))
+    points = published_point(B, C, beta_deg, A_MM)
+    assert points.shape == (3, len(pairs))
     for i, pair in enumerate(pairs):
         # Points up to 2 m away where both rays meet under 5 deg.
-        np.testing.assert_allclose(found[:, i], rays_meet(*pair, beta_deg), atol=10 * ROUNDING_MM)
-        np.testing.assert_array_equal(published_point(*pair, beta_deg, A_MM), found[:, i])
-    distance = np.hypot(found[0], found[2])
-    np.testing.assert_allclose(found[1], A_MM / 2 - distance / np.tan(np.radians(C)), atol=10 * ROUNDING_MM)
-    np.testing.assert_allclose(found[1], -A_MM / 2 + distance / np.tan(np.radians(B)), atol=10 * ROUNDING_MM)
+        np.testing.assert_allclose(points[:, i], rays_meet(*pair, beta_deg), atol=10 * ROUNDING_MM)
+        np.testing.assert_array_equal(published_point(*pair, beta_deg, A_MM), points[:, i])
+    distance = np.hypot(points[0], points[2])
+    np.testing.assert_allclose(points[1], A_MM / 2 - distance / np.tan(np.radians(C)), atol=10 * ROUNDING_MM)
+    np.testing.assert_allclose(points[1], -A_MM / 2 + distance / np.tan(np.radians(B)), atol=10 * ROUNDING_MM)
 
 
 @pytest.mark.parametrize(("B", "C", "y_mm"), [(90, 70, -100.0), (95, 70, -163.3), (110, 50, -253.2)])
@@ -47,8 +47,8 @@ def test_published_y_is_the_table(B, C, y_mm):
 
 
 def test_published_point_diverges_without_a_warning():
-    found = published_point(np.array([100.0, 90.0]), np.array([80.0, 120.0]), 0.0, A_MM)
-    assert abs(found[0, 0]) > 1e15 and found[0, 1] < 0
+    points = published_point(np.array([100.0, 90.0]), np.array([80.0, 120.0]), 0.0, A_MM)
+    assert abs(points[0, 0]) > 1e15 and points[0, 1] < 0
 
 
 def test_the_printed_branch_jumps_at_90_degrees():

@@ -77,10 +77,10 @@ def test_paper_twin_reproduces_table_1():
     result = classic(twin("paper_twin"))
     assert len(result.experiments) == 96 and result.skipped == ()
     for direction, (mean, sd, n) in table_1().items():
-        found = result.directions[direction]
-        assert found.n == n
-        assert found.mean_deg_per_step == pytest.approx(mean, abs=sd / np.sqrt(n)), direction
-        assert found.sd_deg_per_step == pytest.approx(sd, rel=0.20), direction
+        row = result.directions[direction]
+        assert row.n == n
+        assert row.mean_deg_per_step == pytest.approx(mean, abs=sd / np.sqrt(n)), direction
+        assert row.sd_deg_per_step == pytest.approx(sd, rel=0.20), direction
 
 
 def test_paper_twin_has_equal_gears_and_says_what_is_assumed():
@@ -210,10 +210,10 @@ def test_make_twins_writes_what_is_shipped():
     difference = (stereo.parameter_covariance - rig.stereo.parameter_covariance) / np.outer(scale, scale)
     assert np.abs(difference).max() < 7e-7
     seed = twin("paper_twin").header["seed"]
-    for name, made in (("paper_twin", make_twins.matched(rig, seed)), ("grid_twin", make_twins.grid_twin(rig))):
+    for name, simulated in (("paper_twin", make_twins.matched(rig, seed)), ("grid_twin", make_twins.grid_twin(rig))):
         shipped = twin(name)
-        assert made.campaign.moves == shipped.moves
-        for one, other in zip(made.campaign.spots, shipped.spots, strict=True):
+        assert simulated.campaign.moves == shipped.moves
+        for one, other in zip(simulated.campaign.spots, shipped.spots, strict=True):
             # Solved parameters are rounded to seven digits; pixels follow to rounding times 10^6.
             assert one.u_left_px == pytest.approx(other.u_left_px, abs=1e-6)
             assert one.v_right_px == pytest.approx(other.v_right_px, abs=1e-6)

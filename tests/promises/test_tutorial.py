@@ -25,9 +25,9 @@ QUICK = ("simulate", "check", "classic", "new")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Where the page's commands run: a folder with `data/`, as the root of a clone."""
-    made = tmp_path_factory.mktemp("clone")
-    (made / "data").symlink_to(ROOT / "data")
-    return made
+    clone = tmp_path_factory.mktemp("clone")
+    (clone / "data").symlink_to(ROOT / "data")
+    return clone
 
 
 def test_commands_without_a_fit_print_what_the_page_says(folder, monkeypatch, capsys):
@@ -58,7 +58,7 @@ def test_the_whole_page_prints_what_it_says(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("found", "wanted", "agree"),
+    ("output", "wanted", "agree"),
     [
         ("left 24 0.050935", "left  24  0.050936", True),
         ("left 24 0.050935", "left 24 0.050938", False),
@@ -68,8 +68,8 @@ def test_the_whole_page_prints_what_it_says(tmp_path, monkeypatch, capsys):
         ("5.2e-06 a minute", "5.2e-05 a minute", False),
     ],
 )
-def test_lines_are_compared_by_words_and_numbers(found, wanted, agree):
-    assert same(found, wanted) == agree
+def test_lines_are_compared_by_words_and_numbers(output, wanted, agree):
+    assert same(output, wanted) == agree
 
 
 def test_left_out_lines_are_marked():
@@ -121,11 +121,11 @@ HALF_POINT = 0.5
 
 
 def test_shipped_picture_is_what_the_script_draws(drawing, tmp_path, monkeypatch):
-    made = tmp_path / "rig.svg"
-    monkeypatch.setattr(drawing, "OUT", made)
+    picture = tmp_path / "rig.svg"
+    monkeypatch.setattr(drawing, "OUT", picture)
     monkeypatch.setattr("sys.argv", ["draw_rig"])
     drawing.main()
-    texts = [path.read_text(encoding="utf-8") for path in (made, ROOT / "data" / "tutorial" / "rig.svg")]
+    texts = [path.read_text(encoding="utf-8") for path in (picture, ROOT / "data" / "tutorial" / "rig.svg")]
     words, shipped_words = (re.findall(r"<!-- (.*?) -->", text, flags=re.DOTALL) for text in texts)
     assert words == shipped_words
     assert {"S: stereo frame, Z up", "P: positioner frame, z up", "laser spot", "B", "C", "L"} <= set(words)

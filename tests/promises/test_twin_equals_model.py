@@ -82,25 +82,25 @@ def test_mirror_chain(truths, values, poses_rad):
     rays = batched(lambda v, p: trace(model_of(v).optics, p[:, 0], p[:, 1]), values, poses_rad)
     for rig, truth in enumerate(truths):
         origin, direction = mirror_chain(*poses_rad[rig].T, truth.parameters)
-        for found, expected, tolerance in (
+        for vector, expected, tolerance in (
             (rays.origin_mm, origin, LENGTH_MM),
             (rays.direction, direction, ANGLE_RAD),
         ):
-            seen = np.stack([found.x[rig], found.y[rig], found.z[rig]], axis=1)
-            assert np.abs(seen - expected).max() < tolerance
+            array = np.stack([vector.x[rig], vector.y[rig], vector.z[rig]], axis=1)
+            assert np.abs(array - expected).max() < tolerance
 
 
 def test_cameras(truths, values):
     """Random points of the sheets' volume; the twin sees all of them that stand in both images."""
     points = np.random.default_rng(79).uniform([160.0, -60.0, -50.0], [400.0, 40.0, 50.0], (RIGS, 20, 3))
     pixels = batched(lambda v, p: project(model_of(v).cameras, p.T).T, values, points)
-    seen = 0
+    count = 0
     for rig, truth in enumerate(truths):
         expected = physics.project(points[rig], truth.stereo, truth.parameters["focal_scale"])
         in_view = np.isfinite(expected).all(axis=1)
         assert np.abs(pixels[rig] - expected)[in_view].max() < PIXEL_PX
-        seen += in_view.sum()
-    assert seen > 0.9 * RIGS * 20
+        count += in_view.sum()
+    assert count > 0.9 * RIGS * 20
 
 
 @pytest.mark.parametrize("period_deg", [(30.0, 360.0), (360.0, 12.5)])
@@ -120,8 +120,8 @@ def test_gears_and_play(truths, values, period_deg):
         model = model_of(v, np.tile(np.array(period_deg)[:, None], 3))
         return mirror_angles(model.transmission, model.tilt_zero_rad, MoveArrays(steps, first, approach))
 
-    found = batched(angles, values, counters, first, approach)
-    assert np.all(found.play_sd_rad == 0)
+    result = batched(angles, values, counters, first, approach)
+    assert np.all(result.play_sd_rad == 0)
     for rig, truth in enumerate(truths):
         p = truth.parameters
         for axis, name in enumerate(("pan", "tilt")):
@@ -130,18 +130,18 @@ def test_gears_and_play(truths, values, period_deg):
             args = counters[rig, :, axis], first[rig], start, np.zeros(MOVES), ratios, p[f"backlash_deg.{name}"]
             wobble = harmonics_deg(p, name), period_deg[axis]
             expected = np.radians(transmission(*args, *wobble) + (p["tilt_zero_deg"] if axis else 0.0))
-            assert np.abs(found.angle_rad[rig, :, axis] - expected).max() < ANGLE_RAD
+            assert np.abs(result.angle_rad[rig, :, axis] - expected).max() < ANGLE_RAD
 
 
 def test_zeros_in_time(truths, values):
     """Creep and temperature, at random times and temperatures."""
     rng = np.random.default_rng(83)
     minutes, kelvin = rng.uniform(0, 100, (RIGS, MOVES)), rng.uniform(-5, 5, (RIGS, MOVES))
-    found = batched(lambda v, t, k: model_of(v).transmission.zero_shift.shift_rad(t, k), values, minutes, kelvin)
+    shifts = batched(lambda v, t, k: model_of(v).transmission.zero_shift.shift_rad(t, k), values, minutes, kelvin)
     for rig, truth in enumerate(truths):
         for axis, name in enumerate(AXES):
             expected = np.radians(zero_shift_deg(truth.parameters, name, minutes[rig], kelvin[rig]))
-            assert np.abs(found[rig, :, axis] - expected).max() < ANGLE_RAD
+            assert np.abs(shifts[rig, :, axis] - expected).max() < ANGLE_RAD
 
 
 @pytest.mark.parametrize("convention", ["in-plane", "azimuth"])
@@ -151,12 +151,12 @@ def test_aperture_angle(truths, values, convention):
     def angle(v, p):
         return aperture_angle(model_of(v).receiver, Vectors.of(p.T), jnp.asarray(convention == "azimuth"))
 
-    found = batched(angle, values, points)
+    angles = batched(angle, values, points)
     for rig, truth in enumerate(truths):
         baseline_mm = truth.parameters["baseline_mm"]
         in_t = to_tvs(points[rig], baseline_mm, truth.parameters["pan_zero_emission_deg"])
         expected = np.radians(aperture_angle_deg(in_t, baseline_mm, convention))
-        assert np.abs(found[rig] - expected).max() < ANGLE_RAD
+        assert np.abs(angles[rig] - expected).max() < ANGLE_RAD
 
 
 def test_headlines_of_a_fit(mounted_rig):
@@ -180,17 +180,17 @@ def test_headlines_of_a_fit(mounted_rig):
         with jax.enable_x64(True):
             space = parameter_space(mounted_rig.table, mounted_rig.stereo)
             places = Places(*map(jnp.asarray, (at.steps, at.on_tilt, np.ones(len(at.steps), bool))))
-            seen = SeenLine(np.radians(pose_deg), places, line_share(at, used))
+            seen_line = SeenLine(np.radians(pose_deg), places, line_share(at, used))
             true = np.array([*(p[name] for name in RIG_NAMES), *truth.stereo.vector])
             # What the priors hold fixed is at its value here, as in the rig that the point stands for.
             z = coordinates_of(space, true)[None]
             repeated = np.radians(np.concatenate([error_deg, play_deg]))[None]
-            found = jax.tree.map(lambda x: np.asarray(x)[0], derived_quantities(z, repeated, space, seen))
+            headlines = jax.tree.map(lambda x: np.asarray(x)[0], derived_quantities(z, repeated, space, seen_line))
         local = local_deg_per_step(p, pose_deg)
-        assert np.abs(found.local_deg_per_step - list(local.values())).max() < 1e-9 * 0.1
-        assert abs(found["effective_mirror_offset_mm"] - effective_mirror_offset_mm(p, pose_deg)) < LENGTH_MM
+        assert np.abs(headlines.local_deg_per_step - list(local.values())).max() < 1e-9 * 0.1
+        assert abs(headlines["effective_mirror_offset_mm"] - effective_mirror_offset_mm(p, pose_deg)) < LENGTH_MM
         line = np.array(list(truth.effective_deg_per_step(campaign).values()))
-        pairs = found.effective_deg_per_step.reshape(2, 2)
+        pairs = headlines.effective_deg_per_step.reshape(2, 2)
         assert np.abs(pairs.mean(axis=1) - line.reshape(2, 2).mean(axis=1)).max() < 1e-9 * 0.1
         # The twin's half contrast turns the mirrors' mean slope, the model's that of the line: 2 % of one, errors being
         # 0.1 deg over some 8.
@@ -243,8 +243,8 @@ def test_errors_that_repeat_drift_and_scatter(mounted_rig):
             true = np.array([*(run.truth.parameters[name] for name in RIG_NAMES), *run.truth.stereo.vector])
             z = coordinates_of(space, true)
             # With all coordinates held, the squares of a stage's residuals are the quadratic form of the campaign.
-            found = linear_campaign(z, space, arrays, Fixed(np.ones(len(z), dtype=bool), z, np.array(1.0)))
-        squares.append(found.value @ found.value)
+            terms = linear_campaign(z, space, arrays, Fixed(np.ones(len(z), dtype=bool), z, np.array(1.0)))
+        squares.append(terms.value @ terms.value)
         # Four pixels of a spot less its range.
         count += 3 * sum(spot.status == "ok" for spot in run.campaign.spots)
     assert np.sum(squares) / count == pytest.approx(1.0, abs=4 * np.sqrt(2 / count))
