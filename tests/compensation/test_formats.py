@@ -43,30 +43,30 @@ def test_every_file_says_of_what_it_is_in_which_sense_and_that_nothing_is_applie
 def test_csv_holds_the_readings_expected():
     header, *rows = lines_of(written("csv"))
     assert header.split(",") == [*CSV_COLUMNS]
-    found = np.array([[float(cell) for cell in row.split(",")] for row in rows])
-    assert found.shape == (17, 5) and np.all(np.diff(found[:, 0]) > 0) and np.all(found[:, 3:] > 0)
+    cells = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    assert cells.shape == (17, 5) and np.all(np.diff(cells[:, 0]) > 0) and np.all(cells[:, 3:] > 0)
     # Lost motion: arriving forward the reading lags, by a play of 0.3 that varies by 0.02.
-    assert np.mean(found[:, 2] - found[:, 1]) == pytest.approx(0.3, abs=0.06)
+    assert np.mean(cells[:, 2] - cells[:, 1]) == pytest.approx(0.3, abs=0.06)
 
 
 def test_linuxcnc_sends_the_corrected_command_by_its_rule():
     """It subtracts (forward - nominal) or (reverse - nominal), linear between lines."""
-    made = table("linuxcnc")
+    result = table("linuxcnc")
     nominal, forward, reverse = np.array([[float(c) for c in line.split()] for line in lines_of(written("linuxcnc"))]).T
     at = np.array([-13.0, 4.4, 17.0])
     for side, column in ((1, forward), (-1, reverse)):
         by_rule = at - np.interp(at, nominal, column - nominal)
         # Seven decimals in the file.
-        np.testing.assert_allclose(by_rule, Correction.of(made).sent(at, np.full(3, side)), atol=2e-7)
+        np.testing.assert_allclose(by_rule, Correction.of(result).sent(at, np.full(3, side)), atol=2e-7)
 
 
 def test_linuxcnc_of_counters_that_run_backwards_exchanges_the_sides():
     """The unit falls as the command rises: LinuxCNC's forward is the campaign's backward."""
-    made = compensation_of(results(-1.002), Wish("linuxcnc"))
-    assert made.per_command == -1.0
-    rows = np.array([[float(c) for c in line.split()] for line in lines_of(FORMATS["linuxcnc"].write(made, ORIGIN))])
+    result = compensation_of(results(-1.002), Wish("linuxcnc"))
+    assert result.per_command == -1.0
+    rows = np.array([[float(c) for c in line.split()] for line in lines_of(FORMATS["linuxcnc"].write(result, ORIGIN))])
     assert np.all(np.diff(rows[:, 0]) > 0)
-    sent = Correction.of(made).sent(np.array([10.0]), np.array([1]))[0]
+    sent = Correction.of(result).sent(np.array([10.0]), np.array([1]))[0]
     at_unit = rows[np.argmin(np.abs(rows[:, 0] + 10.0))]
     assert at_unit[0] - (at_unit[2] - at_unit[0]) == pytest.approx(-sent, abs=2e-7)
 
@@ -85,15 +85,15 @@ def test_urdf_states_covariance_and_what_it_corrects():
     """The YAML beside the xacro: the same numbers, their covariance, and the hash that keeps it from acting twice."""
     beside = FORMATS["urdf"].beside
     assert beside is not None and all(FORMATS[name].beside is None for name in FORMATS if name != "urdf")
-    made = table("urdf")
-    document = yaml.safe_load(beside(made, ORIGIN))
+    result = table("urdf")
+    document = yaml.safe_load(beside(result, ORIGIN))
     assert document["axis_corrects"] == ORIGIN.data_sha256 and document["applied"] is False
     assert f'name="axis_corrects" value="{ORIGIN.data_sha256}"' in written("urdf")
     joint = document["joint"]
-    assert joint["values"] == [made.settings["axis_zero"], made.settings["axis_reduction"]]
+    assert joint["values"] == [result.settings["axis_zero"], result.settings["axis_reduction"]]
     sd = np.sqrt(np.diag(joint["covariance"]))
-    np.testing.assert_allclose(sd, [made.settings["u_axis_zero"], made.settings["u_axis_reduction"]], rtol=1e-12)
-    assert joint["covariance"][0][1] == joint["covariance"][1][0] == made.settings["covariance_zero_reduction"]
+    np.testing.assert_allclose(sd, [result.settings["u_axis_zero"], result.settings["u_axis_reduction"]], rtol=1e-12)
+    assert joint["covariance"][0][1] == joint["covariance"][1][0] == result.settings["covariance_zero_reduction"]
     assert set(document["left_after_applying_95"]) == {"forward", "backward"}
 
 
@@ -122,8 +122,8 @@ def test_header_adds_what_the_table_adds(tmp_path):
     (tmp_path / "try.c").write_text(f'#include <stdio.h>\n#include "axis.h"\nint main(void) {{ {calls} return 0; }}\n')
     subprocess.run(["cc", "-std=c99", "-Wall", "-Werror", "-o", "try", "try.c"], cwd=tmp_path, check=True)
     out = subprocess.run([tmp_path / "try"], capture_output=True, text=True, check=True).stdout
-    found = np.array([[float(cell) for cell in line.split()] for line in out.splitlines()])
+    cells = np.array([[float(cell) for cell in line.split()] for line in out.splitlines()])
     applied = Correction.of(table("header"))
     for column, side in enumerate((1, -1)):
         # Nine decimals printed; the table of the file has nine digits.
-        np.testing.assert_allclose(found[:, column], applied.sent(np.array(at), np.full(5, side)), atol=2e-8)
+        np.testing.assert_allclose(cells[:, column], applied.sent(np.array(at), np.full(5, side)), atol=2e-8)

@@ -16,9 +16,9 @@ PATH = [5.0, 17.0, 10.0, -5.0, 10.0]
 @pytest.mark.slow
 @pytest.mark.skipif(not installed(), reason="no linuxcnc: apt-get install --no-install-recommends linuxcnc-uspace")
 def test_motor_gets_what_the_table_adds():
-    made = table("linuxcnc")
-    text = FORMATS["linuxcnc"].write(made, Origin("a test", "0" * 64))
-    wanted = Correction.of(made).sent(np.array(PATH), np.sign(np.diff([0.0, *PATH])))
+    result = table("linuxcnc")
+    text = FORMATS["linuxcnc"].write(result, Origin("a test", "0" * 64))
+    wanted = Correction.of(result).sent(np.array(PATH), np.sign(np.diff([0.0, *PATH])))
     # The file has seven decimals, the pin six digits.
     np.testing.assert_allclose(motor_positions(PATH, text), wanted, atol=1e-4)
     np.testing.assert_allclose(motor_positions(PATH, text, backlash=0.5), wanted, atol=1e-4)

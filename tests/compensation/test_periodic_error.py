@@ -36,21 +36,21 @@ def results() -> AxisResults:
     readings = tuple(
         Reading(k, 0, float(v), U, time_s=float(t)) for k, (v, t) in enumerate(zip(value, TIME_S, strict=True))
     )
-    asked = WavePeriods(stated=(WORM_S, WORM_S / 3), in_seconds=True)
+    periods = WavePeriods(stated=(WORM_S, WORM_S / 3), in_seconds=True)
     moves = (AxisMove(0, 0, 0.0, 0.0, "forward"),)
-    return results_for(AxisCampaign("arcsec", moves, readings, {}, {"rate": RATE}, asked))
+    return results_for(AxisCampaign("arcsec", moves, readings, {}, {"rate": RATE}, periods))
 
 
 @pytest.mark.thorough
 def test_the_table_takes_off_the_wave_within_the_promise():
-    made = compensation_of(results(), Wish("pec"))
-    assert made.settings["period_command"] == pytest.approx(PERIOD)
+    result = compensation_of(results(), Wish("pec"))
+    assert result.settings["period_command"] == pytest.approx(PERIOD)
     command = RATE * np.linspace(100.0, 1100.0, 500)
-    begins = made.table[0].command
+    begins = result.table[0].command
     phase = begins + (command - begins) % PERIOD
-    added = Correction.of(made).sent(phase, np.zeros(len(phase))) - phase
-    left, before = wave(command / RATE) + made.per_command * added, wave(command / RATE)
-    promise = made.promise["forward"]
+    added = Correction.of(result).sent(phase, np.zeros(len(phase))) - phase
+    left, before = wave(command / RATE) + result.per_command * added, wave(command / RATE)
+    promise = result.promise["forward"]
     # 95 % of a wave's errors: the table's cause is the bound of its own error alone.
     assert np.quantile(np.abs(left), 0.95) <= promise.causes["table"] + promise.causes["format"]
     assert np.std(left) < 0.1 * np.std(before)
@@ -77,10 +77,10 @@ def test_other_formats_need_stops_and_a_rate_is_not_in_the_table():
 
 
 def test_the_file_repeats_and_says_how_to_see_what_is_left():
-    made = compensation_of(results(), Wish("pec"))
-    text = FORMATS["pec"].write(made, Origin("tvsbayes of a mount", "0" * 64))
+    result = compensation_of(results(), Wish("pec"))
+    text = FORMATS["pec"].write(result, Origin("tvsbayes of a mount", "0" * 64))
     rows = np.array([line.split(",") for line in text.splitlines() if line[0].isdigit()], dtype=float)
-    expected = -wave(rows[:, 0] * WORM_S) / made.per_command
+    expected = -wave(rows[:, 0] * WORM_S) / result.per_command
     # 300 readings of u 0.3 know a wave to 0.3 sqrt(2 / 300) = 0.024 in each of four columns; 0.3 is 6 of their sums.
     np.testing.assert_allclose(rows[:, 1], expected, atol=0.3)
     assert "run tvsbayes fit" in text and "homing" not in text
@@ -89,11 +89,11 @@ def test_the_file_repeats_and_says_how_to_see_what_is_left():
 
 def test_the_text_says_the_size_of_what_repeats_and_what_shows_the_rest():
     """A drive has no sides and no stops: neither a row for each nor a verification by them."""
-    made = compensation_of(results(), Wish("pec"))
-    text = compensation_text(made)
+    result = compensation_of(results(), Wish("pec"))
+    text = compensation_text(result)
     size = float(re.search(r"3000 commands, 200 s: (\S+) arcsec peak to peak", text)[1])
     assert size == pytest.approx(np.ptp(wave(np.linspace(0, WORM_S, 1000))), abs=0.3)
     assert "backward" not in text and text.count("while it drives") == 2
     with pytest.raises(NothingToEstimate, match="not verified by stops") as refused:
-        refuse_drive(made)
+        refuse_drive(result)
     assert "`periods = [200]`" in refused.value.remedy

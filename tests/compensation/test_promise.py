@@ -18,31 +18,31 @@ from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_record import AxisResults, summarise_axis
 
 
-def errors_after(made, seed: int) -> np.ndarray:
+def errors_after(result, seed: int) -> np.ndarray:
     """Errors of 28 stops between the positions of the campaign, under a table."""
-    asked, read = to_and_fro(np.linspace(-18.7, 18.7, 14))
-    fresh = driven(true_axis(), asked, read, seed, by=Correction.of(made))
-    at = np.array([asked[r.move].command for r in fresh.readings])
-    return np.array([r.value for r in fresh.readings]) - made.offset - made.per_command * at
+    commands, read = to_and_fro(np.linspace(-18.7, 18.7, 14))
+    fresh = driven(true_axis(), commands, read, seed, by=Correction.of(result))
+    at = np.array([commands[r.move].command for r in fresh.readings])
+    return np.array([r.value for r in fresh.readings]) - result.offset - result.per_command * at
 
 
 def test_errors_after_applying_lie_within_the_promise():
-    made = table()
-    bound = np.repeat([made.promise["forward"].error95, made.promise["backward"].error95], 14)
-    inside = np.mean([np.mean(np.abs(errors_after(made, seed)) <= bound) for seed in range(12)])
+    result = table()
+    bound = np.repeat([result.promise["forward"].error95, result.promise["backward"].error95], 14)
+    inside = np.mean([np.mean(np.abs(errors_after(result, seed)) <= bound) for seed in range(12)])
     # 95 % of 336 errors that share twelve homings and one table: a few per cent either way.
     assert 0.88 <= inside <= 1.0
-    before = min(left.without95 for left in made.promise.values())
+    before = min(left.without95 for left in result.promise.values())
     assert bound.max() < 0.2 * before
 
 
 def test_within_one_homing_errors_lie_within_the_promise_but_for_a_shift():
-    made = table()
-    bound = np.repeat([made.promise[side].shift_free95 for side in ("forward", "backward")], 14)
-    errors = [errors_after(made, seed) for seed in range(12)]
+    result = table()
+    bound = np.repeat([result.promise[side].shift_free95 for side in ("forward", "backward")], 14)
+    errors = [errors_after(result, seed) for seed in range(12)]
     # 95 % of 336 errors that share one table.
     assert 0.88 <= np.mean([np.abs(each - each.mean()) <= bound for each in errors]) <= 1.0
-    assert all(left.shift_free95 < left.error95 for left in made.promise.values())
+    assert all(left.shift_free95 < left.error95 for left in result.promise.values())
 
 
 @pytest.mark.thorough
@@ -67,10 +67,10 @@ def test_what_rounding_costs_is_in_the_promise():
 
 def test_nominal_is_what_is_stated_or_one_or_the_fit():
     assert table().per_command == 1.0
-    made = table("csv", per_command=1.01)
-    assert made.per_command == 1.01
+    result = table("csv", per_command=1.01)
+    assert result.per_command == 1.01
     # The table then takes off the ratio too: 0.8 % of 40 mm.
-    assert made.table[-1].add_forward - made.table[0].add_forward == pytest.approx(0.32, abs=0.1)
+    assert result.table[-1].add_forward - result.table[0].add_forward == pytest.approx(0.32, abs=0.1)
 
 
 def test_time_and_travel_since_homing_are_the_longest_segment():
@@ -84,7 +84,7 @@ def test_time_and_travel_since_homing_are_the_longest_segment():
 
 
 @pytest.mark.parametrize(
-    ("wish", "said"),
+    ("wish", "message"),
     [
         (Wish("step7"), "unknown"),
         (Wish("grbl"), "$100"),
@@ -96,10 +96,10 @@ def test_time_and_travel_since_homing_are_the_longest_segment():
         (Wish("pec", period=4.0), "eight positions"),
     ],
 )
-def test_wishes_that_cannot_be_met_are_refused(wish, said):
+def test_wishes_that_cannot_be_met_are_refused(wish, message):
     with pytest.raises(InputError) as refused:
         compensation_of(results(), wish)
-    assert said in f"{refused.value.message} {refused.value.allowed}"
+    assert message in f"{refused.value.message} {refused.value.allowed}"
 
 
 def test_a_play_that_was_never_read_is_no_setting():
@@ -109,8 +109,8 @@ def test_a_play_that_was_never_read_is_no_setting():
     turn = int(np.argmax([move.command for move in first]))
     moves = tuple(first[: turn + 1])
     campaign = replace(whole, moves=moves, readings=tuple(r for r in whole.readings if r.move < len(moves)))
-    made = compensate(campaign, "grblhal", in_force=250.0)
-    assert set(made.settings) == {"$100"} and any("one side" in text for text in made.unsaid)
+    result = compensate(campaign, "grblhal", in_force=250.0)
+    assert set(result.settings) == {"$100"} and any("one side" in text for text in result.unsaid)
 
 
 def test_no_table_is_made_of_what_is_not_accepted():
@@ -124,5 +124,5 @@ def test_no_table_is_made_of_what_is_not_accepted():
 
 
 def test_python_makes_the_file_in_one_call():
-    made = compensate(replace(results().fit.campaign, header={"serial": "A 7"}), "linuxcnc")
-    assert made.machine == "A 7" and "machine: A 7" in made.text and made.text.startswith("-20.0")
+    result = compensate(replace(results().fit.campaign, header={"serial": "A 7"}), "linuxcnc")
+    assert result.machine == "A 7" and "machine: A 7" in result.text and result.text.startswith("-20.0")

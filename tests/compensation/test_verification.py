@@ -39,21 +39,21 @@ from tvsbayes.results.compensation_record import (
 )
 def test_every_world_is_named(factors, world):
     """Also where it befell the play alone, as a lost reversal or a backlash setting beside the table do."""
-    found = verify_readings(results().fit, table(), fresh(3, factors))
-    assert found.world == world and found.worlds[world] > 0.95
-    assert found.verdict == (KEPT if world == APPLIED else BROKEN)
-    assert (found.p > 0.01) == (world == APPLIED)
-    assert sum(found.worlds.values()) == pytest.approx(1.0)
+    check = verify_readings(results().fit, table(), fresh(3, factors))
+    assert check.world == world and check.worlds[world] > 0.95
+    assert check.verdict == (KEPT if world == APPLIED else BROKEN)
+    assert (check.p > 0.01) == (world == APPLIED)
+    assert sum(check.worlds.values()) == pytest.approx(1.0)
 
 
 def test_sizes_are_those_of_the_readings():
     new = fresh(3)
-    found = verify_readings(results().fit, table(), new)
+    check = verify_readings(results().fit, table(), new)
     aim = table().offset + np.array([new.moves[r.move].command for r in new.readings])
     errors = np.array([r.value for r in new.readings]) - aim
-    assert found.after.rms == pytest.approx(np.sqrt(np.mean(errors**2)))
-    assert found.after.worst == pytest.approx(np.max(np.abs(errors)))
-    assert found.before.rms > 5 * found.after.rms and found.promised95 < 0.1 and found.readings == 12
+    assert check.after.rms == pytest.approx(np.sqrt(np.mean(errors**2)))
+    assert check.after.worst == pytest.approx(np.max(np.abs(errors)))
+    assert check.before.rms > 5 * check.after.rms and check.promised95 < 0.1 and check.readings == 12
 
 
 def test_with_one_homing_errors_are_given_without_their_shift_too():
@@ -61,37 +61,37 @@ def test_with_one_homing_errors_are_given_without_their_shift_too():
     new = fresh(3)
     assert verify_readings(results().fit, table(), new).shift_free is None
     shifted = replace(new, readings=tuple(replace(reading, value=reading.value + 0.05) for reading in new.readings))
-    found = verify_readings(results().fit, structs.replace(table(), homings=1), shifted)
+    check = verify_readings(results().fit, structs.replace(table(), homings=1), shifted)
     aim = table().offset + np.array([new.moves[r.move].command for r in new.readings])
-    left, promised = found.shift_free
-    assert left.rms == pytest.approx(np.std([r.value for r in new.readings] - aim)) and left.rms < 0.5 * found.after.rms
-    assert promised < found.promised95
-    assert "but for one shift common to all" in verification_text(found)
-    page = compensation_section(structs.replace(table(), homings=1), found)
+    left, promised = check.shift_free
+    assert left.rms == pytest.approx(np.std([r.value for r in new.readings] - aim)) and left.rms < 0.5 * check.after.rms
+    assert promised < check.promised95
+    assert "but for one shift common to all" in verification_text(check)
+    page = compensation_section(structs.replace(table(), homings=1), check)
     assert "as within one homing, at most: forward" in page.items[-1]
     assert "one homing" not in " ".join(compensation_section(table(), None).items)
 
 
 def test_another_axis_is_none_of_the_worlds():
-    asked, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
-    other = driven(true_axis(8, 1.004), asked, read, 9, by=Correction.of(table()))
-    found = verify_readings(results().fit, table(), other)
-    assert (found.verdict, found.world) == (BROKEN, OTHER_MACHINE)
+    commands, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
+    other = driven(true_axis(8, 1.004), commands, read, 9, by=Correction.of(table()))
+    check = verify_readings(results().fit, table(), other)
+    assert (check.verdict, check.world) == (BROKEN, OTHER_MACHINE)
 
 
 def test_a_table_too_small_to_be_seen_cannot_be_told():
     """Three readings of 0.5 mm uncertainty: every world explains them."""
     new = fresh(3)
     blurred = replace(new, readings=tuple(replace(r, u=0.5) for r in new.readings[:3]))
-    found = verify_readings(results().fit, table(), blurred)
-    assert found.verdict == CANNOT_TELL and found.needed != 0
+    check = verify_readings(results().fit, table(), blurred)
+    assert check.verdict == CANNOT_TELL and check.needed != 0
 
 
 def test_what_lies_outside_or_takes_longer_is_said():
-    asked, read = to_and_fro(np.array([-15.0, 1.0, 23.0]))
-    slow = tuple(replace(m, time_s=100 * m.time_s) for m in asked)
-    found = verify_readings(results().fit, table(), driven(true_axis(), slow, read, 4, by=Correction.of(table())))
-    assert "outside" in found.remarks[0] and "larger errors are expected" in found.remarks[1]
+    commands, read = to_and_fro(np.array([-15.0, 1.0, 23.0]))
+    slow = tuple(replace(m, time_s=100 * m.time_s) for m in commands)
+    check = verify_readings(results().fit, table(), driven(true_axis(), slow, read, 4, by=Correction.of(table())))
+    assert "outside" in check.remarks[0] and "larger errors are expected" in check.remarks[1]
 
 
 def test_other_units_and_missing_tables_are_refused(tmp_path):
@@ -104,12 +104,12 @@ def test_other_units_and_missing_tables_are_refused(tmp_path):
 @pytest.mark.thorough
 def test_grblhal_may_begin_in_either_half_of_the_play():
     """One shift of all readings by half the play is no fault of a format that leaves the zero open."""
-    made = table("grblhal", in_force=250.0)
-    asked, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
-    new = driven(true_axis(), asked, read, 5, by=Correction.of(made))
+    result = table("grblhal", in_force=250.0)
+    commands, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
+    new = driven(true_axis(), commands, read, 5, by=Correction.of(result))
     shifted = replace(new, readings=tuple(replace(r, value=float(r.value or 0) + 0.15) for r in new.readings))
-    assert verify_readings(results().fit, made, shifted).verdict == KEPT
-    assert verify_readings(results().fit, structs.replace(made, zero_free=False), shifted).verdict == BROKEN
+    assert verify_readings(results().fit, result, shifted).verdict == KEPT
+    assert verify_readings(results().fit, structs.replace(result, zero_free=False), shifted).verdict == BROKEN
 
 
 def test_python_verifies_in_one_call():
@@ -117,13 +117,13 @@ def test_python_verifies_in_one_call():
 
 
 def test_plan_spreads_its_stops_and_knows_whether_they_tell():
-    found = plan_verification(results().fit, table())
-    assert found.enough and len(found.stops) >= 6 and {side for _, side in found.stops} == {-1, 1}
-    assert np.ptp([command for command, _ in found.stops]) > 30
-    rows = [line.split(",") for line in found.plan_bytes().decode().splitlines()[1:]]
+    plan = plan_verification(results().fit, table())
+    assert plan.enough and len(plan.stops) >= 6 and {side for _, side in plan.stops} == {-1, 1}
+    assert np.ptp([command for command, _ in plan.stops]) > 30
+    rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[1:]]
     at = [float(row[1]) for row in rows]
     for k, row in enumerate(rows):
         if row[3] == "1":
-            assert (at[k] > at[k - 1]) == (row[2] == "forward") and abs(at[k] - at[k - 1]) >= found.run_up - 1e-9
+            assert (at[k] > at[k - 1]) == (row[2] == "forward") and abs(at[k] - at[k - 1]) >= plan.run_up - 1e-9
     tiny = [structs.replace(r, add_forward=1e-5, add_backward=-1e-5) for r in table().table]
     assert not plan_verification(results().fit, structs.replace(table(), table=tuple(tiny))).enough
