@@ -84,14 +84,14 @@ def test_twin_and_model_are_the_same_optics(truths):
         return trace(model_of(v, mechanism=HEAD).optics, p[:, 0], p[:, 1])
 
     with jax.enable_x64(True):
-        found = jax.jit(jax.vmap(rays))(jnp.asarray(values), jnp.asarray(poses))
+        model_rays = jax.jit(jax.vmap(rays))(jnp.asarray(values), jnp.asarray(poses))
     for k, truth in enumerate(truths):
         expected = mirror_chain(*poses[k].T, truth.parameters)
         # The NumPy side of a robot, frame T of a head being frame P.
         robot = beam_components(truth.parameters, *np.degrees(poses[k]).T)
-        for seen, own, wanted in zip(found, robot, expected, strict=True):
-            assert np.abs(np.stack([x[k] for x in seen], axis=1) - wanted).max() < 100 * ROUNDING
-            assert np.abs(np.stack(np.broadcast_arrays(*own), axis=1) - wanted).max() < 100 * ROUNDING
+        for ray, beam, wanted in zip(model_rays, robot, expected, strict=True):
+            assert np.abs(np.stack([x[k] for x in ray], axis=1) - wanted).max() < 100 * ROUNDING
+            assert np.abs(np.stack(np.broadcast_arrays(*beam), axis=1) - wanted).max() < 100 * ROUNDING
 
 
 @pytest.mark.thorough
@@ -122,10 +122,10 @@ def test_headlines_count_on_around_the_circle_and_through_the_zenith(azimuth_zer
             pose_rad = np.radians(run.truth.reference_pose_deg)
             line = SeenLine(pose_rad, places, line_share(at, np.ones(len(spots), bool)))
             none, mirrors = jnp.zeros(2 * len(at.steps)), beam_angles(model.optics, *jnp.asarray(pose_rad))
-            found = np.asarray(line_deg_per_step(model, line, none, mirrors)).reshape(2, 2).mean(axis=1)
+            means = np.asarray(line_deg_per_step(model, line, none, mirrors)).reshape(2, 2).mean(axis=1)
         expected = np.array(list(run.truth.effective_deg_per_step(run.campaign).values()))
         both = expected.reshape(2, 2).mean(axis=1)
-        assert np.abs(found - both).max() < 1e-9 * 0.05
+        assert np.abs(means - both).max() < 1e-9 * 0.05
         ratios = np.array([p["degrees_per_step.pan"], p["degrees_per_step.tilt"]])
         # Terms move a direction by some of them, more by the tangent of the elevation, over at least 110 deg.
         assert np.abs(both / ratios - 1).max() < 6 * TERM_DEG / 110

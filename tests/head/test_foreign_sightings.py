@@ -54,7 +54,7 @@ def test_names_of_columns(name, field):
 
 def test_counters_and_radians_with_a_row_that_was_refused():
     azimuth = [math.radians((0.01 * pan + 20) % 360) for pan, _ in STEPS]
-    found = understood(
+    log = understood(
         {
             "pan count": [str(pan) for pan, _ in STEPS],
             "tilt count": [str(tilt) for _, tilt in STEPS],
@@ -64,12 +64,12 @@ def test_counters_and_radians_with_a_row_that_was_refused():
             "status": ["ok", "1", "good", "", "clouds"],
         }
     )
-    assert [s.status for s in found.sightings] == ["ok"] * 4 + ["clouds"]
-    first = found.sightings[0]
+    assert [s.status for s in log.sightings] == ["ok"] * 4 + ["clouds"]
+    first = log.sightings[0]
     assert (first.azimuth_deg, first.elevation_deg, first.u_deg) == pytest.approx((290.0, 0.5, 0.05), abs=1e-6)
-    assert found.priors["degrees_per_step.pan"].value == pytest.approx(0.01)
-    assert found.priors["degrees_per_step.tilt"].value == pytest.approx(0.005, rel=0.02)
-    assert "1 sighting left out" in " ".join(found.assumed)
+    assert log.priors["degrees_per_step.pan"].value == pytest.approx(0.01)
+    assert log.priors["degrees_per_step.tilt"].value == pytest.approx(0.005, rel=0.02)
+    assert "1 sighting left out" in " ".join(log.assumed)
 
 
 @pytest.mark.parametrize(("azimuth_deg", "zeros"), [(0.0, {}), (170.0, {"azimuth_zero_deg": 170.0})])
@@ -81,19 +81,19 @@ def test_a_zero_far_from_the_default_is_stated(azimuth_deg, zeros):
         "azimuth": [str((0.01 * pan + azimuth_deg) % 360) for pan, _ in STEPS],
         "elevation": [str(0.005 * tilt) for _, tilt in STEPS],
     }
-    found = understood(columns)
-    assert {name: prior.value for name, prior in found.priors.items() if "zero" in name} == pytest.approx(zeros)
-    assert ("azimuth_zero_deg" in " ".join(found.assumed)) == bool(zeros)
+    log = understood(columns)
+    assert {name: prior.value for name, prior in log.priors.items() if "zero" in name} == pytest.approx(zeros)
+    assert ("azimuth_zero_deg" in " ".join(log.assumed)) == bool(zeros)
 
 
 def test_encoders_in_radians_become_counters():
     """A scale known to a hundredth; whole turns as they stand."""
     pan = [-0.5, 0.0, 7.0]
     columns = {"enc az [rad]": pan, "enc el [rad]": [0.1, 0.2, 0.3], "az": [331.0, 0.0, 41.0], "el": [6.0, 11.0, 17.0]}
-    found = understood({name: [str(cell) for cell in cells] for name, cells in columns.items()}, u_deg=0.002)
-    assert [m.pan_steps for m in found.moves] == [round(math.degrees(angle) / STEP_DEG) for angle in pan]
-    assert {s.u_deg for s in found.sightings} == {0.002}
-    assert found.priors["degrees_per_step.tilt"].value == STEP_DEG
+    log = understood({name: [str(cell) for cell in cells] for name, cells in columns.items()}, u_deg=0.002)
+    assert [m.pan_steps for m in log.moves] == [round(math.degrees(angle) / STEP_DEG) for angle in pan]
+    assert {s.u_deg for s in log.sightings} == {0.002}
+    assert log.priors["degrees_per_step.tilt"].value == STEP_DEG
 
 
 def test_a_counter_that_counts_the_other_way_is_named_and_turned():
@@ -132,10 +132,10 @@ def test_no_ratio_of_angles_that_lie_on_no_line():
 
 
 @pytest.mark.parametrize(
-    ("cells", "said"),
+    ("cells", "message"),
     [(["95", "1", "1", "1", "1"], "a number from -90 to 90"), (["", "1", "1", "1", "1"], "alt: found an empty cell")],
 )
-def test_cells_that_are_no_sightings_are_refused(cells, said):
+def test_cells_that_are_no_sightings_are_refused(cells, message):
     counters = {"pan": [str(pan) for pan, _ in STEPS], "tilt": [str(tilt) for _, tilt in STEPS]}
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         understood({**counters, "az": ["1", "2", "3", "4", "5"], "alt": cells})

@@ -116,9 +116,9 @@ def test_a_model_is_corrected_and_says_so(ask, known_head, tmp_path):
     assert code == 0 and document["files"] == {"urdf": str(out), "yaml": f"{out}.yaml"}
     kept = yaml.safe_load((tmp_path / "new.urdf.yaml").read_text())
     u = dict(zip(kept["names"], np.sqrt(np.diag(kept["covariance"])), strict=True))
-    found = head_joints(out.read_bytes(), "new.urdf", dict.fromkeys(AXES)).terms
+    terms = head_joints(out.read_bytes(), "new.urdf", dict.fromkeys(AXES)).terms
     for name in ("azimuth_axis_tilt_deg.north", "axes_not_square_deg", "azimuth_zero_deg"):
-        assert abs(found[name] - truth.parameters[name]) < 4 * u[name], name
+        assert abs(terms[name] - truth.parameters[name]) < 4 * u[name], name
     again = tmp_path / "again"
     again.mkdir()
     for path in folder.rglob("*"):

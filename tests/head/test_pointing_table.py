@@ -80,8 +80,8 @@ def test_a_long_night_stays_within_its_turns(tmp_path):
 def test_broken_blocks_are_left_out_and_malformed_ones_refused(tmp_path):
     path, blocks = tmp_path / "night.dat", table(5)
     path.write_text("".join([*blocks[:3], blocks[3].split("TAA")[0], blocks[4]]))
-    found = read_stars(path)
-    assert (len(found.stars), found.left_out) == (4, 1)
+    catalogue = read_stars(path)
+    assert (len(catalogue.stars), catalogue.left_out) == (4, 1)
     path.write_text("".join([*blocks[:2], blocks[2].replace("RAA: ", "RAA: x")]))
     with pytest.raises(InputError) as refused:
         read_stars(path)

@@ -87,8 +87,8 @@ def test_a_nominal_head_comes_back_as_it_was():
 
 def test_an_estimated_head_is_what_another_parser_reads():
     head = head_joints(UNIT, "unit.urdf", BY_NAME)
-    found = model(head, 200.0, **OFF, **{"degrees_per_step.pan": 1.01})
-    data = found.urdf(head)
+    head_model = model(head, 200.0, **OFF, **{"degrees_per_step.pan": 1.01})
+    data = head_model.urdf(head)
     again = head_joints(data, "unit.urdf", BY_NAME)
     for name, off in OFF.items():
         assert again.terms[name] == pytest.approx(head.terms[name] + off, abs=1e-7), name
@@ -96,7 +96,7 @@ def test_an_estimated_head_is_what_another_parser_reads():
     lines, before = data.decode().splitlines(), UNIT.decode().splitlines()
     assert len([line for line in before if line not in lines]) == 5, "robot, two origins, one axis, one reduction"
     with pytest.raises(InputError, match="not applied twice"):
-        found.urdf(again)
+        head_model.urdf(again)
     terms = {name: again.terms[name] for name in OFF}
     for pan, tilt in ((0.0, 0.0), (0.7, 0.3), (-2.0, -0.6)):
         other = by_another_parser(data, pan, tilt)
@@ -106,9 +106,9 @@ def test_an_estimated_head_is_what_another_parser_reads():
 def test_a_joint_without_an_origin_gets_one():
     origin = b'    <origin rpy="0 0 -1.5707963267948966" xyz="0 -0.02 0.01" />\n'
     head = head_joints(UNIT.replace(origin, b"").replace(b"1.5707963267948966", b"0"), "unit.urdf", BY_NAME)
-    found = head_joints(model(head, **OFF).urdf(head), "unit.urdf", BY_NAME).terms
+    terms = head_joints(model(head, **OFF).urdf(head), "unit.urdf", BY_NAME).terms
     for name, off in OFF.items():
-        assert found[name] == pytest.approx(head.terms[name] + off, abs=1e-7), name
+        assert terms[name] == pytest.approx(head.terms[name] + off, abs=1e-7), name
 
 
 def test_a_later_correction_takes_the_place_of_an_earlier_one():
@@ -134,7 +134,7 @@ def test_without_a_model_there_are_properties():
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "names", "said"),
+    ("old", "new", "names", "message"),
     [
         (b"unit", b"unit", {"pan": "pn_joint"}, "did you mean pan_joint"),
         (b"unit", b"unit", {"pan": "foot"}, "joint foot is fixed"),
@@ -150,11 +150,11 @@ def test_without_a_model_there_are_properties():
         (b'"continuous"', b'"fixed"', {}, "joints that turn: tilt_joint"),
     ],
 )
-def test_refusals_teach(old, new, names, said):
+def test_refusals_teach(old, new, names, message):
     data = UNIT.replace(old, new)
-    if said is None:
+    if message is None:
         assert head_joints(data, "unit.urdf", BY_NAME).names["pan"] == "first", "the only two that turn"
         return
     with pytest.raises(InputError) as refused:
         head_joints(data, "unit.urdf", {**BY_NAME, **names})
-    assert said in refused.value.message + (refused.value.remedy or "")
+    assert message in refused.value.message + (refused.value.remedy or "")
