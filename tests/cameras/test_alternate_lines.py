@@ -39,16 +39,16 @@ def fields(
 @pytest.mark.parametrize("columns", [False, True])
 def test_a_shift_is_measured_and_stated(sd, columns):
     """As pixels are (3 px) and in blocks of three (14 px): 0.5 px along v and half of it along u."""
-    found = find_spot(fields(sd, 0.5, 0.06, 1, columns=columns), KNOWN)
+    spot = find_spot(fields(sd, 0.5, 0.06, 1, columns=columns), KNOWN)
     true = np.array([0.25, 0.5])
-    shift = found.lines_px[int(columns)]
+    shift = spot.lines_px[int(columns)]
     # The stated uncertainty of the whole without the shift is some 0.01 sd; twice that for the difference, four of it.
-    noise = np.sqrt(np.diag(found.covariance_px2 - np.outer(shift, shift) / 12))
+    noise = np.sqrt(np.diag(spot.covariance_px2 - np.outer(shift, shift) / 12))
     assert (np.abs(shift - true) < 8 * noise).all() and (noise < 0.03).all()
-    sds = np.sqrt(np.diag(found.covariance_px2))
+    sds = np.sqrt(np.diag(spot.covariance_px2))
     assert (sds >= np.abs(shift) / np.sqrt(12)).all()
     # The whole lies between both.
-    assert (np.abs(found.centre_px - PLACE - true / 2) < 5 * noise + 0.03 * true).all()
+    assert (np.abs(spot.centre_px - PLACE - true / 2) < 5 * noise + 0.03 * true).all()
 
 
 @pytest.mark.parametrize("sd", [3.0, 14.0])
@@ -56,9 +56,9 @@ def test_a_gain_of_the_odd_rows_moves_nothing(sd):
     """6 %, as in a real camera: no finding, and chi-square of the difference as noise has it."""
     chi2 = []
     for seed in range(30):
-        seen = find_spot(fields(sd, 0.0, 0.06, seed), KNOWN)
-        shift = seen.lines_px[0]
-        chi2.append(shift @ np.linalg.solve(4 * seen.covariance_px2, shift))
+        spot = find_spot(fields(sd, 0.0, 0.06, seed), KNOWN)
+        shift = spot.lines_px[0]
+        chi2.append(shift @ np.linalg.solve(4 * spot.covariance_px2, shift))
     # 60 degrees of freedom: mean 2, its standard uncertainty 0.37; four of them.
     assert 0.5 < np.mean(chi2) < 3.5
 
@@ -68,10 +68,10 @@ def test_good_pictures_stay_as_they_are():
     rng = np.random.default_rng(5)
     for number in range(40):
         mark = Footprint(PLACE + rng.uniform(-1, 1, 2), oval(rng, 2.5), 200.0)
-        made = picture(mark, scene=Scene(speckle_contrast=0.4 * (number % 2)))
+        frame = picture(mark, scene=Scene(speckle_contrast=0.4 * (number % 2)))
         noise = SpotNoise(GAIN_DN, 0.4 * (number % 2))
-        without = centre_of(patch_around(in_grey_levels(made)), noise)
-        assert (find_spot(made, noise).covariance_px2 == without.covariance_px2).all()
+        without = centre_of(patch_around(in_grey_levels(frame)), noise)
+        assert (find_spot(frame, noise).covariance_px2 == without.covariance_px2).all()
 
 
 def test_small_differences_that_all_looks_share_are_found_together():
@@ -82,12 +82,12 @@ def test_small_differences_that_all_looks_share_are_found_together():
     for size, expected in ((3.0, 40), (1.5, 0)):
         shifts = signs * size * 2 * np.array([0.1, 0.2])
         shifts[:, 1] = 0.0
-        found = widening(list(shifts), covariances)
-        assert [(one.lines, one.spots) for one in found.lines] == ([("rows", 40)] if expected else [])
+        result = widening(list(shifts), covariances)
+        assert [(one.lines, one.spots) for one in result.lines] == ([("rows", 40)] if expected else [])
         if expected:
-            np.testing.assert_allclose(found.added_px2[3], np.outer(shifts[3, 0], shifts[3, 0]) / 12, rtol=1e-12)
+            np.testing.assert_allclose(result.added_px2[3], np.outer(shifts[3, 0], shifts[3, 0]) / 12, rtol=1e-12)
         else:
-            assert not found.added_px2.any()
+            assert not result.added_px2.any()
     assert 2.25 < EXCESS_MIN < 9
     assert widened([Centre("no-spot")]).lines == ()
 
@@ -95,9 +95,9 @@ def test_small_differences_that_all_looks_share_are_found_together():
 def test_one_look_alone_is_widened_alone():
     shifts = [np.zeros((2, 2))] * 30
     shifts[4] = np.array([[0.0, 0.0], [2.0, 0.0]])
-    found = widening(shifts, [0.01 * np.eye(2)] * 30)
-    assert [(one.lines, one.spots, one.apart_px) for one in found.lines] == [("columns", 1, 2.0)]
-    assert np.flatnonzero(found.added_px2.any(axis=(1, 2))).tolist() == [4]
+    result = widening(shifts, [0.01 * np.eye(2)] * 30)
+    assert [(one.lines, one.spots, one.apart_px) for one in result.lines] == [("columns", 1, 2.0)]
+    assert np.flatnonzero(result.added_px2.any(axis=(1, 2))).tolist() == [4]
 
 
 def test_detect_says_which_camera_reads_in_fields(tmp_path):
@@ -110,16 +110,16 @@ def test_detect_says_which_camera_reads_in_fields(tmp_path):
     places = PLACE + rng.uniform(-1, 1, (6, 2))
     for look, place in enumerate(places):
         for side, shift in (("left", 0.4), ("right", 0.0)):
-            made = fields(4.0, shift, 0.02, look + 100 * (side == "right"), place=place)
-            (tmp_path / "c" / "frames" / f"{look:06d}_{side}.png").write_bytes(png_bytes(made))
-    found = detect(read_campaign(tmp_path / "c"), workers=1)
-    (left,), right = found.lines["left"], found.lines["right"]
+            frame = fields(4.0, shift, 0.02, look + 100 * (side == "right"), place=place)
+            (tmp_path / "c" / "frames" / f"{look:06d}_{side}.png").write_bytes(png_bytes(frame))
+    detection = detect(read_campaign(tmp_path / "c"), workers=1)
+    (left,), right = detection.lines["left"], detection.lines["right"]
     assert (left.lines, left.spots, right) == ("rows", 6, ())
     # 0.4 down, 0.2 to the right.
     assert left.apart_px == pytest.approx(0.447, abs=0.05)
-    text = detection_text(found)
+    text = detection_text(detection)
     assert "left camera: odd and even rows of 6 spots" in text and "right camera" not in text
-    assert found.as_json()["alternate_lines"] == {
+    assert detection.as_json()["alternate_lines"] == {
         "left": [{"lines": "rows", "spots": 6, "apart_px": left.apart_px}],
         "right": [],
     }

@@ -48,8 +48,8 @@ def corners(stereo: Stereo, pose: np.ndarray, board: Board = BOARD) -> tuple[np.
     """Where both cameras see the corners, by OpenCV."""
     left = board.points_mm @ rotation_matrix(pose[:3]).T + pose[3:]
     still = np.zeros(3)
-    own = (left, stereo.M1, stereo.D1), (left @ stereo.R.T + stereo.T, stereo.M2, stereo.D2)
-    one, two = (cv2.projectPoints(points, still, still, m, d)[0].reshape(-1, 2) for points, m, d in own)
+    cameras = (left, stereo.M1, stereo.D1), (left @ stereo.R.T + stereo.T, stereo.M2, stereo.D2)
+    one, two = (cv2.projectPoints(points, still, still, m, d)[0].reshape(-1, 2) for points, m, d in cameras)
     return one, two
 
 
@@ -59,33 +59,33 @@ def test_information_is_that_of_the_bundle_adjustment(mounted):
     rng = np.random.default_rng(3)
     views = []
     for k, pose in enumerate(poses):
-        left, right = (seen + 1e-3 * rng.standard_normal(seen.shape) for seen in corners(mounted, pose))
+        left, right = (pixels + 1e-3 * rng.standard_normal(pixels.shape) for pixels in corners(mounted, pose))
         views.append(View(f"{k}", left, right))
     done = bundle_adjustment(views, BOARD, mounted.vector, np.array(poses), np.ones(24, bool))
     whole = np.sum([view_information(mounted, BOARD, pose).together for pose in poses], axis=0)
-    made, own = np.linalg.inv(whole), done.covariance / done.noise_sd_px**2
-    sds = np.sqrt(np.diag(own))
-    np.testing.assert_allclose(made / np.outer(sds, sds), own / np.outer(sds, sds), atol=1e-4)
+    covariance, expected = np.linalg.inv(whole), done.covariance / done.noise_sd_px**2
+    sds = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(covariance / np.outer(sds, sds), expected / np.outer(sds, sds), atol=1e-4)
 
 
 def test_boards_are_seen_whole_by_both_cameras(mounted):
-    found = placed_boards(mounted, BOARD)
-    assert {name: len(poses) for name, poses in found.items()} == {"bumblebee2": 11, "opencv": 13}
+    boards = placed_boards(mounted, BOARD)
+    assert {name: len(poses) for name, poses in boards.items()} == {"bumblebee2": 11, "opencv": 13}
     size = np.array([mounted.image_width, mounted.image_height])
-    for pose in chain(*found.values()):
+    for pose in chain(*boards.values()):
         for pixels in corners(mounted, pose):
             assert (pixels > -0.5).all() and (pixels < size - 0.5).all()
 
 
 def test_covariance_scales_as_a_calibration(mounted):
     """With the RMS, with one over the root of the views (degrees of freedom aside), T with the pitch."""
-    made = calibration_covariance(mounted, BOARD, 20, 0.2)
-    np.testing.assert_allclose(calibration_covariance(mounted, BOARD, 20, 0.4), 4 * made, rtol=1e-12)
+    covariance = calibration_covariance(mounted, BOARD, 20, 0.2)
+    np.testing.assert_allclose(calibration_covariance(mounted, BOARD, 20, 0.4), 4 * covariance, rtol=1e-12)
     coordinates = 4 * BOARD.corners
     share = [1 - (24 / views + 6) / coordinates for views in (20, 80)]
     fewer = calibration_covariance(mounted, BOARD, 80, 0.2) * 4 * share[1] / share[0]
-    np.testing.assert_allclose(fewer, made, rtol=1e-9)
-    sd = np.sqrt(np.diag(calibration_covariance(mounted, replace(BOARD, pitch_u_mm=0.25), 20, 0.2) - made))[21:]
+    np.testing.assert_allclose(fewer, covariance, rtol=1e-9)
+    sd = np.sqrt(np.diag(calibration_covariance(mounted, replace(BOARD, pitch_u_mm=0.25), 20, 0.2) - covariance))[21:]
     # Differences of variances: their digits are those of the larger one.
     np.testing.assert_allclose(sd, 0.01 * np.abs(mounted.T), rtol=1e-6, atol=1e-6)
     joint, fixed, either = (calibration_covariance(mounted, BOARD, 20, 0.2, way) for way in (False, True, None))
@@ -110,7 +110,7 @@ def drawn(seed: int) -> tuple[Stereo, list[np.ndarray]]:
         across = rng.uniform(-0.45, 0.45, 2) * size / focal
         shift = depth * np.append(across, 1.0) + [baseline / 2, 0, 0]
         pose = np.array([*rng.uniform(-0.5, 0.5, 2), rng.normal(0, 0.3), *shift])
-        if all(((seen > 0) & (seen < size - 1)).all() for seen in corners(true, pose)):
+        if all(((pixels > 0) & (pixels < size - 1)).all() for pixels in corners(true, pose)):
             poses.append(pose)
     return true, poses
 
@@ -118,9 +118,9 @@ def drawn(seed: int) -> tuple[Stereo, list[np.ndarray]]:
 def by_opencv(true: Stereo, poses: list[np.ndarray], seed: int, fixed: bool) -> tuple[Stereo, float]:
     """What cv2.stereoCalibrate makes of noisy corners, all free from each camera's own calibration or R and T alone."""
     rng = np.random.default_rng([seed, 46])
-    seen = [corners(true, pose) for pose in poses]
+    views = [corners(true, pose) for pose in poses]
     sides = [
-        [(view[k] + NOISE_PX * rng.standard_normal(view[k].shape)).astype(np.float32) for view in seen] for k in (0, 1)
+        [(view[k] + NOISE_PX * rng.standard_normal(view[k].shape)).astype(np.float32) for view in views] for k in (0, 1)
     ]
     points, size = [BOARD.points_mm.astype(np.float32)] * len(poses), (true.image_width, true.image_height)
     alone = [cv2.calibrateCamera(points, side, size, None, None)[1:3] for side in sides]
@@ -143,15 +143,15 @@ def test_opencvs_errors_are_as_large_as_assumed(fixed):
     squares: dict[tuple[str, str], list[float]] = {}
     for seed in range(BENCHES):
         true, poses = drawn(seed)
-        found, rms = by_opencv(true, poses, seed, fixed)
-        difference = found.vector - true.vector
+        stereo, rms = by_opencv(true, poses, seed, fixed)
+        difference = stereo.vector - true.vector
         stated = Provenance(rms, VIEWS, (9, 6), 25.0, fixed_intrinsics=fixed)
         for kind, known in (("all", stated), ("nothing", Provenance())):
-            covariance = with_assumed_covariance(found, known, Provenance()).parameter_covariance
+            covariance = with_assumed_covariance(stereo, known, Provenance()).parameter_covariance
             for name in ("focal length", "principal point", "rotation", "translation"):
-                own = covariance[np.ix_(GROUPS[name], GROUPS[name])]
+                block = covariance[np.ix_(GROUPS[name], GROUPS[name])]
                 error = difference[GROUPS[name]]
-                squares.setdefault((kind, name), []).append(float(error @ np.linalg.solve(own, error)) / len(error))
+                squares.setdefault((kind, name), []).append(float(error @ np.linalg.solve(block, error)) / len(error))
     for (kind, name), values in squares.items():
         low = {"all": 0.5, "nothing": 0.2}[kind]
         assert 0.8 * low < np.sqrt(np.mean(values)) < 1.2 * 1.5, (kind, name)
@@ -170,19 +170,19 @@ def test_a_stated_uncertainty_replaces_that_of_its_group(mounted):
         group = GROUPS[
             {"focal": "focal length", "princ": "principal point", "rotat": "rotation"}.get(name[2:7], "translation")
         ]
-        found = with_assumed_covariance(mounted, Provenance(**{name: getattr(stated, name)}), Provenance())
-        np.testing.assert_allclose(np.sqrt(np.diag(found.parameter_covariance))[group], values, rtol=1e-9)
-        assert "(stated)" in found.assumed_from and found.assumed
-        stereo_bytes(found)
-    own = plain.parameter_covariance
-    sds = np.sqrt(np.diag(own))[GROUPS["rotation"]]
+        stereo = with_assumed_covariance(mounted, Provenance(**{name: getattr(stated, name)}), Provenance())
+        np.testing.assert_allclose(np.sqrt(np.diag(stereo.parameter_covariance))[group], values, rtol=1e-9)
+        assert "(stated)" in stereo.assumed_from and stereo.assumed
+        stereo_bytes(stereo)
+    matrix = plain.parameter_covariance
+    sds = np.sqrt(np.diag(matrix))[GROUPS["rotation"]]
     # The sds that it has change nothing; units span ten powers of ten.
-    scale = np.sqrt(np.outer(np.diag(own), np.diag(own)))
-    np.testing.assert_allclose(with_marginal(own, GROUPS["rotation"], sds) / scale, own / scale, atol=1e-9)
+    scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+    np.testing.assert_allclose(with_marginal(matrix, GROUPS["rotation"], sds) / scale, matrix / scale, atol=1e-9)
     # A group that is known exactly leaves the conditional covariance of the others.
-    tiny = with_marginal(own, GROUPS["rotation"], 1e-6 * sds)
+    tiny = with_marginal(matrix, GROUPS["rotation"], 1e-6 * sds)
     rest = [k for k in range(24) if k not in GROUPS["rotation"]]
-    expected = np.linalg.inv(np.linalg.inv(own / scale)[np.ix_(rest, rest)])
+    expected = np.linalg.inv(np.linalg.inv(matrix / scale)[np.ix_(rest, rest)])
     np.testing.assert_allclose(tiny[np.ix_(rest, rest)] / scale[np.ix_(rest, rest)], expected, atol=1e-6)
 
 
@@ -223,15 +223,15 @@ def test_command_takes_what_is_known(mounted, tmp_path, capsys):
     for name, data in exported(mounted, "opencv").items():
         (tmp_path / name).write_bytes(data)
     named = [part for name in ("intrinsics.yml", "extrinsics.yml") for part in ("--import", str(tmp_path / name))]
-    made = ["--rms-px", "0.21", "--views", "20", "--board", "9x6", "--pitch-mm", "25", "--joint"]
-    assert run(["stereo", *named, *made, "-o", str(tmp_path / "stereo.json"), "--json"]) == 0
+    facts = ["--rms-px", "0.21", "--views", "20", "--board", "9x6", "--pitch-mm", "25", "--joint"]
+    assert run(["stereo", *named, *facts, "-o", str(tmp_path / "stereo.json"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["assumed"] and document["assumed_from"] == (
         "RMS 0.21 px (stated), 20 views (stated), a board of 9x6 corners (stated), squares of 25 mm (stated), "
         "all in one adjustment"
     )
-    found = read_stereo(tmp_path / "stereo.json")
-    assert found.assumed_from == document["assumed_from"] and found.rms_px == 0.21
+    stereo = read_stereo(tmp_path / "stereo.json")
+    assert stereo.assumed_from == document["assumed_from"] and stereo.rms_px == 0.21
     # The shipped pair's own sds, of 20 views at another noise, within the factor that is stated of a guess twice.
     assert run(["stereo", "--import", str(tmp_path / "stereo.json"), "--u-rotation-mrad", "1", "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
@@ -239,8 +239,8 @@ def test_command_takes_what_is_known(mounted, tmp_path, capsys):
     for options in (["--rms-px", "0"], ["--views", "0"], ["--u-baseline-mm", "-1"], ["--board", "9"]):
         assert run(["stereo", *named, *options, "--json"]) == 2
         assert json.loads(capsys.readouterr().out)["error"]["remedy"]
-    own = shipped_data() / "rigs" / "mounted" / "stereo.json"
-    assert run(["stereo", "--import", str(own), "--rms-px", "0.2", "--json"]) == 2
+    path = shipped_data() / "rigs" / "mounted" / "stereo.json"
+    assert run(["stereo", "--import", str(path), "--rms-px", "0.2", "--json"]) == 2
     assert "its own covariance" in json.loads(capsys.readouterr().out)["error"]["message"]
     assert run(["stereo", str(tmp_path), "--board", "9x6", "--pitch-mm", "25", "--rms-px", "0.2", "--json"]) == 2
 
@@ -258,8 +258,8 @@ def test_a_fit_says_how_much_comes_from_it(mounted):
     ]
     assert assumed_stereo(mounted, tables) is None
     assumed = replace(mounted, assumed=True, assumed_from="RMS 0.21 px (stated)")
-    told = assumed_stereo(assumed, tables)
-    assert told is not None and "(from RMS 0.21 px (stated))" in told and "backlash" not in told
-    assert "62 % of the variance of the effective ratio (left, right);" in told and "--rms-px" in told
-    told = assumed_stereo(assumed, tables[2:])
-    assert told is not None and "less than 5 %" in told and "--rms-px" not in told
+    sentence = assumed_stereo(assumed, tables)
+    assert sentence is not None and "(from RMS 0.21 px (stated))" in sentence and "backlash" not in sentence
+    assert "62 % of the variance of the effective ratio (left, right);" in sentence and "--rms-px" in sentence
+    sentence = assumed_stereo(assumed, tables[2:])
+    assert sentence is not None and "less than 5 %" in sentence and "--rms-px" not in sentence

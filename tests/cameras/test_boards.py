@@ -37,9 +37,9 @@ def test_pairs_of_png_and_jpeg_are_found_where_they_are(six_views):
     assert (six_views.image_width, six_views.image_height) == SIZE
     assert six_views.unpaired == six_views.without_board == six_views.other_size == six_views.reordered == ()
     for view, pose in zip(six_views.views, POSES, strict=True):
-        seen = np.hstack([view.left, view.right])
-        turned = seen[::-1]
-        misses = [np.abs(order - true_corners(pose)).max() for order in (seen, turned)]
+        corners = np.hstack([view.left, view.right])
+        turned = corners[::-1]
+        misses = [np.abs(order - true_corners(pose)).max() for order in (corners, turned)]
         assert min(misses) < FOUND_PX
 
 
@@ -63,12 +63,12 @@ def test_cameras_of_two_picture_sizes(tmp_path, proportion):
         with pytest.raises(InputError, match=f"two sizes: {width} x {height} and {width // 2} x {height // 2 - 40}"):
             find_views(tmp_path, BOARD)
         return
-    found = find_views(tmp_path, BOARD)
-    assert found.right_image_size == (width // 2, height // 2) and not found.other_size
-    for view, pose in zip(found.views, POSES[:3], strict=True):
-        seen = np.hstack([view.left, view.right])
+    views = find_views(tmp_path, BOARD)
+    assert views.right_image_size == (width // 2, height // 2) and not views.other_size
+    for view, pose in zip(views.views, POSES[:3], strict=True):
+        corners = np.hstack([view.left, view.right])
         # A corner of a picture of half the size is found half as well.
-        assert min(np.abs(order - true_corners(pose)).max() for order in (seen, seen[::-1])) < 2 * FOUND_PX
+        assert min(np.abs(order - true_corners(pose)).max() for order in (corners, corners[::-1])) < 2 * FOUND_PX
 
 
 def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):
@@ -80,11 +80,11 @@ def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):
     (tmp_path / "left_notes.txt").write_text("no picture")
     (tmp_path / "right.yml").write_text("%YAML:1.0")
     (tmp_path / ".left9.png").write_bytes(b"hidden")
-    found = find_views(tmp_path, BOARD)
-    assert [(v.name, v.left is None, v.right is None) for v in found.views] == [("1", False, False), ("2", False, True)]
-    assert found.unpaired == ("left2.png", "RIGHT3.PNG")
-    assert found.without_board == ("RIGHT3.PNG",)
-    assert (found.other_size, found.unnamed) == (("left_small.png",), ("leaf.png",))
+    views = find_views(tmp_path, BOARD)
+    assert [(v.name, v.left is None, v.right is None) for v in views.views] == [("1", False, False), ("2", False, True)]
+    assert views.unpaired == ("left2.png", "RIGHT3.PNG")
+    assert views.without_board == ("RIGHT3.PNG",)
+    assert (views.other_size, views.unnamed) == (("left_small.png",), ("leaf.png",))
 
 
 @pytest.mark.parametrize("swap", (False, True))
@@ -93,9 +93,9 @@ def test_wide_frames_are_split(tmp_path, six, six_views, swap):
         halves = [cv2.imread(str(next(six.glob(f"{side}{view.name}.*"))), 0) for side in ("left", "right")]
         cv2.imwrite(str(tmp_path / f"frame{view.name}.png"), np.hstack(halves[::-1] if swap else halves))
     cv2.imwrite(str(tmp_path / "portrait.png"), np.zeros((400, 300), np.uint8))
-    found = find_views(tmp_path, BOARD, pairing=Pairing(swap=swap))
-    assert (found.image_width, found.image_height) == SIZE
-    for split, view in zip(found.views, six_views.views[:2], strict=True):
+    views = find_views(tmp_path, BOARD, pairing=Pairing(swap=swap))
+    assert (views.image_width, views.image_height) == SIZE
+    for split, view in zip(views.views, six_views.views[:2], strict=True):
         assert split.name == f"frame{view.name}"
         np.testing.assert_array_equal(split.left, view.left)
         np.testing.assert_array_equal(split.right, view.right)
@@ -144,20 +144,20 @@ def test_colours_decide_for_a_camera_on_its_head(tmp_path):
     write_pair(tmp_path, "1", [left, right[::-1, ::-1]])
     view = find_views(tmp_path, BOARD).views[0]
     upright = np.array(SIZE) - 1 - view.right
-    seen = np.hstack([view.left, upright])
-    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (seen, seen[::-1])) < FOUND_PX
+    corners = np.hstack([view.left, upright])
+    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (corners, corners[::-1])) < FOUND_PX
 
 
 def test_other_finder_steps_in_by_name(six, monkeypatch, tmp_path):
     write_pair(tmp_path, "1", pictures(POSES[0]))
     monkeypatch.setattr(boards, "_find_classic", lambda grey, board: None)
-    found = find_views(tmp_path, BOARD)
-    assert found.by_fallback == ("left1.png", "right1.png")
-    seen = np.hstack([found.views[0].left, found.views[0].right])
-    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (seen, seen[::-1])) < FOUND_PX
+    views = find_views(tmp_path, BOARD)
+    assert views.by_fallback == ("left1.png", "right1.png")
+    corners = np.hstack([views.views[0].left, views.views[0].right])
+    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (corners, corners[::-1])) < FOUND_PX
     direct = find_views(tmp_path, BOARD, finder="sector")
     assert direct.by_fallback == ()
-    np.testing.assert_array_equal(direct.views[0].left, found.views[0].left)
+    np.testing.assert_array_equal(direct.views[0].left, views.views[0].left)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.2])
@@ -249,10 +249,10 @@ def test_corners_that_the_refining_gives_back_get_a_wider_window():
     """A board at 65 degrees: with the narrow window cornerSubPix returns a corner as it came, 2.5 px off."""
     pose = np.array([-0.387, 1.073, 0.189, -11.453, 19.857, 477.414])
     right = true_corners(pose)[:, 2:]
-    found, by_fallback = find_corners(pictures(pose)[1], BOARD)
+    corners, by_fallback = find_corners(pictures(pose)[1], BOARD)
     # The drawn board's warp leaves 0.4 px on squares of 10 px.
     assert not by_fallback
-    assert min(np.abs(found - right).max(), np.abs(found[::-1] - right).max()) < 1.0
+    assert min(np.abs(corners - right).max(), np.abs(corners[::-1] - right).max()) < 1.0
 
 
 @pytest.fixture(scope="module")

@@ -53,12 +53,12 @@ def written(folder: Path, files: dict[str, bytes]) -> list[Path]:
     return [folder / name for name in files]
 
 
-def close(found: Stereo, stereo: Stereo, rotation_atol: float = 1e-12) -> None:
-    np.testing.assert_allclose(found.vector[:18], stereo.vector[:18], rtol=1e-14, atol=1e-15)
-    np.testing.assert_allclose(found.R, stereo.R, atol=rotation_atol)
-    np.testing.assert_allclose(found.T, stereo.T, atol=rotation_atol * 1e3)
-    assert (found.image_width, found.image_height) == (stereo.image_width, stereo.image_height)
-    assert found.assumed
+def close(pair: Stereo, stereo: Stereo, rotation_atol: float = 1e-12) -> None:
+    np.testing.assert_allclose(pair.vector[:18], stereo.vector[:18], rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(pair.R, stereo.R, atol=rotation_atol)
+    np.testing.assert_allclose(pair.T, stereo.T, atol=rotation_atol * 1e3)
+    assert (pair.image_width, pair.image_height) == (stereo.image_width, stereo.image_height)
+    assert pair.assumed
 
 
 @pytest.mark.parametrize("form", ("opencv", "ros"))
@@ -66,13 +66,13 @@ def close(found: Stereo, stereo: Stereo, rotation_atol: float = 1e-12) -> None:
 def test_what_is_exported_is_imported_again(mounted, tmp_path, form, backwards):
     """Every digit of matrices and distortion; R and T of ROS through rectification to rounding."""
     paths = written(tmp_path, exported(mounted, form))
-    found = read_calibration(paths[::-1] if backwards else paths)
-    assert found.source == form
-    close(found.stereo, mounted)
+    result = read_calibration(paths[::-1] if backwards else paths)
+    assert result.source == form
+    close(result.stereo, mounted)
     way = Provenance(fixed_intrinsics={"opencv": None, "ros": True}[form])
-    assert found.stereo.assumed_from == with_assumed_covariance(found.stereo, Provenance(), way).assumed_from
-    assert any(found.stereo.assumed_from in note for note in found.notes)
-    assert found.stereo.assumed and b'"assumed": true' in stereo_bytes(found.stereo)
+    assert result.stereo.assumed_from == with_assumed_covariance(result.stereo, Provenance(), way).assumed_from
+    assert any(result.stereo.assumed_from in note for note in result.notes)
+    assert result.stereo.assumed and b'"assumed": true' in stereo_bytes(result.stereo)
 
 
 def test_ros_export_is_in_metres(mounted):
@@ -134,9 +134,9 @@ def test_what_opencv_writes_as_json_is_read(mounted, tmp_path):
     ):
         with pytest.raises(InputError, match="--image-size"):
             read_calibration(paths)
-        found = read_calibration(paths, (1280, 720))
-        assert found.source == "opencv"
-        close(found.stereo, mounted)
+        result = read_calibration(paths, (1280, 720))
+        assert result.source == "opencv"
+        close(result.stereo, mounted)
     (path,) = written(tmp_path, {"other.json": b'{"a": 1}'})
     with pytest.raises(InputError, match="no M1 M2"):
         read_calibration([path])
@@ -152,21 +152,21 @@ def test_opencv_lengths_need_their_unit(mounted, tmp_path):
 
 def test_millimetres_taken_for_metres_are_doubted(mounted, tmp_path):
     """85 mm would be 85 m; nothing is refused, for nobody forbids a hall."""
-    found = read_calibration(written(tmp_path, exported(mounted, "opencv")), unit_mm=1000.0)
-    (told,) = found.warnings
-    assert "was it in mm before it was taken for metres?" in told
+    result = read_calibration(written(tmp_path, exported(mounted, "opencv")), unit_mm=1000.0)
+    (warning,) = result.warnings
+    assert "was it in mm before it was taken for metres?" in warning
 
 
 def test_kalibr_camchain(tmp_path):
     (path,) = written(tmp_path, {"camchain.yaml": KALIBR.encode()})
-    found = read_calibration([path])
-    assert found.source == "kalibr" and found.stereo.assumed
-    np.testing.assert_allclose(found.stereo.T, [-85.0, 0.2, -0.3])
+    result = read_calibration([path])
+    assert result.source == "kalibr" and result.stereo.assumed
+    np.testing.assert_allclose(result.stereo.T, [-85.0, 0.2, -0.3])
     # The file's ten digits.
-    np.testing.assert_allclose(found.stereo.R, rotation_matrix(np.array([0, 0, 0.02])), atol=1e-9)
-    np.testing.assert_array_equal(found.stereo.D1, [-0.3, 0.1, 0.0003, -0.0005, 0.0])
-    np.testing.assert_array_equal(found.stereo.M2, [[798.5, 0, 636], [0, 798, 363], [0, 0, 1]])
-    assert found.stereo.parameter_covariance[8, 8] > 0
+    np.testing.assert_allclose(result.stereo.R, rotation_matrix(np.array([0, 0, 0.02])), atol=1e-9)
+    np.testing.assert_array_equal(result.stereo.D1, [-0.3, 0.1, 0.0003, -0.0005, 0.0])
+    np.testing.assert_array_equal(result.stereo.M2, [[798.5, 0, 636], [0, 798, 363], [0, 0, 1]])
+    assert result.stereo.parameter_covariance[8, 8] > 0
 
 
 def test_cameras_on_the_wrong_sides_are_named(mounted, tmp_path):
@@ -180,9 +180,9 @@ def test_cameras_on_the_wrong_sides_are_named(mounted, tmp_path):
         "tvsbayes": {"stereo.json": stereo_bytes(swapped)},
     }
     for source, files in folders.items():
-        found = read_calibration(written(tmp_path, files))
-        assert found.source == source and found.stereo.T[0] > 0
-        assert ["swapped" in warning for warning in found.warnings] == [True], source
+        result = read_calibration(written(tmp_path, files))
+        assert result.source == source and result.stereo.T[0] > 0
+        assert ["swapped" in warning for warning in result.warnings] == [True], source
 
 
 def test_an_image_size_of_other_pictures_is_named(mounted, tmp_path):
@@ -208,9 +208,9 @@ def test_the_bounds_of_a_plausible_principal_point(mounted):
 
 def test_native_calibration_keeps_its_covariance(mounted, tmp_path):
     (path,) = written(tmp_path, {"stereo.json": stereo_bytes(mounted)})
-    found = read_calibration([path])
-    assert found.source == "tvsbayes" and not found.stereo.assumed and found.notes == ()
-    np.testing.assert_array_equal(found.stereo.parameter_covariance, mounted.parameter_covariance)
+    result = read_calibration([path])
+    assert result.source == "tvsbayes" and not result.stereo.assumed and result.notes == ()
+    np.testing.assert_array_equal(result.stereo.parameter_covariance, mounted.parameter_covariance)
 
 
 def test_opencvs_own_sample_files():

@@ -43,10 +43,10 @@ def mounted() -> Stereo:
     return read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")
 
 
-def same(found: Stereo, stereo: Stereo) -> None:
-    np.testing.assert_allclose(found.vector, stereo.vector, rtol=1e-9, atol=1e-9)
-    assert (found.image_width, found.image_height) == (stereo.image_width, stereo.image_height)
-    assert found.assumed and found.assumed_from
+def same(pair: Stereo, stereo: Stereo) -> None:
+    np.testing.assert_allclose(pair.vector, stereo.vector, rtol=1e-9, atol=1e-9)
+    assert (pair.image_width, pair.image_height) == (stereo.image_width, stereo.image_height)
+    assert pair.assumed and pair.assumed_from
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def same(found: Stereo, stereo: Stereo) -> None:
     ),
 )
 def test_foreign_files_are_read_as_they_are(names, source):
-    found = read_calibration([FOREIGN / name for name in names])
-    assert found.source == source
-    np.testing.assert_allclose(found.stereo.T, T_MM, atol=1e-9)
-    assert (found.stereo.image_width, found.stereo.image_height) == (640, 480)
-    np.testing.assert_allclose(found.stereo.M2[[0, 1, 0, 1], [0, 1, 2, 2]], [809.1, 808.8, 325.6, 239.4], atol=1e-9)
+    result = read_calibration([FOREIGN / name for name in names])
+    assert result.source == source
+    np.testing.assert_allclose(result.stereo.T, T_MM, atol=1e-9)
+    assert (result.stereo.image_width, result.stereo.image_height) == (640, 480)
+    np.testing.assert_allclose(result.stereo.M2[[0, 1, 0, 1], [0, 1, 2, 2]], [809.1, 808.8, 325.6, 239.4], atol=1e-9)
 
 
 def test_a_transposed_rotation_is_known_by_the_fundamental_matrix():
@@ -101,19 +101,19 @@ def test_centimetres_are_asked_for():
 def test_a_fold_is_named_with_its_radius():
     """1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 = 0 at r = 0.53, as the page of that file says."""
     warnings = read_calibration([FOREIGN / "distortion_folds" / "pair.yml"]).warnings
-    assert any("D1 of pair.yml" in told and "r = 0.53" in told for told in warnings)
+    assert any("D1 of pair.yml" in warning and "r = 0.53" in warning for warning in warnings)
     for k1, expected in ((-0.3, 1 / np.sqrt(0.9)), (0.3, np.inf), (0.0, np.inf)):
         assert fold_radius(np.array([k1, 0, 0, 0, 0])) == pytest.approx(expected)
 
 
 def test_a_fisheye_is_fitted_or_refused_and_its_renaming_doubted(mounted):
-    found = read_calibration([FOREIGN / "fisheye_advice" / "fisheye.yaml"])
-    (note,) = (n for n in found.notes if "cam0.distortion_coeffs of fisheye.yaml" in n)
+    result = read_calibration([FOREIGN / "fisheye_advice" / "fisheye.yaml"])
+    (note,) = (n for n in result.notes if "cam0.distortion_coeffs of fisheye.yaml" in n)
     assert "a fisheye lens, fitted to five coefficients within" in note
     followed = read_calibration([FOREIGN / "fisheye_advice" / "followed.yaml"])
     assert sum("fisheye (equidistant) model under another name" in w for w in followed.warnings) == 2
     # OpenCV's own projections agree within what is stated, plus the grid's coarseness.
-    stereo, coefficients = found.stereo, np.array([0.03, -0.02, 0.03, -0.01])
+    stereo, coefficients = result.stereo, np.array([0.03, -0.02, 0.03, -0.01])
     rays = np.random.default_rng(1).uniform(-0.35, 0.35, (50, 2))
     points = np.column_stack([rays, np.ones(50)]).reshape(-1, 1, 3)
     still = np.zeros(3)
@@ -280,9 +280,9 @@ def test_messages_of_ros_2_and_old_orb_slam_settings(mounted, tmp_path):
                 "   dt: d",
                 f"   data: [{data}]",
             ]
-    found = read_calibration(paths)
-    same(found.stereo, mounted)
-    assert found.source == "ros" and "each camera by itself" in found.stereo.assumed_from
+    result = read_calibration(paths)
+    same(result.stereo, mounted)
+    assert result.source == "ros" and "each camera by itself" in result.stereo.assumed_from
     (tmp_path / "EuRoC.yaml").write_text("\n".join([*slam, "Camera.fx: 435.2", "Camera.bf: 47.9"]))
     with pytest.raises(InputError, match="--import-unit m "):
         read_calibration([tmp_path / "EuRoC.yaml"])
@@ -318,10 +318,10 @@ def test_matlab_structures(mounted, tmp_path):
     ]
     document = {"CameraParameters1": cameras[0], "CameraParameters2": cameras[1], "RotationOfCamera2": mounted.R.T}
     scipy.io.savemat(tmp_path / "s.mat", {"stereoParams": {**document, "TranslationOfCamera2": mounted.T}})
-    found = read_calibration([tmp_path / "s.mat"])
-    same(found.stereo, mounted)
-    assert found.source == "matlab" and any("rows, columns" in note for note in found.notes)
-    assert any("MATLAB counts pixels from 1" in note for note in found.notes)
+    result = read_calibration([tmp_path / "s.mat"])
+    same(result.stereo, mounted)
+    assert result.source == "matlab" and any("rows, columns" in note for note in result.notes)
+    assert any("MATLAB counts pixels from 1" in note for note in result.notes)
 
 
 def test_one_file_each_and_one_between_them(mounted, tmp_path):
@@ -330,8 +330,8 @@ def test_one_file_each_and_one_between_them(mounted, tmp_path):
     between = {"R": mounted.R.tolist(), "T": mounted.T.tolist()}
     cameras = (("left", mounted.M1, mounted.D1), ("right", mounted.M2, mounted.D2))
     for name, m, d in cameras:
-        own = {"camera_matrix": m.tolist(), "distortion_coefficients": d.tolist(), **size}
-        (tmp_path / f"{name}.json").write_text(json.dumps(own))
+        document = {"camera_matrix": m.tolist(), "distortion_coefficients": d.tolist(), **size}
+        (tmp_path / f"{name}.json").write_text(json.dumps(document))
     (tmp_path / "between.json").write_text(json.dumps(between))
     for order in (("left", "right", "between"), ("between", "right", "left")):
         same(read_calibration([tmp_path / f"{name}.json" for name in order]).stereo, mounted)
@@ -348,22 +348,22 @@ def test_a_rectified_pair_alone(mounted, tmp_path):
     )
     path = tmp_path / "p.json"
     path.write_text(json.dumps({"P1": np.array(p1).tolist(), "P2": np.array(p2).tolist(), "image_size": size}))
-    found = read_calibration([path]).stereo
+    stereo = read_calibration([path]).stereo
     points = np.array([[250.0, 40.0, 10.0], [400.0, -20.0, -30.0], [600.0, 5.0, 60.0]])
     left = np.column_stack((-points[:, 1], -points[:, 2], points[:, 0])) @ np.array(r1).T
-    seen = [
+    pixels = [
         (left + np.array([b, 0, 0]))[:, :2] / left[:, 2:] * p[0, 0] + p[:2, 2]
         for p, b in ((p1, 0), (p2, p2[0, 3] / p2[0, 0]))
     ]
-    again = triangulate(found, np.hstack(seen))
+    again = triangulate(stereo, np.hstack(pixels))
     np.testing.assert_allclose(np.column_stack((-again[:, 1], -again[:, 2], again[:, 0])), left, atol=1e-6)
     # R1, R2, P1, P2 beside M and D, without R and T, give R and T.
     files = exported(mounted, "opencv")
     files["extrinsics.yml"] = files["extrinsics.yml"].replace(b"\nR:", b"\nx:").replace(b"\nT:", b"\ny:")
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
-    found = read_calibration([tmp_path / name for name in files]).stereo
-    np.testing.assert_allclose(triangulate(found, project_pair(mounted, points)), points, atol=1e-6)
+    stereo = read_calibration([tmp_path / name for name in files]).stereo
+    np.testing.assert_allclose(triangulate(stereo, project_pair(mounted, points)), points, atol=1e-6)
 
 
 def test_rational_models(mounted, tmp_path):
@@ -383,10 +383,10 @@ def test_rational_models(mounted, tmp_path):
             ):
                 read_calibration([path])
             continue
-        found = read_calibration([path])
-        assert (word is None) != any(word in note for note in found.notes if word)
+        result = read_calibration([path])
+        assert (word is None) != any(word in note for note in result.notes if word)
         if word is None:
-            same(found.stereo, mounted)
+            same(result.stereo, mounted)
 
 
 def test_poses_of_both_cameras_and_turns_the_other_way(mounted, tmp_path):
@@ -410,8 +410,8 @@ def test_messages_of_both_cameras_in_one_paste(mounted, tmp_path):
     texts = [exported(mounted, "ros")[f"{side}.yaml"].decode() for side in ("left", "right")]
     path = tmp_path / "pasted.txt"
     path.write_text("".join(f"header: {{seq: {k}}}\n{text}---\n" for k, text in enumerate(2 * texts)))
-    found = read_calibration([path])
-    assert found.source == "ros" and np.abs(found.stereo.vector - mounted.vector).max() < 1e-9
+    result = read_calibration([path])
+    assert result.source == "ros" and np.abs(result.stereo.vector - mounted.vector).max() < 1e-9
 
 
 def test_a_fisheye_of_orb_slam_and_a_rectified_pair_by_its_baseline(tmp_path):
@@ -429,14 +429,14 @@ def test_a_fisheye_of_orb_slam_and_a_rectified_pair_by_its_baseline(tmp_path):
     size = ["Camera.width: 640", "Camera.height: 480"]
     path = tmp_path / "orb.yaml"
     path.write_text("\n".join(["%YAML:1.0", "Camera.type: KannalaBrandt8", *lens, *size, pose]))
-    found = read_calibration([path])
-    assert found.source == "orb-slam" and found.stereo.T.tolist() == [-100.0, 0, 0]
-    fitted = fitted_to_five(found.stereo.M1, np.array([0.03, -0.02, 0.03, -0.01]), (640, 480), "fisheye")
-    np.testing.assert_array_equal(found.stereo.D2, fitted.distortion)
+    result = read_calibration([path])
+    assert result.source == "orb-slam" and result.stereo.T.tolist() == [-100.0, 0, 0]
+    fitted = fitted_to_five(result.stereo.M1, np.array([0.03, -0.02, 0.03, -0.01]), (640, 480), "fisheye")
+    np.testing.assert_array_equal(result.stereo.D2, fitted.distortion)
     path.write_text("\n".join(["%YAML:1.0", "Camera.type: Rectified", *lens[:4], *size, "Stereo.b: 0.11"]))
-    found = read_calibration([path])
-    assert found.stereo.T.tolist() == [-110.0, 0, 0] and np.array_equal(found.stereo.M1, found.stereo.M2)
-    assert not found.stereo.D1.any() and np.array_equal(found.stereo.R, np.eye(3))
+    result = read_calibration([path])
+    assert result.stereo.T.tolist() == [-110.0, 0, 0] and np.array_equal(result.stereo.M1, result.stereo.M2)
+    assert not result.stereo.D1.any() and np.array_equal(result.stereo.R, np.eye(3))
 
 
 def test_two_picture_sizes_of_one_proportion(mounted, tmp_path):
@@ -448,9 +448,9 @@ def test_two_picture_sizes_of_one_proportion(mounted, tmp_path):
     tables["right"] = {"K": K2.tolist(), "D": larger["D2"], "size": [1920, 1080]}
     path = tmp_path / "two.json"
     path.write_text(json.dumps({**tables, "R": larger["R"], "T": larger["T"]}))
-    found = read_calibration([path])
-    same(found.stereo, mounted)
-    assert found.stereo.right_image_size == (1920, 1080) and any("two sizes" in note for note in found.notes)
+    result = read_calibration([path])
+    same(result.stereo, mounted)
+    assert result.stereo.right_image_size == (1920, 1080) and any("two sizes" in note for note in result.notes)
     tables["right"]["size"] = [1920, 1200]
     path.write_text(json.dumps({**tables, "R": larger["R"], "T": larger["T"]}))
     with pytest.raises(InputError, match="two sizes: 1280 x 720 and 1920 x 1200"):
@@ -569,11 +569,11 @@ def test_absurd_pairs_are_named_by_file_and_key(mounted, tmp_path):
     assert pair_doubts(mounted) == ()
     wide = replace(mounted, M1=np.array([[50.0, 0, 640], [0, 50, 360], [0, 0, 1]]), D1=np.zeros(5))
     assert any(
-        told.startswith("fx in left.K of x.json is 50 px: a view of 171 deg")
-        for told in pair_doubts(wide, {"M1": "left.K of x.json"})
+        doubt.startswith("fx in left.K of x.json is 50 px: a view of 171 deg")
+        for doubt in pair_doubts(wide, {"M1": "left.K of x.json"})
     )
     turned = replace(mounted, R=rotation_matrix(np.array([0, 1.0, 0])))
-    assert any("R of stereo.json turns by 57 deg" in told for told in pair_doubts(turned))
+    assert any("R of stereo.json turns by 57 deg" in doubt for doubt in pair_doubts(turned))
 
 
 def test_what_would_pass_in_silence_is_said(mounted, tmp_path):
@@ -599,11 +599,11 @@ def test_what_would_pass_in_silence_is_said(mounted, tmp_path):
         path = tmp_path / "a.json"
         path.write_text(json.dumps({**good, **new}))
         try:
-            found = read_calibration([path])
-            said = " ".join([*found.notes, *found.warnings])
+            result = read_calibration([path])
+            text = " ".join([*result.notes, *result.warnings])
         except InputError as error:
-            said = str(error)
-        assert word in said, word
+            text = str(error)
+        assert word in text, word
 
 
 HOSTILE = {

@@ -51,12 +51,12 @@ class Folder:
     def put(self, look: int, side: str, picture: np.ndarray) -> None:
         (self.path / "frames" / f"{10 * look:06d}_{side}.png").write_bytes(png_bytes(picture))
 
-    def errors(self, found) -> tuple[np.ndarray, np.ndarray]:
+    def errors(self, detection) -> tuple[np.ndarray, np.ndarray]:
         """Errors and stated sds (n, 4) of the ok spots."""
-        ok = [s for s in found.campaign.spots if s.status == "ok"]
-        seen = np.array([[s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px] for s in ok])
+        ok = [s for s in detection.campaign.spots if s.status == "ok"]
+        pixels = np.array([[s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px] for s in ok])
         stated = np.array([[s.su_left_px, s.sv_left_px, s.su_right_px, s.sv_right_px] for s in ok])
-        return seen - self.true_px[[s.spot // 10 for s in ok]], stated
+        return pixels - self.true_px[[s.spot // 10 for s in ok]], stated
 
 
 @pytest.fixture(scope="module")
@@ -70,13 +70,13 @@ def speckled(tmp_path_factory) -> Folder:
 
 
 @pytest.fixture(scope="module")
-def found_plain(plain):
-    told = []
-    found = detect(read_campaign(plain.path), progress=told.append)
-    check_forward(told)
-    assert doings(told) == [LEARNING, DETECTING]
-    assert told[-2].doing == f"{DETECTING}: {found.processed} of {found.processed} looks"
-    return found
+def plain_detection(plain):
+    states = []
+    detection = detect(read_campaign(plain.path), progress=states.append)
+    check_forward(states)
+    assert doings(states) == [LEARNING, DETECTING]
+    assert states[-2].doing == f"{DETECTING}: {detection.processed} of {detection.processed} looks"
+    return detection
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +84,9 @@ def found_speckled(speckled):
     return detect(read_campaign(speckled.path))
 
 
-def check_sds(folder: Folder, found, tolerance: float) -> None:
+def check_sds(folder: Folder, detection, tolerance: float) -> None:
     """Root mean square of error over stated sd is 1 to the tolerance and what so few spots leave open."""
-    errors, stated = folder.errors(found)
+    errors, stated = folder.errors(detection)
     assert len(errors) >= LOOKS - 2
     ratio = np.sqrt(np.mean((errors / stated) ** 2))
     # Relative sd of a root mean square of n normal values is 1 / sqrt(2 n); four of them.
@@ -94,9 +94,9 @@ def check_sds(folder: Folder, found, tolerance: float) -> None:
     assert (1 - tolerance) * (1 - open_by_chance) < ratio < (1 + tolerance) * (1 + open_by_chance)
 
 
-def test_stated_sd_is_the_actual_error_without_speckle(plain, found_plain):
-    check_sds(plain, found_plain, 0.10)
-    assert np.sqrt(np.mean(plain.errors(found_plain)[0] ** 2)) < 0.02
+def test_stated_sd_is_the_actual_error_without_speckle(plain, plain_detection):
+    check_sds(plain, plain_detection, 0.10)
+    assert np.sqrt(np.mean(plain.errors(plain_detection)[0] ** 2)) < 0.02
 
 
 def test_spots_of_a_camera_with_larger_pictures_are_scaled(tmp_path):
@@ -128,13 +128,13 @@ def test_stated_sd_is_the_actual_error_with_speckle_and_clipped_cores(speckled, 
     assert np.sqrt(np.mean(errors**2)) < 0.08
 
 
-def test_the_median_is_of_all_four_coordinates(plain, found_plain):
-    assert found_plain.median_sd_px == np.median(plain.errors(found_plain)[1])
+def test_the_median_is_of_all_four_coordinates(plain, plain_detection):
+    assert plain_detection.median_sd_px == np.median(plain.errors(plain_detection)[1])
 
 
-def test_what_is_learned_of_the_noise(found_plain, found_speckled):
+def test_what_is_learned_of_the_noise(plain_detection, found_speckled):
     for side in ("left", "right"):
-        assert found_plain.noise[side].speckle_contrast < 0.08
+        assert plain_detection.noise[side].speckle_contrast < 0.08
         assert found_speckled.noise[side].speckle_contrast == pytest.approx(0.4, rel=0.25)
 
 
@@ -160,9 +160,9 @@ def test_dark_pictures_are_subtracted(tmp_path, each):
                 put(f"dark/{name if each else side + '.png'}", np.zeros_like(frame))
     campaign = read_campaign(folder.path)
     assert detect(campaign).statuses.get("ok", 0) < 6
-    found = detect(campaign, dark=folder.path / "dark")
-    assert found.statuses == {"ok": 6}
-    errors, stated = folder.errors(found)
+    detection = detect(campaign, dark=folder.path / "dark")
+    assert detection.statuses == {"ok": 6}
+    errors, stated = folder.errors(detection)
     # Noise of two pictures; 24 coordinates beyond four of their sds by chance: 1 in 600.
     assert np.abs(errors / stated).max() < 4 and np.abs(errors).max() < 0.2
     (folder.path / "dark" / ("000000_left.png" if each else "left.png")).unlink()
@@ -180,14 +180,14 @@ def test_deep_frames_are_detected_with_all_their_bits(tmp_path, monkeypatch):
     monkeypatch.setattr("tvsbayes.cameras.detection.PILOT_LOOKS_MAX", 2)
     for name in sorted((folder.path / "frames").glob("0000[05]0_*")):
         name.write_bytes(png_bytes(cv2.imread(str(name), cv2.IMREAD_UNCHANGED) // 5))
-    told = []
-    found = detect(read_campaign(folder.path), progress=told.append)
-    check_forward(told)
-    assert doings(told) == [LEVELLING, LEARNING, DETECTING]
+    states = []
+    looks = detect(read_campaign(folder.path), progress=states.append)
+    check_forward(states)
+    assert doings(states) == [LEVELLING, LEARNING, DETECTING]
     # A fifth of the light as it is, not scaled up by its own peak: its centre is worse.
-    assert found.statuses == {"ok": 6} and found.campaign.spots[0].su_left_px > 1.3 * found.campaign.spots[1].su_left_px
+    assert looks.statuses == {"ok": 6} and looks.campaign.spots[0].su_left_px > 1.3 * looks.campaign.spots[1].su_left_px
     shallow = detect(read_campaign(Folder(tmp_path / "shallow", looks=6).path))
-    for deep, eight in zip(found.campaign.spots[1:-1], shallow.campaign.spots[1:-1], strict=True):
+    for deep, eight in zip(looks.campaign.spots[1:-1], shallow.campaign.spots[1:-1], strict=True):
         assert abs(deep.u_left_px - eight.u_left_px) < 0.1 * eight.su_left_px
         # 8 bits are 255 levels and these 4095 / 16: noise is what it was.
         assert deep.su_left_px == pytest.approx(eight.su_left_px, rel=0.1)
@@ -208,9 +208,9 @@ def test_a_beam_s_own_skew_is_no_noise(tmp_path):
                 for k, mark in enumerate(marks)
             )
             folder.put(look, side, np.clip(light + rng.normal(0, 0.1, light.shape), 0, 255).astype(np.uint8))
-    found = detect(read_campaign(folder.path))
-    assert found.statuses == {"ok": 15, "misshapen left": 1}
-    assert all(noise.speckle_contrast < 0.1 and max(np.abs(noise.skew)) > 0.01 for noise in found.noise.values())
+    detection = detect(read_campaign(folder.path))
+    assert detection.statuses == {"ok": 15, "misshapen left": 1}
+    assert all(noise.speckle_contrast < 0.1 and max(np.abs(noise.skew)) > 0.01 for noise in detection.noise.values())
 
 
 def test_the_paper_s_contour_is_several_times_worse_and_says_so(speckled, found_speckled):
@@ -241,8 +241,8 @@ def test_an_uncertain_calibration_forgives_more(plain):
     assert not epipolar_refused(plain.true_px + np.array([0, 3.0, 0, 0]), covariances, loose).any()
 
 
-def test_the_number_of_threads_changes_nothing(plain, found_plain):
-    assert detect(read_campaign(plain.path), workers=1).campaign.spots == found_plain.campaign.spots
+def test_the_number_of_threads_changes_nothing(plain, plain_detection):
+    assert detect(read_campaign(plain.path), workers=1).campaign.spots == plain_detection.campaign.spots
 
 
 def test_in_place_same_rows_other_columns_untouched(tmp_path, capsys):
@@ -326,9 +326,9 @@ def test_all_damaged_frames_are_named_at_once(tmp_path):
     names = [f"{look}_{side}.png" for look in looks for side in ("left", "right")][2:]
     for name in names:
         (folder.path / "frames" / name).write_bytes(b"no picture")
-    told = f"{names[0]}: found .*; likewise {', '.join(names[1:6])} and 4 more$"
+    message = f"{names[0]}: found .*; likewise {', '.join(names[1:6])} and 4 more$"
     for method in ("fit", "contour"):
-        with pytest.raises(InputError, match=told) as caught:
+        with pytest.raises(InputError, match=message) as caught:
             detect(read_campaign(folder.path), method)
         assert caught.value.file == names[0] and names[6] not in str(caught.value)
 

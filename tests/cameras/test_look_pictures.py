@@ -16,27 +16,27 @@ from tvsbayes.files.images import png_bytes, read_image
 def test_the_number_in_the_name_is_the_move(tmp_path):
     """Of several numbers the one that tells most looks apart; the rest of the name is the sheet."""
     drawn(tmp_path, *pairs("_d1_000", "_d1_007", "_d2_007", "_d1_012"))
-    found = pair_looks(views_of(tmp_path).views, range(20))
-    assert found.matching == "number"
-    assert [(s.spot, s.move, s.target, s.status) for s in found.spots] == [
+    matched = pair_looks(views_of(tmp_path).views, range(20))
+    assert matched.matching == "number"
+    assert [(s.spot, s.move, s.target, s.status) for s in matched.spots] == [
         (0, 0, "d1", "undetected"),
         (1, 7, "d1", "undetected"),
         (2, 7, "d2", "undetected"),
         (3, 12, "d1", "undetected"),
     ]
-    assert found.pictures[2].name == "_d2_007"
-    assert found.without == tuple(move for move in range(20) if move not in (0, 7, 12))
+    assert matched.pictures[2].name == "_d2_007"
+    assert matched.without == tuple(move for move in range(20) if move not in (0, 7, 12))
 
 
 def test_names_without_a_fitting_number_count_in_order(tmp_path):
     """1, 2 ... 10 for moves 0 to 9: the names sort as people count."""
     drawn(tmp_path, *pairs(*map(str, range(1, 11))))
     views = views_of(tmp_path).views
-    found = pair_looks(views, range(10))
-    assert (found.matching, [s.move for s in found.spots]) == ("order", list(range(10)))
-    assert [found.pictures[k].name for k in (0, 1, 9)] == ["1", "2", "10"]
+    matched = pair_looks(views, range(10))
+    assert (matched.matching, [s.move for s in matched.spots]) == ("order", list(range(10)))
+    assert [matched.pictures[k].name for k in (0, 1, 9)] == ["1", "2", "10"]
     assert pair_looks(views, range(11)).matching == "number"
-    assert pair_looks(views, range(10), matching="order").spots == found.spots
+    assert pair_looks(views, range(10), matching="order").spots == matched.spots
     for moves, matching in ((9, None), (10, "number"), (12, "order")):
         with pytest.raises(InputError, match="number of its row"):
             pair_looks(views, range(moves), matching=matching)
@@ -44,16 +44,16 @@ def test_names_without_a_fitting_number_count_in_order(tmp_path):
 
 def test_without_moves_every_number_is_one(tmp_path):
     drawn(tmp_path, *pairs("_5", "_7_a", "_7_b", "_12"))
-    found = pair_looks(views_of(tmp_path).views, None)
-    assert [s.move for s in found.spots] == [5, 7, 7, 12] and found.renumbered is None
-    assert [s.target for s in found.spots] == ["", "a", "b", ""]
-    assert found.without == tuple(move for move in range(12) if move not in (5, 7))
+    matched = pair_looks(views_of(tmp_path).views, None)
+    assert [s.move for s in matched.spots] == [5, 7, 7, 12] and matched.renumbered is None
+    assert [s.target for s in matched.spots] == ["", "a", "b", ""]
+    assert matched.without == tuple(move for move in range(12) if move not in (5, 7))
 
 
 def test_numbers_too_sparse_for_moves_are_counted_anew_and_told(tmp_path):
     drawn(tmp_path, *pairs("_0930", "_0931", "_1015"))
-    found = pair_looks(views_of(tmp_path).views, None)
-    assert [s.move for s in found.spots] == [0, 1, 2] and found.renumbered == (930, 1015)
+    matched = pair_looks(views_of(tmp_path).views, None)
+    assert [s.move for s in matched.spots] == [0, 1, 2] and matched.renumbered == (930, 1015)
 
 
 def test_rows_that_wait_take_their_own_pictures(tmp_path):
@@ -65,9 +65,9 @@ def test_rows_that_wait_take_their_own_pictures(tmp_path):
         spot_row(5, 1, "far", 1, 3, *(None,) * 8, status="undetected"),
         spot_row(6, 1, "near", 1, 4, *(None,) * 8, status="undetected"),
     ]
-    found = pair_looks(views_of(tmp_path).views, range(2), rows)
-    assert found.spots == tuple(rows)
-    assert ({spot: view.name for spot, view in found.pictures.items()}, found.without) == ({3: "3", 5: "5"}, (6,))
+    matched = pair_looks(views_of(tmp_path).views, range(2), rows)
+    assert matched.spots == tuple(rows)
+    assert ({spot: view.name for spot, view in matched.pictures.items()}, matched.without) == ({3: "3", 5: "5"}, (6,))
     with pytest.raises(InputError, match="none waits"):
         pair_looks(views_of(tmp_path).views, range(2), rows[1:2])
 
@@ -77,15 +77,15 @@ def test_what_is_no_pair_is_said(tmp_path):
     drawn(tmp_path, *pairs("4"), size=(3, 4))
     (tmp_path / "left5.tif").write_bytes(b"")
     drawn(tmp_path, "IMG_0007.png", "IMG_0008.png")
-    seen = views_of(tmp_path)
-    assert [view.name for view in seen.views] == ["1", "2"]
-    assert (seen.unpaired, seen.unnamed, seen.other_size, seen.unread) == (
+    views = views_of(tmp_path)
+    assert [view.name for view in views.views] == ["1", "2"]
+    assert (views.unpaired, views.unnamed, views.other_size, views.unread) == (
         ("left3.png",),
         ("IMG_0007.png", "IMG_0008.png"),
         ("left4.png", "right4.png"),
         ("left5.tif",),
     )
-    assert seen.image_sizes == dict.fromkeys(("left", "right"), SIZE[::-1])
+    assert views.image_sizes == dict.fromkeys(("left", "right"), SIZE[::-1])
     drawn(tmp_path / "lonely", "left1.png")
     with pytest.raises(InputError, match="no pair among 1"):
         views_of(tmp_path / "lonely")
@@ -98,10 +98,10 @@ def test_what_is_no_pair_is_said(tmp_path):
 @pytest.mark.parametrize("swap", (False, True))
 def test_wide_pictures_are_split_and_nothing_is_overwritten(tmp_path, swap):
     drawn(tmp_path / "wide", "look_0.png", size=(6, 16))
-    seen = views_of(tmp_path / "wide", swap=swap)
+    views = views_of(tmp_path / "wide", swap=swap)
     out = tmp_path / "mine"
     out.mkdir()
-    pictures = pair_looks(seen.views, range(1)).pictures
+    pictures = pair_looks(views.views, range(1)).pictures
     assert copy_frames(pictures, out) == copy_frames(pictures, out) == 2
     whole = cv2.imread(str(tmp_path / "wide" / "look_0.png"))
     names = ("right", "left") if swap else ("left", "right")

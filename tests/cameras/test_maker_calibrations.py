@@ -35,14 +35,14 @@ M2, D2 = [809.1, 808.8, 325.6, 239.4], [-0.2, 0.07, 0.0004, 0.0007, 0.0]
 )
 def test_the_pair_of_every_maker(name, source, size):
     """Chains of sockets in cm, R by rows or by columns in m, the pose from right to left, components in mm."""
-    found = read_calibration([FOREIGN / name], size)
-    assert found.source == source
-    np.testing.assert_allclose(found.stereo.T, [-118.6, 0.4, 1.9], atol=1e-9)
-    np.testing.assert_allclose(rotation_vector(found.stereo.R), [0.01, 0.02, -0.005], atol=1e-9)
+    calibration = read_calibration([FOREIGN / name], size)
+    assert calibration.source == source
+    np.testing.assert_allclose(calibration.stereo.T, [-118.6, 0.4, 1.9], atol=1e-9)
+    np.testing.assert_allclose(rotation_vector(calibration.stereo.R), [0.01, 0.02, -0.005], atol=1e-9)
     moved = np.array([0.0, 0.0, 640.0, 300.0]) if source == "zed" else np.zeros(4)
-    np.testing.assert_allclose(found.stereo.M2[[0, 1, 0, 1], [0, 1, 2, 2]], M2 + moved, atol=1e-9)
-    np.testing.assert_allclose(found.stereo.D2, D2, atol=1e-9)
-    assert (found.stereo.image_width, found.stereo.image_height) == (size or SMALL)
+    np.testing.assert_allclose(calibration.stereo.M2[[0, 1, 0, 1], [0, 1, 2, 2]], M2 + moved, atol=1e-9)
+    np.testing.assert_allclose(calibration.stereo.D2, D2, atol=1e-9)
+    assert (calibration.stereo.image_width, calibration.stereo.image_height) == (size or SMALL)
 
 
 @pytest.mark.parametrize(
@@ -127,12 +127,12 @@ def test_a_lens_described_from_pixels_to_rays_is_fitted():
     k1, k2, p1, p2, _ = coefficients
     f = 1 + k1 * r2 + k2 * r2**2
     ray = np.array([x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * f + 2 * p2 * x * y + p1 * (r2 + 2 * y * y), 1])
-    found = fitted_to_five(matrix, coefficients, SMALL, "inverse")
+    lens = fitted_to_five(matrix, coefficients, SMALL, "inverse")
     still = np.zeros(3)
-    ours = cv2.projectPoints(ray[None], still, still, matrix, found.distortion)[0].ravel()
+    ours = cv2.projectPoints(ray[None], still, still, matrix, lens.distortion)[0].ravel()
     renamed = cv2.projectPoints(ray[None], still, still, matrix, coefficients)[0].ravel()
     # The fit's largest error is over a grid; a pixel between its points is off by hardly more.
-    assert np.abs(ours - pixel).max() < 1.1 * found.error_px < 0.1
+    assert np.abs(ours - pixel).max() < 1.1 * lens.error_px < 0.1
     assert np.abs(renamed - pixel).max() > 5
     assert json.loads(text)["left"]["model"] == "Inverse Brown Conrady"
 

@@ -42,25 +42,25 @@ def few(folder, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def found(folder):
+def part_views(folder):
     return find_views(folder, NAMED)
 
 
-def test_corners_of_parts_are_found_where_they_are(found):
+def test_corners_of_parts_are_found_where_they_are(part_views):
     """The size of the markers and the older first square (an even number of rows) come from the pictures."""
-    assert [view.name for view in found.views] == [f"_{k}" for k in range(6)]
+    assert [view.name for view in part_views.views] == [f"_{k}" for k in range(6)]
     counts = []
-    for view, pose in zip(found.views, POSES, strict=True):
-        seen = np.hstack([view.left, view.right])
-        counts.append(np.isfinite(seen[:, 0]).sum())
-        assert np.nanmax(np.abs(seen - true_corners(pose, DRAWN))) < FOUND_PX
+    for view, pose in zip(part_views.views, POSES, strict=True):
+        corners = np.hstack([view.left, view.right])
+        counts.append(np.isfinite(corners[:, 0]).sum())
+        assert np.nanmax(np.abs(corners - true_corners(pose, DRAWN))) < FOUND_PX
     assert min(counts) < NAMED.corners and min(counts) >= CORNERS_MIN
 
 
 @pytest.mark.thorough
-def test_a_pair_is_calibrated_from_parts(found):
+def test_a_pair_is_calibrated_from_parts(part_views):
     """Within four of its own sds, the largest of 24; the sds are those of tenths of a pixel."""
-    result = calibrate_stereo(found.views, NAMED, SIZE, fix_k3=True, pictures=found)
+    result = calibrate_stereo(part_views.views, NAMED, SIZE, fix_k3=True, pictures=part_views)
     sds = np.sqrt(np.diag(result.stereo.parameter_covariance))
     free = sds > 0
     assert np.abs((result.stereo.vector - PAIR.vector)[free] / sds[free]).max() < 4

@@ -89,9 +89,9 @@ def write(folder: Path, names) -> None:
 def test_names_pair_up(tmp_path, way, swap):
     write(tmp_path, [name for pair in NAMES[way] for name in pair])
     (tmp_path / "notes.txt").write_text("ignored")
-    found = paired_pictures(tmp_path, 100, Pairing(swap=swap))
+    pictures = paired_pictures(tmp_path, 100, Pairing(swap=swap))
     by_view: dict[str, dict[str, str]] = {}
-    for picture in found:
+    for picture in pictures:
         by_view.setdefault(picture.view, {})[picture.sides[0]] = picture.path.relative_to(tmp_path).as_posix()
     # What names say of left and right stands; a number or a folder does not say it.
     sides = SIDES[::-1] if swap and way in UNSURE else SIDES
@@ -146,9 +146,9 @@ CLOCKS = ("A/t9.png", "A/t10.png", "B/t11.png", "B/t8.png")
 def test_pairs_as_stated_go_by_their_order(tmp_path, options, first, second):
     """Times of 9 and 10 s belong to 8 and 11 s; numbers are counted, and no name pairs up."""
     write(tmp_path, CLOCKS)
-    found = paired_pictures(tmp_path, 4, Pairing(**options))
+    pictures = paired_pictures(tmp_path, 4, Pairing(**options))
     by_view: dict[str, dict[str, str]] = {}
-    for picture in found:
+    for picture in pictures:
         (side,) = picture.sides
         by_view.setdefault(picture.view, {})[side] = picture.path.relative_to(tmp_path).as_posix()
     assert sorted((pair[first], pair[second]) for pair in by_view.values()) == [

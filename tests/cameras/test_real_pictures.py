@@ -48,8 +48,8 @@ def test_pairs_are_calibrated_as_opencv_does(views, calibration):
 
 def test_columns_and_rows_may_be_exchanged(calibration):
     """6 x 4 for 4 x 6: corners in another order in all pictures, the same cameras."""
-    found = find_views(PAIRS, Board(6, 4, 30.0))
-    other = calibrate_stereo(found.views, Board(6, 4, 30.0), SIZE)
+    pictures = find_views(PAIRS, Board(6, 4, 30.0))
+    other = calibrate_stereo(pictures.views, Board(6, 4, 30.0), SIZE)
     # The classic finder starts at other corners and ends a hundredth of a pixel beside.
     assert abs(other.stereo.rms_px - calibration.stereo.rms_px) < 0.002
     z = (other.stereo.vector - calibration.stereo.vector) / np.sqrt(np.diag(calibration.stereo.parameter_covariance))
@@ -79,9 +79,9 @@ def test_pictures_without_the_board_are_named_and_left_out(tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "left01.png"), deep)
     (tmp_path / "left01.jpg").unlink()
     code = run(["stereo", str(tmp_path), "--board", "4x6", "--pitch-mm", "30", "--json"])
-    found = json.loads(capsys.readouterr().out)
-    assert code == 0 and found["pairs"] == 9 and found["without_board"] == ["right03.jpg"]
-    assert found["unpaired"] == ["right07.jpg"] and found["rms_px"] < 0.1
+    document = json.loads(capsys.readouterr().out)
+    assert code == 0 and document["pairs"] == 9 and document["without_board"] == ["right03.jpg"]
+    assert document["unpaired"] == ["right07.jpg"] and document["rms_px"] < 0.1
 
 
 @pytest.mark.parametrize("name", ("t-348mm", "t-770mm", "TEM00_140mm"))

@@ -24,9 +24,9 @@ def test_propagation_of_known_noise(contrast):
     rng, scene, chi2 = np.random.default_rng(8), Scene(speckle_contrast=contrast), []
     for number in range(200):
         centre = np.array([40.0, 32.0]) + rng.uniform(-1, 1, 2)
-        made = render_spot(Footprint(centre, oval(rng, 2.0), 200.0), 80, 64, scene, Sensor(), (9, number, 0))
-        seen = find_spot(made, SpotNoise(Sensor().gain_dn_per_electron, contrast))
-        chi2.append((seen.centre_px - centre) @ np.linalg.solve(seen.covariance_px2, seen.centre_px - centre))
+        frame = render_spot(Footprint(centre, oval(rng, 2.0), 200.0), 80, 64, scene, Sensor(), (9, number, 0))
+        spot = find_spot(frame, SpotNoise(Sensor().gain_dn_per_electron, contrast))
+        chi2.append((spot.centre_px - centre) @ np.linalg.solve(spot.covariance_px2, spot.centre_px - centre))
     # 400 degrees of freedom: 1 / sqrt(800) of the sd; four of them, and 8 % for the small picture's background.
     assert abs(np.sqrt(np.sum(chi2) / 400) - 1) < 4 / np.sqrt(800) + 0.08
 
@@ -76,26 +76,26 @@ def test_all_reasons_are_tested():
 def test_a_window_in_the_corner_moves_no_spot():
     """The centre is that of the dark picture to a quarter of its sd: the background is estimated from other pixels."""
     frame = picture(Footprint(HERE, SMALL, 180.0))
-    dark, lit = (find_spot(made, SpotNoise(0.04, 0)) for made in (frame, window(frame)))
+    dark, lit = (find_spot(image, SpotNoise(0.04, 0)) for image in (frame, window(frame)))
     assert dark.status == lit.status == "ok"
     assert np.abs(lit.centre_px - dark.centre_px).max() < 0.25 * np.sqrt(dark.covariance_px2.max())
 
 
 def test_a_weak_second_reflection_and_a_gradient_do_no_harm():
     steep = Scene(speckle_contrast=0.0, ambient_dn=60.0, ambient_gradient_dn=100.0)
-    seen = find_spot(
+    spot = find_spot(
         picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 25.0), scene=steep), SpotNoise(0.04, 0)
     )
-    assert seen.status == "ok"
-    assert np.abs(seen.centre_px - HERE).max() < 5 * np.sqrt(seen.covariance_px2.max())
+    assert spot.status == "ok"
+    assert np.abs(spot.centre_px - HERE).max() < 5 * np.sqrt(spot.covariance_px2.max())
 
 
 def test_a_clipped_core_is_normal_and_a_larger_one_widens_the_sd():
     sds = []
     for peak in (240.0, 400.0, 700.0):
-        seen = find_spot(picture(Footprint(HERE, SMALL, peak)), SpotNoise(0.04, 0.4))
-        assert seen.status == "ok"
-        sds.append(np.sqrt(np.trace(seen.covariance_px2)) * np.sqrt(peak))
+        spot = find_spot(picture(Footprint(HERE, SMALL, peak)), SpotNoise(0.04, 0.4))
+        assert spot.status == "ok"
+        sds.append(np.sqrt(np.trace(spot.covariance_px2)) * np.sqrt(peak))
     assert sds[0] < sds[1] < sds[2]
 
 
@@ -131,8 +131,8 @@ def beam(rng: np.random.Generator, white: int, gain_dn: float = 0.03) -> np.ndar
     x, y = (u - 231.4) / 24.0, (v - 187.7) / 28.0
     light = 190 * np.exp(-(x**2 + y**2 + 0.4 * x * y) / 2) * (1 + 0.05 * (x**3 - 3 * x) / (1 + x**2) - 0.04 * y)
     light += 4 * np.exp(-((np.hypot(x, y) - 3) ** 2) / 0.1) + 1.5
-    seen = np.clip(rng.normal(light, np.sqrt(gain_dn * light)), 0, 255) * (white / 255)
-    return np.rint(np.repeat(seen[..., None], 3, axis=2)).astype(np.uint8 if white == 255 else np.uint16)
+    levels = np.clip(rng.normal(light, np.sqrt(gain_dn * light)), 0, 255) * (white / 255)
+    return np.rint(np.repeat(levels[..., None], 3, axis=2)).astype(np.uint8 if white == 255 else np.uint16)
 
 
 @pytest.mark.parametrize("white", (255, 4095, 65535))
@@ -142,10 +142,10 @@ def test_pixels_of_a_wide_beam_tell_its_uncertainty(white):
     centres, variances = [], []
     for row in range(4):
         for column in range(4):
-            seen = find_spot(np.ascontiguousarray(picture_of[row::4, column::4]))
-            assert seen.status == "ok"
-            centres.append(4 * seen.centre_px + [column, row])
-            variances.append(16 * np.diag(seen.covariance_px2))
+            spot = find_spot(np.ascontiguousarray(picture_of[row::4, column::4]))
+            assert spot.status == "ok"
+            centres.append(4 * spot.centre_px + [column, row])
+            variances.append(16 * np.diag(spot.covariance_px2))
     z = (np.array(centres) - np.mean(centres, axis=0)) / np.sqrt(variances)
     # 30 degrees of freedom: 1 / sqrt(60) of the root; four of them would be 0.52.
     assert 0.6 < np.sqrt(np.sum(z**2) / 30) < 1.4

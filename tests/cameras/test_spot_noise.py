@@ -31,8 +31,8 @@ def test_noise_is_learned_from_skews_drawn_from_it():
         skews = np.tile(SHAPE, 100) + rng.normal(0, np.sqrt(variance))
         learned = learn_noise(np.column_stack((skews, parts)).reshape(100, 4, 4))
         # 400 squares tell a variance to sqrt(2 / 400) = 7 %; what of it is gain and what contrast^2 they tell less.
-        said = parts @ [1.0, learned.gain_dn, learned.speckle_contrast**2]
-        assert said.mean() == pytest.approx(variance.mean(), rel=4 * np.sqrt(2 / 400))
+        prediction = parts @ [1.0, learned.gain_dn, learned.speckle_contrast**2]
+        assert prediction.mean() == pytest.approx(variance.mean(), rel=4 * np.sqrt(2 / 400))
         # A median of 100 values is known to 1.25 sds / 10; four of them.
         np.testing.assert_allclose(learned.skew, SHAPE, atol=4 * 0.125 * np.sqrt(variance.max()))
     assert learned.speckle_contrast == pytest.approx(0.4, rel=0.2)

@@ -106,12 +106,12 @@ def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
             view = corners_of(scene, f"{k:02d}", rng)
             moved = np.einsum("qca,ca->cq", _corner_slopes(view, BOARD, scene.stereo), away)
             views.append(replace(view, left=view.left + moved[:, :2], right=view.right + moved[:, 2:]))
-        found = calibrate_stereo(views, BOARD, SIZE)
+        result = calibrate_stereo(views, BOARD, SIZE)
         # 155 displacements tell their sd to 6 %; three of them, and what noise of the corners leaves open.
-        assert abs(found.board_error_mm - off_mm) < 0.02 + 3 * 0.06 * off_mm
-        missed = found.stereo.vector - drawn[0].stereo.vector
-        total += chi2(missed, found.stereo.parameter_covariance)
-        alone += chi2(missed, found.covariance_independent)
+        assert abs(result.board_error_mm - off_mm) < 0.02 + 3 * 0.06 * off_mm
+        missed = result.stereo.vector - drawn[0].stereo.vector
+        total += chi2(missed, result.stereo.parameter_covariance)
+        alone += chi2(missed, result.covariance_independent)
     low, high = stats.chi2(24 * 3).ppf([5e-5, 1 - 5e-5])
     assert low / 1.3**2 < total < high
     assert (alone > high) == (off_mm > 0)
@@ -155,10 +155,10 @@ def test_single_camera_agrees_with_opencv(pairs, side):
     """
     corners = [getattr(view, side) for view in pairs.views]
     start = camera_start(dict(enumerate(corners)), BOARD, PAIRS_SIZE, side, False)
-    alone = [View(str(k), seen, None) for k, seen in enumerate(corners)]
+    alone = [View(str(k), pixels, None) for k, pixels in enumerate(corners)]
     vector, poses = np.concatenate([start.vector, start.vector, np.zeros(6)]), list(start.poses.values())
     ours = bundle_adjustment(alone, BOARD, vector, np.array(poses), np.arange(24) < 9)
-    found, ours_sds = ours.vector[:9], sds(ours.covariance[:9, :9])
+    estimate, ours_sds = ours.vector[:9], sds(ours.covariance[:9, :9])
     # OpenCV's rms is over corners, of which each has two coordinates.
     rms_px = np.sqrt(np.nansum(ours.residuals_px**2) / (len(corners) * BOARD.corners))
     points = [BOARD.points_mm.astype(np.float32)] * len(corners)
@@ -171,7 +171,7 @@ def test_single_camera_agrees_with_opencv(pairs, side):
     ratio = ours_sds / np.ravel(deviations)[:9]
     # Without the degrees of freedom the sds would be 3 % too small.
     assert (np.abs(ratio - 1) < 0.01).all() or (np.abs(ratio / np.sqrt((n - p) / (2 * n - p)) - 1) < 0.01).all()
-    assert (np.abs(found - theirs) < 0.01 * ours_sds).all()
+    assert (np.abs(estimate - theirs) < 0.01 * ours_sds).all()
     assert abs(rms_px - rms) < 1e-4
 
 
@@ -265,10 +265,10 @@ def test_stereo_json_holds_the_result(calibration):
 
 def test_pictures_of_two_moments_are_left_out_by_name(views, calibration, without_the_sixth):
     wrong = [*views[:5], replace(views[5], right=views[6].right), *views[6:]]
-    found = calibrate_stereo(wrong, BOARD, SIZE)
-    assert found.outliers == found.excluded == ("05",)
-    assert any("05" in warning for warning in found.warnings)
-    np.testing.assert_allclose(found.stereo.vector, without_the_sixth.stereo.vector, rtol=1e-6, atol=1e-9)
+    result = calibrate_stereo(wrong, BOARD, SIZE)
+    assert result.outliers == result.excluded == ("05",)
+    assert any("05" in warning for warning in result.warnings)
+    np.testing.assert_allclose(result.stereo.vector, without_the_sixth.stereo.vector, rtol=1e-6, atol=1e-9)
     assert calibration.outliers == ()
 
 
@@ -291,9 +291,9 @@ def test_a_board_that_moved_between_the_two_pictures(views, moved_px, doubt):
         with pytest.raises(NothingToEstimate, match="together they miss by"):
             calibrate_stereo(moved, BOARD, SIZE)
         return
-    found = calibrate_stereo(moved, BOARD, SIZE)
-    assert any("each camera by itself" in warning for warning in found.warnings) == (doubt == "warned")
-    assert found.alone_rms_px < 1.1 * np.sqrt(2) * CORNER_SD_PX
+    result = calibrate_stereo(moved, BOARD, SIZE)
+    assert any("each camera by itself" in warning for warning in result.warnings) == (doubt == "warned")
+    assert result.alone_rms_px < 1.1 * np.sqrt(2) * CORNER_SD_PX
 
 
 @pytest.mark.parametrize("which", (slice(5, 6), slice(0, None), slice(0, None, 2)))
@@ -302,9 +302,9 @@ def test_corners_in_another_order_are_put_right_and_named(views, calibration, wh
     turn = corner_orders(BOARD)[1]
     names = {view.name for view in views[which]}
     turned = [replace(view, right=view.right[turn]) if view.name in names else view for view in views]
-    found = calibrate_stereo(turned, BOARD, SIZE)
-    assert found.excluded == () and set(found.reordered) == names and found.as_json()["reordered"]
-    np.testing.assert_allclose(found.stereo.vector, calibration.stereo.vector, rtol=1e-6, atol=1e-7)
+    result = calibrate_stereo(turned, BOARD, SIZE)
+    assert result.excluded == () and set(result.reordered) == names and result.as_json()["reordered"]
+    np.testing.assert_allclose(result.stereo.vector, calibration.stereo.vector, rtol=1e-6, atol=1e-7)
 
 
 def test_doubtful_view_is_named_and_left_out_on_request(views, without_the_sixth):
@@ -321,10 +321,10 @@ def test_doubtful_view_is_named_and_left_out_on_request(views, without_the_sixth
 
 def test_views_of_one_camera_inform_that_camera(views, calibration):
     half = [view if k % 2 else replace(view, right=None) for k, view in enumerate(views)]
-    found = calibrate_stereo(half, BOARD, SIZE)
+    result = calibrate_stereo(half, BOARD, SIZE)
     only = calibrate_stereo([view for view in half if view.right is not None], BOARD, SIZE)
-    assert found.pairs == VIEWS // 2 and len(found.views) == VIEWS
-    ratio = sds(found.covariance_independent / found.noise_sd_px**2) / sds(
+    assert result.pairs == VIEWS // 2 and len(result.views) == VIEWS
+    ratio = sds(result.covariance_independent / result.noise_sd_px**2) / sds(
         only.covariance_independent / only.noise_sd_px**2
     )
     assert ratio[0] < 0.9 and (ratio < 1 + 1e-6).all()
@@ -335,12 +335,12 @@ def test_views_of_one_camera_inform_that_camera(views, calibration):
 
 
 def test_fixed_k3_has_no_variance(drawn, views):
-    found = calibrate_stereo(views, BOARD, SIZE, fix_k3=True)
+    result = calibrate_stereo(views, BOARD, SIZE, fix_k3=True)
     fixed = [STEREO_PARAMETER_NAMES.index(f"stereo.{side}.k3") for side in ("left", "right")]
-    assert not found.stereo.vector[fixed].any()
-    assert not found.stereo.parameter_covariance[fixed].any()
-    assert (sds(found.stereo.parameter_covariance)[:8] > 0).all()
-    parse_stereo(stereo_bytes(found.stereo), "stereo.json")
+    assert not result.stereo.vector[fixed].any()
+    assert not result.stereo.parameter_covariance[fixed].any()
+    assert (sds(result.stereo.parameter_covariance)[:8] > 0).all()
+    parse_stereo(stereo_bytes(result.stereo), "stereo.json")
 
 
 def test_too_little_is_refused_in_words(views):
@@ -447,8 +447,8 @@ def test_command_refuses_with_the_right_code(ask, tmp_path, arguments, code, wor
     folder.mkdir()
     write_pair(folder, "1", pictures(POSES[0]))
     places = {"FOLDER": folder, "NOWHERE": tmp_path / "nowhere"}
-    found, document = ask(*(places.get(argument, argument) for argument in arguments))
-    assert (found, document["error"]["code"]) == (code, word)
+    exit_code, document = ask(*(places.get(argument, argument) for argument in arguments))
+    assert (exit_code, document["error"]["code"]) == (code, word)
     assert document["error"]["remedy"]
 
 
