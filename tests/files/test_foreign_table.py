@@ -158,14 +158,14 @@ def bomb() -> bytes:
 
 def workbook(sheet: str) -> bytes:
     """A workbook whose one sheet has this XML inside."""
-    stream, made = io.BytesIO(), io.BytesIO()
+    stream, output = io.BytesIO(), io.BytesIO()
     openpyxl.Workbook().save(stream)
     name = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
-    with zipfile.ZipFile(stream) as old, zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as new:
+    with zipfile.ZipFile(stream) as old, zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as new:
         for part in old.namelist():
-            own = f'<worksheet xmlns="{name}">{sheet}</worksheet>'
-            new.writestr(part, own if part == "xl/worksheets/sheet1.xml" else old.read(part))
-    return made.getvalue()
+            content = f'<worksheet xmlns="{name}">{sheet}</worksheet>'
+            new.writestr(part, content if part == "xl/worksheets/sheet1.xml" else old.read(part))
+    return output.getvalue()
 
 
 def test_a_stated_size_of_a_sheet_is_not_believed(tmp_path):
