@@ -172,7 +172,7 @@ def test_hashes_cover_the_data_and_not_the_names(tmp_path):
 
 def test_transmission_error_is_written_read_and_hashed(tmp_path):
     campaign = small_campaign()
-    seen = {input_hashes(campaign)["rig"]}
+    hashes = {input_hashes(campaign)["rig"]}
     for number, (priors, periods) in enumerate(
         [
             ({}, {"pan": (30.0,)}),
@@ -187,8 +187,8 @@ def test_transmission_error_is_written_read_and_hashed(tmp_path):
         again = read_campaign(tmp_path / str(number))
         assert_same(wobbling, again)
         assert again.rig == table
-        seen.add(input_hashes(again)["rig"])
-    assert len(seen) == 5
+        hashes.add(input_hashes(again)["rig"])
+    assert len(hashes) == 5
 
 
 @pytest.mark.parametrize(("name", "moves", "spots"), [("rig_a", 195, 384), ("rig_b", 145, 144), ("rig_c", 195, 384)])

@@ -33,10 +33,10 @@ PIXEL_NAMES = [
 def test_pixels_by_any_name(names):
     """In any order, beside their spreads."""
     spreads = tuple(f"std {name}" for name in names)
-    found = map_columns([*spreads, *names][::-1])
-    assert [found.columns[field] for field in PIXELS] == list(names)
-    assert [found.columns[field] for field in PIXEL_SDS] == list(spreads)
-    assert not found.unused and not found.ambiguous
+    mapping = map_columns([*spreads, *names][::-1])
+    assert [mapping.columns[field] for field in PIXELS] == list(names)
+    assert [mapping.columns[field] for field in PIXEL_SDS] == list(spreads)
+    assert not mapping.unused and not mapping.ambiguous
 
 
 COUNTER_NAMES = [
@@ -75,8 +75,8 @@ def test_other_fields_in_four_languages():
 
 def test_our_own_names_and_other_words():
     assert map_columns(SPOTS.columns).columns == {name: name for name in SPOTS.columns}
-    found = map_columns(["steps pan", "TiltCount", "t (ms)", "Blatt", "B (rad)", "pan_approach", "remark"])
-    assert found.columns == {
+    mapping = map_columns(["steps pan", "TiltCount", "t (ms)", "Blatt", "B (rad)", "pan_approach", "remark"])
+    assert mapping.columns == {
         "pan_steps": "steps pan",
         "tilt_steps": "TiltCount",
         "time_s": "t (ms)",
@@ -84,7 +84,7 @@ def test_our_own_names_and_other_words():
         "aperture_deg": "B (rad)",
         "pan_approach": "pan_approach",
     }
-    assert found.unused == ("remark",)
+    assert mapping.unused == ("remark",)
 
 
 def test_units_in_names():
@@ -109,12 +109,12 @@ def test_units_in_names():
 
 
 def test_what_two_columns_claim_is_asked_for():
-    found = map_columns(["pan_pos", "pan_goal", "tilt"])
-    assert found.ambiguous == {"pan_steps": ("pan_pos", "pan_goal")}
-    assert "pan_steps" not in found.columns
-    said = map_columns(["pan_pos", "pan_goal", "tilt"], {"pan_steps": "pan_goal", "tilt_steps": ""})
-    assert said.columns == {"pan_steps": "pan_goal"}
-    assert "pan_pos" in said.unused
+    mapping = map_columns(["pan_pos", "pan_goal", "tilt"])
+    assert mapping.ambiguous == {"pan_steps": ("pan_pos", "pan_goal")}
+    assert "pan_steps" not in mapping.columns
+    choice = map_columns(["pan_pos", "pan_goal", "tilt"], {"pan_steps": "pan_goal", "tilt_steps": ""})
+    assert choice.columns == {"pan_steps": "pan_goal"}
+    assert "pan_pos" in choice.unused
     for stated, match in (({"pan": "tilt"}, "did you mean|allowed: move"), ({"pan_steps": "Pan"}, "no such column")):
         with pytest.raises(InputError, match=match):
             map_columns(["pan_pos", "tilt"], stated)

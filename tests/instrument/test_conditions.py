@@ -32,9 +32,9 @@ def header(text: str) -> dict[str, object]:
 def test_minutes_since_the_first_move_or_since_switching_on():
     moves = moves_at([120.0, 180.0, 3720.0])
     np.testing.assert_array_equal(warm_minutes(moves), [0.0, 1.0, 60.0])
-    found = header(CREATED + "powered_on = 2026-01-15T09:30:00Z\n")
-    assert found["powered_on"] == datetime.datetime(2026, 1, 15, 9, 30, tzinfo=datetime.UTC)
-    np.testing.assert_array_equal(warm_minutes(moves, powered_on_s(found)), [32.0, 33.0, 92.0])
+    entries = header(CREATED + "powered_on = 2026-01-15T09:30:00Z\n")
+    assert entries["powered_on"] == datetime.datetime(2026, 1, 15, 9, 30, tzinfo=datetime.UTC)
+    np.testing.assert_array_equal(warm_minutes(moves, powered_on_s(entries)), [32.0, 33.0, 92.0])
     assert powered_on_s(header(CREATED)) is None
 
 

@@ -19,11 +19,11 @@ def twin() -> Campaign:
 
 
 def test_a_flip_changes_one_counter_and_leaves_the_approach(twin):
-    found = corrected(twin.moves, twin.spots, Correction(flipped=("tilt",)))
-    assert [m.tilt_steps for m in found.moves] == [-m.tilt_steps for m in twin.moves]
-    assert tuple(replace(m, tilt_steps=-m.tilt_steps) for m in found.moves) == twin.moves
-    assert found.spots == twin.spots and found.moves[0].tilt_approach == twin.moves[0].tilt_approach != ""
-    assert "approaches stay" in found.changes[0]
+    result = corrected(twin.moves, twin.spots, Correction(flipped=("tilt",)))
+    assert [m.tilt_steps for m in result.moves] == [-m.tilt_steps for m in twin.moves]
+    assert tuple(replace(m, tilt_steps=-m.tilt_steps) for m in result.moves) == twin.moves
+    assert result.spots == twin.spots and result.moves[0].tilt_approach == twin.moves[0].tilt_approach != ""
+    assert "approaches stay" in result.changes[0]
 
 
 def test_steps_of_moves_are_summed_up_again(twin):
@@ -35,12 +35,12 @@ def test_steps_of_moves_are_summed_up_again(twin):
 
 
 def test_looks_are_shifted_from_a_spot_on_and_none_is_lost(twin):
-    found = corrected(twin.moves, twin.spots, Correction(shifts=(Shift(1, twin.spots[62].spot),)))
-    assert [b.move - a.move for a, b in zip(twin.spots, found.spots, strict=True)] == [0] * 62 + [1] * 81 + [0]
+    result = corrected(twin.moves, twin.spots, Correction(shifts=(Shift(1, twin.spots[62].spot),)))
+    assert [b.move - a.move for a, b in zip(twin.spots, result.spots, strict=True)] == [0] * 62 + [1] * 81 + [0]
     # Nobody listed a move after the last one.
-    last = found.spots[-1]
+    last = result.spots[-1]
     assert last.status == f"refused: move {len(twin.moves)} is not listed" and last.u_left_px is not None
-    assert "1 left out" in found.changes[0]
+    assert "1 left out" in result.changes[0]
     alone = corrected(None, twin.spots, Correction(shifts=(Shift(-1),)), count=len(twin.moves))
     assert alone.moves is None and [s.move for s in alone.spots] == [s.move - 1 for s in twin.spots]
 
@@ -55,8 +55,8 @@ def test_cameras_are_exchanged_with_all_that_is_stated_of_them(twin):
 
 def test_pixels_are_counted_from_zero_and_empty_ones_stay_empty(twin):
     empty = replace(twin.spots[1], u_left_px=None, status="undetected")
-    found = corrected(None, (twin.spots[0], empty), Correction(pixels_from=1)).spots
-    assert found[0].u_left_px == twin.spots[0].u_left_px - 1 and found[1].u_left_px is None
+    spots = corrected(None, (twin.spots[0], empty), Correction(pixels_from=1)).spots
+    assert spots[0].u_left_px == twin.spots[0].u_left_px - 1 and spots[1].u_left_px is None
 
 
 @pytest.mark.parametrize("text", ["pan", "pan_step", "TILT_STEPS", ""])

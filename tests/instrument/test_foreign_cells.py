@@ -22,9 +22,9 @@ from tvsbayes.instrument.foreign_cells import plain_column
 )
 def test_notations_of_numbers(cells, plain, unit):
     """The sign of an angle of less than a degree is kept; a minute has 60 seconds."""
-    found = plain_column("x", cells)
-    assert [float(cell) for cell in found.cells] == pytest.approx(plain, rel=1e-12)
-    assert found.unit == unit and bool(found.remark) == (found.cells != cells)
+    column = plain_column("x", cells)
+    assert [float(cell) for cell in column.cells] == pytest.approx(plain, rel=1e-12)
+    assert column.unit == unit and bool(column.remark) == (column.cells != cells)
 
 
 @pytest.mark.parametrize("cells", [("1.5 mm", "2 deg"), ("12:61:00", "1:2:3"), ("slipped", "1"), ("1/0", "1/2")])

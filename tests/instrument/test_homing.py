@@ -12,11 +12,11 @@ from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance,
 
 def moves(*first: tuple[str, str]) -> tuple[Move, ...]:
     """A segment of two moves for every pair of approaches."""
-    found = []
+    rows = []
     for segment, (pan, tilt) in enumerate(first):
-        found.append(move_row(2 * segment, segment, 0.0, 0, 0, pan, tilt))
-        found.append(move_row(2 * segment + 1, segment, 0.0, 100, 0))
-    return tuple(found)
+        rows.append(move_row(2 * segment, segment, 0.0, 0, 0, pan, tilt))
+        rows.append(move_row(2 * segment + 1, segment, 0.0, 100, 0))
+    return tuple(rows)
 
 
 def test_an_axis_is_unrecorded_only_if_every_homing_is():
@@ -33,14 +33,14 @@ def test_chances_of_an_axis_sum_to_one(axis):
 
 
 def test_every_combination_once():
-    found = every_way(("pan", "tilt"))
-    assert len(found) == 9 and len({tuple(sorted(sides.items())) for sides in found}) == 9
-    assert sum(map(prior_chance, found)) == pytest.approx(1.0, abs=1e-14)
+    choices = every_way(("pan", "tilt"))
+    assert len(choices) == 9 and len({tuple(sorted(sides.items())) for sides in choices}) == 9
+    assert sum(map(prior_chance, choices)) == pytest.approx(1.0, abs=1e-14)
 
 
 def test_only_unknown_approaches_are_told():
     campaign = replace(small_campaign(), moves=moves(("unknown", "up"), ("left", "unknown")))
-    found = homed(campaign, {"pan": "right", "tilt": ANYWHERE}).moves
-    assert [m.pan_approach for m in found] == ["right", "", "left", ""]
-    assert [m.tilt_approach for m in found] == ["up", "", "unknown", ""]
+    rows = homed(campaign, {"pan": "right", "tilt": ANYWHERE}).moves
+    assert [m.pan_approach for m in rows] == ["right", "", "left", ""]
+    assert [m.tilt_approach for m in rows] == ["up", "", "unknown", ""]
     assert homed(campaign, {"pan": ANYWHERE}) is campaign

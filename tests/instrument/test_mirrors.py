@@ -36,8 +36,8 @@ def optics() -> Optics:
     """Of the printed test vector; the registry names what each field is made of."""
 
     def block(name: str) -> float | list[float]:
-        found = [math.radians(VECTOR[n]) if name.endswith("_deg") else VECTOR[n] for n in BLOCKS[name]]
-        return found if len(found) > 1 else found[0]
+        values = [math.radians(VECTOR[n]) if name.endswith("_deg") else VECTOR[n] for n in BLOCKS[name]]
+        return values if len(values) > 1 else values[0]
 
     return Optics.of(block)
 
@@ -47,8 +47,8 @@ def vectors(seed: int, count: int = 50) -> Vectors:
 
 
 def unit_vectors(seed: int, count: int = 50) -> Vectors:
-    found = vectors(seed, count)
-    return found * (1 / np.sqrt(found.dot(found)))
+    drawn = vectors(seed, count)
+    return drawn * (1 / np.sqrt(drawn.dot(drawn)))
 
 
 @pytest.mark.parametrize("functions", [np, jnp])
@@ -128,8 +128,8 @@ def test_the_chain_is_the_twins():
     values = {name: VECTOR[name] for name in OPTICS_NAMES}
     for pan, tilt in zip(PAN_RAD.tolist(), TILT_RAD.tolist(), strict=True):
         way = beam_path(optics(), pan, tilt, math)
-        found = [np.array(way.pan.forward(part)) for part in way.rays[-1]]
-        for part, expected in zip(found, mirror_chain(pan, tilt, values), strict=True):
+        parts = [np.array(way.pan.forward(part)) for part in way.rays[-1]]
+        for part, expected in zip(parts, mirror_chain(pan, tilt, values), strict=True):
             np.testing.assert_allclose(part, expected, atol=CHAIN_ROUNDING)
 
 
@@ -152,11 +152,11 @@ def test_floats_numpy_and_jax_take_the_same_way():
 
 def test_a_compiler_may_be_told_to_compute_each_part_once():
     """The turns of the stages and the ray that leaves each mirror pass through it, and what it returns is used."""
-    seen = []
+    trees = []
 
     def materialise(tree):
-        seen.append(tree)
+        trees.append(tree)
         return tree
 
     way = beam_path(optics(), 0.1, 0.2, math, materialise)
-    assert seen[0][0] is way.pan and [tuple(ray) for ray in way.rays] == seen[1:]
+    assert trees[0][0] is way.pan and [tuple(ray) for ray in way.rays] == trees[1:]

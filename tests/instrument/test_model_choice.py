@@ -12,8 +12,8 @@ def test_the_choice_of_a_model_keeps_what_the_rig_states():
     table = RigTable(stated, harmonic_period_deg={"pan": (30.0,)})
     assert ModelChoice().table(table) == table
     chosen = ModelChoice(harmonics=True).table(table)
-    asked = {"harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin"}
-    assert {n for n in HARMONIC_NAMES if chosen.priors[n] == Prior(0.0, HARMONIC_SD_DEG)} == asked
+    names = {"harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin"}
+    assert {n for n in HARMONIC_NAMES if chosen.priors[n] == Prior(0.0, HARMONIC_SD_DEG)} == names
     assert all(chosen.priors[name] == prior for name, prior in stated.items())
     assert all(p == Prior(0.0, 0.0) for n, p in chosen.priors.items() if n.startswith("harmonic_deg.tilt"))
     bare = ModelChoice(no_backlash=True, per_axis=True).table(table).priors

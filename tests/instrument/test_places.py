@@ -96,9 +96,9 @@ def moves() -> list[Move]:
 
 def test_looks_have_the_error_of_their_counter_and_half_the_play_of_their_side():
     looks = [0, 1, 2, 3, 4, 4, 5]
-    seen = seen_places(moves(), looks, RigTable())
-    np.testing.assert_array_equal(seen.steps, [0, 20, 60, -40, 0, 40])
-    np.testing.assert_array_equal(seen.on_tilt, [False] * 3 + [True] * 3)
+    places = seen_places(moves(), looks, RigTable())
+    np.testing.assert_array_equal(places.steps, [0, 20, 60, -40, 0, 40])
+    np.testing.assert_array_equal(places.on_tilt, [False] * 3 + [True] * 3)
     where = np.array([(0, 4), (2, 4), (2, 5), (1, 5), (1, 3), (1, 3), (2, 3)])
     # Pan: homed from the right, left, held, right, held, left; tilt: nobody knows, held, up, held, down, held.
     side = np.array([(-1, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (-1, -1), (1, -1)])
@@ -106,32 +106,32 @@ def test_looks_have_the_error_of_their_counter_and_half_the_play_of_their_side()
     for row in range(7):
         error[row, where[row]] = 1.0
         play[row, where[row]] = -side[row] / 2
-    np.testing.assert_array_equal(seen.error_share, error)
-    np.testing.assert_array_equal(seen.play_share, play)
+    np.testing.assert_array_equal(places.error_share, error)
+    np.testing.assert_array_equal(places.play_share, play)
 
 
 def test_the_line_is_the_least_squares_line_of_the_looks_used():
     rng = np.random.default_rng(2)
     counters = [rng.integers(-300, 300, 30), rng.permutation([-20, 0, 0, 50, 50, 50, 80] * 5)[:30]]
-    found = [places_of(each, 0.07) for each in counters]
-    shares = [interpolation(each.astype(float), nodes) for each, nodes in zip(counters, found, strict=True)]
-    assert len(found[0]) < 30 and len(found[1]) == 4, "one axis is interpolated, the other is not"
-    on_tilt = np.repeat([False, True], [len(nodes) for nodes in found])
-    seen = SeenPlaces(np.concatenate(found), on_tilt, np.concatenate(shares, axis=1), np.zeros((30, len(on_tilt))))
+    grids = [places_of(each, 0.07) for each in counters]
+    shares = [interpolation(each.astype(float), nodes) for each, nodes in zip(counters, grids, strict=True)]
+    assert len(grids[0]) < 30 and len(grids[1]) == 4, "one axis is interpolated, the other is not"
+    on_tilt = np.repeat([False, True], [len(nodes) for nodes in grids])
+    places = SeenPlaces(np.concatenate(grids), on_tilt, np.concatenate(shares, axis=1), np.zeros((30, len(on_tilt))))
     used = rng.uniform(size=30) < 0.7
     values = rng.standard_normal(len(on_tilt))
-    share = line_share(seen, used)
+    share = line_share(places, used)
     for axis in (0, 1):
-        own = on_tilt == bool(axis)
-        expected = np.polyfit(counters[axis][used], (shares[axis] @ values[own])[used], 1)[0]
-        assert share[own] @ values[own] == pytest.approx(expected, rel=1e-9)
-        assert share[own] @ seen.steps[own] == pytest.approx(1.0, rel=1e-12)
+        columns = on_tilt == bool(axis)
+        expected = np.polyfit(counters[axis][used], (shares[axis] @ values[columns])[used], 1)[0]
+        assert share[columns] @ values[columns] == pytest.approx(expected, rel=1e-9)
+        assert share[columns] @ places.steps[columns] == pytest.approx(1.0, rel=1e-12)
 
 
 def test_through_one_counter_there_is_no_line():
-    seen = seen_places(moves()[:2], [0, 1], RigTable())
-    np.testing.assert_allclose(line_share(seen, np.array([True, True])), [-1 / 60, 1 / 60, 0.0], rtol=1e-12)
-    assert not line_share(seen, np.array([True, False])).any()
+    places = seen_places(moves()[:2], [0, 1], RigTable())
+    np.testing.assert_allclose(line_share(places, np.array([True, True])), [-1 / 60, 1 / 60, 0.0], rtol=1e-12)
+    assert not line_share(places, np.array([True, False])).any()
 
 
 def test_gears_vary_where_a_scale_may_be_above_zero():

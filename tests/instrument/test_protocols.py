@@ -44,22 +44,22 @@ def test_four_point_plans(name: str):
         else:
             looks.setdefault(step.experiment, []).append((step.point, target, counters))
     assert len(looks) == 96 and [step.step for step in plan] == list(range(len(plan)))
-    seen = []
+    differences = []
     for four in looks.values():
         assert [look[:2] for look in four] == [(1, "d1"), (2, "d2"), (3, "d2"), (4, "d1")]
         assert four[0][2] == four[1][2] and four[2][2] == four[3][2]
-        seen.append(tuple(np.subtract(four[2][2], four[1][2])))
+        differences.append(tuple(np.subtract(four[2][2], four[1][2])))
     sizes = {(200,), (100, 200)}
     for direction, (axis, sign) in DIRECTION_SIGNS.items():
-        mine = [s[axis == "tilt"] for s in seen if np.sign(s[axis == "tilt"]) == sign and s[axis == "pan"] == 0]
+        mine = [s[axis == "tilt"] for s in differences if np.sign(s[axis == "tilt"]) == sign and s[axis == "pan"] == 0]
         assert len(mine) == 24, direction
         assert tuple(sorted({abs(s) for s in mine})) in sizes
 
 
 def test_approaches_of_the_protocols():
     """Reversed where asked; right and up cleared in the twin's; both kinds in the mixed."""
-    asked = four_point_protocol(repeats=3, approaches={name: ("reversed",) for name in DIRECTION_SIGNS})
-    assert _approach_signs(asked) == {name: {False} for name in DIRECTION_SIGNS}
+    plan = four_point_protocol(repeats=3, approaches={name: ("reversed",) for name in DIRECTION_SIGNS})
+    assert _approach_signs(plan) == {name: {False} for name in DIRECTION_SIGNS}
     twin = _approach_signs(PROTOCOLS["paper_twin"]())
     assert twin == {"left": {False}, "right": {True}, "up": {True}, "down": {False}}
     assert _approach_signs(PROTOCOLS["mixed"]()) == {name: {True, False} for name in DIRECTION_SIGNS}
@@ -79,7 +79,7 @@ def test_grid_sees_every_pose_from_both_sides():
     plan = grid_protocol()
     assert sum(step.action == "place" for step in plan) == 3
     approach, counters, target = [0, 0], [0, 0], ""
-    seen: dict[tuple, set] = {}
+    approaches: dict[tuple, set] = {}
     for step in plan:
         if step.action == "place":
             target = step.target
@@ -88,9 +88,9 @@ def test_grid_sees_every_pose_from_both_sides():
                 if value != counters[axis]:
                     approach[axis], counters[axis] = int(np.sign(value - counters[axis])), value
         else:
-            seen.setdefault((target, *counters), set()).add(tuple(approach))
-    assert len(seen) == 3 * 24
-    for pose, sides in seen.items():
+            approaches.setdefault((target, *counters), set()).add(tuple(approach))
+    assert len(approaches) == 3 * 24
+    for pose, sides in approaches.items():
         assert {pan for pan, _ in sides} == {-1, 1} and {tilt for _, tilt in sides} == {-1, 1}, pose
 
 
@@ -110,7 +110,7 @@ def test_starts_are_reached_as_ordered(how):
     """The last move of the axis before point 1 runs against (reversed) or along (cleared) the experiment."""
     plan = four_point_protocol(3, approaches=dict.fromkeys(DIRECTION_SIGNS, (how,)))
     directions = [name for name in DIRECTION_SIGNS for _ in range(3)]
-    counters, last_sign, seen = {"pan": 0, "tilt": 0}, {"pan": 0, "tilt": 0}, 0
+    counters, last_sign, count = {"pan": 0, "tilt": 0}, {"pan": 0, "tilt": 0}, 0
     for step in plan:
         if step.action == "move":
             for moved, value in (("pan", step.pan_steps), ("tilt", step.tilt_steps)):
@@ -119,10 +119,10 @@ def test_starts_are_reached_as_ordered(how):
         if step.action == "look" and step.point == 1:
             axis, sign = DIRECTION_SIGNS[directions[step.experiment]]
             assert last_sign[axis] == (sign if how == "cleared" else -sign)
-            seen += 1
+            count += 1
         if step.action == "look" and step.point == 4:
             assert last_sign[axis] == sign
-    assert seen == 12
+    assert count == 12
 
 
 def test_step_counts_are_taken_in_turn(mounted_rig):
@@ -150,6 +150,6 @@ def test_grid_sees_each_pose_from_either_side_of_both_axes(mounted_rig):
             sides.setdefault((move.pan_steps, move.tilt_steps), []).append((sign["pan"], sign["tilt"]))
         previous = move
     assert len(sides) == 24
-    for pan_signs, tilt_signs in (zip(*seen, strict=True) for seen in sides.values()):
+    for pan_signs, tilt_signs in (zip(*signs, strict=True) for signs in sides.values()):
         assert sorted(pan_signs) == [-1, 1]
         assert sorted(tilt_signs) == [-1, 1]

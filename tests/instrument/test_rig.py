@@ -60,13 +60,13 @@ def test_rig_table_round_trip():
     assert "harmonic" not in rig_table_toml(table), "a table without a period has nothing to say of them"
     stated = {name: Prior(0.01 * i, 0.02) for i, name in enumerate(HARMONIC_NAMES)}
     for periods in ({"pan": (22.5,)}, {"tilt": (360.0, 36.0)}, {"pan": (360.0, 0.1, 30.0), "tilt": (1.25,)}):
-        own = {name: prior for name, prior in stated.items() if name.split(".")[1] in periods}
+        waves = {name: prior for name, prior in stated.items() if name.split(".")[1] in periods}
         for axis, known in periods.items():
             for number in range(1, len(known) + 1):
-                own[f"harmonic_amplitude_deg.{axis}.{number}"] = Prior(0.0, 0.01 * number, "half-normal")
-        table = RigTable({**priors, **own}, "azimuth", periods)
+                waves[f"harmonic_amplitude_deg.{axis}.{number}"] = Prior(0.0, 0.01 * number, "half-normal")
+        table = RigTable({**priors, **waves}, "azimuth", periods)
         assert rig_table(rig_table_toml(table)) == table
-        assert {name for name in AMPLITUDE_NAMES if f'"{name}"' in rig_table_toml(table)} == own.keys() - {*stated}
+        assert {name for name in AMPLITUDE_NAMES if f'"{name}"' in rig_table_toml(table)} == waves.keys() - {*stated}
 
 
 def test_the_scatter_of_looks_is_written_where_it_is_stated():
@@ -416,8 +416,8 @@ def test_options_of_drivers_stand_beside_the_other_entries(tmp_path):
         "settle_s = 0.2\n[positioner.options]\nlaser = 'M8'\nunwatched = true\npower = 0.5\n[cameras.options]\nn = 3"
     )
     rig = read_rig(write_rig(tmp_path, RIG_FILE.replace("settle_s = 0.2", options)))
-    found = {key: value for key, value in rig.positioner.items() if key.startswith("options.")}
-    assert found == {"options.laser": "M8", "options.unwatched": 1, "options.power": 0.5}
+    entries = {key: value for key, value in rig.positioner.items() if key.startswith("options.")}
+    assert entries == {"options.laser": "M8", "options.unwatched": 1, "options.power": 0.5}
     assert rig.cameras["options.n"] == 3 and rig.cameras["source"] == "opencv"
 
 

@@ -45,15 +45,15 @@ def test_folder_there_and_back(simulated, tmp_path):
         "sightings.csv",
         "truth.json",
     ]
-    found = read_campaign(tmp_path)
-    assert found.spots == simulated.campaign.spots
-    assert found.rig == simulated.campaign.rig
+    campaign = read_campaign(tmp_path)
+    assert campaign.spots == simulated.campaign.spots
+    assert campaign.rig == simulated.campaign.rig
     text = (tmp_path / "campaign.toml").read_text() + (tmp_path / "truth.json").read_text()
     scanners = set(NAMES) - SIGHTING_HEAD.documented
     assert not [name for name in scanners if f'"{name}"' in text]
-    truth = read_truth(tmp_path / "truth.json", found.stereo)
+    truth = read_truth(tmp_path / "truth.json", campaign.stereo)
     assert truth.parameters["azimuth_zero_deg"] == simulated.truth.parameters["azimuth_zero_deg"]
-    assert not check_campaign(found).findings
+    assert not check_campaign(campaign).findings
 
 
 @pytest.mark.parametrize(

@@ -111,9 +111,9 @@ def test_every_segment_has_its_own_zero():
 def test_a_rest_knows_how_it_was_reached():
     """Distance of the last move, the way since the last reversal, and the homing that the counter counts from."""
     moves = (*pan_moves(0, 200, 260, 260, 100), move_row(5, 1, 5.0, 30, 0, "right", "up"))
-    found = [(rest.move, rest.sign, rest.distance, rest.leg, rest.homing) for rest in rests_of(moves, "pan")]
-    assert found[:3] == [(0, 1, 0, math.inf, 0), (1, 1, 200, math.inf, 0), (2, 1, 60, math.inf, 0)]
-    assert found[3:] == [(2, 1, 60, math.inf, 0), (4, -1, -160, 160, 0), (5, -1, 0, math.inf, 5)]
+    rests = [(rest.move, rest.sign, rest.distance, rest.leg, rest.homing) for rest in rests_of(moves, "pan")]
+    assert rests[:3] == [(0, 1, 0, math.inf, 0), (1, 1, 200, math.inf, 0), (2, 1, 60, math.inf, 0)]
+    assert rests[3:] == [(2, 1, 60, math.inf, 0), (4, -1, -160, 160, 0), (5, -1, 0, math.inf, 5)]
     assert legs_of(moves) == {"left": [200, 60], "right": [160]}
 
 
