@@ -169,12 +169,12 @@ def evaluate():
     def compiled(z, space, arrays):
         model = space.model(z)
         angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-        found = likelihood.look_terms(model, arrays)
+        result = likelihood.look_terms(model, arrays)
         terms = {
-            "residual": jnp.stack(found.terms.residual, axis=1),
-            "slope": jnp.stack([jnp.stack(found.terms.by_pan, 1), jnp.stack(found.terms.by_tilt, 1)], axis=2),
-            "log_scale": found.terms.log_scale,
-            "predicted": jnp.stack(found.looks.predicted, axis=1),
+            "residual": jnp.stack(result.terms.residual, axis=1),
+            "slope": jnp.stack([jnp.stack(result.terms.by_pan, 1), jnp.stack(result.terms.by_tilt, 1)], axis=2),
+            "log_scale": result.terms.log_scale,
+            "predicted": jnp.stack(result.looks.predicted, axis=1),
         }
         return model, angles, terms
 

@@ -52,12 +52,12 @@ def test_a_table_for_pandas_has_the_numbers_themselves():
 
 def shown_classes() -> list[type]:
     """Every class of the package that shows itself."""
-    found = {}
+    classes = {}
     for name in MODULES:
         for each in vars(importlib.import_module(f"tvsbayes.{name}")).values():
             if inspect.isclass(each) and issubclass(each, Shown) and each is not Shown:
-                found[each.__qualname__] = each
-    return list(found.values())
+                classes[each.__qualname__] = each
+    return list(classes.values())
 
 
 def test_every_result_that_the_package_offers_shows_itself():

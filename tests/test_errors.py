@@ -29,9 +29,9 @@ def test_message_tells_place_found_allowed_and_remedy():
 @pytest.mark.parametrize("kind", [TvsError, InputError, NothingToEstimate, NotConverged, DeviceFault])
 def test_errors_pass_between_processes_whole(kind):
     """A pool that cannot unpickle its worker's error waits for ever."""
-    told = kind("code", "what was found", file="a.csv", line=3, column="u_px", found="x", allowed="y", remedy="z")
-    again = pickle.loads(pickle.dumps(told))
-    assert type(again) is kind and again.args == told.args and vars(again) == vars(told)
+    error = kind("code", "what was found", file="a.csv", line=3, column="u_px", found="x", allowed="y", remedy="z")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is kind and again.args == error.args and vars(again) == vars(error)
 
 
 @pytest.mark.parametrize(

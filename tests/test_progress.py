@@ -27,71 +27,71 @@ class Clock:
 
 def followed(stages, steps):
     """What is told of a job whose steps are (seconds that pass, stage to begin or share of the present one)."""
-    clock, told = Clock(), []
-    with Job(stages, told.append, clock) as job:
+    clock, states = Clock(), []
+    with Job(stages, states.append, clock) as job:
         for seconds, step in steps:
             clock.now_s += seconds
             if isinstance(step, str):
                 job.begin(step)
             else:
                 job.at(step)
-    return told
+    return states
 
 
 def test_stages_add_up_to_the_whole():
-    told = followed({"one": 1.0, "nothing": 0.0, "two": 2.0, "three": 5.0}, [(1, n) for n in ("one", "two", "three")])
-    assert [state.share for state in told] == pytest.approx([0, 1 / 8, 3 / 8, 1], abs=ROUNDING)
-    assert [state.doing for state in told] == ["one", "two", "three", "three"]
-    check_forward(told)
+    states = followed({"one": 1.0, "nothing": 0.0, "two": 2.0, "three": 5.0}, [(1, n) for n in ("one", "two", "three")])
+    assert [state.share for state in states] == pytest.approx([0, 1 / 8, 3 / 8, 1], abs=ROUNDING)
+    assert [state.doing for state in states] == ["one", "two", "three", "three"]
+    check_forward(states)
     again = followed({"one": 3.0, "two": 1.0}, [(1, 0.5), (1, 1.0), (1, "two"), (1, 0.25), (0, 9.0)])
     assert [state.share for state in again] == pytest.approx([3 / 8, 3 / 4, 3 / 4, 13 / 16, 1, 1], abs=ROUNDING)
 
 
 def test_stages_without_time_are_not_told():
-    told = followed({"nothing": 0.0, "all": 2.0}, [(1, "nothing"), (1, 0.5), (1, "all")])
-    assert [state.doing for state in told] == ["all", "all"]
+    states = followed({"nothing": 0.0, "all": 2.0}, [(1, "nothing"), (1, 0.5), (1, "all")])
+    assert [state.doing for state in states] == ["all", "all"]
     for stages in ({}, {"nothing": 0.0}, {"back": -1.0, "forth": 3.0}):
         with pytest.raises(ValueError, match="shares of the time"):
             Job(stages)
 
 
 def test_what_goes_backwards_is_not_told_so():
-    told = followed({"one": 1.0, "two": 1.0}, [(1, 0.9), (1, 0.2), (1, "two"), (1, -3.0), (-9, 0.5), (1, "one")])
-    check_forward(told)
-    assert [state.share for state in told] == pytest.approx([0.45, 0.45, 0.5, 0.5, 0.75, 0.75, 1], abs=ROUNDING)
+    states = followed({"one": 1.0, "two": 1.0}, [(1, 0.9), (1, 0.2), (1, "two"), (1, -3.0), (-9, 0.5), (1, "one")])
+    check_forward(states)
+    assert [state.share for state in states] == pytest.approx([0.45, 0.45, 0.5, 0.5, 0.75, 0.75, 1], abs=ROUNDING)
 
 
 def test_time_left_of_an_even_job_is_right_from_the_beginning():
     """A hundred steps of half a second: 50 s less what has passed, once there is something to predict by."""
-    told = followed({"all": 1.0}, [(0.5, (k + 1) / 100) for k in range(100)])
-    known = [state for state in told if state.seconds_left is not None]
+    states = followed({"all": 1.0}, [(0.5, (k + 1) / 100) for k in range(100)])
+    known = [state for state in states if state.seconds_left is not None]
     assert known[0].share >= EXPECTED_SHARE and known[0].seconds >= EXPECTED_SECONDS and len(known) >= 99
     for state in known:
         assert state.seconds_left == pytest.approx(50 - state.seconds, abs=1e-9), "50 s, shares rounded to 1e-16"
-    check_forward(told)
+    check_forward(states)
 
 
 def test_time_left_of_an_uneven_job_rises_with_the_clock_at_most():
     """A stage that takes fifty times what was expected, and one that takes nothing."""
     steps = [(0.1, k / 10) for k in range(10)] + [(0.0, "slow")] + [(5, k / 10) for k in range(10)] + [(0, "none")]
-    told = followed({"fast": 1.0, "slow": 1.0, "none": 8.0}, steps)
-    check_forward(told)
-    assert max(state.seconds_left for state in told if state.seconds_left is not None) > 20, "or nothing could rise"
+    states = followed({"fast": 1.0, "slow": 1.0, "none": 8.0}, steps)
+    check_forward(states)
+    assert max(state.seconds_left for state in states if state.seconds_left is not None) > 20, "or nothing could rise"
 
 
-@pytest.mark.parametrize("asked", [True, False])
-def test_what_was_not_needed_predicts_nothing(asked):
+@pytest.mark.parametrize("needed", [True, False])
+def test_what_was_not_needed_predicts_nothing(needed):
     """Ten steps of a second each, after a stage of nine tenths whose result was there already."""
-    clock, told = Clock(), []
-    with Job({"fit": 9.0, "work": 1.0, "more": 0.0}, told.append, clock) as job:
-        if asked:
+    clock, states = Clock(), []
+    with Job({"fit": 9.0, "work": 1.0, "more": 0.0}, states.append, clock) as job:
+        if needed:
             job.part("fit")
         job.begin("work")
         for k in range(1, 11):
             clock.now_s += 1
             job.at(k / 10)
-    check_forward(told)
-    known = [state for state in told if state.seconds_left is not None]
+    check_forward(states)
+    known = [state for state in states if state.seconds_left is not None]
     # A step is a hundredth of the whole: two of them are enough to predict by.
     assert len(known) == 10
     for state in known:
@@ -99,18 +99,18 @@ def test_what_was_not_needed_predicts_nothing(asked):
 
 
 def test_a_job_within_a_job_fills_its_stage():
-    clock, told = Clock(), []
-    with Job({"first": 1.0, "second": 3.0}, told.append, clock) as job:
+    clock, states = Clock(), []
+    with Job({"first": 1.0, "second": 3.0}, states.append, clock) as job:
         with Job({"a": 1.0, "b": 1.0}, job.part("first"), clock) as inner:
             inner.begin("b")
         with Job({"c": 1.0}, job.part("second"), clock) as inner:
             inner.at(0.5, "2 of 4")
-    assert [(state.doing, state.share) for state in told] == [
+    assert [(state.doing, state.share) for state in states] == [
         *(("first", 0), ("first: b", 1 / 8), ("first: b", 1 / 4)),
         *(("second", 1 / 4), ("second: c: 2 of 4", 5 / 8), ("second: c: 2 of 4", 1)),
         ("second: c: 2 of 4", 1),
     ]
-    check_forward(told)
+    check_forward(states)
 
 
 def test_nobody_listens_nothing_is_read():
@@ -127,17 +127,17 @@ def test_nobody_listens_nothing_is_read():
 
 def test_who_listens_may_end_the_work():
     """The exception is the listener's own, and the end is not told of a job that was ended."""
-    told = []
+    states = []
 
     def stop(state):
-        told.append(state)
+        states.append(state)
         if state.share > 0.3:
             raise LookupError("enough")
 
     with pytest.raises(LookupError, match="enough"), Job({"all": 1.0}, stop) as job:
         for k in range(10):
             job.at(k / 10)
-    assert [state.share for state in told] == [0, 0.1, 0.2, 0.3, 0.4]
+    assert [state.share for state in states] == [0, 0.1, 0.2, 0.3, 0.4]
 
 
 def test_a_stage_of_unknown_length_goes_on_when_more_is_expected():
@@ -187,10 +187,10 @@ def test_a_session_sees_one_line_and_is_left_without(session):
 
 def test_scripts_and_whoever_listens_see_no_line(session, monkeypatch):
     lines, _ = session
-    told = []
-    with Job({"fit": 1.0}, told.append):
+    states = []
+    with Job({"fit": 1.0}, states.append):
         pass
     monkeypatch.delattr(sys, "ps1")
     with Job({"fit": 1.0}):
         pass
-    assert told and lines == []
+    assert states and lines == []
