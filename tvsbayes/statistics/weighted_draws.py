@@ -18,7 +18,7 @@ PRIOR_DRAWS, PRIOR_K = 10, 0.5
 """Weight and centre of the prior of k (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72, appendix G)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Moments:
     """Quantities by draws; every field has the shape of the quantities.
 
