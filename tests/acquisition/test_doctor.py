@@ -55,7 +55,7 @@ def bench(**camera):
     return device, Camera(device, **camera)
 
 
-def found(device, camera, tmp_path, *, laser=False, homed=True):
+def checks_of(device, camera, tmp_path, *, laser=False, homed=True):
     """The checks by name, after a homing where wanted."""
     links = lambda: ModelLink(device)  # noqa: E731
     if homed:
@@ -80,7 +80,7 @@ def found(device, camera, tmp_path, *, laser=False, homed=True):
 
 def test_healthy_instrument(tmp_path):
     device, camera = bench()
-    checks = found(device, camera, tmp_path, laser=True)
+    checks = checks_of(device, camera, tmp_path, laser=True)
     assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}
     assert checks["firmware"].found == "version 1.1.0" and "rises by" in checks["laser"].found
     assert checks["timing"].found.startswith("0.6 ms, 0 of 20") and camera.closed
@@ -97,17 +97,17 @@ def test_a_grbl_board_is_examined_by_its_own_rules(tmp_path):
         open_camera=lambda: camera,
         clock=device.clock,
     )
-    checks_of = {check.name: check for check in checks}
-    assert (checks_of["firmware"].status, checks_of["firmware"].found) == ("ok", "version Grbl 1.1h")
-    assert "no watchdog" in checks_of["positioner"].found and checks_of["positioner"].remedy
-    assert (checks_of["homing"].status, checks_of["homing"].found) == ("warning", "alarm") and board.steps == [400, 250]
+    by_name = {check.name: check for check in checks}
+    assert (by_name["firmware"].status, by_name["firmware"].found) == ("ok", "version Grbl 1.1h")
+    assert "no watchdog" in by_name["positioner"].found and by_name["positioner"].remedy
+    assert (by_name["homing"].status, by_name["homing"].found) == ("warning", "alarm") and board.steps == [400, 250]
 
 
 def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):
     device, camera = bench()
     grab = camera.grab
     camera.grab = lambda: (pair := grab(), StereoImage(*(p.astype(np.uint16) * 16 for p in (pair.left, pair.right))))[1]
-    checks = found(device, camera, tmp_path, laser=True)
+    checks = checks_of(device, camera, tmp_path, laser=True)
     assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}, checks
 
 
@@ -119,7 +119,7 @@ def test_a_dark_picture_is_judged_by_the_bits_that_its_driver_states(tmp_path):
         pair := grab(),
         StereoImage(*(p.astype(np.uint16) for p in (pair.left, pair.right)), white=4095),
     )[1]
-    check = found(device, camera, tmp_path)["exposure left"]
+    check = checks_of(device, camera, tmp_path)["exposure left"]
     assert check.status == "warning" and check.found.startswith("mean 1 of 255") and "cap" in check.remedy
 
 
@@ -136,7 +136,7 @@ def test_a_dark_picture_is_judged_by_the_bits_that_its_driver_states(tmp_path):
 )
 def test_bad_pictures_are_named_with_a_remedy(tmp_path, camera, name, word):
     device, camera = bench(**camera)
-    check = found(device, camera, tmp_path, laser=True)[name]
+    check = checks_of(device, camera, tmp_path, laser=True)[name]
     assert check.status in ("warning", "fault") and word in check.remedy
 
 
@@ -145,7 +145,7 @@ def test_laser_stays_off_unless_asked_for(tmp_path):
     lasers = []
     grab = camera.grab
     camera.grab = lambda: (lasers.append(device.mechanics.laser_on), grab())[1]
-    assert found(device, camera, tmp_path)["laser"].status == "skipped"
+    assert checks_of(device, camera, tmp_path)["laser"].status == "skipped"
     assert lasers and not any(lasers)
 
 
@@ -162,23 +162,23 @@ def test_laser_check_that_is_ended_from_outside_leaves_it_off(tmp_path, name):
 
     camera.grab = ended
     with pytest.raises(KeyboardInterrupt):
-        found(device, camera, tmp_path, laser=True)
+        checks_of(device, camera, tmp_path, laser=True)
     assert lit[-1] and not device.mechanics.laser_on and camera.closed
 
 
 def test_unhomed_positioner_refuses_the_laser(tmp_path):
     device, camera = bench()
-    checks = found(device, camera, tmp_path, laser=True, homed=False)
+    checks = checks_of(device, camera, tmp_path, laser=True, homed=False)
     assert (checks["homing"].status, checks["laser"].status) == ("warning", "fault")
 
 
 def test_dead_camera_and_dead_device(tmp_path):
     device, camera = bench(fail_at=1)
-    checks = found(device, camera, tmp_path, laser=True)
+    checks = checks_of(device, camera, tmp_path, laser=True)
     assert (checks["cameras"].status, checks["laser"].status) == ("fault", "skipped") and camera.closed
     device, camera = bench()
     device.model.receive = lambda data, now_us: None
-    checks = found(device, camera, tmp_path, homed=False)
+    checks = checks_of(device, camera, tmp_path, homed=False)
     assert checks["firmware"].status == "fault" and camera.closed
 
 

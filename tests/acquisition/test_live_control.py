@@ -20,7 +20,7 @@ from tvsbayes.instrument.campaign import read_campaign
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 
 
-def asked(folder) -> list[tuple[str, bool]]:
+def requests(folder) -> list[tuple[str, bool]]:
     """What the journal holds of requests: what, and whether the laser was on then."""
     records = read_journal(folder).records
     return [(r.data["what"], r.data["device"]["laser_on"]) for r in records if r.event == "asked"]
@@ -49,7 +49,7 @@ def test_pause_and_resume_lose_nothing(mounted_rig, tmp_path):
     outcome = run.engine.run()
     assert (outcome.reason, outcome.looks, outcome.ok) == ("done", 8, 8)
     assert pauses == [("paused", False)]
-    assert asked(tmp_path / "c") == [("pause", False), ("resume", False)]
+    assert requests(tmp_path / "c") == [("pause", False), ("resume", False)]
     assert states(live) == [("pause", "acknowledged"), ("resume", "acknowledged")]
     assert all("laser off" in request.answer and request.waited_s >= 0 for request in live.requests.recent())
     times = [r.data["time_s"] for r in read_journal(tmp_path / "c").records if "time_s" in r.data]
@@ -61,7 +61,7 @@ def test_stop_ends_in_good_order_and_the_rest_is_resumed(mounted_rig, tmp_path):
     run = run_with(mounted_rig, tmp_path / "c", live, 3, "stop")
     outcome = run.engine.run()
     assert (outcome.reason, outcome.looks) == ("interrupted", 3) and run.dark()
-    assert asked(tmp_path / "c") == [("stop", False)] and states(live) == [("stop", "acknowledged")]
+    assert requests(tmp_path / "c") == [("stop", False)] and states(live) == [("stop", "acknowledged")]
     assert (live.latest.state, live.latest.reason, live.latest.fault) == ("ended", "interrupted", None)
     again = Run(mounted_rig, tmp_path / "c", resume=True, start=1)
     assert again.engine.run().reason == "done"
@@ -83,7 +83,7 @@ def test_laser_off_breaks_off_the_look_which_is_taken_again(mounted_rig, tmp_pat
     assert (outcome.reason, outcome.looks, outcome.ok, outcome.retries) == ("done", 8, 8, 0)
     # The first order after the request is the one that it asks for.
     assert [on for on, waiting in lit if "laser off" in waiting] == [False]
-    assert asked(tmp_path / "c") == [("laser off", False), ("resume", False)]
+    assert requests(tmp_path / "c") == [("laser off", False), ("resume", False)]
     assert run.dark()
 
 
@@ -92,7 +92,7 @@ def test_laser_off_then_stop(mounted_rig, tmp_path):
     run = run_with(mounted_rig, tmp_path / "c", live, 3, "laser off")
     outcome = run.engine.run()
     assert (outcome.reason, outcome.looks) == ("interrupted", 2) and run.dark()
-    assert [what for what, _ in asked(tmp_path / "c")] == ["laser off", "stop"]
+    assert [what for what, _ in requests(tmp_path / "c")] == ["laser off", "stop"]
 
 
 def test_laser_off_before_a_motion(mounted_rig, tmp_path):
@@ -107,7 +107,7 @@ def test_laser_off_before_a_motion(mounted_rig, tmp_path):
 
     run.positioner.move_to = moving
     assert run.engine.run().ok == 8
-    assert asked(tmp_path / "c") == [("laser off", False), ("resume", False)]
+    assert requests(tmp_path / "c") == [("laser off", False), ("resume", False)]
 
 
 def test_a_pause_without_a_page_ends_with_ctrl_c_only(mounted_rig, tmp_path):
@@ -136,7 +136,7 @@ def test_what_cannot_be_carried_out_is_said_to_have_failed(mounted_rig, tmp_path
     run = Run(mounted_rig, tmp_path / "c", observer=lambda i: Failing(i, 3, gone), live=live)
     with pytest.raises(DeviceFault):
         run.engine.run()
-    assert states(live) == [("pause", "failed")] and asked(tmp_path / "c") == []
+    assert states(live) == [("pause", "failed")] and requests(tmp_path / "c") == []
     assert live.latest.fault.code == "reset" and "--resume" in live.latest.fault.remedy and run.dark()
 
 

@@ -19,5 +19,5 @@ def test_the_remedy_hits(say, tmp_path, name):
     code, out, log = say(*command.split())
     printed = " ".join((out + log).split())
     assert code == wrong.code, printed
-    for words in wrong.said:
+    for words in wrong.words:
         assert any(word in printed for word in words.split("|")), printed

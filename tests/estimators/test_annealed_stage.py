@@ -30,31 +30,31 @@ def beside(dozen) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def found(dozen, evaluate):
+def point(dozen, evaluate):
     with jax.enable_x64(True):
         return SimpleNamespace(z=beside(dozen), **vars(found_at(evaluate, dozen, beside(dozen))))
 
 
-def test_squares_are_the_quadratic_form_of_the_dense_gaussian(dozen, found):
+def test_squares_are_the_quadratic_form_of_the_dense_gaussian(dozen, point):
     """And the prior's: with stop errors, scatter of looks and errors at places, as in the density."""
     count = len(ordered_spots(dozen.campaign))
-    residual, slope = found.terms.residual[:count].ravel(), found.terms.slope[:count]
-    covariance = residual_covariance(angle_covariances(dozen.campaign, physical(found)), slope)
-    value, prior = found.reduced.value, np.where(NOISE, 0.0, found.z)
+    residual, slope = point.terms.residual[:count].ravel(), point.terms.slope[:count]
+    covariance = residual_covariance(angle_covariances(dozen.campaign, physical(point)), slope)
+    value, prior = point.reduced.value, np.where(NOISE, 0.0, point.z)
     squares = residual @ np.linalg.solve(covariance, residual) + prior @ prior
     # Dense solves of a covariance of condition 1e8.
     assert value @ value == pytest.approx(squares, rel=1e-7)
 
 
-def test_reduced_residuals_have_length_slope_and_curvature_of_all(dozen, found):
+def test_reduced_residuals_have_length_slope_and_curvature_of_all(dozen, point):
     """Against the smoother in NumPy: r'C^-1 r + z'z, J'C^-1 r and J'C^-1 J + 1, held coordinates without a part."""
-    lin = found.reduced.also
+    lin = point.reduced.also
     jacobian = np.where(NOISE, 0.0, -lin.residual_jacobian)
     whole = stop_information(linear_spots(lin, dozen.arrays, jacobian))
     residual = lin.residual.reshape(-1)
     solved = np.concatenate([group.residual for group in whole.groups])
-    prior = np.where(NOISE, 0.0, found.z)
-    value, root = found.reduced.value, found.reduced.jacobian
+    prior = np.where(NOISE, 0.0, point.z)
+    value, root = point.reduced.value, point.reduced.jacobian
     assert value @ value == pytest.approx(residual @ solved + prior @ prior, rel=ALGEBRA)
     slope = -jacobian.reshape(-1, len(NAMES)).T @ solved + prior
     np.testing.assert_allclose(root.T @ value, slope, atol=ALGEBRA * np.abs(slope).max())
@@ -62,10 +62,10 @@ def test_reduced_residuals_have_length_slope_and_curvature_of_all(dozen, found):
     np.testing.assert_allclose(root.T @ root, curvature, atol=ALGEBRA * np.abs(curvature).max())
 
 
-def test_gears_that_repeat_no_error_leave_residuals_and_derivatives_alone(dozen, found):
+def test_gears_that_repeat_no_error_leave_residuals_and_derivatives_alone(dozen, point):
     arrays = campaign_arrays(dozen.campaign, perfect_gears(dozen.campaign.rig))
-    stayed = linearised_at(found.z, dozen.space, arrays)
-    assert np.array_equal(stayed.z, found.z)
+    stayed = linearised_at(point.z, dozen.space, arrays)
+    assert np.array_equal(stayed.z, point.z)
     for name in ("residual", "slope", "residual_jacobian", "predicted_jacobian", "stop_variance"):
-        expected = getattr(found.reduced.also, name)
+        expected = getattr(point.reduced.also, name)
         np.testing.assert_allclose(getattr(stayed, name), expected, atol=1e-12 * max(np.abs(expected).max(), 1e-30))

@@ -87,31 +87,31 @@ def varying(dozen) -> Varying:
 
 
 @pytest.fixture(scope="module", params=SCALES)
-def found(request, varying, evaluate) -> SimpleNamespace:
+def point(request, varying, evaluate) -> SimpleNamespace:
     moved = varying.z + np.where(NOISE, 0.0, 0.3 * np.random.default_rng(33).standard_normal(len(NAMES)))
     with jax.enable_x64(True):
         z = coordinates_with(varying.space, moved, SCALES[request.param])
-        here = found_at(evaluate, varying, z)
-    values = physical(here)
+        evaluated = found_at(evaluate, varying, z)
+    values = physical(evaluated)
     for name, value in SCALES[request.param].items():
         assert values[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
-    return SimpleNamespace(z=z, values=values, **vars(here))
+    return SimpleNamespace(z=z, values=values, **vars(evaluated))
 
 
-def test_log_density_is_that_of_the_dense_gaussian(varying, found):
-    dense = dense_log_density(varying.campaign, found)
-    assert found.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
+def test_log_density_is_that_of_the_dense_gaussian(varying, point):
+    dense = dense_log_density(varying.campaign, point)
+    assert point.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
 
 
-def test_every_scale_matters(varying, found):
+def test_every_scale_matters(varying, point):
     """Each error left out of the dense covariance is seen a thousand times above what the comparison allows."""
-    dense = dense_log_density(varying.campaign, found)
-    for name, value in found.values.items():
+    dense = dense_log_density(varying.campaign, point)
+    for name, value in point.values.items():
         scale = any(part in name for part in ("transmission_error", "play_var", "drift", "amplitude"))
         if not scale or value < 1e-9:
             continue
-        without = SimpleNamespace(**vars(found))
-        values = {**found.values, name: value * 1.1}
+        without = SimpleNamespace(**vars(point))
+        values = {**point.values, name: value * 1.1}
         count = len(ordered_spots(varying.campaign))
         residual, slope = without.terms.residual[:count].ravel(), without.terms.slope[:count]
         covariance = residual_covariance(angle_covariances(varying.campaign, values), slope)
@@ -144,17 +144,17 @@ def dense_places(varying: Varying, values: dict[str, float]) -> tuple[np.ndarray
     return covariance, angles
 
 
-def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varying, found):
+def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varying, point):
     """Mean, and covariance from what each normal number moves: no draw is left to chance."""
     count, places = len(ordered_spots(varying.campaign)), varying.arrays.gears.places
     filled, valid = varying.arrays.gears.filled, np.asarray(places.valid)
-    residual, slope = found.terms.residual[:count], found.terms.slope[:count]
-    prior, angles = dense_places(varying, found.values)
+    residual, slope = point.terms.residual[:count], point.terms.slope[:count]
+    prior, angles = dense_places(varying, point.values)
     load = np.einsum("iua,aie->iue", slope, angles).reshape(4 * count, -1)
-    whole = residual_covariance(angle_covariances(varying.campaign, found.values), slope)
+    whole = residual_covariance(angle_covariances(varying.campaign, point.values), slope)
     gain = np.linalg.solve(whole, load @ prior).T
     normals = np.concatenate([np.zeros((1, 2 * filled)), np.eye(2 * filled)])
-    points = np.repeat(found.z[None], len(normals), axis=0)
+    points = np.repeat(point.z[None], len(normals), axis=0)
     drawn = likelihood.evaluate(points, normals, varying.space, varying.arrays).place_errors_rad
     valid_places = np.tile(valid[:filled], 2)
     mean, moved = drawn[0][valid_places], (drawn[1:] - drawn[0])[:, valid_places]
@@ -167,16 +167,16 @@ def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varyin
     assert not np.asarray(gears.error_share)[:, ~valid].any() and not np.asarray(gears.play_share)[:, ~valid].any()
 
 
-def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying, found):
+def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying, point):
     """r'C^-1 r + z'z, J'C^-1 r and J'C^-1 J + 1, held coordinates without a part."""
-    lin = found.reduced.also
+    lin = point.reduced.also
     # The scatter of looks is in the unit noise of the linearised campaign.
-    values = {n: 0.0 if n.startswith("look_scatter") else value for n, value in found.values.items()}
+    values = {n: 0.0 if n.startswith("look_scatter") else value for n, value in point.values.items()}
     covariance = residual_covariance(angle_covariances(varying.campaign, values), lin.slope)
     residual, jacobian = lin.residual.ravel(), np.where(NOISE, 0.0, -lin.residual_jacobian).reshape(-1, len(NAMES))
     solved = np.linalg.solve(covariance, np.column_stack([residual, jacobian]))
-    prior = np.where(NOISE, 0.0, found.z)
-    value, root = found.reduced.value, found.reduced.jacobian
+    prior = np.where(NOISE, 0.0, point.z)
+    value, root = point.reduced.value, point.reduced.jacobian
     assert value @ value == pytest.approx(residual @ solved[:, 0] + prior @ prior, rel=ALGEBRA)
     slope = -jacobian.T @ solved[:, 0] + prior
     np.testing.assert_allclose(root.T @ value, slope, atol=ALGEBRA * np.abs(slope).max())

@@ -27,15 +27,15 @@ def believers(knowledge, *z) -> Instruments:
 
 
 @pytest.mark.parametrize(("together", "kept"), [pytest.param(4096, 16, marks=pytest.mark.slow), (1, 2)])
-def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge, found, monkeypatch, together, kept):
+def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge, pool, monkeypatch, together, kept):
     """One by one, move by move through the filter: at the true noise for the scales, at these for the covariance.
 
     In parts of any size, and a design asked for later than others.
     """
     monkeypatch.setattr(Assurance, "PAIRS", together)
     monkeypatch.setattr(Assurance, "CACHED", kept)
-    picks = np.random.default_rng(4).integers(0, len(found.looks), 12)
-    family = Family(knowledge, found, np.concatenate([picks, picks]), False)
+    picks = np.random.default_rng(4).integers(0, len(pool.looks), 12)
+    family = Family(knowledge, pool, np.concatenate([picks, picks]), False)
     target = parse_target(DEFAULT_TARGET)
     drawn = draw_instruments(knowledge, 2, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
@@ -46,14 +46,14 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
     reported = {**first, **assurance.values([6, 2])}
     instruments = assurance.instruments
     for row in range(2):
-        here, z, space = instruments[np.array([row])], instruments.z[row], instruments.space_of(row)
+        instrument, z, space = instruments[np.array([row])], instruments.z[row], instruments.space_of(row)
         seen = assurance.arrays.at(z, space)
         for n in (2, 6):
             steps, chosen = family.arranged(n).steps, assurance.index[: 4 * n]
             exact = information_of(steps, knowledge, z=z, space=space).fisher
             noise = assurance.noise[None, row]
             covariance = covariance_of(knowledge.precision + exact)[None]
-            at = judged_z(here, seen[None], assurance.looks.side, chosen, covariance, knowledge, noise)[0]
+            at = judged_z(instrument, seen[None], assurance.looks.side, chosen, covariance, knowledge, noise)[0]
             pose = seen.mirror_angles_rad[assurance.index].mean(axis=0)
             judged = information_of(steps, knowledge, z=at, space=space).fisher
             expected = sensitivity(target, z, space, knowledge.rig.table, pose).value(
@@ -62,19 +62,19 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
             assert reported[n][row] == pytest.approx(expected, rel=ROUNDING)
 
 
-def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(knowledge, found, monkeypatch):
+def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(knowledge, pool, monkeypatch):
     """Infinite, and the others as if those were not there."""
-    family = Family(knowledge, found, np.arange(8), False)
+    family = Family(knowledge, pool, np.arange(8), False)
     target = parse_target("u(left) <= 1 deg/step")
     instruments = draw_instruments(knowledge, 4, 1)
     every = Assurance(family, target, instruments, 1).values([2])[2]
     poses = []
 
-    def refused(*asked):
-        poses.append(asked)
+    def refused(*arguments):
+        poses.append(arguments)
         if len(poses) == 2:
             raise InputError("out-of-reach", "no beam")
-        return sensitivity(*asked)
+        return sensitivity(*arguments)
 
     monkeypatch.setattr("tvsbayes.planning.assurance.sensitivity", refused)
     blind = Assurance(family, target, instruments, 1)
@@ -91,9 +91,9 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
     assert values[[0, 2]] == pytest.approx(every[[0, 2]], rel=1e-12) and np.isfinite(every).all()
 
 
-def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
+def test_other_noise_scales_need_no_new_look(knowledge, pool, seen):
     """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
-    family = Family(knowledge, found, np.arange(len(found.looks)), False)
+    family = Family(knowledge, pool, np.arange(len(pool.looks)), False)
     truth = believers(knowledge, knowledge.z)
     assurance = Assurance(family, parse_target(DEFAULT_TARGET), truth, 0)
     z = knowledge.z.copy()
@@ -106,40 +106,40 @@ def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
     assert np.abs(one - before).max() > 0.1 * np.abs(one).max(), "the scales matter, or the law would be empty"
 
 
-def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, seen):
+def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, seen):
     """Thousands of stops tell the true sd; none leave the prior's root mean square; the scatter is 1 / sqrt(2 n)."""
     true = knowledge.z.copy()
     columns = STOP_COLUMNS.ravel()
     true[columns] = 1.5
     truth, exact = believers(knowledge, true), np.zeros((1, PARAMETERS, PARAMETERS))
-    many = np.tile(np.arange(len(found.looks)), 40)
+    many = np.tile(np.arange(len(pool.looks)), 40)
 
     def scales(chosen, noise):
         noise = np.full((1, 5), noise)
-        return judged_z(truth, seen[None], found.looks.side, chosen, exact, knowledge, noise)[0, columns]
+        return judged_z(truth, seen[None], pool.looks.side, chosen, exact, knowledge, noise)[0, columns]
 
     assert scales(many, 0.0) == pytest.approx(1.5, abs=0.01)
     one = scales(many[:1], 0.0)
     assert (np.abs(one) < 1.5).all()
     # E s^2 of a log-normal with sd u of ln s is exp(2 u^2) times the square of its median: its root lies at z = u.
-    unseen = ~np.isin(columns, STOP_COLUMNS[np.arange(2), (found.looks.side[many[0]] > 0).astype(int)])
+    unseen = ~np.isin(columns, STOP_COLUMNS[np.arange(2), (pool.looks.side[many[0]] > 0).astype(int)])
     np.testing.assert_allclose(one[unseen], np.asarray(knowledge.space.u)[columns][unseen], rtol=1e-12)
     per_direction = len(many) / 2
     # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
     assert scales(many, 1.0) - scales(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
 
 
-def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, found, seen):
+def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, pool, seen):
     """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
     columns = STOP_COLUMNS.ravel()
     true = knowledge.z.copy()
     true[columns] = 1.5
     truth = believers(knowledge, true)
-    chosen = np.resize(np.arange(len(found.looks)), 60)
+    chosen = np.resize(np.arange(len(pool.looks)), 60)
 
     def scatter(covariance):
         low, high = (
-            judged_z(truth, seen[None], found.looks.side, chosen, covariance[None], knowledge, np.full((1, 5), x))
+            judged_z(truth, seen[None], pool.looks.side, chosen, covariance[None], knowledge, np.full((1, 5), x))
             for x in (0.0, 1.0)
         )
         return (high - low)[0, columns]

@@ -31,7 +31,7 @@ def test_a_run_up_takes_up_play_and_stops_of_its_own_axis():
     np.testing.assert_array_equal(run_up_steps(physical, np.array([0.3, 0.1])), [13, 4])
 
 
-def test_limits_are_kept(mounted_rig, found):
+def test_limits_are_kept(mounted_rig, pool):
     """Stated limits bind every counter of a plan, run-ups included; without them the grid's own range does."""
     tight = {"pan_min_steps": 0, "pan_max_steps": 150, "tilt_min_steps": -70, "tilt_max_steps": 90}
     known = prior_knowledge(replace(mounted_rig, positioner=tight))
@@ -43,8 +43,8 @@ def test_limits_are_kept(mounted_rig, found):
     for counters in (moves, inside.looks.steps):
         assert (counters.min(axis=0) == low).all() and (counters.max(axis=0) == high).all()
     assert not inside.notes
-    assert "pan_min_steps" in found.notes[0] and "pan -100 to 280" in found.notes[0]
-    assert np.abs(found.looks.steps).max() <= 280
+    assert "pan_min_steps" in pool.notes[0] and "pan -100 to 280" in pool.notes[0]
+    assert np.abs(pool.looks.steps).max() <= 280
 
 
 @pytest.mark.thorough

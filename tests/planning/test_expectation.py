@@ -57,12 +57,12 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     assert all(spot.status == "ok" for spot in run.campaign.spots)
     problem = Problem(run.campaign, mounted_rig.table)
     with jax.enable_x64(True):
-        own = problem.information(problem.linearised(z)).fisher
+        of_fit = problem.information(problem.linearised(z)).fisher
     planned = information_of(dozen_plan(), knowledge, aperture=True, z=z).fisher
-    scale = np.sqrt(np.diag(own))
+    scale = np.sqrt(np.diag(of_fit))
     safe = np.where(scale > 0, scale, 1.0)
     # The spots are triangulated from pixels without noise: linear triangulation is exact to 1e-9 of its point.
-    assert np.abs(planned / np.outer(safe, safe) - own / np.outer(safe, safe)).max() < 1e-6
+    assert np.abs(planned / np.outer(safe, safe) - of_fit / np.outer(safe, safe)).max() < 1e-6
     assert (scale[~NOISE_COLUMNS] > 0).sum() > 40
 
 
@@ -74,7 +74,7 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
     for pan, tilt in ((0, 0), (60, 40), (100, -20), (20, 60), (140, 10)):
         plan.move(pan, tilt)
         plan.look()
-    told = {}
+    fishers = {}
     for stop_deg, scatter_deg in ((0.05, 0.0), (0.03, 0.04), (0.03, 0.0)):
         z, space = knowledge.z.copy(), knowledge.space
         for name, index in INDEX.items():
@@ -82,8 +82,8 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
                 z[index] = np.log(stop_deg / float(space.value[index])) / float(space.u[index])
             if name.startswith("look_scatter_deg"):
                 z[[index]] = half_normal_coordinate(np.array([scatter_deg / float(space.u[index])]))
-        told[stop_deg, scatter_deg] = information_of(plan.steps, knowledge, z=z).fisher
-    both, sum_alone, less = told[0.03, 0.04], told[0.05, 0.0], told[0.03, 0.0]
+        fishers[stop_deg, scatter_deg] = information_of(plan.steps, knowledge, z=z).fisher
+    both, sum_alone, less = fishers[0.03, 0.04], fishers[0.05, 0.0], fishers[0.03, 0.0]
     np.testing.assert_allclose(both, sum_alone, atol=1e-9 * np.abs(sum_alone).max())
     ratio = INDEX["degrees_per_step.pan"]
     assert both[ratio, ratio] < 0.9 * less[ratio, ratio]

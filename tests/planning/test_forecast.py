@@ -56,15 +56,15 @@ def test_the_classics_forecast_is_what_its_experiments_do(mounted_rig, knowledge
     count, standard_errors = 400, 4.0
     run = simulate(mounted_rig, four_point_protocol(count), 6, Truth(parameters, drawn.stereo))
     effective = local_deg_per_step(parameters, run.truth.reference_pose_deg)
-    for index, (name, found) in enumerate(classic(run.campaign).directions.items()):
-        assert found.n == count and DIRECTIONS[index] == name
-        sd = found.sd_deg_per_step
+    for index, (name, result) in enumerate(classic(run.campaign).directions.items()):
+        assert result.n == count and DIRECTIONS[index] == name
+        sd = result.sd_deg_per_step
         assert forecast.sd[0, index] == pytest.approx(sd, rel=standard_errors / math.sqrt(2 * count)), name
-        error = found.mean_deg_per_step - effective[name]
+        error = result.mean_deg_per_step - effective[name]
         assert forecast.error[0, index] == pytest.approx(error, abs=standard_errors * sd / math.sqrt(count)), name
         assert abs(error) > 10 * sd / math.sqrt(count), "the error shows, or its sign would be free"
         # Scatter moves pixels and so the derivatives: by its share of the ratio, 1 %, over sqrt(400).
-        assert forecast.stereo_u[index] == pytest.approx(found.u_stereo_deg_per_step, rel=0.02), name
+        assert forecast.stereo_u[index] == pytest.approx(result.u_stereo_deg_per_step, rel=0.02), name
 
 
 def test_the_classics_value_adds_stereo_to_the_mean_of_its_experiments():

@@ -54,8 +54,8 @@ def real_rig(mounted_rig):
 def real(real_rig, small_searches):
     """Before any data, and the candidates over which its places lie."""
     bare = prior_knowledge(real_rig)
-    found = candidates(bare)
-    return bare.with_gears(found.looks.steps), found
+    pool = candidates(bare)
+    return bare.with_gears(pool.looks.steps), pool
 
 
 def some_places(error_deg=0.04, play_deg=0.02) -> GearPlaces:
@@ -90,9 +90,9 @@ def test_a_full_turn_away_is_a_window_of_its_own_and_no_part_of_the_line():
     assert [window.tolist() for window in windows] == [[0, 100, 200], [6000, 6100], [-6000]]
     gears = some_places()
     for axis, range_steps in ((False, 240), (True, 180)):
-        own = gears.on_tilt == axis
-        assert np.ptp(gears.steps[own]) == range_steps
-        assert gears.share[own] @ gears.steps[own] == pytest.approx(1) and gears.share[own].sum() == pytest.approx(0)
+        mask = gears.on_tilt == axis
+        assert np.ptp(gears.steps[mask]) == range_steps
+        assert gears.share[mask] @ gears.steps[mask] == pytest.approx(1) and gears.share[mask].sum() == pytest.approx(0)
 
 
 def test_a_line_through_looks_is_the_least_squares_line_of_what_places_carry():
@@ -139,13 +139,13 @@ def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
 
     nothing = np.zeros(gears.size)
     for one in (share, np.where(gears.on_tilt, 0.0, share), gears.share):
-        found = replace(gears, share=one).headlines(z, known.space, pose)
-        np.testing.assert_allclose(np.asarray(found.value)[:4], slopes(z, nothing, one), rtol=1e-12)
+        headlines = replace(gears, share=one).headlines(z, known.space, pose)
+        np.testing.assert_allclose(np.asarray(headlines.value)[:4], slopes(z, nothing, one), rtol=1e-12)
         step = np.random.default_rng(3).standard_normal(known.size)
         ends = [slopes(z + h * step[:PARAMETERS], h * step[PARAMETERS:], one) for h in (1e-5, -1e-5)]
         wanted = (ends[0] - ends[1]) / 2e-5
         # Central differences of angles near 1 rad in float64: 1e-16 / 1e-5 in 100 steps, some 1e-11 deg/step.
-        np.testing.assert_allclose(np.asarray(found.gradient)[:4] @ step, wanted, atol=1e-9)
+        np.testing.assert_allclose(np.asarray(headlines.gradient)[:4] @ step, wanted, atol=1e-9)
 
 
 @pytest.mark.thorough
@@ -155,8 +155,8 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
     Neither the line over all candidates, nor over looks that the cameras miss, nor the scales believed beforehand would
     do: all tell another u.
     """
-    known, found = real
-    family = Family(known, found, np.random.default_rng(4).integers(0, len(found.looks), 24), False)
+    known, pool = real
+    family = Family(known, pool, np.random.default_rng(4).integers(0, len(pool.looks), 24), False)
     drawn = draw_instruments(known, 3, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
     # Looks count without creep, by the median of its time constant.
@@ -166,17 +166,17 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
     assurance = Assurance(family, WORST, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
     reported, steps = assurance.values([6])[6], family.arranged(6).steps
     for row in range(3):
-        here, z, space = assurance.instruments[np.array([row])], drawn.z[row], drawn.space_of(row)
-        mine = instrument_gears(known, here.physical[0])
-        own = known.with_places(mine)
-        assert own.gears.scales.error_rad == pytest.approx(np.radians(here.physical[0][ERRORS]))
-        seen = LookArrays(assurance.looks, own, False).at(z, space)
-        exact = information_of(steps, own, z=z, space=space)
-        first = covariance_of(own.precision + exact.fisher)[None]
-        at = judged_z(here, seen[None], assurance.looks.side, assurance.index, first, own, assurance.noise[None, row])[
+        one, z, space = assurance.instruments[np.array([row])], drawn.z[row], drawn.space_of(row)
+        mine = instrument_gears(known, one.physical[0])
+        local = known.with_places(mine)
+        assert local.gears.scales.error_rad == pytest.approx(np.radians(one.physical[0][ERRORS]))
+        seen = LookArrays(assurance.looks, local, False).at(z, space)
+        exact = information_of(steps, local, z=z, space=space)
+        first = covariance_of(local.precision + exact.fisher)[None]
+        at = judged_z(one, seen[None], assurance.looks.side, assurance.index, first, local, assurance.noise[None, row])[
             0
         ]
-        baseline_of = covariance_of(own.precision + information_of(steps, own, z=at, space=space).fisher)
+        baseline_of = covariance_of(local.precision + information_of(steps, local, z=at, space=space).fisher)
         pose = seen.mirror_angles_rad[assurance.index].mean(axis=0)
         planned = np.bincount(assurance.index)
         assert (planned * seen.seen).sum() < planned.sum() if row == 2 else seen.seen.all()
@@ -198,26 +198,26 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
 def test_what_a_fit_says_at_its_places_is_carried_to_others():
     """Nothing taught leaves the prior; errors known at the fit's counters are known at those of the plan between."""
     gears = some_places(play_deg=0.0)
-    own = replace(gears, steps=gears.steps * 0.9, share=gears.share / 0.9)
-    nothing = np.eye(PARAMETERS + own.size)
-    assert FittedErrors(own, nothing).covariance_at(gears) == pytest.approx(np.eye(PARAMETERS + gears.size), abs=1e-6)
+    old = replace(gears, steps=gears.steps * 0.9, share=gears.share / 0.9)
+    nothing = np.eye(PARAMETERS + old.size)
+    assert FittedErrors(old, nothing).covariance_at(gears) == pytest.approx(np.eye(PARAMETERS + gears.size), abs=1e-6)
     known = nothing.copy()
     known[PARAMETERS:, PARAMETERS:] *= 1e-6
     known[0, PARAMETERS] = known[PARAMETERS, 0] = 1e-4
-    left = gears.root @ FittedErrors(own, known).covariance_at(gears)[PARAMETERS:, PARAMETERS:] @ gears.root.T
+    left = gears.root @ FittedErrors(old, known).covariance_at(gears)[PARAMETERS:, PARAMETERS:] @ gears.root.T
     inside = np.abs(gears.steps) < 80
     count = len(gears.steps)
     assert np.sqrt(np.diag(left)[:count][inside]).max() < 0.1 * np.radians(0.04)
-    follows = FittedErrors(own, known).covariance_at(gears)[0, PARAMETERS:]
+    follows = FittedErrors(old, known).covariance_at(gears)[0, PARAMETERS:]
     assert follows[:count] @ gears.root[:count, :count].T @ np.ones(count) != 0
 
 
 def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
     """The fast sum equals the filter's pass over the arranged plan: errors are columns of both."""
-    known, found = real
-    seen = LookArrays(found.looks, known, False).at(known.z, known.space)
-    picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
-    arranged = arrange(found.looks[picks], known.sheets, found.run_up)
+    known, pool = real
+    seen = LookArrays(pool.looks, known, False).at(known.z, known.space)
+    picks = np.random.default_rng(5).integers(0, len(pool.looks), 24)
+    arranged = arrange(pool.looks[picks], known.sheets, pool.run_up)
     exact = information_of(arranged.steps, known).fisher
     quick = information_of_looks(seen, picks, arranged.path, known.space, False, arranged.warm_minutes(known.rig))
     assert exact.shape == (known.size, known.size) and known.gears.size > 20
@@ -229,22 +229,22 @@ def test_expected_ratio_is_that_of_dense_matrices(real):
 
     By the matrices themselves: whitened looks, of which the errors are a part of the noise.
     """
-    known, found = real
-    seen = LookArrays(found.looks, known, False).at(known.z, known.space)
+    known, pool = real
+    seen = LookArrays(pool.looks, known, False).at(known.z, known.space)
     rows = seen.rows[seen.seen][::7, :, :-2].reshape(-1, known.size)
     at = sensitivity(WORST, known.z, known.space, known.rig.table, seen.mirror_angles_rad.mean(axis=0), known.gears)
     by_columns = at.values(covariance_of(known.precision + rows.T @ rows))
-    own, errors = rows[:, :PARAMETERS], rows[:, PARAMETERS:]
+    columns, errors = rows[:, :PARAMETERS], rows[:, PARAMETERS:]
     noise = np.eye(len(rows)) + errors @ errors.T
-    gain = np.linalg.solve(own @ own.T + noise, rows)
+    gain = np.linalg.solve(columns @ columns.T + noise, rows)
     left = np.eye(known.size) - rows.T @ gain
     assert by_columns == pytest.approx(
         np.sqrt(np.einsum("qi,ij,qj->q", at.gradient, left, at.gradient).max()), rel=1e-6
     )
 
 
-def test_perfect_gears_have_no_places(knowledge, found):
-    assert knowledge.with_gears(found.looks.steps) is knowledge and knowledge.gears is NO_PLACES
+def test_perfect_gears_have_no_places(knowledge, pool):
+    assert knowledge.with_gears(pool.looks.steps) is knowledge and knowledge.gears is NO_PLACES
 
 
 @pytest.mark.parametrize(("ratio", "axis"), [("left", 0), ("up", 1)])
@@ -287,18 +287,18 @@ def test_the_papers_two_counters_are_worse_off_elsewhere_and_named(real, real_ri
 def test_a_point_between_the_places_has_what_they_leave_open(real):
     known, _ = real
     pose = np.zeros(2)
-    own = {}
+    left_open = {}
     for y_mm in (0.0, 900.0):
         target = parse_target(f"U95(y) at 1000,{y_mm},0 mm <= 5 mm")
         at = sensitivity(target, known.z, known.space, known.rig.table, pose, known.gears)
         assert at.gradient.shape == (1, known.size)
-        own[y_mm] = float(at.own[GEARS_AT_POINT][0])
-        errors = float(np.sum(at.gradient[0, PARAMETERS:] ** 2)) + own[y_mm]
+        left_open[y_mm] = float(at.own[GEARS_AT_POINT][0])
+        errors = float(np.sum(at.gradient[0, PARAMETERS:] ** 2)) + left_open[y_mm]
         # Errors of 0.05 and half the play's 0.02 deg, root mean squares of half-normals. A look there meets a stop
         # error of 0.04 deg and the scatter of looks, both as most probable: the median of a half-normal of 0.01 deg.
         of_a_look = np.hypot(0.04, 0.01 * stats.halfnorm.median())
         assert np.sqrt(errors / at.own[AT_POINT[0]][0]) == pytest.approx(np.hypot(0.05, 0.01) / of_a_look, rel=1e-3)
-    assert own[0.0] < 0.1 * own[900.0]
+    assert left_open[0.0] < 0.1 * left_open[900.0]
 
 
 def test_limits_name_the_transmission_error(real):
@@ -313,7 +313,7 @@ def test_limits_name_the_transmission_error(real):
             for s in (PlanStep(n, "move", pan, tilt), PlanStep(n, "look"))
         ),
     )
-    found = information_of(steps, known)
-    at = sensitivity(WORST, known.z, known.space, known.rig.table, found.pose_rad, known.gears)
-    shares = split_of(known, found.fisher, None, at)
+    information = information_of(steps, known)
+    at = sensitivity(WORST, known.z, known.space, known.rig.table, information.pose_rad, known.gears)
+    shares = split_of(known, information.fisher, None, at)
     assert "transmission error" in shares and sum(shares.values()) == pytest.approx(1)

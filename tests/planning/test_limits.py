@@ -36,13 +36,13 @@ def wide(mounted_rig):
 def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
     """As many looks a turn away as here: 6000 steps of 0.06 deg. Gains are those of the plan judged move by move."""
     known = prior_knowledge(wide)
-    found = candidates(known)
-    seen = LookArrays(found.looks, known, False).at(known.z, known.space)
+    pool = candidates(known)
+    seen = LookArrays(pool.looks, known, False).at(known.z, known.space)
     target = parse_target("u(left) <= 1e-5 deg/step")
     pose = seen.mirror_angles_rad.mean(axis=0)
     at = sensitivity(target, known.z, known.space, wide.table, pose)
     now = at.value(known.covariance)
-    batches = next_experiments(DesignProblem(known, found, seen, target, at))
+    batches = next_experiments(DesignProblem(known, pool, seen, target, at))
     turned = [batch for batch in batches if batch.text.startswith("a full turn of pan away, ")]
     assert turned and len(turned) < len(batches)
     for batch in batches:
@@ -100,28 +100,28 @@ def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
     assert not limit(float(needed[1]) + last, wanted).reachable
 
 
-def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, found):
+def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, pool):
     target = parse_target("U95(x) at 1000,0,0 mm <= 0.5 mm")
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
-    path = arrange(found.looks, knowledge.sheets, found.run_up).path
-    information = information_of_looks(seen, np.arange(len(found.looks)), path, knowledge.space, False)
+    path = arrange(pool.looks, knowledge.sheets, pool.run_up).path
+    information = information_of_looks(seen, np.arange(len(pool.looks)), path, knowledge.space, False)
     limit = limit_of(knowledge, information, at, target)
     assert not limit.reachable and "at the point itself" in limit.needed
 
 
 def test_errors_of_the_gears_at_the_point_are_not_called_its_stop(knowledge):
     """Stop 3 mm and reading 4 mm make 5 mm; with 12 mm of the gears, which looks nearer by would tell, 13 mm."""
-    own = {AT_POINT[0]: np.array([9.0]), AT_POINT[1]: np.array([16.0]), GEARS_AT_POINT: np.array([144.0])}
-    found, none = Sensitivity(at({SCALE: 1e-3})[None], own), np.zeros((PARAMETERS, PARAMETERS))
+    parts = {AT_POINT[0]: np.array([9.0]), AT_POINT[1]: np.array([16.0]), GEARS_AT_POINT: np.array([144.0])}
+    point, none = Sensitivity(at({SCALE: 1e-3})[None], parts), np.zeros((PARAMETERS, PARAMETERS))
 
     def needed(limit_mm: float) -> str | None:
         target = parse_target(f"u(x) at 1000,0,0 mm <= {limit_mm} mm")
-        return limit_of(knowledge, none, found, target).needed
+        return limit_of(knowledge, none, point, target).needed
 
     assert needed(4.9).startswith("5 mm come from the stop and the reading at the point itself")
-    told = needed(5.1)
-    assert "13 mm come from the point itself" in told and "5 from the stop" in told and "12 from errors of the" in told
-    assert "only a smaller stop error" not in told and "[positioner]" in told
+    text = needed(5.1)
+    assert "13 mm come from the point itself" in text and "5 from the stop" in text and "12 from errors of the" in text
+    assert "only a smaller stop error" not in text and "[positioner]" in text
     assert needed(13.1) is None
 
 
@@ -151,8 +151,8 @@ def test_shares_of_two_parameters_by_hand(knowledge):
     """Data diag(3, 1) on priors of 1: S = diag(1/4, 1/2); g = (2, 3) is pulled by S g = (1/2, 3/2)."""
     data, noise = (np.diag(at({SCALE: scale, STEREO: camera})) for scale, camera in ((3.0, 1.0), (2.0, 0.2)))
     gradient = np.stack([at({SCALE: 0.1}), at({SCALE: 2.0, STEREO: 3.0})])
-    own = {AT_POINT[0]: np.array([0.0, 0.5]), AT_POINT[1]: np.array([0.4, 0.0])}
-    target = Sensitivity(gradient, own)
+    at_point = {AT_POINT[0]: np.array([0.0, 0.5]), AT_POINT[1]: np.array([0.4, 0.0])}
+    target = Sensitivity(gradient, at_point)
     # Prior 1/4 and 9/4; pixels 2/4 + 0.2 * 9/4; the rest of the data 1/4 + 0.8 * 9/4; the point 0.5.
     parts = {"focal scale": 0.25, "stereo calibration": 2.25, AT_POINT[0]: 0.5}
     looks = {"pixel noise": 0.95, "stop errors of the looks": 2.05}

@@ -27,10 +27,10 @@ from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 pytestmark = pytest.mark.usefixtures("small_searches")
 
 
-def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
+def test_looks_add_up_to_the_plan_they_make(knowledge, pool, seen):
     """The fast sum equals the filter's pass over the arranged plan, with and without an unknown home offset."""
-    picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
-    arranged = arrange(found.looks[picks], knowledge.sheets, found.run_up)
+    picks = np.random.default_rng(5).integers(0, len(pool.looks), 24)
+    arranged = arrange(pool.looks[picks], knowledge.sheets, pool.run_up)
     for after_data in (False, True):
         known = replace(knowledge, after_data=after_data)
         exact = information_of(arranged.steps, known).fisher
@@ -40,9 +40,9 @@ def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
         assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
 
 
-def test_order_of_experiments_does_not_matter(knowledge, found, seen):
+def test_order_of_experiments_does_not_matter(knowledge, pool, seen):
     generator = np.random.default_rng(6)
-    picks = generator.permutation(len(found.looks))[:16]
+    picks = generator.permutation(len(pool.looks))[:16]
     at = sensitivity(
         parse_target(DEFAULT_TARGET),
         knowledge.z,
@@ -52,14 +52,14 @@ def test_order_of_experiments_does_not_matter(knowledge, found, seen):
     )
     values = []
     for order in (picks, generator.permutation(picks)):
-        path = arrange(found.looks[order], knowledge.sheets, found.run_up).path
+        path = arrange(pool.looks[order], knowledge.sheets, pool.run_up).path
         information = information_of_looks(seen, order, path, knowledge.space, False)
         values.append(at.value(covariance_of(knowledge.precision + information)))
     assert values[1] == pytest.approx(values[0], rel=ROUNDING)
 
 
-def test_every_look_is_reached_from_its_side(found, knowledge):
-    arranged = arrange(found.looks, knowledge.sheets, found.run_up)
+def test_every_look_is_reached_from_its_side(pool, knowledge):
+    arranged = arrange(pool.looks, knowledge.sheets, pool.run_up)
     assert [s.target for s in arranged.steps if s.action == "place"] == list(knowledge.sheets)
     counters, last, row = np.zeros(2, dtype=int), np.zeros(2, dtype=int), 0
     for step in arranged.steps:
@@ -68,19 +68,19 @@ def test_every_look_is_reached_from_its_side(found, knowledge):
             counters = counters + last
         elif step.action == "look":
             look = arranged.order[row]
-            assert (counters == found.looks.steps[look]).all()
-            assert (last * found.looks.side[look] >= found.run_up).all()
+            assert (counters == pool.looks.steps[look]).all()
+            assert (last * pool.looks.side[look] >= pool.run_up).all()
             row += 1
-    assert row == len(found.looks)
+    assert row == len(pool.looks)
 
 
 @pytest.mark.parametrize("home", [(0, 0), (120, -40)])
-def test_an_arranged_plan_travels_and_costs_what_its_steps_do(knowledge, found, home):
+def test_an_arranged_plan_travels_and_costs_what_its_steps_do(knowledge, pool, home):
     """Step by step; with a look that is taken twice running, and one where the homing ends."""
-    picks = np.random.default_rng(2).integers(0, len(found.looks), 30)
-    looks = found.looks[np.concatenate([picks, picks[:1]])]
+    picks = np.random.default_rng(2).integers(0, len(pool.looks), 30)
+    looks = pool.looks[np.concatenate([picks, picks[:1]])]
     looks.steps[5], looks.side[5], looks.sheet[5] = home, (1, 1), 0
-    arranged = arrange(looks, knowledge.sheets, found.run_up, home)
+    arranged = arrange(looks, knowledge.sheets, pool.run_up, home)
     at, far, travelled = np.array(home), np.zeros(2, dtype=int), []
     for step in arranged.steps[1:]:
         if step.action == "move":
@@ -104,8 +104,8 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
         u = generator.uniform(0.5, 1.0, PARAMETERS)
 
     for homed in (False, True):
-        found = information_of_looks(seen, chosen, path, Space, homed)
-        for one, information in zip(rows, found, strict=True):
+        informations = information_of_looks(seen, chosen, path, Space, homed)
+        for one, information in zip(rows, informations, strict=True):
             every = one[chosen].copy()
             for axis, column in enumerate(CONTRAST_COLUMNS):
                 every[:, :, column] = every[:, :, PARAMETERS + axis] * path[:, axis, None]

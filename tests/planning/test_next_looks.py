@@ -46,60 +46,60 @@ def begun_fit(first):
 
 
 @pytest.fixture(scope="module")
-def found(begun_fit, mounted_rig):
+def proposal(begun_fit, mounted_rig):
     return next_looks(begun_fit, mounted_rig, TARGET, 12)
 
 
-def whole_plan(rig, found) -> tuple[PlanStep, ...]:
+def whole_plan(rig, proposal) -> tuple[PlanStep, ...]:
     """The plan so far with the proposal behind it."""
     before = begun(rig, 12)
-    return (*before, *steps_of(found.steps, len(before)))
+    return (*before, *steps_of(proposal.steps, len(before)))
 
 
-def laplace_sds(found) -> list[float]:
-    return [ratio.sd for ratio in found.effective_deg_per_step.values()]
+def laplace_sds(proposal) -> list[float]:
+    return [ratio.sd for ratio in proposal.effective_deg_per_step.values()]
 
 
-def test_what_is_promised_is_the_information_of_the_whole_run(found, mounted_rig, begun_fit):
+def test_what_is_promised_is_the_information_of_the_whole_run(proposal, mounted_rig, begun_fit):
     """The plan so far and the proposal through the filter, move by move, at the point that the fit believes in."""
-    assert found.now == pytest.approx(max(laplace_sds(found)), rel=0.1)
-    assert found.expected == found.after_each[-1] < 0.7 * found.now
-    assert np.all(np.diff([found.now, *found.after_each]) < 1e-12)
+    assert proposal.now == pytest.approx(max(laplace_sds(proposal)), rel=0.1)
+    assert proposal.expected == proposal.after_each[-1] < 0.7 * proposal.now
+    assert np.all(np.diff([proposal.now, *proposal.after_each]) < 1e-12)
     after = knowledge_of(begun_fit, mounted_rig)
     before = Knowledge(after.rig, after.space, after.z, np.eye(after.size))
-    told = information_of(whole_plan(mounted_rig, found), before)
+    information = information_of(whole_plan(mounted_rig, proposal), before)
     at = sensitivity(TARGET, after.z, after.space, after.rig.table, begun_fit.reference_pose_rad, before.gears)
-    value = at.value(covariance_of(before.precision + told.fisher), TARGET.factor)
+    value = at.value(covariance_of(before.precision + information.fisher), TARGET.factor)
     # The fit's Hessian beside Fisher's information of the first looks: a few percent.
-    assert found.expected == pytest.approx(value, rel=0.1)
+    assert proposal.expected == pytest.approx(value, rel=0.1)
 
 
-def test_every_look_is_reached_with_a_run_up_inside_the_limits(found, mounted_rig, begun_fit):
+def test_every_look_is_reached_with_a_run_up_inside_the_limits(proposal, mounted_rig, begun_fit):
     limits = counter_range(mounted_rig.limits, UNSTATED_STEPS).limits
     least = expected_run_up(knowledge_of(begun_fit, mounted_rig))
-    assert found.steps[0].action == "place" and sum(step.action == "look" for step in found.steps) == 12
-    log = run_plan(whole_plan(mounted_rig, found), mounted_rig)
+    assert proposal.steps[0].action == "place" and sum(step.action == "look" for step in proposal.steps) == 12
+    log = run_plan(whole_plan(mounted_rig, proposal), mounted_rig)
     for axis, (low, high), needed in zip(AXES, limits, least, strict=True):
         rests = rests_of(log.moves, axis)
         for look in log.looks[12:]:
             assert low <= rests[look.move].steps <= high and rests[look.move].leg >= needed
-    first_move = next(step for step in found.steps if step.action == "move")
-    after = found.steps[found.steps.index(first_move) + 1]
+    first_move = next(step for step in proposal.steps if step.action == "move")
+    after = proposal.steps[proposal.steps.index(first_move) + 1]
     run_up = np.abs(np.array([after.pan_steps, after.tilt_steps]) - [first_move.pan_steps, first_move.tilt_steps])
     assert np.all(run_up >= least), "wherever the axes stood"
 
 
-def test_a_sheet_that_stands_there_costs_nothing(found, mounted_rig):
+def test_a_sheet_that_stands_there_costs_nothing(proposal, mounted_rig):
     """Of equally good looks those without a placement come first: minutes say so."""
-    placements = [step.target for step in found.steps if step.action == "place"]
-    seconds = 60 * found.minutes
-    own = sum({"place": 60.0, "move": 1.5, "look": 1.0}[step.action] for step in found.steps)
-    assert seconds == pytest.approx(own - 60.0 * (placements[0] == "d1"))
+    placements = [step.target for step in proposal.steps if step.action == "place"]
+    seconds = 60 * proposal.minutes
+    cost_s = sum({"place": 60.0, "move": 1.5, "look": 1.0}[step.action] for step in proposal.steps)
+    assert seconds == pytest.approx(cost_s - 60.0 * (placements[0] == "d1"))
 
 
-def test_the_posterior_confirms_where_it_is_asked_to(begun_fit, mounted_rig, found, monkeypatch):
+def test_the_posterior_confirms_where_it_is_asked_to(begun_fit, mounted_rig, proposal, monkeypatch):
     """In place of draws of the posterior those of Laplace, spread by half as much again."""
-    asked = []
+    tiers = []
 
     def sample(fit, tier):
         def propagate(quantity):
@@ -107,16 +107,16 @@ def test_the_posterior_confirms_where_it_is_asked_to(begun_fit, mounted_rig, fou
             mean, sd = values.mean(axis=0), 1.5 * values.std(axis=0)
             return SimpleNamespace(mean=mean, sd=sd, interval95=np.stack([mean - 2 * sd, mean + 2 * sd]))
 
-        asked.append(tier)
+        tiers.append(tier)
         return SimpleNamespace(converged=True, propagate=propagate)
 
     monkeypatch.setattr("tvsbayes.planning.next_looks.sample", sample)
-    worst = max(laplace_sds(found))
-    assert found.confirmed is None
-    assert next_looks(begun_fit, mounted_rig, TARGET, 2, confirm_below=0.99 * worst).confirmed is None and not asked
+    worst = max(laplace_sds(proposal))
+    assert proposal.confirmed is None
+    assert next_looks(begun_fit, mounted_rig, TARGET, 2, confirm_below=0.99 * worst).confirmed is None and not tiers
     confirmed = next_looks(begun_fit, mounted_rig, TARGET, 2, confirm_below=1.01 * worst).confirmed
-    assert confirmed.accepted and asked == ["importance"]
-    for direction, ratio in found.effective_deg_per_step.items():
+    assert confirmed.accepted and tiers == ["importance"]
+    for direction, ratio in proposal.effective_deg_per_step.items():
         sampled = confirmed.effective_deg_per_step[direction]
         assert sampled.sd == pytest.approx(1.5 * ratio.sd)
         low, high = sampled.interval95

@@ -43,12 +43,12 @@ def test_where_a_plan_stands_follows_the_twin(mounted_rig):
 @pytest.mark.parametrize("fixed", ["ratio_contrast_deg_per_step", "backlash_deg"])
 def test_what_the_rig_holds_fixed_has_no_contraction(mounted_rig, fixed):
     """The model with one ratio per axis (formulation 3.1) is such a rig."""
-    given = mounted_rig.table.priors
-    rig = with_priors(mounted_rig, **{f"{fixed}__{a}": replace(given[f"{fixed}.{a}"], u=0.0) for a in ("pan", "tilt")})
-    told = []
-    check = check_plan(rig, grid_protocol(pan_steps=(0, 120, 240), tilt_steps=(-90, 0, 90)), progress=told.append)
-    check_forward(told)
-    assert doings(told) == [JUDGING, CURING]
+    priors = mounted_rig.table.priors
+    rig = with_priors(mounted_rig, **{f"{fixed}__{a}": replace(priors[f"{fixed}.{a}"], u=0.0) for a in ("pan", "tilt")})
+    waits = []
+    check = check_plan(rig, grid_protocol(pan_steps=(0, 120, 240), tilt_steps=(-90, 0, 90)), progress=waits.append)
+    check_forward(waits)
+    assert doings(waits) == [JUDGING, CURING]
     name = "contrast" if fixed.startswith("ratio") else "backlash"
     document = json.loads(json.dumps(check.as_json(), allow_nan=False))
     assert {k for k, share in document["contraction"].items() if share is None} == {f"{name}.pan", f"{name}.tilt"}

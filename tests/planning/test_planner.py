@@ -34,11 +34,11 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 def result(knowledge):
     target = parse_target("u(worst) <= 5e-4 deg/step")
     scope = Scope(largest=12)
-    told = []
-    found = plan_from(knowledge, target, scope=scope, draws=20, seed=1, progress=told.append)
-    check_forward(told)
-    assert doings(told) == [LOOKING, CHOOSING, COUNTING, EXCHANGING, JUDGING]
-    return found
+    waits = []
+    plan = plan_from(knowledge, target, scope=scope, draws=20, seed=1, progress=waits.append)
+    check_forward(waits)
+    assert doings(waits) == [LOOKING, CHOOSING, COUNTING, EXCHANGING, JUDGING]
+    return plan
 
 
 def test_the_curve_is_monotone(result):

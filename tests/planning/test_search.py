@@ -54,21 +54,21 @@ def test_greedy_choices_are_those_of_covariances_inverted_anew(criterion, share)
     """Every candidate beside everything chosen before it, by a whole inverse each; prior sds from 1 to 1000."""
     generator = np.random.default_rng(11)
     rows, gradient = generator.normal(size=(30, 4, 7)), generator.normal(size=(3, 7))
-    precision, own = np.diag(np.logspace(0, -6, 7)), np.array([0.0, 1e-3, 0.0])
-    here = generator.uniform(size=30) < share
-    search = Search(rows, precision, gradient, own, criterion)
-    reference = np.diag(gradient @ np.linalg.inv(precision) @ gradient.T) + own
+    precision, noise = np.diag(np.logspace(0, -6, 7)), np.array([0.0, 1e-3, 0.0])
+    allowed = generator.uniform(size=30) < share
+    search = Search(rows, precision, gradient, noise, criterion)
+    reference = np.diag(gradient @ np.linalg.inv(precision) @ gradient.T) + noise
     expected, known = [], precision
     for _ in range(40):
-        found = {}
-        for k in np.flatnonzero(here).tolist():
-            covariance = gradient @ np.linalg.inv(known + rows[k].T @ rows[k]) @ gradient.T + np.diag(own)
-            found[k] = float(scores(covariance, reference, criterion))
-        expected.append(min(found, key=found.__getitem__))
+        score_of = {}
+        for k in np.flatnonzero(allowed).tolist():
+            covariance = gradient @ np.linalg.inv(known + rows[k].T @ rows[k]) @ gradient.T + np.diag(noise)
+            score_of[k] = float(scores(covariance, reference, criterion))
+        expected.append(min(score_of, key=score_of.__getitem__))
         known = known + rows[expected[-1]].T @ rows[expected[-1]]
     # Scores of the best two differ by 1e-6 of themselves or more: rounding decides nothing.
-    assert search.among(here).greedy(40) == expected
-    assert search.among(here).value(expected) == pytest.approx(search.value(expected), rel=1e-12)
+    assert search.among(allowed).greedy(40) == expected
+    assert search.among(allowed).value(expected) == pytest.approx(search.value(expected), rel=1e-12)
     assert search.among(np.zeros(30, dtype=bool)).greedy(3) == []
 
 
@@ -91,7 +91,7 @@ def test_criteria_are_what_they_say():
     assert scores(covariance, reference, "D") == pytest.approx(math.log(7.0 / 16.0))
 
 
-def test_a_search_after_data_knows_no_home_offset(knowledge, found, seen):
+def test_a_search_after_data_knows_no_home_offset(knowledge, pool, seen):
     """Offsets of the new session are two columns with the variance of homing: eliminated, they leave the exact sum."""
     known = replace(knowledge, after_data=True)
     rows = seen.rows.copy()
@@ -108,26 +108,26 @@ def test_a_search_after_data_knows_no_home_offset(knowledge, found, seen):
 
 
 @pytest.fixture(scope="module")
-def refine(knowledge, found, seen):
+def refine(knowledge, pool, seen):
     """(first choice, limit, minutes) -> reported values of that choice, and what became of it."""
 
     def run(picks, limit, minutes=None):
         target = structs.replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
-        family = Family(knowledge, found, np.asarray(picks), False)
+        family = Family(knowledge, pool, np.asarray(picks), False)
         pose = seen.mirror_angles_rad.mean(axis=0)
         at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
         assurance = Assurance(family, target, draw_instruments(knowledge, 10, 3), 3)
         plain = assurance.values([2])[2]
-        asked = DesignProblem(knowledge, found, seen, target, at)
-        return plain, search.refine(family, asked, 2, Scope(minutes=minutes), assurance)
+        problem = DesignProblem(knowledge, pool, seen, target, at)
+        return plain, search.refine(family, problem, 2, Scope(minutes=minutes), assurance)
 
     return run
 
 
 @pytest.fixture(scope="module")
-def poor(found):
+def poor(pool):
     """Eight looks at one sheet, all at one place: they tell nothing of the ratio."""
-    return np.full(2 * LOOKS_PER_EXPERIMENT, np.flatnonzero(found.looks.sheet == 1)[0])
+    return np.full(2 * LOOKS_PER_EXPERIMENT, np.flatnonzero(pool.looks.sheet == 1)[0])
 
 
 def test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median(refine, poor):

@@ -95,8 +95,8 @@ def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig,
         origin, direction = ray(aimed + np.radians([pan_deg, tilt_deg]))
 
         def excess_deg(reach_mm: float) -> float:
-            found = aperture_angle_deg(origin + reach_mm * direction, base_mm, convention)
-            return float(found) - reading_deg - aperture_deg
+            angle = aperture_angle_deg(origin + reach_mm * direction, base_mm, convention)
+            return float(angle) - reading_deg - aperture_deg
 
         return origin + optimize.brentq(excess_deg, 500.0, 2000.0, xtol=1e-10) * direction
 

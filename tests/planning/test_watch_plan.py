@@ -55,9 +55,9 @@ def test_the_plan_notices_what_it_states(planned, measured, watched_fit, designs
     assert len(taken.spots) == planned.looks <= 384 and planned.minutes <= planned.minutes_allowed == 10
     assert sum(step.action == "home" for step in planned.steps) == planned.homings
     departure = WatchedLooks(watched_fit, taken).departure(designs.z)
-    seen = powers(departure, null_distribution(departure, 0).limit, 0)
+    shares = powers(departure, null_distribution(departure, 0).limit, 0)
     # Pixels elsewhere by their noise and by stops change slopes by a percent.
-    np.testing.assert_allclose(seen, [change.power for change in planned.changes], atol=0.03)
+    np.testing.assert_allclose(shares, [change.power for change in planned.changes], atol=0.03)
 
 
 def test_what_is_out_of_reach_is_said(planned):
@@ -87,9 +87,9 @@ def test_independent_stops_add_up_to_the_plan_itself(designs):
 def test_candidates_keep_to_the_limits(designs, watched_fit, monkeypatch):
     reached = {axis: [getattr(m, f"{axis}_steps") for m in watched_fit.campaign.moves] for axis in ("pan", "tilt")}
     steps = designs.steps(designs.grown(("d2",), 1.0)[-1], 2)
-    for axis, own in reached.items():
+    for axis, counters in reached.items():
         moved = [getattr(step, f"{axis}_steps") for step in steps if step.action in ("home", "move")]
-        assert min(own) <= min(moved) and max(moved) <= max(own)
+        assert min(counters) <= min(moved) and max(moved) <= max(counters)
     # A run-up longer than the travel leads beyond it, whatever the look.
     monkeypatch.setitem(designs.__dict__, "_run_up", np.array([1000, 1000]))
     assert not any(map(designs._reachable, designs.candidates))
@@ -114,9 +114,9 @@ def test_a_short_budget_is_kept_or_refused(watched_fit, monkeypatch):
 
 
 def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch, capsys):
-    asked = []
+    calls = []
     monkeypatch.setattr(
-        "tvsbayes.planning.watch_plan.watch_plan", lambda *rest, **named: asked.append((rest[1], named)) or planned
+        "tvsbayes.planning.watch_plan.watch_plan", lambda *rest, **named: calls.append((rest[1], named)) or planned
     )
     monkeypatch.setattr("tvsbayes.pipeline.StoredOrFitted.fit", watched_fit)
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", lambda _: watched_fit.campaign)
@@ -128,8 +128,8 @@ def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch
     assert document["plan"] == str(out) and sum(step.action == "look" for step in steps) == document["looks"]
     assert plan_minutes(rig, steps) == pytest.approx(document["minutes"], abs=1e-9)
     assert run(["plan", "mine", "--watch"]) == 0
-    assert asked[0][0].costs_s == rig.costs_s and asked[1][0] is None
-    assert [named["minutes"] for _, named in asked] == [3, 10]
+    assert calls[0][0].costs_s == rig.costs_s and calls[1][0] is None
+    assert [named["minutes"] for _, named in calls] == [3, 10]
     text = capsys.readouterr().out
     assert "no number of looks improves that: the campaign determines it too poorly: add about" in text
     assert run(["plan", "mine", "--watch", "--target", "u(worst) <= 1e-4 deg/step"]) == 2

@@ -49,7 +49,7 @@ def shared(first: WayDraws, rounds: int = 1) -> WayDraws:
 
 
 @pytest.fixture(scope="module")
-def own(run, first):
+def second(run, first):
     """Two rounds of a way's own draws, by the proposal fitted for the most probable one."""
     target = Target(run.density.fit, run.density.path)
     return WayDraws(target, Pool.empty(run.pool.proposals[-1]), SEED + 1).extended(2, run.pool)
@@ -62,10 +62,10 @@ def test_the_same_density_weighed_anew_has_the_same_weights(first):
     assert again.log_evidence == pytest.approx(first.log_evidence, abs=1e-9)
 
 
-def test_draws_of_its_own_give_the_same_evidence(first, own):
-    assert own.rounds == 2 and not own.shared and own.reliable
-    error = np.hypot(*(way.weighed.importance.log_evidence_mcse for way in (first, own)))
-    assert error < 0.05 and own.log_evidence == pytest.approx(first.log_evidence, abs=SIGMAS * error)
+def test_draws_of_its_own_give_the_same_evidence(first, second):
+    assert second.rounds == 2 and not second.shared and second.reliable
+    error = np.hypot(*(way.weighed.importance.log_evidence_mcse for way in (first, second)))
+    assert error < 0.05 and second.log_evidence == pytest.approx(first.log_evidence, abs=SIGMAS * error)
 
 
 def test_a_way_that_shares_all_draws_adds_no_knowledge(first):
@@ -78,27 +78,27 @@ def test_a_way_that_shares_all_draws_adds_no_knowledge(first):
     assert mixture.acceptance.missing == one.acceptance.missing == () and mixture.improved() is None
 
 
-def test_independent_draws_add_their_squared_errors(first, own):
+def test_independent_draws_add_their_squared_errors(first, second):
     """Shares of the error are those of the variance of a sum of independent means."""
-    mixture = Mixture((first, own), 0)
+    mixture = Mixture((first, second), 0)
     shares = mixture.shares_of_error
     assert shares.sum() == pytest.approx(1) and shares[1] > shares[0], "two rounds are less than three or more"
     column = mixture.names.index("backlash_deg.pan")
-    each = [Mixture((way,), 0).summary.mcse_mean[column] for way in (first, own)]
+    each = [Mixture((way,), 0).summary.mcse_mean[column] for way in (first, second)]
     together = np.hypot(*(p * error for p, error in zip(mixture.probabilities, each, strict=True)))
     assert mixture.summary.mcse_mean[column] == pytest.approx(together, rel=0.05)
 
 
-def test_shares_of_the_error_of_a_mean_do_not_depend_on_its_origin(run, first, own, monkeypatch):
+def test_shares_of_the_error_of_a_mean_do_not_depend_on_its_origin(run, first, second, monkeypatch):
     monkeypatch.setattr(homing_mixture, "END_ERROR_MAX", 1e9)
-    shares = Mixture((first, own), 0).shares_of_error
-    moved = tuple(replace(way) for way in (first, own))
-    for way, each in zip(moved, (first, own), strict=True):
+    shares = Mixture((first, second), 0).shares_of_error
+    moved = tuple(replace(way) for way in (first, second))
+    for way, each in zip(moved, (first, second), strict=True):
         way.weighed.__dict__["columns"] = {name: 1.0 + x for name, x in each.weighed.columns.items()}
     # Rounding of numbers of 1e-4 beside 1.
     np.testing.assert_allclose(Mixture(moved, 0).shares_of_error, shares, rtol=1e-9)
     monkeypatch.undo()
-    assert not np.allclose(Mixture((first, own), 0).shares_of_error, shares, rtol=1e-3), "ends weigh draws otherwise"
+    assert not np.allclose(Mixture((first, second), 0).shares_of_error, shares, rtol=1e-3), "ends weigh draws otherwise"
 
 
 def test_a_way_is_as_probable_as_firmware_homes_that_way(first):
@@ -116,9 +116,9 @@ def few(way: WayDraws) -> WayDraws:
     return replace(way, pool=replace(way.pool, points=points, counts=(128,)))
 
 
-def test_rounds_go_to_the_way_that_the_error_comes_from(first, own, monkeypatch):
+def test_rounds_go_to_the_way_that_the_error_comes_from(first, second, monkeypatch):
     """Of an equally probable way there are a few draws only: it is extended, as far as rounds are left."""
-    mixture = Mixture((first, few(own)), 5)
+    mixture = Mixture((first, few(second)), 5)
     assert mixture.acceptance.missing and mixture.shares_of_error[1] > 0.9
     monkeypatch.setattr(WayDraws, "reliable", True)
     better = mixture.improved()
@@ -144,10 +144,10 @@ def test_weights_that_cannot_be_trusted_are_replaced(first, monkeypatch):
     assert refitted.improved() is None
 
 
-def test_an_improbable_way_need_not_be_reliable(first, own, monkeypatch):
+def test_an_improbable_way_need_not_be_reliable(first, second, monkeypatch):
     """Its tail index is not that of the mixture."""
-    heavy = replace(own)
-    heavy.weighed.__dict__["smoothed"] = replace(own.weighed.smoothed, pareto_k=0.9)
+    heavy = replace(second)
+    heavy.weighed.__dict__["smoothed"] = replace(second.weighed.smoothed, pareto_k=0.9)
     for chance, k in ((0.05, first.weighed.smoothed.pareto_k), (0.2, 0.9)):
         mixture = Mixture((first, heavy), 0)
         mixture.__dict__["probabilities"] = np.array([1 - chance, chance])
@@ -155,12 +155,12 @@ def test_an_improbable_way_need_not_be_reliable(first, own, monkeypatch):
         assert bool(mixture.acceptance.missing) == (k == 0.9)
 
 
-def test_the_posterior_says_how_probable_each_way_is(first, own):
+def test_the_posterior_says_how_probable_each_way_is(first, second):
     """All draws, by the weight of their way; the diagnosis is that of the mixture."""
     fit = first.target.fit
     ways = tuple(Alternative({}, 0.5, fit) for _ in range(2))
     with_ways = replace(first, target=Target(replace(fit, alternatives=ways), first.target.path))
-    mixture = Mixture((with_ways, own), 0)
+    mixture = Mixture((with_ways, second), 0)
     posterior = mixture.posterior(1.0)
     assert posterior.weights.sum() == pytest.approx(1) and posterior.seconds == 1.0
     by_way = [posterior.weights[posterior.way == k].sum() for k in range(2)]

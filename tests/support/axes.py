@@ -43,11 +43,11 @@ def drawn(seed: int, moves: Sequence[AxisMove] | None = None, **stated: AxisPrio
 def random_moves(seed: int, count: int = 30, segments: int = 2) -> tuple[AxisMove, ...]:
     """Stops at random among few positions, some repeated at once, homed in between."""
     rng = np.random.default_rng(seed)
-    found = []
+    moves = []
     for k in range(count):
         segment = k * segments // count
-        first = k == 0 or found[-1].segment != segment
+        first = k == 0 or moves[-1].segment != segment
         again = not first and rng.random() < 0.2
-        command = found[-1].command if again else float(rng.choice(PLACES))
-        found.append(AxisMove(k, segment, 30.0 * k, command, "forward" if first else ""))
-    return tuple(found)
+        command = moves[-1].command if again else float(rng.choice(PLACES))
+        moves.append(AxisMove(k, segment, 30.0 * k, command, "forward" if first else ""))
+    return tuple(moves)

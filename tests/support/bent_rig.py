@@ -159,9 +159,9 @@ def twin_points(origin: np.ndarray, direction: np.ndarray, baseline_mm, reading_
     The angle grows along a beam that comes from the positioner. No closed form is shared with the library.
     """
     low, high = np.zeros(len(origin)), np.full(len(origin), 1e5)
-    seen = origin + np.multiply.outer(0.5 * np.broadcast_to(baseline_mm, len(origin)), [0.0, 1.0, 0.0])
+    centre = origin + np.multiply.outer(0.5 * np.broadcast_to(baseline_mm, len(origin)), [0.0, 1.0, 0.0])
     for _ in range(80):
         middle = 0.5 * (low + high)
-        angle = aperture_angle_deg(seen + middle[:, None] * direction, 0.0, "azimuth" if azimuth else "in-plane")
+        angle = aperture_angle_deg(centre + middle[:, None] * direction, 0.0, "azimuth" if azimuth else "in-plane")
         low, high = np.where(angle < reading_deg, middle, low), np.where(angle < reading_deg, high, middle)
     return origin + (0.5 * (low + high))[:, None] * direction

@@ -48,8 +48,8 @@ class Browsed:
         self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", self.one(name))
         self.one(name).click()
 
-    def js(self, code: str, *given):
-        return self.driver.execute_script(code, *given)
+    def js(self, code: str, *arguments):
+        return self.driver.execute_script(code, *arguments)
 
     def layers(self, plot: str, name: str) -> list[int]:
         """Of a plot, the layers whose name begins so that are seen: how many points each has."""
@@ -75,8 +75,8 @@ class Browsed:
         """On a screen so wide, "light" or "dark"."""
         metrics = {"width": width, "height": 1200, "deviceScaleFactor": 1, "mobile": False}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-        asked = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", asked)
+        media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
         try:
             yield
         finally:
@@ -94,8 +94,8 @@ class Browsed:
     def complaints(self) -> list[str]:
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
 
-    def asked(self) -> set[str]:
-        """Hosts of everything that was asked over a network since the last call."""
+    def requested_hosts(self) -> set[str]:
+        """Hosts of all network requests since the last call."""
         events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
         urls = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
         return {urlsplit(url).netloc for url in urls if urlsplit(url).scheme in ("http", "https", "ws", "wss")}

@@ -131,8 +131,8 @@ def descended(residual, start: np.ndarray, args, steps: int = STEPS) -> End:
     value = descend(
         lambda at: residuals_and_jacobian(residual, jnp.asarray(at), args), np.asarray(start), TOLERANCE, steps
     ).value
-    found = residuals_and_jacobian(residual, value, args)
-    residuals, jacobian = np.asarray(found.value), np.asarray(found.jacobian)
+    linear = residuals_and_jacobian(residual, value, args)
+    residuals, jacobian = np.asarray(linear.value), np.asarray(linear.jacobian)
     sd = np.linalg.norm(residuals) / np.sqrt(max(residuals.size - value.size, 1))
     left = np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals)
     # At a perfect fit the residuals are rounding errors and their direction means nothing.

@@ -45,7 +45,7 @@ def knowledge(mounted_rig) -> Knowledge:
 
 
 @pytest.fixture(scope="module")
-def found(knowledge, small_searches) -> Candidates:
+def pool(knowledge, small_searches) -> Candidates:
     """Candidates of the mounted rig."""
     from tvsbayes.planning.candidates import candidates
 
@@ -53,11 +53,11 @@ def found(knowledge, small_searches) -> Candidates:
 
 
 @pytest.fixture(scope="module")
-def seen(knowledge, found) -> Seen:
+def seen(knowledge, pool) -> Seen:
     """What they show at the most probable instrument."""
     from tvsbayes.planning.looks import LookArrays
 
-    return LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
+    return LookArrays(pool.looks, knowledge, False).at(knowledge.z, knowledge.space)
 
 
 def with_priors(rig: Rig, **priors: Prior) -> Rig:

@@ -36,17 +36,17 @@ def true_axis(seed: int = 1, ratio: float = 1.002) -> AxisTruth:
     return draw_axis(grid, {**TRUE, "per_command": AxisPrior(ratio, 0.0)}, ratio, 40.0, np.random.default_rng(seed))
 
 
-def driven(truth: AxisTruth, asked: tuple[AxisMove, ...], read: list[int], seed: int, **applied) -> AxisCampaign:
+def driven(truth: AxisTruth, planned: tuple[AxisMove, ...], read: list[int], seed: int, **applied) -> AxisCampaign:
     """Readings of moves under a correction: `by` of it, `factors` of its common part and its play."""
     rng = np.random.default_rng([seed, 5])
     by = applied.get("by")
-    sent = asked if by is None else by.moved(asked, *applied.get("factors", (1.0, 1.0)))
+    sent = planned if by is None else by.moved(planned, *applied.get("factors", (1.0, 1.0)))
     moves = (AxisMove(0, 0, 0.0, 0.0, "forward"), *(replace(m, move=m.move + 1, segment=m.segment + 1) for m in sent))
     at = np.unique([m.command for m in moves])
     curves = {name: np.interp(at, truth.command, getattr(truth, name)) for name in ("error", "play_variation")}
-    value = stops_of(replace(truth, command=at, **curves), moves, rng)[1:] + U * rng.standard_normal(len(asked))
+    value = stops_of(replace(truth, command=at, **curves), moves, rng)[1:] + U * rng.standard_normal(len(planned))
     readings = tuple(Reading(k, m, float(value[m]), U) for k, m in enumerate(read))
-    return AxisCampaign("mm", asked, readings, dict(STATED))
+    return AxisCampaign("mm", planned, readings, dict(STATED))
 
 
 def to_and_fro(places, homings: int = 1) -> tuple[tuple[AxisMove, ...], list[int]]:
@@ -74,5 +74,5 @@ def table(target: str = "csv", **wish) -> Compensation:
 
 def fresh(seed: int, factors: tuple[float, float] = (1.0, 1.0), places=(-15.0, -7.0, 1.0, 6.0, 12.0, 18.0)):
     """Twelve readings under the table of csv."""
-    asked, read = to_and_fro(np.array(places))
-    return driven(true_axis(), asked, read, 100 + seed, by=Correction.of(table()), factors=factors)
+    planned, read = to_and_fro(np.array(places))
+    return driven(true_axis(), planned, read, 100 + seed, by=Correction.of(table()), factors=factors)

@@ -8,5 +8,5 @@ from tvsbayes.metrology.simulated_cycles import simulated_runs
 
 
 def up_and_down(*arguments, **options) -> tuple[np.ndarray, np.ndarray]:
-    found = simulated_runs(*arguments, **options)
-    return found.up_deg, found.down_deg
+    runs = simulated_runs(*arguments, **options)
+    return runs.up_deg, runs.down_deg

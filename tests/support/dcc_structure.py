@@ -105,7 +105,7 @@ def local(element: ET.Element) -> str:
 
 def structure_problems(root: ET.Element) -> list[str]:
     """What the schema would not take: order, number and content of elements, prefixes, identifiers, languages."""
-    found = []
+    faults = []
     si = {"real", *ORDER["real"].replace("?", "").split(), "measurementUncertaintyUnivariate", "standardMU"}
     si |= {"expandedMU", "coverageIntervalMU", "distribution", "intervalMin", "intervalMax"}
     si |= {"valueStandardMU", "valueExpandedMU", "coverageFactor", "coverageProbability"}
@@ -115,32 +115,32 @@ def structure_problems(root: ET.Element) -> list[str]:
         inside = parent.get(element)
         is_si = name in si and not (name == "value" and local(inside) == "identification")
         if not element.tag.startswith(URI["si" if is_si else "dcc"]):
-            found.append(f"{element.tag}: wrong namespace")
+            faults.append(f"{element.tag}: wrong namespace")
         children = "".join(local(child) + " " for child in element)
         if name in ORDER:
             pattern = re.sub(r"[A-Za-z_0-9]+", lambda m: f"(?:{m.group()} )", ORDER[name]).replace(" )", "\0")
             pattern = pattern.replace(" ", "").replace("\0", " )")
             if not re.fullmatch(pattern, children):
-                found.append(f"{name}: children {children}")
+                faults.append(f"{name}: children {children}")
             if (element.text or "").strip():
-                found.append(f"{name}: text between elements")
+                faults.append(f"{name}: text between elements")
             continue
         if children:
-            found.append(f"{name}: unknown to the table of children: {children}")
+            faults.append(f"{name}: unknown to the table of children: {children}")
         leaf = NOT_EMPTY if name == "value" and not is_si else NUMBER if name == "value" else LEAVES.get(name)
         if leaf is None or not re.fullmatch(leaf, element.text or ""):
-            found.append(f"{name}: content {element.text!r}")
+            faults.append(f"{name}: content {element.text!r}")
     ids = [e.get("id") for e in root.iter() if e.get("id")]
     references = {r for e in root.iter() for r in (e.get("refId") or "").split()}
     if len(ids) != len(set(ids)) or set(ids) != references:
-        found.append(f"ids {ids} against references {references}")
+        faults.append(f"ids {ids} against references {references}")
     languages = {e.get("lang") for e in root.iter(URI["dcc"] + "content")}
     if languages != {e.text for e in root.iter(URI["dcc"] + "usedLangCodeISO639_1")}:
-        found.append(f"languages {languages}")
+        faults.append(f"languages {languages}")
     if any(list(map(local, e)).count("content") > 1 for e in root.iter()):
-        found.append("a language twice")
+        faults.append("a language twice")
     known = {"id", "refId", "refType", "lang"}
     for element in root.iter():
         if element is not root and set(element.attrib) - known:
-            found.append(f"{element.tag}: attributes {element.attrib}")
-    return found
+            faults.append(f"{element.tag}: attributes {element.attrib}")
+    return faults

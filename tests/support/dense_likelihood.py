@@ -112,13 +112,13 @@ class RepeatedCovariances:
     def error(self, one: int, other: int) -> float:
         """Of the transmission error e: Matern, and a cosine of random phase for each stated period."""
         distance = self._distance_deg(one, other)
-        found = self._of("transmission_error_deg") ** 2 * matern(distance, self._of("transmission_error_length_deg"))
-        own = self._of("transmission_error_deg") ** 2
+        value = self._of("transmission_error_deg") ** 2 * matern(distance, self._of("transmission_error_length_deg"))
+        variance = self._of("transmission_error_deg") ** 2
         for number in (1, 2, 3):
             amplitude = self.values[f"harmonic_amplitude_deg.{self.axis}.{number}"]
-            found += amplitude**2 * np.cos(2 * np.pi * distance / self.values[f"period_deg.{self.axis}.{number}"])
-            own += amplitude**2
-        return found + SAME_PLACE * own * (one == other)
+            value += amplitude**2 * np.cos(2 * np.pi * distance / self.values[f"period_deg.{self.axis}.{number}"])
+            variance += amplitude**2
+        return value + SAME_PLACE * variance * (one == other)
 
     def play(self, one: int, other: int) -> float:
         """Of what the play is wider by than its mean."""
@@ -135,7 +135,7 @@ def angle_covariances(campaign: Campaign, values: dict[str, float], *, persisten
     """Covariance of what the angles (pan, tilt) of all ordered spots are off by, rad^2, shape (2, n, n)."""
     moves, spots = campaign.moves, ordered_spots(campaign)
     homing_h = {m.segment: m.time_s / 3600 for m in reversed(moves)}
-    found = np.zeros((2, len(spots), len(spots)))
+    covariances = np.zeros((2, len(spots), len(spots)))
     for axis, name in enumerate(SENSES):
         labels, repeated = stop_labels(moves, name), RepeatedCovariances(values, name)
         band_sd = play_band_deg(moves, name, values) / np.sqrt(12)
@@ -155,8 +155,8 @@ def angle_covariances(campaign: Campaign, values: dict[str, float], *, persisten
                 shared += values[f"look_scatter_deg.{name}"] ** 2 * (i == j)
                 shared += repeated.error(at, there)
                 shared += side(directions) * side(directions_there) / 4 * repeated.play(at, there)
-                found[axis, i, j] = np.radians(np.radians(shared))
-    return found
+                covariances[axis, i, j] = np.radians(np.radians(shared))
+    return covariances
 
 
 def residual_covariance(covariance_rad2: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -13,12 +13,12 @@ from tvsbayes.model.headlines import MODELLED, Derived
 def drawn_quantities(*shape: int, physical: np.ndarray | None = None, **blocks: np.ndarray) -> Derived:
     """Draws of a shape: parameters, and quantities by block (..., entries); what is not named is 0."""
     point = Derived(*(jnp.zeros(n) for n in (len(NAMES), len(MODELLED), (2, 2), 0)))
-    found = jax.tree.map(lambda x: np.zeros((*shape, *x.shape)), point)
+    drawn = jax.tree.map(lambda x: np.zeros((*shape, *x.shape)), point)
     if physical is not None:
-        found.physical[...] = physical
+        drawn.physical[...] = physical
     for block, values in blocks.items():
         names = QUANTITIES.blocks[block]
         for name, each in zip(names, np.moveaxis(np.reshape(values, (*shape, len(names))), -1, 0), strict=True):
-            column = found.physical[..., INDEX[name]] if name in INDEX else found.modelled[..., MODELLED[name]]
+            column = drawn.physical[..., INDEX[name]] if name in INDEX else drawn.modelled[..., MODELLED[name]]
             column[...] = each
-    return found
+    return drawn

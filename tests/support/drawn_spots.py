@@ -38,5 +38,5 @@ def oval(rng: np.random.Generator, sd: float) -> np.ndarray:
 def picture(*marks: Footprint, scene: Scene | None = None) -> np.ndarray:
     """Several spots in one picture, without speckle."""
     scene = scene or Scene(speckle_contrast=0.0)
-    made = [render_spot(mark, WIDTH, HEIGHT, scene, Sensor(), (1, k, 0)) for k, mark in enumerate(marks)]
-    return np.maximum.reduce(made)
+    pictures = [render_spot(mark, WIDTH, HEIGHT, scene, Sensor(), (1, k, 0)) for k, mark in enumerate(marks)]
+    return np.maximum.reduce(pictures)

@@ -62,6 +62,6 @@ def proposing(
     return Ahead(laplace, proposal, sampled, accepted)
 
 
-def given_rig(sheet: str, step: int, ratio: float, accepted: bool, rig: Path, *told: object) -> Ahead:
+def given_rig(sheet: str, step: int, ratio: float, accepted: bool, rig: Path, *rest: object) -> Ahead:
     """In place of the function of the command, which is given the rig file too."""
-    return proposing(sheet, step, ratio, accepted, *told)
+    return proposing(sheet, step, ratio, accepted, *rest)

@@ -119,9 +119,9 @@ def drawn_calibration(campaign) -> Calibration:
     for name in names:
         value = RIG_PRIORS[name].value
         columns.append(value + 0.01 * abs(value) * generator.standard_normal(600))
-    found = calibration_of_draws(names, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
-    parts = np.stack([0.25 * found.covariance, 0.75 * found.covariance])
-    return replace(found, causes=("pixel noise", "stereo calibration"), cause_covariance=parts)
+    calibration = calibration_of_draws(names, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
+    parts = np.stack([0.25 * calibration.covariance, 0.75 * calibration.covariance])
+    return replace(calibration, causes=("pixel noise", "stereo calibration"), cause_covariance=parts)
 
 
 def write_journal(folder: Path) -> None:
@@ -752,8 +752,8 @@ def mutations(folder: Path, numbers: range, seed: int, traced: bool = False) -> 
             tracemalloc.start()
         try:
             target.read(path)
-        except TvsError as found:
-            error = found
+        except TvsError as refusal:
+            error = refusal
         finally:
             peak = tracemalloc.get_traced_memory()[1] if traced else None
             tracemalloc.stop()

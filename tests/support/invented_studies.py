@@ -52,12 +52,12 @@ def job(mounted_rig) -> StudyJob:
 @pytest.fixture
 def quick(monkeypatch):
     """Rows without simulation and fit; the list of those made."""
-    made = []
+    simulated = []
 
     def row(job, index):
-        made.append(index)
+        simulated.append(index)
         return invented(job, index)
 
     monkeypatch.setattr("tvsbayes.studies.study_job.study_row", row)
     monkeypatch.setattr("tvsbayes.studies.executors.study_row", row)
-    return made
+    return simulated

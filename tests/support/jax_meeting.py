@@ -110,8 +110,8 @@ def meeting(
     cone = (w.y**2 - cos_b**2 * w.dot(w)) / ahead
     plane = (w.y * sin_b - w.x * cos_b) / (d.x * cos_b - d.y * sin_b)
     range_mm = jnp.where(azimuth_convention, plane, cone)
-    seen = w + d * range_mm
-    in_sight = jnp.where(azimuth_convention, seen.x * sin_b, 0.0) + seen.y * cos_b
+    spot = w + d * range_mm
+    in_sight = jnp.where(azimuth_convention, spot.x * sin_b, 0.0) + spot.y * cos_b
     # At B = 90 deg both nappes are one plane, and y is zero but for rounding.
     faces = in_sight >= -ROUNDING * jnp.abs(range_mm * cos_b)
     points = rays.at(range_mm)
@@ -195,10 +195,10 @@ def _law(case: Case, mean: Array, stop_sd_deg: Array, covariance: Array) -> Line
     return linear(function, mean, covariance)
 
 
-def jax_carry(calibration: Calibration, found: Drawn, settings: Settings) -> np.ndarray:
+def jax_carry(calibration: Calibration, drawn: Drawn, settings: Settings) -> np.ndarray:
     """Every draw through the geometry: (draws, points, 3), not a number where there is no point."""
     with jax.enable_x64(True):
-        return np.asarray(_carried(case_of(calibration, settings), jnp.asarray(found.inputs), jnp.asarray(found.noise)))
+        return np.asarray(_carried(case_of(calibration, settings), jnp.asarray(drawn.inputs), jnp.asarray(drawn.noise)))
 
 
 def jax_law(calibration: Calibration, settings: Settings) -> Linear:
@@ -209,7 +209,7 @@ def jax_law(calibration: Calibration, settings: Settings) -> Linear:
     mean = np.concatenate([calibration.mean, np.zeros(NOISES)])
     stop_sd_deg = np.sqrt([calibration.noise_variance[name] for name in NOISE_NAMES])
     with jax.enable_x64(True):
-        given = map(jnp.asarray, (mean, stop_sd_deg, calibration.covariance_with_noise))
-        found = _law(case_of(calibration, settings), *given)
-    lost = np.where(np.isnan(found.value), np.nan, 0.0)[..., None]
-    return Linear(found.value, np.asarray(found.jacobian) + lost, np.asarray(found.covariance) + lost)
+        moments = map(jnp.asarray, (mean, stop_sd_deg, calibration.covariance_with_noise))
+        law = _law(case_of(calibration, settings), *moments)
+    lost = np.where(np.isnan(law.value), np.nan, 0.0)[..., None]
+    return Linear(law.value, np.asarray(law.jacobian) + lost, np.asarray(law.covariance) + lost)

@@ -57,19 +57,19 @@ def running(tree: ast.AST) -> ast.AST:
 def imported(tree: ast.AST, modules: frozenset[str] | None = None) -> set[str]:
     """Modules that code imports: at the top, inside functions, for type checkers, or named in a string of code."""
     known = frozenset(MODULES) if modules is None else modules
-    found: set[str] = set()
+    names: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found.update(alias.name for alias in node.names)
+            names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "relative imports hide what a module needs"
             base = node.module or ""
             inside = {f"{base}.{alias.name}" for alias in node.names}
-            own = {name for name in inside if name.removeprefix("tvsbayes.") in known}
-            found.update(own or {base})
+            submodules = {name for name in inside if name.removeprefix("tvsbayes.") in known}
+            names.update(submodules or {base})
     for text in strings(tree):
-        found.update(name for name in MODULE.findall(text) if name.removeprefix("tvsbayes.") in known)
-    return found
+        names.update(name for name in MODULE.findall(text) if name.removeprefix("tvsbayes.") in known)
+    return names
 
 
 def parsed(name: str) -> ast.AST:
@@ -94,9 +94,9 @@ def room(name: str) -> str:
 
 
 def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
-    seen, todo = set(), [start]
+    reached, todo = set(), [start]
     while todo:
-        for name in graph[todo.pop()] - seen:
-            seen.add(name)
+        for name in graph[todo.pop()] - reached:
+            reached.add(name)
             todo.append(name)
-    return seen
+    return reached

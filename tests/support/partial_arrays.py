@@ -13,10 +13,10 @@ from tvsbayes.model.gear_processes import Places
 
 def partial_arrays(**parts: Any) -> CampaignArrays:
     """A campaign of which nothing but these parts is there."""
-    found = object.__new__(CampaignArrays)
+    arrays = object.__new__(CampaignArrays)
     for name, part in parts.items():
-        object.__setattr__(found, name, part)
-    return found
+        object.__setattr__(arrays, name, part)
+    return arrays
 
 
 def no_gears(spots: int) -> GearArrays:

@@ -23,14 +23,14 @@ class Shown:
 
 def shown(text: str) -> list[Shown]:
     """Every `$ tvsbayes ...` of the page in order, long lines joined at their backslashes."""
-    found = []
+    commands = []
     for block in re.findall(r"```console\n(.*?)```", text, flags=re.DOTALL):
         for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
             command, printed = part.replace("\\\n", "").split("\n", 1)
             words = [word.strip("'") for word in re.findall(r"'[^']*'|\S+", command)]
             assert words[0] == "tvsbayes", command
-            found.append(Shown(tuple(words[1:]), printed))
-    return found
+            commands.append(Shown(tuple(words[1:]), printed))
+    return commands
 
 
 def same(line: str, expected: str) -> bool:
@@ -41,12 +41,12 @@ def same(line: str, expected: str) -> bool:
     if NUMBER.sub("#", " ".join(line.split())) != NUMBER.sub("#", " ".join(expected.split())):
         return False
     pairs = zip(NUMBER.findall(line), NUMBER.finditer(expected), strict=True)
-    for found, wanted in pairs:
+    for number, wanted in pairs:
         digits, _, exponent = wanted[0].partition("e")
         unit = 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
         error = re.match(rf" \+- ({NUMBER.pattern})", expected[wanted.end() :])
         # Half a unit for the binary fractions of the digits themselves.
-        if abs(float(found) - float(wanted[0])) > max(1.5 * unit, float(error[1]) if error else 0.0):
+        if abs(float(number) - float(wanted[0])) > max(1.5 * unit, float(error[1]) if error else 0.0):
             return False
     return True
 
@@ -59,10 +59,10 @@ def first_difference(printed: str, expected: str) -> str | None:
             free = True
             continue
         places = range(at, len(lines)) if free else range(at, min(at + 1, len(lines)))
-        here = next((k for k in places if same(lines[k], wanted)), None)
-        if here is None:
+        place = next((k for k in places if same(lines[k], wanted)), None)
+        if place is None:
             return f"page: {wanted!r}, printed: {lines[at] if at < len(lines) else None!r}"
-        at, free = here + 1, False
+        at, free = place + 1, False
     return None if free or at == len(lines) else f"printed, not on the page: {lines[at]!r}"
 
 

@@ -35,8 +35,8 @@ def small_stereo() -> Stereo:
 
 def seen_steps(campaign: Campaign) -> np.ndarray:
     """Lowest and highest counter of each axis that a look saw, shape (2, 2)."""
-    seen = [campaign.moves[spot.move] for spot in campaign.spots if spot.status == "ok"]
-    counters = np.array([(m.pan_steps, m.tilt_steps) for m in seen], dtype=float)
+    moves = [campaign.moves[spot.move] for spot in campaign.spots if spot.status == "ok"]
+    counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], dtype=float)
     return np.stack([counters.min(axis=0), counters.max(axis=0)], axis=1)
 
 

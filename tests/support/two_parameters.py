@@ -31,12 +31,12 @@ def no_states() -> StopStates:
 
 def linear_campaign(along: np.ndarray, prior: np.ndarray, noise: int) -> LinearCampaign:
     """Of one spot at its predicted place, whose first component sees coordinates y by `along` (g,)."""
-    seen = np.zeros((ROWS, len(along)))
-    seen[0] = along
+    column = np.zeros((ROWS, len(along)))
+    column[0] = along
     nothing = np.zeros(0)
     looks = LookNoise.of(np.zeros((1, ROWS, 2)), np.ones(1), np.zeros(2), np.ones(2))
     of_states = np.zeros((0, noise)), nothing
-    return LinearCampaign(np.zeros(ROWS), seen, no_states(), *of_states, np.zeros((ROWS, 0)), prior, looks)
+    return LinearCampaign(np.zeros(ROWS), column, no_states(), *of_states, np.zeros((ROWS, 0)), prior, looks)
 
 
 class Scaled(Transport):
@@ -80,9 +80,9 @@ WIDE = INDEX["tilt_zero_deg"]
 def ridge_residual(z: np.ndarray) -> np.ndarray:
     """Of one datum, in units of its noise: z_2 (1 + 0.15 z_1) = 0.4 z_1^2 +- 0.02; shape (n, 4)."""
     wide, narrow = z[:, WIDE], z[:, RATIO]
-    found = np.zeros((len(z), ROWS))
-    found[:, 0] = -(narrow * (1 + TURN * wide) - CURVE * wide**2) / NARROW_SD
-    return found
+    residual = np.zeros((len(z), ROWS))
+    residual[:, 0] = -(narrow * (1 + TURN * wide) - CURVE * wide**2) / NARROW_SD
+    return residual
 
 
 def ridge_density(z: np.ndarray) -> np.ndarray:
@@ -116,9 +116,9 @@ PLAY, PLAY_SD, FOLLOW, RATIO_SD = -0.04, 0.08, -0.6, 0.3
 def play_residual(z: np.ndarray) -> np.ndarray:
     """Of a play that was measured below zero and a ratio that follows it, by SciPy's own half-normal; shape (n, 4)."""
     play = stats.halfnorm.ppf(stats.norm.cdf(z[:, BACKLASH]))
-    found = np.zeros((len(z), ROWS))
-    found[:, 0], found[:, 1] = (PLAY - play) / PLAY_SD, (FOLLOW * play - z[:, RATIO]) / RATIO_SD
-    return found
+    residual = np.zeros((len(z), ROWS))
+    residual[:, 0], residual[:, 1] = (PLAY - play) / PLAY_SD, (FOLLOW * play - z[:, RATIO]) / RATIO_SD
+    return residual
 
 
 def play_density(z: np.ndarray) -> np.ndarray:

@@ -47,7 +47,7 @@ def coordinates_with(space: ParameterSpace, z: np.ndarray, values: Mapping[str, 
     for name, value in values.items():
         physical[INDEX[name]] = value
     named = [INDEX[name] for name in values]
-    found = z.copy()
-    found[named] = coordinates_of(space, physical)[named]
-    assert found.shape == (len(NAMES),)
-    return found
+    point = z.copy()
+    point[named] = coordinates_of(space, physical)[named]
+    assert point.shape == (len(NAMES),)
+    return point

@@ -24,13 +24,13 @@ class WrongInput:
     Attributes:
         spoil: does it to a good campaign folder.
         command: what is called then; CAMPAIGN stands for the folder, DATA for the shipped data.
-        said: words in what is printed, all of them.
+        words: in what is printed, all of them.
         code: exit code.
     """
 
     spoil: Callable[[Path], None]
     command: str
-    said: tuple[str, ...]
+    words: tuple[str, ...]
     code: int
 
 
@@ -63,9 +63,9 @@ def text(file: str, old: str, new: str) -> Callable[[Path], None]:
     """A pattern in a file."""
 
     def spoil(folder: Path) -> None:
-        found = (folder / file).read_text()
-        changed = re.sub(old, new, found, flags=re.MULTILINE)
-        assert changed != found, f"{old} is not in {file}"
+        whole = (folder / file).read_text()
+        changed = re.sub(old, new, whole, flags=re.MULTILINE)
+        assert changed != whole, f"{old} is not in {file}"
         (folder / file).write_text(changed)
 
     return spoil

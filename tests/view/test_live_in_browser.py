@@ -138,7 +138,7 @@ def browsed(tmp_path_factory) -> Iterator[Browsed]:
 @pytest.fixture(autouse=True)
 def quiet(browsed) -> Iterator[None]:
     """No page may ask anybody but its own server."""
-    browsed.complaints(), browsed.asked()
+    browsed.complaints(), browsed.requested_hosts()
     yield
     browsed.complaints()
 
@@ -147,7 +147,7 @@ def text(browsed: Browsed, name: str) -> str:
     return browsed.js("return document.getElementById(arguments[0]).textContent", name)
 
 
-def told(browsed: Browsed, name: str, part: str) -> None:
+def wait_for(browsed: Browsed, name: str, part: str) -> None:
     browsed.until(f"document.getElementById('{name}').textContent.includes({part!r})")
 
 
@@ -160,10 +160,10 @@ def test_page_shows_the_run_and_asks_nobody_else(going, browsed):
     assert browsed.js("return document.querySelectorAll('#left .trail').length") == 3
     centre = browsed.js("return Number(document.querySelector('#right .whole .centre').getAttribute('cx'))")
     assert centre == pytest.approx(going.live.latest.look.pixels_px[2])
-    told(browsed, "estimate-remark", "of 3 looks; wanted: u at most 0.00010 in left, right")
+    wait_for(browsed, "estimate-remark", "of 3 looks; wanted: u at most 0.00010 in left, right")
     assert "Temperature 0." in text(browsed, "estimate-remark") and "times the target" in text(browsed, "estimates")
     browsed.until("document.querySelectorAll('#history path[data-name=estimates]').length === 2")
-    assert browsed.complaints() == [] and browsed.asked() == {urlsplit(going.link).netloc}
+    assert browsed.complaints() == [] and browsed.requested_hosts() == {urlsplit(going.link).netloc}
 
 
 def test_every_button_is_acknowledged_by_the_device(going, browsed, tmp_path):
@@ -203,7 +203,7 @@ def test_second_browser_watches_and_may_make_the_run_safer(going, browsed):
     browsed.driver.switch_to.new_window("tab")
     try:
         assert browsed.opened(going.link) == "running"
-        told(browsed, "rights", "another browser controls")
+        wait_for(browsed, "rights", "another browser controls")
         assert browsed.js(f"return {ENABLED}") == "pause,laser-off"
         # Nor past its own buttons.
         code = (
@@ -228,10 +228,10 @@ def test_control_comes_to_who_is_there_once_the_other_browser_is_gone(going, bro
     with browser(tmp_path_factory.mktemp("saved")) as doomed:
         assert doomed.opened(going.link) == "running"
         assert browsed.opened(going.link) == "running"
-        told(browsed, "rights", "another browser controls")
+        wait_for(browsed, "rights", "another browser controls")
         os.kill(doomed.driver.capabilities["goog:processID"], signal.SIGKILL)
     browsed.until("document.body?.dataset.controls === 'true'")
-    told(browsed, "requests", "control passed on")
+    wait_for(browsed, "requests", "control passed on")
     assert "Closing this page changes nothing" in browsed.js("return document.querySelector('header').textContent")
     assert going.finish().ok == 8
     requests = [r.data["what"] for r in read_journal(going.run.engine.journal.folder).records if r.event == "asked"]

@@ -62,11 +62,11 @@ def both(viewed, tmp_path_factory) -> str:
 
 @pytest.fixture
 def page(both, browsed) -> Iterator[Browsed]:
-    browsed.complaints(), browsed.asked()
+    browsed.complaints(), browsed.requested_hosts()
     assert browsed.opened(both) == "ready"
     yield browsed
     assert browsed.complaints() == []
-    assert browsed.asked() == set()
+    assert browsed.requested_hosts() == set()
 
 
 def test_page_shows_everything_and_asks_nobody(page):
@@ -246,7 +246,7 @@ def test_texts_of_a_campaign_are_texts(viewed, browsed, tmp_path):
     browsed.complaints()
     assert browsed.opened(page_of(tmp_path / "page.html", Looked((renamed,)), viewed.bare)) == "ready"
     assert browsed.one("name").text == hostile
-    assert browsed.complaints() == [] and browsed.asked() == set()
+    assert browsed.complaints() == [] and browsed.requested_hosts() == set()
 
 
 def test_folder_without_results_and_one_without_spots(viewed, browsed, tmp_path):

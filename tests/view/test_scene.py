@@ -19,22 +19,22 @@ from tvsbayes.view.scene import NOT_FITTED, NOT_OF_THESE, Looked, look_at, scene
 
 
 @pytest.fixture(scope="module")
-def found(viewed):
+def stored(viewed):
     return stored_campaign(viewed.folder)
 
 
 @pytest.fixture(scope="module")
-def shown(found):
-    return scene(found.campaign, found.fitted)
+def shown(stored):
+    return scene(stored.campaign, stored.fitted)
 
 
-def test_spots_expected_are_those_of_the_fit(found, shown):
+def test_spots_expected_are_those_of_the_fit(stored, shown):
     from tvsbayes.posterior.predictive import looks, turned_by
 
-    fit = found.fitted.fit
+    fit = stored.fitted.fit
     turned = turned_by(fit.arrays, np.asarray(fit.mode.place_errors_rad)[None])
     expected = looks(fit, fit.z[None], turned)[0]
-    numbers = [spot.spot for spot in ordered_spots(found.campaign)]
+    numbers = [spot.spot for spot in ordered_spots(stored.campaign)]
     rows = [shown.looks.spot.tolist().index(spot) for spot in numbers]
     # Rounding of pixels of a thousand.
     np.testing.assert_allclose(shown.looks.predicted_px[rows], expected, atol=1e-8)
@@ -72,10 +72,10 @@ def test_pictures_are_told_by_camera(shown):
     assert kept == [[shown.looks.spot.tolist().index(PICTURED), 0]]
 
 
-def test_stops_stand_at_their_looks(found, shown):
+def test_stops_stand_at_their_looks(stored, shown):
     looks = shown.looks
-    assert len(found.fitted.stops) > 17
-    for stop in found.fitted.stops[::17]:
+    assert len(stored.fitted.stops) > 17
+    for stop in stored.fitted.stops[::17]:
         column = ("pan", "tilt").index(stop.axis)
         rows = np.isin(looks.spot, stop.spots)
         assert set(looks.deviation_deg[rows, column]) == {stop.deviation_deg}
@@ -83,8 +83,8 @@ def test_stops_stand_at_their_looks(found, shown):
         assert {looks.direction[row][column] for row in np.flatnonzero(rows)} == {stop.direction}
 
 
-def test_parameters_and_correlations_are_those_of_the_record(found, shown):
-    record = found.fitted.record
+def test_parameters_and_correlations_are_those_of_the_record(stored, shown):
+    record = stored.fitted.record
     rows = {row.name: row for row in shown.parameters}
     assert rows["mirror_offset_mm"].value == record.summary.parameters["mirror_offset_mm"].value
     assert rows["effective_deg_per_step.left"].unit == "deg/step"
