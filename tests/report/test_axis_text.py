@@ -1,4 +1,4 @@
-"""An axis in words."""
+"""Texts of an axis: plan, fit, firmware, drive."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tvsbayes.single_axis.waves import WavePeriods
 
 
 @pytest.mark.parametrize(("after", "remark"), [(0.99, True), (0.96, True), (0.94, False), (0.3, False)])
-def test_a_plan_that_hardly_helps_says_so(after, remark):
+def test_a_plan_of_little_effect_is_marked(after, remark):
     stop = NextStop(1_250_000.0, "forward", None, after, 1.0 - after, 0.1)
     text = axis_plan_text(AxisPlan("per_command", 1.0, (stop,), 0.5), "mm")
     assert ("these stops have little effect: u falls by" in text) is remark
@@ -59,13 +59,13 @@ def clean():
         (("reading 5 lies 9 sds off", "all moves have the same time"), "usable; see the 2 warnings"),
     ],
 )
-def test_the_verdict_alone_says_that_warnings_stand_beside_it(clean, warnings, verdict):
+def test_the_verdict_counts_the_warnings(clean, warnings, verdict):
     text = axis_fit_text(structs.replace(clean, warnings=warnings))
     assert text.splitlines()[-1] == f"verdict: {verdict}"
     assert text.count("warning: ") == len(warnings)
 
 
-def test_a_fit_says_what_goes_into_firmware(clean):
+def test_a_fit_states_the_numbers_for_firmware(clean):
     sides = {name: structs.replace(of, value=-0.05, sd=0.0005) for name, of in clean.effective_per_command.items()}
     clean = structs.replace(clean, effective_per_command=sides, range_command=(0.0, 1250000.0))
 
@@ -85,7 +85,7 @@ def test_a_fit_says_what_goes_into_firmware(clean):
     )
 
 
-def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(clean):
+def test_a_fit_states_place_and_possible_cause_of_the_largest_error_by_position(clean):
     deviations = (
         PositionDeviation(0.0, 0.02, 0.01, (0.0, 0.04)),
         PositionDeviation(1250000.0, -0.05, 0.01, (-0.07, -0.03)),
@@ -106,8 +106,8 @@ def test_numbers_that_must_not_be_used_are_not_offered_to_firmware(clean):
     assert "for your firmware" not in broken and "largest at command" not in broken
 
 
-def test_a_drive_has_neither_play_nor_directions_nor_stops_to_read():
-    """Numbers and advice that only an axis with stops can have are left out."""
+def test_the_text_of_a_drive_has_no_play_directions_or_stops():
+    """Numbers and advice for an axis with stops are left out."""
     rate, time_s = 15.0, 5.0 * np.arange(200)
     value = rate * time_s + 4.0 * np.sin(2 * np.pi * time_s / 200.0) + 0.3 * np.random.default_rng(1).normal(size=200)
     readings = tuple(

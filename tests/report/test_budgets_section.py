@@ -1,4 +1,4 @@
-"""Budgets on the page: every column closes, no input that matters is left out, one result counts."""
+"""Budgets on the page: every column adds up, no relevant input is left out, one result is stated as final."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def columns_of(table) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize("budgets", [(PAN, TILT), (TILT, PAN), (TILT,)])
-def test_every_column_of_shares_closes(budgets):
+def test_every_column_of_shares_adds_up(budgets):
     for table in (section(*budgets).tables[0], section(*budgets).tables[-1]):
         columns = columns_of(table)
         assert columns
@@ -75,8 +75,8 @@ def test_an_input_of_one_quantity_alone_has_its_row(budgets):
     assert table.rows[-1][0].startswith("correlations") and table.rows[-2][0].startswith("others")
 
 
-def test_what_both_quantities_do_not_share_is_told_of_either():
-    """Stop errors are those of the quantity: no number stands for another's."""
+def test_an_input_with_a_value_per_quantity_states_both():
+    """Stop errors belong to one quantity: its number is not that of another."""
     rows = {row[0]: row for row in section(PAN, TILT).tables[0].rows}
     assert rows["stop errors of the campaign, deg"][2] == "0.015" and rows["play variation, deg"][2] == "0.010"
     wider = entry("backlash_deg.tilt", COMMON, u=0.034)
@@ -85,7 +85,7 @@ def test_what_both_quantities_do_not_share_is_told_of_either():
 
 
 def test_every_row_with_a_u_names_its_unit():
-    """Effects of unit variance count in their standard deviations."""
+    """Effects of unit variance are stated in standard deviations."""
     source = Source("stop error pan", "1", 0.0, 1.0, "A", "normal", math.inf, 0.017)
     (table, *_) = section(budget_table("backlash_deg.pan", "deg", 0.5, 0.017, [source])).tables
     assert table.rows[0][0] == "stop error pan, in sds"
@@ -94,7 +94,7 @@ def test_every_row_with_a_u_names_its_unit():
         assert len(stated) > 2 and all(name.endswith(", deg") for name in stated)
 
 
-def test_the_result_that_counts_is_named_once():
+def test_the_final_result_is_named_once():
     (note,) = (text for text in section(PAN, TILT).text if "first page" in text)
     assert "JCGM 100:2008, clause 5" in note and "at the mode" in note and "where uncertainty comes from" in note
 
@@ -111,7 +111,7 @@ def test_the_result_that_counts_is_named_once():
         (PAN, (0.002, 0.067), ("below 0", "first page", "[0.002, 0.067]")),
     ],
 )
-def test_where_the_linear_interval_is_another_the_quantity_says_so(budget, interval, words):
+def test_a_linear_interval_that_differs_is_remarked_at_its_quantity(budget, interval, words):
     caption = section(budget, pan=interval).tables[0].caption
     assert [word for word in words if word not in caption] == []
     assert ("first page" in caption) == bool(words)

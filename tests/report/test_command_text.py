@@ -1,4 +1,4 @@
-"""What `locate` says of its points, and `locate --cloud` of its uncertainties."""
+"""Texts of `locate` for points and of `locate --cloud` for uncertainties."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tvsbayes.report.command_text import cloud_text, locations_text
 
 
 @pytest.mark.parametrize("aperture_read", [False, True])
-def test_points_say_where_their_distance_is_a_statement(aperture_read):
+def test_points_are_marked_where_their_distance_is_stated(aperture_read):
     located = SimpleNamespace(
         refused=[None],
         covariance_mm2=np.eye(3)[None],
@@ -32,7 +32,7 @@ def test_points_say_where_their_distance_is_a_statement(aperture_read):
 
 
 @pytest.mark.parametrize("held, points, advice", ((25, 156, "do not rely on the sds"), (149, 156, "may be relied on")))
-def test_a_cloud_says_whether_its_sds_may_be_relied_on(held, points, advice):
+def test_a_cloud_states_whether_its_sds_are_reliable(held, points, advice):
     """A user's 25 of 156; 149 of 156 is above 95 %."""
     cloud = CloudFile("out.ply", ("x", "y"), 1000, 0, 0, None, {})
     text = cloud_text(cloud, LawChecked(points, held, 5.7, 2700.0), SimpleNamespace())

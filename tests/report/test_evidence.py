@@ -1,4 +1,4 @@
-"""What a report gathers from `results/`: only what belongs to these data, and is whole."""
+"""Results that a report reads from `results/`: only complete ones of the same data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STORED = {"compare.json": "held_out", "plan.json": "planned", "verification.json
 
 @pytest.mark.parametrize("name", STORED)
 def test_results_that_belong_to_other_data_are_not_reported(reported, name):
-    """Those of another campaign are left out."""
+    """Results of another campaign are left out."""
     (reported / "results" / name).write_text(json.dumps({"inputs": {"moves": "0"}}))
     try:
         assert getattr(evidence_of(reported), STORED[name]) is None
@@ -30,7 +30,7 @@ def test_results_that_belong_to_other_data_are_not_reported(reported, name):
 
 @pytest.mark.parametrize("name", ["compare.json", "plan.json"])
 @pytest.mark.parametrize("content", [{}, {"held_out": None, "target": 3}, {"held_out": {"verdict": "x"}, "target": {}}])
-def test_results_that_no_command_wrote_are_refused_by_name(reported, evidence, name, content):
+def test_results_of_unknown_origin_are_refused_by_name(reported, evidence, name, content):
     path = reported / "results" / name
     path.write_text(json.dumps({"inputs": evidence.fit.provenance.inputs, **content}))
     try:
@@ -71,8 +71,8 @@ def test_criterion_follows_its_rule(share, verdict):
     assert (judged.probability, judged.verdict) == (pytest.approx(share), verdict)
 
 
-def test_the_headline_and_the_table_say_a_probability_alike():
-    """Of draws that all lie within a limit."""
+def test_headline_and_table_write_a_probability_alike():
+    """All draws lie within a limit."""
     sure = Criterion("ratio left", 1e-3, "deg/step", 1.0, MET)
     assert verdict_of(small_summary(), (sure,)).text.endswith("(probability above 0.999)")
     assert criteria_table((sure,)).rows[0][2] == "above 0.999"
@@ -85,7 +85,7 @@ def test_the_headline_and_the_table_say_a_probability_alike():
 
 @pytest.mark.thorough
 def test_a_verification_of_this_calibration_is_reported_with_millimetres(reported, evidence):
-    """Kept by `verify` of the very calibration; of another one it is not."""
+    """A verification of another calibration is not reported."""
     size = {"rms": 0.0123, "worst": 0.045}
     mm = {"distance_mm": 1000.0, "before": {"rms": 37.7, "worst": 60.2}, "after": {"rms": 1.83, "worst": 4.1}}
     mm["promised95"] = 5.18

@@ -50,7 +50,7 @@ def lines_of(figure):
 
 
 def test_figures_take_what_the_estimators_return(evidence):
-    """And not only their insides: a summary and a classic result as they are."""
+    """A summary and a classic result are accepted as returned."""
     result = classic(evidence.campaign)
     whole = intervals(evidence.fit.summary, result)
     parts = intervals(evidence.fit.summary.effective, result.directions)
@@ -71,7 +71,7 @@ def test_figures_take_what_the_estimators_return(evidence):
 
 
 def test_spots_are_triangulated_once_for_classic_and_figures(evidence, monkeypatch):
-    """A copy of a campaign has not been triangulated yet; what it then holds nobody can change."""
+    """A copy of a campaign is triangulated on first use; the stored points are read-only."""
     calls = []
     monkeypatch.setattr(
         "tvsbayes.instrument.campaign.triangulate", lambda *args: calls.append(args) or triangulate(*args)
@@ -87,12 +87,12 @@ def test_spots_are_triangulated_once_for_classic_and_figures(evidence, monkeypat
         campaign.points_mm[0] = 0.0
 
 
-def test_a_prompt_completes_figures_alone():
+def test_completion_lists_figures_alone():
     names = [name for name, value in vars(figures).items() if getattr(value, "__module__", "") == figures.__name__]
     assert dir(figures) == sorted(name for name in names if not name.startswith("_")) and len(dir(figures)) > 10
 
 
-def test_no_text_of_the_ratios_is_cut_or_lies_on_the_points(evidence):
+def test_no_text_of_the_ratios_is_cut_or_covers_points(evidence):
     """Labels end inside of the figure; legends stand beside the axes."""
     at = Measured(0.062, 1e-4, (0.0618, 0.0622))
     places = (0.0, 5.0, 9.0)

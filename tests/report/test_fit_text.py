@@ -1,4 +1,4 @@
-"""A fit in words: what its reader must know, and a demo's truth."""
+"""Text of a fit: results, warnings and the truth of a demo."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tvsbayes.results.convergence import Importance, MonteCarloError, NamedValue
 from tvsbayes.results.estimates import FitSummary, Validation, ValidationTest, WeakDirection
 
 
-def test_a_fit_astray_shows_no_results():
-    """Where it stopped may help to find out why; no uncertainty and no diagnosis rests on it."""
+def test_a_fit_that_did_not_converge_shows_no_results():
+    """The place where it stopped is printed; uncertainties and diagnoses are not."""
     astray = structs.replace(small_summary(), converged=False, problems=("it ran away",), few_stops={"up": 3})
     text = fit_text(astray)
     assert text.splitlines()[0] == "NOT CONVERGED: it ran away"
@@ -34,14 +34,14 @@ def test_a_fit_astray_shows_no_results():
 @pytest.mark.parametrize(
     ("estimator", "word"), [("laplace", "too short; sample"), ("posterior", "intervals include this")]
 )
-def test_few_stops_are_said(estimator, word):
+def test_few_stops_are_reported(estimator, word):
     lines = fit_text(structs.replace(small_summary(), few_stops={"up": 3, "down": 2}, estimator=estimator)).splitlines()
     (line,) = (line for line in lines if line.startswith("few stops"))
     assert "(up 3, down 2)" in line and word in line
     assert "few stops" not in fit_text(small_summary())
 
 
-def test_fit_text_shows_what_the_reader_must_know():
+def test_fit_text_shows_results_and_warnings():
     text = fit_text(small_summary(), details=True, written=["results/fit.json"])
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
     assert "pan 6.00 deg, tilt 0.50 deg" in lines["joint estimator (Laplace) at pan 6.00 deg, tilt 0.50 deg"]
@@ -75,7 +75,7 @@ def test_scales_known_only_in_their_sum_are_not_set_by_the_data():
     assert "1 weak direction," in fit_text(shared) and "sum" not in fit_text(summary)
 
 
-def test_an_encoder_says_what_a_degree_does():
+def test_the_ratio_of_fine_steps_is_stated_for_many_counts():
     summary = small_summary()
     known = next(iter(summary.parameters.values()))
     fine = structs.replace(known, value=1.01234e-5, sd=3.1e-9)
@@ -135,7 +135,7 @@ def sampled(answer: str, missing: tuple[str, ...], steps: int | None = None) -> 
 
 
 @pytest.mark.parametrize(("steps", "helps"), [(None, "fit without --quick"), (900, "--resume and more --max-minutes")])
-def test_a_rough_answer_says_how_rough_and_what_helps(steps, helps):
+def test_a_rough_answer_states_its_error_and_remedy(steps, helps):
     """The table stays; what is missing, the worst Monte Carlo error and the way to more stand before it."""
     text = fit_text(sampled("rough", ("known to 0.17 sd, wanted 0.1",), steps))
     lines = text.splitlines()
@@ -159,7 +159,7 @@ def test_where_nothing_could_be_sampled_the_laplace_table_is_given_with_its_warn
     assert "too short" in lines[-1]
 
 
-def test_an_accepted_answer_needs_no_word():
+def test_an_accepted_answer_has_no_remark():
     text = fit_text(sampled("accepted", ()))
     assert "rough" not in text and "what helps" not in text and "Monte Carlo" not in text
 

@@ -1,4 +1,4 @@
-"""What the gears repeat by position, on the page and in the text of a fit."""
+"""Transmission error by position, on the page and in the text of a fit."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_bands_are_those_of_the_draws(bands):
         assert width[inside].mean() < 0.4 * width[[0, -1]].mean() and 2.5 * sd < width[[0, -1]].mean() < 5 * sd
 
 
-def test_stops_stand_on_the_error(bands):
+def test_stops_lie_on_the_error(bands):
     band = bands[0]
     at = {"axis": "pan", "spots": (1,), "leg_steps": 9, "depth_mm": (1.0,), "within": (), "time_s": 0.0, "u_deg": 0.1}
     stops = [StopResidual(steps=120, direction=side, deviation_deg=off, **at) for side, off in (("left", 0.02),)]
@@ -80,7 +80,7 @@ def test_the_section_states_scales_range_and_both_ratios(geared_evidence, eviden
     assert cells["right, local, deg/step"] == "never moved"
 
 
-def test_the_text_of_a_fit_is_short_of_it(geared_evidence):
+def test_the_text_of_a_fit_summarises_the_section(geared_evidence):
     text = fit_text(geared_evidence.fit.summary, details=True)
     assert "gears: what repeats by position" in text and "pan -60 to 280, tilt -140 to 140 steps" in text
     assert "local ratios, without errors of the gears, deg/step: left 0.06010(10)" in text

@@ -1,4 +1,4 @@
-"""What the page says of traceability and limits."""
+"""Traceability and limits on the page."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ def test_a_stated_length_is_printed_with_its_unit_and_u():
     assert rows == {"board_certificate": "PTB 123", "pitch": "30 mm, u = 0.02 mm"}
 
 
-def test_limits_use_no_symbol_that_the_page_does_not_explain():
+def test_limits_use_only_symbols_that_the_page_explains():
     items = limits_section(SimpleNamespace()).items
     assert any("emission angle at pan 0 (C0)" in item for item in items)

@@ -1,4 +1,4 @@
-"""The report page: structure, policy, what strangers write into campaigns, and how Chromium shows it."""
+"""The report page: structure, security policy, hostile text in campaigns, rendering in Chromium."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_command_writes_this_page(reported, page):
     assert len(page) < BYTES_MAX
 
 
-def test_the_page_is_alone_and_its_policy_allows_only_itself(page):
+def test_the_page_is_self_contained_and_so_is_its_policy(page):
     nodes = Nodes(page)
     assert {tag for tag, _ in nodes.elements} <= KNOWN and not nodes.open
     assert not any(name.startswith("on") for _, attributes in nodes.elements for name in attributes)
@@ -97,7 +97,7 @@ def test_pictures_are_data_with_words(page):
                 assert not name.endswith("href") or value.startswith(("#", "data:image/png;base64,"))
 
 
-def test_the_page_can_be_read_by_ear(page):
+def test_the_page_is_accessible_to_screen_readers(page):
     nodes = Nodes(page)
     assert nodes.of("html")[0]["lang"] == "en"
     assert [len(nodes.of(tag)) for tag in ("h1", "main", "title")] == [1, 1, 1]
@@ -108,7 +108,7 @@ def test_the_page_can_be_read_by_ear(page):
     assert len(nodes.of("figcaption")) == len(nodes.of("figure"))
 
 
-def test_numbers_of_the_page_are_the_libraries(page, evidence):
+def test_numbers_of_the_page_are_those_of_the_libraries(page, evidence):
     text = " ".join(Nodes(page).text)
     for direction in DIRECTIONS:
         joint = evidence.fit.summary.effective[direction]
@@ -126,7 +126,7 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
     assert f"Not met: {missed.quantity} within 1 mm (probability {chance})" in text
 
 
-def test_the_first_page_has_the_answer_and_who_asked(page, evidence, no_pictures):
+def test_the_first_page_has_results_and_customer(page, evidence, no_pictures):
     """Before the contents: ratios, backlashes, millimetres, what to do next, day, laboratory, customer."""
     issued = report_html(evidence, Issue(datetime.date(2026, 1, 15), "Optics Lab", "Robotics group"))
     for source, phrase in (
@@ -141,13 +141,13 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence, no_pictures
             assert row in first
         assert [first.count(f"{name} calibration") for name in ("nominal", "classic", "joint")] == [1, 1, 1]
         assert source.split(b"<nav")[0].count(b"<img") == 1
-        # Typed by nobody who reads: a command stands as code, with the folder's name, and no option of `fit` is undone.
+        # A command is marked as code, names the folder and repeats the options of `fit`.
         assert "`" not in first and "--no-sample" not in first and "tvsbayes fit twin" in first
         # What makes the millimetres: of the joint calibration, and why the classic is farther off.
         assert "Error of classic there" in first and "of the variance" in first
 
 
-def test_millimetres_without_aperture_readings_say_what_they_rest_on(evidence, no_pictures):
+def test_millimetres_without_aperture_readings_state_their_source(evidence, no_pictures):
     """All calibrations share what is stated of the aperture: they are compared by their beams alone."""
 
     def text(e) -> str:
@@ -176,7 +176,7 @@ def test_a_long_cell_wraps_and_is_not_cut(evidence, no_pictures):
     assert "td.long { white-space: normal;" in (shipped_data() / "report" / "report.css").read_text(encoding="utf-8")
 
 
-def test_what_check_warns_of_stands_on_the_first_page(evidence, no_pictures):
+def test_warnings_of_check_are_on_the_first_page(evidence, no_pictures):
     """The page outlives the terminal: an interrupted run is not usable without a word of it."""
     doubted = replace(evidence, criteria=(), doubts=("whether steps were lost in segment 0 is not known",))
     first = " ".join(" ".join(Nodes(report_html(doubted).split(b"<nav")[0] + b"</header></body></html>").text).split())
@@ -186,7 +186,7 @@ def test_what_check_warns_of_stands_on_the_first_page(evidence, no_pictures):
     assert "check warns" not in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
 
 
-def test_ratios_that_are_one_number_share_a_row(evidence):
+def test_equal_ratios_share_a_row(evidence):
     """Without the classic method's own column; the contrast says what they differ by."""
     summary = evidence.fit.summary
     alike = structs.replace(summary, effective=summary.effective | {"right": summary.effective["left"]})
@@ -202,7 +202,7 @@ def test_ratios_that_are_one_number_share_a_row(evidence):
     ]
 
 
-def test_half_an_interval_is_left_out_where_its_ends_lie_unlike_far():
+def test_the_half_width_of_an_asymmetric_interval_is_left_out():
     """0.24 - 0.40 would be a negative play."""
     play = structs.replace(estimate(0.24, 0.21), interval95=(0.016, 0.810))
     assert _cells(play) == ["0.24(21)", "[0.02, 0.81]", ""]
@@ -247,8 +247,8 @@ def test_no_two_reports_have_one_number(evidence, page, no_pictures):
         assert page_html(each).decode().count(each.number) == 4  # title, head, foot of printed pages, end
 
 
-def test_what_was_made_of_an_earlier_page_goes(tmp_path):
-    """A PDF or certificate never stays beside a newer page; beside a page of somebody else nothing is touched."""
+def test_files_of_an_earlier_page_are_removed(tmp_path):
+    """A PDF or certificate of an older page is removed; files beside a page of another program are kept."""
     ours, newer = b'<meta name="generator" content="tvsbayes 1">old', b'<meta name="generator" content="tvsbayes 1">new'
     page, pdf, certificate = (tmp_path / name for name in ("report.html", "report.pdf", "dcc.xml"))
     for each in (pdf, certificate):
@@ -270,13 +270,13 @@ def test_what_was_made_of_an_earlier_page_goes(tmp_path):
         replace_page(tmp_path / "missing" / "mine.html", newer, tmp_path / "missing" / "mine.html")
 
 
-def test_commands_are_code_and_what_strangers_write_is_not():
+def test_commands_are_code_and_campaign_text_is_not():
     assert prose("Do `tvsbayes fit -5`, u <= 2") == "Do <code>tvsbayes fit -5</code>, u \u2264 2"
     assert prose("`<b>` and -1") == "<code>&lt;b&gt;</code> and \u22121"
     assert prose("a ` alone <i>") == "a ` alone &lt;i&gt;"
 
 
-def test_no_paragraph_stands_twice_and_details_are_folded(page):
+def test_no_paragraph_is_repeated_and_details_are_folded(page):
     html = page.decode()
     texts = [re.sub(r"<.*?>", "", part) for part in re.findall(r"<(?:p|li)\b.*?</(?:p|li)>", html, flags=re.DOTALL)]
     long = [text for text in texts if len(text) > 60]
@@ -300,7 +300,7 @@ def test_numbers_get_true_signs_and_names_stay(plain, set):
     assert typeset(plain) == set
 
 
-def test_traceability_is_what_the_certificate_says(evidence, no_pictures):
+def test_traceability_agrees_with_the_certificate(evidence, no_pictures):
     """No page may claim what the DCC of the same fit denies: simulated data, blanks for a certificate's number."""
     header = {k: v for k, v in evidence.campaign.header.items() if k not in ("synthetic", "traceability")}
     named = {"traceability": {"board_certificate": "PTB 123"}}
@@ -317,8 +317,8 @@ def test_traceability_is_what_the_certificate_says(evidence, no_pictures):
         assert trace.statement in text and ("As declared by the user" in text) == declared
 
 
-def test_axes_are_judged_with_the_fitted_contrast(reported, evidence):
-    """ISO 230-2 figures come from all that the fit knows of the gears: unequal ratios carry every run on."""
+def test_axes_are_assessed_with_the_fitted_contrast(reported, evidence):
+    """ISO 230-2 figures include the fitted contrast of the ratios, which shifts every run."""
     with np.load(reported / "results" / "draws.npz") as stored:
         names, physical = stored["names"].tolist(), stored["physical"]
         contrasts = {a: physical[:, names.index(f"ratio_contrast_deg_per_step.{a}")] for a in ("pan", "tilt")}
@@ -343,7 +343,7 @@ def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
     assert "0.06" in first and "classic value(u)" not in first
 
 
-def test_no_limit_no_verdict_and_no_convergence_no_use(evidence, no_pictures):
+def test_without_limit_no_verdict_and_without_convergence_no_results(evidence, no_pictures):
     assert "No limit was stated" in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
     astray = structs.replace(evidence.fit.summary, converged=False, problems=("the mode was not reached",))
     broken = replace(evidence, fit=replace(evidence.fit, summary=astray))
@@ -364,8 +364,8 @@ PAYLOADS = (
 
 
 @pytest.mark.parametrize("shift", range(3))
-def test_what_strangers_write_stays_text(reported, page, shift, tmp_path, no_pictures):
-    """Every text field of campaign.toml; results stay valid, for texts are outside the hash."""
+def test_hostile_text_is_escaped(reported, page, shift, tmp_path, no_pictures):
+    """Every text field of campaign.toml; results stay valid because texts are outside the hash."""
     campaign = read_campaign(reported)
     payloads = PAYLOADS[shift:] + PAYLOADS[:shift]
     header = dict(zip(("name", "operator", "instrument", "serial", "method", "notes"), payloads, strict=False))
@@ -415,7 +415,7 @@ def luminance(colour: str) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def test_text_stands_out_in_both_schemes():
+def test_text_has_contrast_in_both_schemes():
     """4.5:1 for every text colour on the page and on its cards (WCAG 2.2, 1.4.3)."""
     css = (shipped_data() / "report" / "report.css").read_text()
     schemes = [dict(re.findall(r"--(\w+): (#[0-9a-f]+)", block)) for block in re.findall(r":root \{([^}]*)\}", css)]
@@ -442,7 +442,7 @@ document.getElementById("f").onload = function () {{
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_chromium_shows_the_page_without_overflow_or_complaint(reported, tmp_path, width):
+def test_chromium_renders_the_page_without_overflow_or_error(reported, tmp_path, width):
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip("no Chromium or Chrome on the path (Debian's package: chromium)")
@@ -463,7 +463,7 @@ def test_chromium_shows_the_page_without_overflow_or_complaint(reported, tmp_pat
 
 
 @pytest.mark.thorough
-def test_the_printed_twin_has_eight_pages_at_most_and_none_is_empty(reported, tmp_path):
+def test_the_printed_report_has_at_most_eight_pages_none_empty(reported, tmp_path):
     """Folded sections are open in print: a page of nothing but folded headings would be one or two."""
     if not any(map(shutil.which, BROWSERS)):
         pytest.skip("no Chromium or Chrome on the path (Debian's package: chromium)")
@@ -477,7 +477,7 @@ def test_the_printed_twin_has_eight_pages_at_most_and_none_is_empty(reported, tm
 
 
 @pytest.mark.thorough
-def test_no_heading_stands_at_the_foot_of_a_printed_page(tmp_path):
+def test_no_heading_ends_a_printed_page(tmp_path):
     """A heading with a single line below it is as lost as one alone; sections of many lengths meet every foot."""
     reader = shutil.which("pdftotext")
     if reader is None or not any(map(shutil.which, BROWSERS)):

@@ -1,4 +1,4 @@
-"""Cut-outs of spots in the report: the right place in the right picture, suspect ones first, none without frames."""
+"""Crops of spots in the report: place and picture, suspect spots first, none without frames."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_cut_outs_show_the_spot_under_its_cross(pictured):
 
 
 def test_a_centre_far_outside_the_picture_has_no_cut_out(pictured):
-    """The reader takes a centre up to a tenth of the picture outside of it."""
+    """The reader accepts centres up to a tenth of the picture outside of it."""
     first = usable_spots(pictured)[0]
     outside = replace(first, v_left_px=-HALF_PX - 10.0, u_right_px=-HALF_PX - 10.0)
     crops = spot_crops(replace(pictured, spots=(outside,)), ())
@@ -56,7 +56,7 @@ def test_a_centre_far_outside_the_picture_has_no_cut_out(pictured):
     assert edge[0].grey.shape == (HALF_PX - 4, 2 * HALF_PX + 1) and edge[0].corner_px[1] == 0
 
 
-def test_damaged_and_missing_pictures_cost_nobody_the_report(pictured):
+def test_damaged_and_missing_pictures_do_not_stop_the_report(pictured):
     first = pictured.path / frame_name(usable_spots(pictured)[0].spot, "left")
     first.write_bytes(b"no picture")
     crops = spot_crops(pictured, (usable_spots(pictured)[0].spot,))

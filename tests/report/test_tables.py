@@ -51,12 +51,12 @@ def test_concise_shows_two_digits_of_the_uncertainty(value, sd, expected):
         (math.inf, "inf"),
     ],
 )
-def test_uncertainties_have_two_digits_a_zero_among_them(u, expected):
+def test_uncertainties_have_two_digits_zeros_included(u, expected):
     assert two_digits(u) == expected
 
 
 @pytest.mark.parametrize("mantissa", [1.0, 1.049, 1.05, 4.44, 9.4999, 9.5, 9.949, 9.95, 9.96, 9.999])
-def test_concise_says_the_uncertainty_to_five_percent(mantissa):
+def test_concise_rounds_the_uncertainty_within_five_percent(mantissa):
     """Read back: two digits leave at most half a unit of 1.0, 5 %; value and digits end at the same place."""
     for exponent in range(-9, 3):
         sd = mantissa * 10.0**exponent
@@ -126,7 +126,7 @@ def test_a_narrow_terminal_splits_a_table_that_fits_80_columns(monkeypatch):
     assert len(lines) == 6 and max(map(len, lines)) <= 40
 
 
-def test_tables_are_plain_text_whatever_the_terminal_says(monkeypatch):
+def test_tables_are_plain_text_on_every_terminal(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "20")
     text = TableView("title", ["name", "95 %"], [["[bold]a[/bold]", "1.25"], ["longer name", "[1, 2]"]]).text()
@@ -149,5 +149,5 @@ def test_tables_are_plain_text_whatever_the_terminal_says(monkeypatch):
         (0.0, "below 0.001", "below 0.001"),
     ],
 )
-def test_no_share_of_draws_is_said_to_be_certain(probability, text, bound):
+def test_no_share_of_draws_is_printed_as_certain(probability, text, bound):
     assert chance_text(probability) == text and chance_text(probability, "at least ") == bound
