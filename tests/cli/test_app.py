@@ -1,4 +1,4 @@
-"""What all commands share."""
+"""Functions shared by all commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tvsbayes.cli.app import keep
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
 
-def test_what_cannot_be_kept_costs_nobody_the_result(tmp_path, capsys):
+def test_a_cache_that_cannot_be_written_does_not_stop_the_result(tmp_path, capsys):
     (tmp_path / "results").write_text("a file where the folder should be")
     assert not keep({}, tmp_path / "results" / "compare.json")
     assert "warning: not kept" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Commands on an axis folder: documents, exit codes, what is refused."""
+"""Commands on an axis folder: documents, exit codes, refusals."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def folder(tmp_path):
     return tmp_path / "axis"
 
 
-def test_check_says_what_it_holds(ask, folder):
+def test_check_reports_the_contents(ask, folder):
     code, document = ask("check", folder)
     assert code == 0
     assert (document["kind"], document["moves"], document["readings"], document["positions"]) == ("axis", 33, 33, 9)
 
 
-def test_fit_and_what_goes_on_from_it(ask, say, folder, tmp_path):
+def test_fit_and_commands_that_use_it(ask, say, folder, tmp_path):
     code, document = ask("fit", folder, "--quick")
     assert code == 0
     assert (document["estimator"], document["tier"], document["converged"]) == ("posterior", "importance", True)
@@ -53,7 +53,7 @@ def test_fit_and_what_goes_on_from_it(ask, say, folder, tmp_path):
 
 
 @pytest.mark.thorough
-def test_positions_left_out(ask, folder):
+def test_held_out_positions(ask, folder):
     code, document = ask("compare", folder, "--by", "positions")
     held = document["hold_out"]
     assert code == 0 and held["by"] == "positions" and held["rms_z"] > 0
@@ -107,7 +107,7 @@ def test_two_positions_leave_nothing_to_predict(ask, tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_sampler_without_an_answer_leaves_laplaces_and_says_so(ask, folder, monkeypatch):
+def test_a_sampler_without_an_answer_falls_back_to_laplace_with_a_warning(ask, folder, monkeypatch):
     """As of a scanner: exit 0 with a warning, no mode is exit 4; of a chain without time weighted draws answer."""
     code, document = ask("fit", folder, "--max-minutes", "0.01")
     assert (code, document["converged"]) == (0, True)

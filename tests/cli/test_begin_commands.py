@@ -1,4 +1,4 @@
-"""`new`: what people have becomes a campaign, nothing is overwritten, and what to do next is said."""
+"""`new`: files become a campaign, nothing is overwritten, the next command is printed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_new_campaign_lacks_only_its_stereo_calibration(ask, say, tmp_path):
 
 @pytest.fixture(scope="module")
 def two_looks(mounted_rig, tmp_path_factory):
-    """A simulated campaign of two moves and its pictures, named as somebody might."""
+    """A simulated campaign of two moves and its pictures under arbitrary names."""
     plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("move", 100, 30), ("look",))
     run = simulate(mounted_rig, plan, seed=5)
     folder = tmp_path_factory.mktemp("rendered")
@@ -71,7 +71,7 @@ def test_pictures_become_looks_that_detect_finds(ask, say, two_looks, tmp_path):
     assert code == 2 and "none waits" in assert_error(document, "occupied")["message"]
 
 
-def test_moves_beside_the_pictures_come_along(ask, two_looks, tmp_path):
+def test_moves_beside_the_pictures_are_copied(ask, two_looks, tmp_path):
     campaign, pictures = two_looks
     shutil.copytree(pictures, tmp_path / "pictures")
     (tmp_path / "pictures" / "moves.csv").write_bytes(moves_bytes(campaign.moves))
@@ -99,8 +99,8 @@ def test_without_moves_their_counters_are_asked_for(ask, say, tmp_path):
     assert code == 2 and "number, order" in assert_error(document, "usage")["message"]
 
 
-def test_commands_that_are_told_can_be_typed_as_they_stand(say, tmp_path):
-    """A shell takes the folder with its blank, quote and dollar for one word."""
+def test_printed_commands_can_be_run_unchanged(say, tmp_path):
+    """The folder's name with blank, quote and dollar is one word of the shell."""
     drawn(tmp_path / "pictures", *pairs("0"))
     out = tmp_path / "Anna's $laser 2"
     _, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
@@ -108,13 +108,13 @@ def test_commands_that_are_told_can_be_typed_as_they_stand(say, tmp_path):
     assert [shlex.split(each) for each in commands] == [["tvsbayes", each, str(out)] for each in ("detect", "check")]
 
 
-def test_moves_that_are_numbered_anew_are_told(say, tmp_path):
+def test_renumbered_moves_are_reported(say, tmp_path):
     drawn(tmp_path / "pictures", *pairs("0930", "1015"))
     code, text, _ = say("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")
     assert code == 0 and "930 to 1015, are too sparse for moves: these are renumbered in order" in text
 
 
-def test_pictures_are_for_a_calibration_of_their_size(ask, tmp_path):
+def test_pictures_need_a_calibration_of_their_size(ask, tmp_path):
     drawn(tmp_path / "pictures", *pairs("0"))
     assert ask("new", tmp_path / "mine")[0] == 0
     shutil.copy(MOUNTED / "stereo.json", tmp_path / "mine")

@@ -28,7 +28,7 @@ from tvsbayes.instrument.plan import write_plan
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
 
-def test_check_says_what_stands_where_the_rig_of_a_plan_belongs(ask, say, tmp_path):
+def test_check_names_a_file_given_in_place_of_a_rig(ask, say, tmp_path):
     plan = MOUNTED / "grid.csv"
     assert ask("new", tmp_path / "axis", "--axis")[0] == 0
     for other, words, remedy in (
@@ -68,7 +68,7 @@ def test_check_reads_campaign_rig_and_plan(ask, say):
     assert out.endswith(", 0 warnings\n")
 
 
-def test_files_of_windows_are_known_by_their_capital_endings_too(ask, tmp_path):
+def test_upper_case_endings_are_recognised(ask, tmp_path):
     for name, copied in (("rig.toml", "RIG.TOML"), ("stereo.json", "stereo.json"), ("paper.csv", "PAPER.CSV")):
         (tmp_path / copied).write_bytes((MOUNTED / name).read_bytes())
     assert ask("check", tmp_path / "RIG.TOML")[1]["kind"] == "rig"
@@ -86,13 +86,13 @@ def test_check_warns_without_failing(ask, say, grid_campaign, tmp_path):
     assert "warning: the stereo covariance is zero" in say("check", tmp_path / "exact")[1]
 
 
-def test_check_tells_a_folder_from_a_file(ask, grid_folder, tmp_path):
+def test_check_distinguishes_folder_and_file(ask, grid_folder, tmp_path):
     shutil.copytree(grid_folder, tmp_path / "camp.csv")
     code, document = ask("check", tmp_path / "camp.csv")
     assert code == 0 and document["spots"] > 0
 
 
-def test_simulate_writes_a_campaign_and_repeats_itself(ask, tmp_path):
+def test_simulate_writes_a_campaign_reproducibly(ask, tmp_path):
     plan = tmp_path / "plan.csv"
     write_plan(two_sheets((100, 30)), plan)
     documents = []
@@ -112,8 +112,8 @@ def test_simulate_writes_a_campaign_and_repeats_itself(ask, tmp_path):
     assert_error(document, "occupied")
 
 
-def test_simulate_can_keep_the_homing_sides_to_itself(ask, tmp_path):
-    """The campaign says nothing; truth.json has the side, the errors of the gears and both kinds of ratios."""
+def test_simulate_can_leave_out_the_homing_sides(ask, tmp_path):
+    """The campaign has no sides; truth.json has them, the errors of the gears and both kinds of ratios."""
     plan = tmp_path / "plan.csv"
     write_plan(two_sheets((100, 30)), plan)
     assert ask("simulate", MOUNTED / "rig.toml", plan, tmp_path / "a", "--unrecorded-sides", "--seed", 7)[0] == 0
@@ -127,7 +127,7 @@ def test_simulate_can_keep_the_homing_sides_to_itself(ask, tmp_path):
 
 @pytest.fixture(scope="module")
 def demonstrated(own_compilation_cache) -> SimpleNamespace:
-    """What `demo` ends with: its document, its text, and the summary of its fit."""
+    """Results of `demo`: its document, its text, and the summary of its fit."""
     fitted, ended = [], []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(campaign_commands, "_sampled", lambda *args: fitted.append(_sampled(*args)) or fitted[0])
@@ -148,25 +148,25 @@ def test_demo_shows_classic_and_joint_beside_the_truth(demonstrated):
     assert set(truth) == set(intervals)
     for name, (low, high) in intervals.items():
         assert low < truth[name] < high, name
-    # The claim that the demo exists for: type A intervals of the classic estimator miss.
+    # The claim of the demo: type A intervals of the classic estimator miss the truth.
     for direction, result in document["classic"]["directions"].items():
         low, high = result["interval95_type_a"]
         assert not low < truth[direction] < high
-    # What the joint model expects the classic estimator to say is what it says, within five sds of both.
+    # The joint model predicts the result of the classic estimator within five sds of both.
     for direction, result in document["classic"]["directions"].items():
         predicted = fit["classic_predicted_deg_per_step"][direction]
         sd = np.hypot(predicted["sd"], result["u_type_a_deg_per_step"])
         assert abs(predicted["value"] - result["mean_deg_per_step"]) < 5 * sd
 
 
-def test_demo_keeps_campaign_and_results_where_it_is_told(ask, demonstrated, tmp_path, monkeypatch):
+def test_demo_keeps_campaign_and_results_in_the_given_folder(ask, demonstrated, tmp_path, monkeypatch):
     out, kept = tmp_path / "kept", []
 
     def calibrate(campaign, place, *, tier, progress):
         kept.append((len(campaign.spots), place, tier))
         return SimpleNamespace(record=demonstrated)
 
-    # A checkout whose twin somebody has fitted.
+    # A checkout whose twin has results.
     shipped = tmp_path / "data"
     shutil.copytree(PAPER_TWIN, shipped / "twins" / "paper_twin")
     (shipped / "twins" / "paper_twin" / "results").mkdir(exist_ok=True)
@@ -178,7 +178,7 @@ def test_demo_keeps_campaign_and_results_where_it_is_told(ask, demonstrated, tmp
     assert ask("demo", out)[0] == 2
 
 
-def test_readme_shows_what_the_demo_prints(demonstrated):
+def test_readme_shows_the_output_of_the_demo(demonstrated):
     """Same lines; each number within a tenth of its uncertainty (another processor rounds differently)."""
     readme = DATA.parent / "README.md"
     if not readme.is_file():

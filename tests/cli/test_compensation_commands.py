@@ -1,4 +1,4 @@
-"""compensate, verify and plan --verify: files, documents by their schemas, exit codes, what is refused."""
+"""compensate, verify and plan --verify: files, documents by their schemas, exit codes, refusals."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_without_a_file_nothing_is_written(say, folder):
     assert code == 2 and "tvsbayes compensate" in err
 
 
-def test_too_few_readings_tell_nothing(ask, folder, tmp_path):
+def test_too_few_readings_give_no_verdict(ask, folder, tmp_path):
     ask("compensate", folder, "--to", "csv", "-o", tmp_path / "stage.csv")
     fresh = read_axis(drive(folder, tmp_path / "many", (1.0, 1.0)))
     few = replace(fresh, readings=tuple(replace(r, u=0.5) for r in fresh.readings[:3]))
@@ -99,13 +99,13 @@ def test_too_few_readings_tell_nothing(ask, folder, tmp_path):
         ("plan", "--verify"),
     ],
 )
-def test_scanners_are_sent_elsewhere(ask, line):
+def test_scanners_are_refused_with_a_remedy(ask, line):
     code, document = ask(*line)
     assert code == 2
     assert_error(document, "usage")
 
 
-def test_verify_wants_two_of_a_kind_and_results(ask, folder):
+def test_verify_needs_two_campaigns_of_one_kind_and_results(ask, folder):
     for line in (("verify", PAPER_TWIN, folder), ("verify", folder, PAPER_TWIN), ("verify", folder, folder, *AT)):
         code, document = ask(*line)
         assert code == 2
@@ -122,6 +122,6 @@ def test_verify_wants_two_of_a_kind_and_results(ask, folder):
         ("--to", "grbl", "--in-force", "250", "--letter", "Q"),
     ],
 )
-def test_options_that_cannot_be(ask, folder, options):
+def test_impossible_options_are_refused(ask, folder, options):
     code, document = ask("compensate", folder, *options)
     assert code == 2 and document["error"]["remedy"]

@@ -30,7 +30,7 @@ from tvsbayes.twin.simulated_campaign import simulate
 pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once")
 
 
-def test_classic_document_has_the_contracts_keys(ask):
+def test_classic_document_has_the_documented_keys(ask):
     code, document = ask("classic", PAPER_TWIN)
     assert code == 0
     assert set(document) == {"directions", "experiments", "skipped"}
@@ -72,7 +72,7 @@ def test_classic_without_a_complete_experiment_has_nothing_to_estimate(ask, grid
     assert set(document) == {"error"}
 
 
-def test_fit_document_has_the_contracts_keys_and_its_files(ask, grid_folder):
+def test_fit_document_has_the_documented_keys_and_files(ask, grid_folder):
     code, document = ask("fit", grid_folder, "--no-sample", "--seed", 4)
     assert code == 0
     assert (document["estimator"], document["converged"], document["seed"]) == ("laplace", True, 4)
@@ -136,8 +136,8 @@ def test_fit_for_people_names_value_interval_and_origin(say, grid_folder, tmp_pa
 
 
 @pytest.mark.slow
-def test_fit_samples_writes_for_arviz_and_gives_the_better_answer(ask, grid_folder, monkeypatch):
-    """The limits are loosened: what is tested is the way from options to files, not convergence."""
+def test_fit_samples_writes_for_arviz_and_keeps_the_better_answer(ask, grid_folder, monkeypatch):
+    """The limits are loosened: the test covers options and files, not convergence."""
     import arviz
 
     from tvsbayes.inference import diagnosis, ensemble
@@ -175,7 +175,7 @@ def test_fit_samples_writes_for_arviz_and_gives_the_better_answer(ask, grid_fold
 
 
 @pytest.mark.slow
-def test_weights_that_are_not_sound_leave_laplaces_table_with_its_warning(ask, say, grid_folder, monkeypatch):
+def test_unreliable_weights_fall_back_to_laplace_with_a_warning(ask, say, grid_folder, monkeypatch):
     """The posterior is proper and its mode explains the data: there is an answer, and exit code 0."""
     from tvsbayes.inference import importance
     from tvsbayes.posterior import sampling
@@ -258,13 +258,13 @@ def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
     code, document = ask("fit", tmp_path / "still", "--no-sample")
     assert code == 3
     assert_error(document, "uninformed")
-    # The document is there all the same, and says where the values come from.
+    # The document is written and states the source of the values.
     assert all(e["contraction"] < 0.1 for e in document["effective_deg_per_step"].values())
 
 
 @pytest.mark.thorough
-def test_swapped_cameras_end_in_words_and_files(ask, mounted_rig, tmp_path):
-    """Predicted pixels beyond the lens model, draws far out: no number that JSON cannot hold."""
+def test_swapped_cameras_give_a_warning_and_files(ask, mounted_rig, tmp_path):
+    """Pixels outside the lens model and remote draws give no number that JSON cannot hold."""
 
     def swapped(s):
         left, right = (s.u_left_px, s.v_left_px), (s.u_right_px, s.v_right_px)
@@ -284,7 +284,7 @@ def test_swapped_cameras_end_in_words_and_files(ask, mounted_rig, tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_spot_beyond_the_lens_and_one_twice_cost_themselves_only(ask, mounted_rig, tmp_path):
+def test_a_spot_outside_the_lens_model_and_a_duplicate_are_left_out(ask, mounted_rig, tmp_path):
     """One that cannot be undistorted is left out by name; experiments without a ratio have no gap."""
     four = simulate(mounted_rig, mixed_protocol(2), seed=3).campaign
     selection = select_experiments(four)
@@ -310,7 +310,7 @@ def test_a_spot_beyond_the_lens_and_one_twice_cost_themselves_only(ask, mounted_
 
 
 @pytest.mark.thorough
-def test_looks_at_one_stop_have_nothing_to_tell(ask, grid_campaign, tmp_path):
+def test_looks_at_one_stop_are_nothing_to_estimate(ask, grid_campaign, tmp_path):
     stop = grid_campaign.moves[grid_campaign.spots[0].move]
     only = replace(grid_campaign.moves[0], pan_steps=stop.pan_steps, tilt_steps=stop.tilt_steps)
     campaign = replace(grid_campaign, moves=(only,), spots=tuple(s for s in grid_campaign.spots if s.move == stop.move))
@@ -330,8 +330,8 @@ def test_all_fixed_is_nothing_to_estimate(ask, grid_campaign, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("u", "swap", "ends"), [(0.05, False, 0), (0.5, False, 0), (0.0, False, 0), (0.0, True, 4)])
-def test_noise_above_the_stated_is_no_misfit(ask, grid_campaign, tmp_path, u, swap, ends):
-    """A misfit is a factor on the stated noise, however sure the noise was said to be; swapped cameras are one."""
+def test_noise_larger_than_stated_is_no_misfit(ask, grid_campaign, tmp_path, u, swap, ends):
+    """A misfit is a factor on the stated noise, whatever its uncertainty; swapped cameras are one."""
     rng = np.random.default_rng(1)
 
     def louder(s):
@@ -362,7 +362,7 @@ def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatc
     assert "NOT CONVERGED: it went astray" in log
 
 
-def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder, monkeypatch):
+def test_a_report_without_a_browser_ends_at_once(ask, grid_folder, monkeypatch):
     monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
     monkeypatch.setattr("tvsbayes.cli.report_commands.StoredOrFitted", None)
     code, document = ask("report", grid_folder, "--pdf")
@@ -370,8 +370,8 @@ def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder,
 
 
 @pytest.mark.thorough
-def test_counters_of_a_scanner_are_left_out_and_predicted(ask, say, grid_folder, monkeypatch):
-    """Three counters of pan; two of tilt are too few. No experiments are needed, nothing is kept."""
+def test_held_out_counters_of_a_scanner_are_predicted(ask, say, grid_folder, monkeypatch):
+    """Three counters of pan; two of tilt are too few. No experiments are needed, nothing is stored."""
     monkeypatch.setattr("tvsbayes.comparison.held_positions.refit", lambda fit_of_all, *_: fit_of_all)
     code, document = ask("compare", grid_folder, "--by", "positions")
     assert code == 0 and document["kind"] == "positions left out" and document["unit"] == "deg"
@@ -386,7 +386,7 @@ def test_counters_of_a_scanner_are_left_out_and_predicted(ask, say, grid_folder,
     assert code == 2 and "positions" in json.dumps(refused)
 
 
-def test_without_experiments_nothing_is_fitted_to_be_compared(ask, grid_folder, monkeypatch):
+def test_without_experiments_compare_fits_nothing(ask, grid_folder, monkeypatch):
     monkeypatch.setattr("tvsbayes.cli.estimate_commands.StoredOrFitted", None)
     code, document = ask("compare", grid_folder)
     assert code == 3 and "--by positions" in assert_error(document, "no-experiments")["remedy"]

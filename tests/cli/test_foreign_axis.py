@@ -1,6 +1,6 @@
-"""Files of an axis as people have them: each read by one command with the right answer, or refused with the mend.
+"""Foreign files of an axis: each is read by one command with the correct result, or refused with a remedy.
 
-Files in tests/data/foreign are of own numbers in layouts that were met; the others are written here.
+Files in tests/data/foreign have observed layouts and invented numbers; the test writes the others.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def test_every_notation_gives_the_same_axis(ask, tmp_path, name):
     code, document = ask("import", file, "--axis", "--to", out, "--yes")
     assert code == 0 and document["ok"] == len(readings()) and document["next"] == f"tvsbayes calibrate {out}"
     line = classic_axis(rows_of(read_axis(out)))
-    # A second of arc or 1e-4 is the last digit that is written; of the first stop without a word the side is unknown.
+    # A second of arc or 1e-4 is the last digit written; the side of the first stop is unknown where it is not stated.
     without = ("serial", "clock", "camonitor", "commas in a serial monitor")
     loose = PLAY / 3200 if name in without else 1e-4 / 3200
     assert line.per_command == pytest.approx(RATIO, abs=loose)
@@ -103,7 +103,7 @@ def test_every_notation_gives_the_same_axis(ask, tmp_path, name):
         ("wide_forward_backward/dial.csv", 1.0012, 0.035, "mm", "runs: 4 columns"),
     ],
 )
-def test_files_that_people_have(ask, tmp_path, file, ratio, play, unit, remark):
+def test_observed_file_layouts(ask, tmp_path, file, ratio, play, unit, remark):
     out = tmp_path / "out"
     code, document = ask("import", FOREIGN / file, "--axis", "--to", out, "--yes")
     campaign = read_axis(out)
@@ -117,7 +117,7 @@ def test_files_that_people_have(ask, tmp_path, file, ratio, play, unit, remark):
 
 
 SILENT = {
-    # header and rows, what is said, and the last reading with its u
+    # header and rows, the remark, and the last reading with its u
     "gon": ("steps,angle (gon)\n0,300\n100,350\n200,0\n300,50\n400,100\n", "400 gon each", (500.0, 0.0)),
     "expanded": ("steps,mm,U (k=2.5)\n0,0,0.5\n1,1,0.5\n2,2.1,0.5\n", "an expanded uncertainty, over 2.5", (2.1, 0.2)),
     "the command again": ("target,actual\n0,0\n1,1\n2,2\n", "equals the command in every row", (2.0, 0.0)),
@@ -126,7 +126,7 @@ SILENT = {
 
 
 @pytest.mark.parametrize("name", SILENT)
-def test_what_would_be_a_wrong_answer_in_silence(ask, tmp_path, name):
+def test_assumptions_that_change_the_answer_are_reported(ask, tmp_path, name):
     content, remark, last = SILENT[name]
     file, out = tmp_path / "log.csv", tmp_path / "out"
     file.write_text(content)
@@ -136,7 +136,7 @@ def test_what_would_be_a_wrong_answer_in_silence(ask, tmp_path, name):
 
 
 def test_a_workbook_needs_no_format(ask, tmp_path):
-    """Its bytes contain what ends a message of Klipper's logger."""
+    """Its bytes contain the end marker of a message of Klipper's logger."""
     file, out, book = tmp_path / "dial.xlsx", tmp_path / "out", openpyxl.Workbook()
     book.active.append(["Position (mm)", "Forward (mm)", "Backward (mm)"])
     for position in range(0, 50, 10):
@@ -149,7 +149,7 @@ def test_a_workbook_needs_no_format(ask, tmp_path):
 
 
 def test_greek_letters_in_utf_16_are_no_log(ask, tmp_path):
-    """Their high byte is that of the end of a message of Klipper's logger."""
+    """Their high byte is the end marker of a message of Klipper's logger."""
     file, out = tmp_path / "dial.csv", tmp_path / "out"
     rows = "".join(f"{10 * k};{10.01 * k:.3f}\n" for k in range(9))
     file.write_text(f"Position (mm);\u03bb laser (mm)\n{rows}", encoding="utf-16")
@@ -157,7 +157,7 @@ def test_greek_letters_in_utf_16_are_no_log(ask, tmp_path):
     assert (code, document["readings"]) == (0, 9)
 
 
-def test_deviations_on_demand(ask, tmp_path):
+def test_deviations_by_option(ask, tmp_path):
     """A sheet of target and error alone: positions are target plus error, in their own unit."""
     file, out = tmp_path / "log.csv", tmp_path / "out"
     rows = [(10.0 * k, 0.002 * k + 0.05 * (side < 0), side) for side in (1, -1) for k in range(0, 10)[::side]]
@@ -185,7 +185,7 @@ def night(frames: int) -> str:
 
 
 def test_a_guide_log_is_listed_and_one_run_taken(ask, say, tmp_path):
-    """`--yes` without a run is no way to get the first of several in silence."""
+    """`--yes` without a run does not select the first of several."""
     file, out = tmp_path / "PHD2_GuideLog.txt", tmp_path / "out"
     file.write_text(night(20) + "\n" + night(300))
     code, document = ask("import", file, "--axis", "--to", out)
@@ -205,7 +205,7 @@ def test_a_guide_log_is_listed_and_one_run_taken(ask, say, tmp_path):
 
 TABLE = "steps;reading (mm);direction\n" + lines("{c};{v:.4f};{s}\n")
 MISTAKES = {
-    # content, options, what the message says, what the remedy says
+    # content, options, part of the message, part of the remedy
     "directions the other way": (
         TABLE.replace(";+\n", ";~\n").replace(";-\n", ";+\n").replace(";~\n", ";-\n"),
         (),
@@ -274,7 +274,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_refused_in_one_sentence_with_the_mend(ask, tmp_path, name):
+def test_mistakes_are_refused_in_one_sentence_with_a_remedy(ask, tmp_path, name):
     """Nothing is written, and the message is one line."""
     content, options, message, remedy = MISTAKES[name]
     file, out = tmp_path / "log.txt", tmp_path / "out"

@@ -1,4 +1,4 @@
-"""Options that this use of a command would ignore are refused before anything is read, with what to do."""
+"""Options without effect are refused before anything is read, with a remedy."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ IGNORED = [
 
 
 @pytest.mark.parametrize(("line", "message"), IGNORED, ids=[line for line, _ in IGNORED])
-def test_what_would_be_ignored_is_refused(ask, line, message):
+def test_options_without_effect_are_refused(ask, line, message):
     code, document = ask(*line.split())
     assert (code, document["error"]["code"]) == (2, "usage")
     assert document["error"]["message"].startswith(message) and document["error"]["remedy"]
@@ -78,7 +78,7 @@ def test_a_unit_is_for_files_that_state_none(ask, tmp_path):
     ],
 )
 def test_infinity_is_refused_before_anything_is_read(ask, line, option):
-    """No JSON holds it: at the end of the work there would be nothing to show."""
+    """JSON cannot hold it, so the document could not be written."""
     code, document = ask(*line.split())
     assert (code, document["error"]["code"], document["error"]["column"]) == (2, "number", option)
 

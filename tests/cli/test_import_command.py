@@ -22,8 +22,8 @@ UNIT = Path(__file__).parents[1] / "head" / "unit.urdf"
 TABLE = "Nr;Pan;Tilt;XL;YL;XR;YR;Blatt\n1;0;0;640,5;360,25;500;360;nah\n2;200;0;700,5;360,25;560;360;nah\n"
 
 
-def test_every_option_says_for_which_files_it_is():
-    """One that does not would be ignored in silence where it means nothing."""
+def test_every_option_declares_its_kinds_of_files():
+    """An undeclared option would be ignored without a message."""
     for_all = {"file", "to", "yes", "as_json"}
     assert set(KINDS_OF) == set(inspect.signature(import_).parameters) - for_all
     of_an_axis = {option for option, kinds in KINDS_OF.items() if AXIS in kinds}
@@ -60,8 +60,8 @@ def test_a_table_is_shown_then_written_and_read_by_check(ask, say, table, tmp_pa
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_a_log_for_a_campaign_whose_counters_wait_is_told_the_way(ask, tmp_path):
-    """`new --pictures` leaves counters to fill in; who has a log of them imports it first."""
+def test_a_log_for_a_campaign_with_empty_counters_is_refused_with_a_remedy(ask, tmp_path):
+    """`new --pictures` leaves empty counters; a log of them is imported first."""
     out, table = tmp_path / "mine", tmp_path / "log.csv"
     assert ask("new", out)[0] == 0
     (out / "moves.csv").write_text(
@@ -74,8 +74,8 @@ def test_a_log_for_a_campaign_whose_counters_wait_is_told_the_way(ask, tmp_path)
     assert "import it --to a new folder" in error["remedy"] and "--pictures FOLDER" in error["remedy"]
 
 
-def test_a_counter_with_the_wrong_sign_stops_and_is_mended_as_said(ask, say, grid_campaign, tmp_path):
-    """From `check` through the command that it names to a copy that is the campaign as it should be."""
+def test_a_counter_with_the_wrong_sign_is_refused_and_corrected_by_the_remedy(ask, say, grid_campaign, tmp_path):
+    """The command named by `check` writes a corrected copy of the campaign."""
     moves = tuple(replace(m, tilt_steps=-m.tilt_steps) for m in grid_campaign.moves)
     write_campaign(replace(grid_campaign, moves=moves), tmp_path / "wrong")
     code, document = ask("check", tmp_path / "wrong")
@@ -97,7 +97,7 @@ def test_a_counter_with_the_wrong_sign_stops_and_is_mended_as_said(ask, say, gri
     assert ask(*words[1:])[0] == 2, "nothing is overwritten"
 
 
-def test_a_campaign_is_copied_only_to_be_corrected(ask, say, grid_folder, tmp_path):
+def test_a_campaign_is_copied_only_with_a_correction(ask, say, grid_folder, tmp_path):
     code, document = ask("import", grid_folder, "--to", tmp_path / "x", "--yes")
     assert code == 2 and "--flip" in document["error"]["remedy"]
     for option in (("--column", "move=Nr"), ("--sd-px", "0.2"), ("--pan-approach", "left")):
@@ -108,7 +108,7 @@ def test_a_campaign_is_copied_only_to_be_corrected(ask, say, grid_folder, tmp_pa
 
 
 def test_a_table_gets_the_other_sign(ask, table, tmp_path):
-    """And keeps the approach, which names the direction of the beam."""
+    """The approach is kept because it names the direction of the beam."""
     out = tmp_path / "mine"
     code, document = ask("import", table, "--to", out, "--flip", "pan_steps", "--pan-approach", "right", "--yes")
     assert code == 0 and "other sign" in document["assumed"][-1]
@@ -135,12 +135,12 @@ def test_values_are_shown_where_rows_without_a_look_come_first(ask, say, table, 
     assert "640.5 (3 of 4 empty)" in say("import", table, "--to", tmp_path / "mine")[1]
 
 
-def test_what_is_not_understood_is_asked_for(ask, say, table, tmp_path, monkeypatch):
+def test_columns_not_recognised_are_asked_for(ask, say, table, tmp_path, monkeypatch):
     table.write_text("pan_goal,pan_pos,tilt,XL,YL,XR,bottom\n0,1,0,640,360,500,360\n")
     code, document = ask("import", table, "--to", tmp_path / "mine", "--yes")
     error = assert_error(document, "missing-column")
     assert code == 2 and "pan_steps (pan_goal or pan_pos)" in error["found"] and "v_right_px" in error["found"]
-    # What was understood is worth knowing before anything is added to it.
+    # The recognised columns are shown before the question.
     assert "understood so far: tilt_steps = tilt, u_left_px = XL, v_left_px = YL, u_right_px = XR" in error["found"]
     stated = ("--column", "pan_steps=pan_pos", "--column", "v_right_px=bottom")
     assert ask("import", table, "--to", tmp_path / "mine", *stated)[1]["columns"]["pan_steps"]["column"] == "pan_pos"
@@ -158,7 +158,7 @@ def test_what_is_not_understood_is_asked_for(ask, say, table, tmp_path, monkeypa
     assert (tmp_path / "asked" / "moves.csv").read_text().splitlines()[1].startswith("0,0,0.0,1,0,")
 
 
-def test_with_a_closed_standard_input_nobody_is_asked(say, table, tmp_path, monkeypatch):
+def test_with_a_closed_standard_input_no_question_is_asked(say, table, tmp_path, monkeypatch):
     """As a service has it (`<&-`): Python then has None for the stream."""
     monkeypatch.setattr("sys.stdin", None)
     code, text, _ = say("import", table, "--to", tmp_path / "mine")
@@ -179,7 +179,7 @@ def test_with_a_closed_standard_input_nobody_is_asked(say, table, tmp_path, monk
         (("--sheet", "one"), "no sheets"),
     ],
 )
-def test_options_that_say_nothing_usable_are_refused(say, table, tmp_path, options, message):
+def test_unusable_options_are_refused(say, table, tmp_path, options, message):
     code, _, log = say("import", table, "--to", tmp_path / "mine", *options)
     assert code == 2
     assert any(part in log for part in message.split("|")), log
@@ -193,7 +193,7 @@ def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path
     assert code == 2 and "--column command=NAME --column value=NAME" in remedy and "none" not in remedy
 
 
-def test_words_that_leave_looks_out_are_told_and_good_ones_of_other_languages_known(ask, table, tmp_path):
+def test_words_that_exclude_looks_are_reported_and_foreign_words_for_good_are_known(ask, table, tmp_path):
     rows = [f"{pan},0,640,360,500,360,{word}" for pan, word in enumerate(("gut", "gültig", "oui", "fine", "mal", "ok"))]
     table.write_text("\n".join(["pan,tilt,XL,YL,XR,YR,state", *rows, "9,0,,,,,fine"]) + "\n", encoding="utf-8")
     code, document = ask("import", table, "--to", tmp_path / "mine", "--yes")
@@ -234,8 +234,8 @@ def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
         *(("Messwert [\u00b5m]", "um"), ("reading [\u03bcm]", "um"), ("encoder_um", "um"), ("encoder_nm", "nm")),
     ],
 )
-def test_readings_are_reported_in_the_unit_of_their_column(ask, say, tmp_path, column, unit):
-    """A new folder says what the column says; where that says nothing, the template's degrees, and it is told."""
+def test_readings_have_the_unit_of_their_column(ask, say, tmp_path, column, unit):
+    """A new folder has the unit of the column; without one it has the template's degrees, which is reported."""
     log, out = tmp_path / "log.csv", tmp_path / "axis"
     turns = [*range(0, 40001, 20000), *range(20000, -1, -20000)] * 2
     log.write_text(f"steps;{column}\n" + "".join(f"{n};{0.0005 * n:.4f}\n" for n in turns))
@@ -255,7 +255,7 @@ def test_a_title_where_names_should_stand_is_called_one(ask, tmp_path, first, ti
 
 
 def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_path):
-    """Written only with --yes; the folder is read by `check`, and its rig file has the limits of the joints."""
+    """It is written only with --yes; `check` reads the folder, and its rig file has the limits of the joints."""
     words = "import", "--urdf", UNIT, "--steps-per-turn", 400, "--to"
     code, text, _ = say(*words, tmp_path / "head")
     assert code == 0 and "nothing written" in text and "position of tilt's joint falls" in text
@@ -334,7 +334,7 @@ SWEEPS = [(cm, step) for cm in ("17,5", "27,5") for step in (-60, 0, 60, 0)]
     ],
 )
 def test_a_sheet_is_named_by_its_distance_where_each_is_one_run(ask, tmp_path, distances, targets):
-    """Without a name for each placement a fit knows of no sheet that several looks share."""
+    """Without a name for each placement a fit has no sheet shared by several looks."""
     file, out = tmp_path / "looks.csv", tmp_path / "out"
     rows = [f"{step};0;{640 + step};360;{500 + step};360" for _, step in SWEEPS]
     head = "Pan;Tilt;XL;YL;XR;YR" + ";Abstand [cm]" * bool(distances)

@@ -1,4 +1,4 @@
-"""The list of instruments: whose folder it is, and that their commands take what `tvsbayes` hands on."""
+"""The list of instruments: recognition of folders, and the options that their commands take."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HANDED_ON = {"out", "issue", "moves", "alone"}
         ("no TOML", ""),
     ],
 )
-def test_a_folder_says_whose_it_is(tmp_path, text, mechanism):
+def test_a_folder_identifies_its_instrument(tmp_path, text, mechanism):
     (tmp_path / "campaign.toml").write_text(text)
     assert mechanism_key(tmp_path) == mechanism
     assert instrument_of(tmp_path) is INSTRUMENTS.get(mechanism)
@@ -32,8 +32,8 @@ def test_a_folder_says_whose_it_is(tmp_path, text, mechanism):
 
 
 @pytest.mark.parametrize("name", INSTRUMENTS)
-def test_commands_of_an_instrument_take_only_what_is_handed_on(name):
-    """A new option of such a function would raise TypeError at every user."""
+def test_commands_of_an_instrument_take_only_existing_options(name):
+    """A parameter without an option would raise TypeError."""
     commands = {command.__name__.rstrip("_"): set(inspect.signature(command).parameters) for command in COMMANDS}
     for command, known in commands.items():
         function = INSTRUMENTS[name].command(command)

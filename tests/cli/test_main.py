@@ -1,4 +1,4 @@
-"""Every way to end: errors, usage, interrupts, broken pipes, bugs; what `--help` loads."""
+"""Ways to end: errors, usage, interrupts, broken pipes, bugs; modules loaded by `--help`."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
 
 @pytest.mark.parametrize("command", ["check", "classic", "fit"])
-def test_hostile_files_are_taught_errors(ask, say, grid_folder, command):
-    """What readers refuse: `promises/test_hostile.py`."""
+def test_hostile_files_are_input_errors(ask, say, grid_folder, command):
+    """Refusals of readers: `promises/test_hostile.py`."""
     file = grid_folder / "campaign.toml"
     file.write_text("colour = 'red'\n" + file.read_text())
     code, document = ask(command, grid_folder)
@@ -69,7 +69,7 @@ def test_control_characters_of_a_name_do_not_reach_the_terminal(say, tmp_path):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux")
 @pytest.mark.parametrize("arguments", [("check", "FOLDER", "--json"), ("check", "nothing here", "--json")])
-def test_a_full_disk_behind_stdout_is_said_without_a_traceback(grid_folder, arguments):
+def test_a_full_disk_behind_stdout_gives_no_traceback(grid_folder, arguments):
     words = [str(grid_folder) if word == "FOLDER" else word for word in arguments]
     command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", *words]
     with open("/dev/full", "w") as full:
@@ -98,7 +98,7 @@ def test_names_that_stdout_cannot_show_are_escaped(tmp_path, encoding):
 @pytest.mark.parametrize(("arguments", "code"), [("check nothing-here", 2), ("--version", 0)])
 @pytest.mark.parametrize("closed", ["2>&-", ">&-"])
 def test_closed_streams_change_no_exit_code(tmp_path, closed, arguments, code):
-    """As cron jobs and services have them."""
+    """Cron jobs and services have closed streams."""
     words = f'"$0" -c "from tvsbayes.cli.main import main; main()" {arguments} {closed}'
     done = subprocess.run(["sh", "-c", words, sys.executable], cwd=tmp_path, capture_output=True, check=False)
     assert done.returncode == code
@@ -107,9 +107,9 @@ def test_closed_streams_change_no_exit_code(tmp_path, closed, arguments, code):
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes that break")
 @pytest.mark.parametrize("arguments", [("check", "nothing here"), ("frobnicate",)])
-def test_a_reader_that_has_gone_changes_no_exit_code(monkeypatch, arguments):
-    """As where Ctrl-C ends the `tee` behind a run, for both streams."""
-    # What is left in a buffer would fail once more when Python ends: exit code 120.
+def test_a_closed_pipe_changes_no_exit_code(monkeypatch, arguments):
+    """As when Ctrl-C ends the `tee` behind a run; both streams."""
+    # The rest of a buffer would fail again when Python exits: exit code 120.
     monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
     command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", *arguments]
     reader, writer = os.pipe()
@@ -154,8 +154,8 @@ def test_interrupt_after_the_command_is_130_too(monkeypatch):
 
 
 @pytest.mark.parametrize(("blocks", "kept"), [(0, False), (1, True)])
-def test_an_interrupted_fit_says_how_to_go_on_where_a_chain_is_kept(say, monkeypatch, blocks, kept):
-    """The chain is told of once when it begins; before its first block of steps there is none to keep."""
+def test_an_interrupted_fit_with_a_stored_chain_names_resume(say, monkeypatch, blocks, kept):
+    """The chain is announced once when it begins; before its first block of steps none is stored."""
     from tvsbayes.pipeline import SAMPLING
     from tvsbayes.posterior.sampling import walking
     from tvsbayes.progress import Progress
@@ -201,7 +201,7 @@ def test_help_loads_nothing_heavy_and_lists_the_commands():
         assert f"  {command} " in result.stdout
 
 
-def test_a_slow_computers_user_is_not_sent_to_the_authors_of_xla(monkeypatch):
+def test_main_silences_messages_of_xla(monkeypatch):
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "")
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
     monkeypatch.setattr(sys, "argv", ["tvsbayes", "--help"])
@@ -211,7 +211,7 @@ def test_a_slow_computers_user_is_not_sent_to_the_authors_of_xla(monkeypatch):
 
 
 @pytest.mark.parametrize("number", ["0,0004", "-1,5", ",5"])
-def test_a_decimal_comma_is_told_its_point(ask, say, number):
+def test_a_decimal_comma_is_refused_with_the_point(ask, say, number):
     code, document = ask("report", PAPER_TWIN, "--limit-mm", number)
     wanted = f"write a decimal point: {number.replace(',', '.')}"
     assert code == 2 and assert_error(document, "usage")["remedy"] == wanted
@@ -219,7 +219,7 @@ def test_a_decimal_comma_is_told_its_point(ask, say, number):
     assert ask("report", PAPER_TWIN, "--limit-mm", "many")[1]["error"]["remedy"] == "see tvsbayes --help"
 
 
-def test_without_the_packages_of_the_command_it_says_what_to_install(tmp_path):
+def test_missing_packages_are_named_with_what_to_install(tmp_path):
     """As after an installation without dependencies, on a robot with NumPy alone."""
     code = "import sys; sys.modules['typer'] = None; from tvsbayes.cli.main import main; main()"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

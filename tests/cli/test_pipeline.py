@@ -1,4 +1,4 @@
-"""Results made whole, and taken up again by anyone who needs them."""
+"""Results: complete, and reused by the commands that need them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once"
 
 
 @pytest.mark.thorough
-def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
+def test_stored_results_are_reused(grid_folder, monkeypatch):
     """`compare` and `plan --given` start from results/: the same model, mode and draws, no second fit."""
     from tvsbayes.estimators.joint_fit import restored
     from tvsbayes.results.stored_draws import stored_mode
@@ -49,8 +49,8 @@ def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
     assert stored_mode(read_campaign(grid_folder)) is None
 
 
-def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
-    """Nobody should look for a mistake of theirs where a version changed."""
+def test_the_reason_for_a_new_fit_is_printed(grid_folder, monkeypatch):
+    """A changed version is distinguished from changed data."""
     messages = []
     monkeypatch.setattr("tvsbayes.pipeline.compile_for", lambda _: None)
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
@@ -89,7 +89,7 @@ def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
         assert why() == reason
 
 
-def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monkeypatch):
+def test_the_first_compilation_is_announced(tmp_path, capsys, monkeypatch):
     import jax
 
     monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
@@ -110,7 +110,7 @@ def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monke
 
 
 def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path):
-    """The same document and draws, but for the command that made them; without a folder nothing is written."""
+    """Document and draws are equal except for the command; without a folder nothing is written."""
     assert ask("fit", grid_folder, "--no-sample", "--seed", 4)[0] == 0
     campaign = read_campaign(grid_folder)
     states = []
@@ -130,8 +130,8 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
 
 
 @pytest.mark.thorough
-def test_no_sample_of_another_fit_stays_beside_a_record(grid_folder):
-    """A report that fits first replaces fit.json: the sample of the fit before it would not be that of fit.json."""
+def test_a_sample_of_another_fit_is_removed(grid_folder):
+    """A report that fits first replaces fit.json, so the sample of the earlier fit no longer belongs to it."""
     results, messages = grid_folder / "results", []
     results.mkdir()
     (results / "posterior.nc").write_bytes(b"of an earlier fit")
@@ -146,8 +146,8 @@ def test_no_sample_of_another_fit_stays_beside_a_record(grid_folder):
     [lambda c: calibrate(c, c.path / "results"), lambda c: StoredOrFitted(c).record],
     ids=["calibrate", "record"],
 )
-def test_a_place_that_takes_no_results_is_refused_before_the_fit(grid_folder, monkeypatch, call):
-    """As an immutable folder or a read-only disk are."""
+def test_an_unwritable_results_folder_is_refused_before_the_fit(grid_folder, monkeypatch, call):
+    """As for an immutable folder or a read-only disk."""
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", None)
     (grid_folder / "results").touch()
     with pytest.raises(InputError) as refused:

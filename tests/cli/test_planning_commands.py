@@ -27,7 +27,7 @@ def test_a_plan_does_not_replace_the_rig_file_that_it_is_made_for(ask, tmp_path,
 
 
 @pytest.mark.thorough
-def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, say, tmp_path, monkeypatch):
+def test_plan_writes_a_plan_and_its_exit_code_states_whether_the_target_is_met(ask, say, tmp_path, monkeypatch):
     whole, plans = planner.plan, []
     small = ("--draws", 20, "--minutes", 3, "-o", tmp_path / "plan.csv")
     monkeypatch.setattr(planner, "plan", lambda *args, **options: plans.append(whole(*args, **options)) or plans[0])
@@ -66,7 +66,7 @@ def test_check_takes_a_rig_with_a_plan(ask):
     assert code == 2 and document["error"]["code"] == "usage"
 
 
-def test_study_counts_and_answers_for_the_users_target(ask, tmp_path, monkeypatch):
+def test_study_states_the_assurance_of_the_users_target(ask, tmp_path, monkeypatch):
     from support.invented_studies import invented
 
     monkeypatch.setattr("tvsbayes.studies.study_job.study_row", invented)

@@ -1,4 +1,4 @@
-"""The bar is seen by anyone who sits at a terminal and waits; nobody else gets a byte of it."""
+"""The progress bar appears at a terminal and nowhere else."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ AT_ONCE, NEVER = "0", "1000"
 
 @dataclass(frozen=True)
 class Seen:
-    """What a process left: exit code, standard output, and what its terminal showed."""
+    """Result of a process: exit code, standard output, and the text on its terminal."""
 
     code: int
     stdout: str
@@ -80,7 +80,7 @@ def on_terminal(code: str, *arguments: str) -> Seen:
             try:
                 part = os.read(master, 65536)
             except OSError:
-                # Linux: nobody holds the other end any more.
+                # Linux: the other end is closed.
                 break
             if not part:
                 break
@@ -90,7 +90,7 @@ def on_terminal(code: str, *arguments: str) -> Seen:
 
 
 @needs_pseudo_terminals
-def test_a_wait_at_a_terminal_shows_what_how_far_and_goes_away():
+def test_a_terminal_shows_task_and_share_and_clears_the_line():
     result = on_terminal(SCRIPT, AT_ONCE)
     assert (result.code, result.stdout) == (0, "bar\nresult\n")
     assert "thinking: 2 of 4" in result.terminal and "100%" in result.terminal
@@ -98,8 +98,8 @@ def test_a_wait_at_a_terminal_shows_what_how_far_and_goes_away():
 
 
 @needs_pseudo_terminals
-def test_the_bar_comes_also_while_nothing_is_told():
-    """As in the first compilation, which says nothing for half a minute."""
+def test_the_bar_appears_without_reports():
+    """As in the first compilation, which reports nothing for half a minute."""
     result = on_terminal(SCRIPT, AT_ONCE, "silent")
     assert (result.code, result.stdout) == (0, "bar\nresult\n") and "%" in result.terminal
 
@@ -109,13 +109,13 @@ def test_a_short_wait_shows_nothing():
     assert on_terminal(SCRIPT, NEVER) == Seen(0, "no bar\nresult\n", "")
 
 
-def test_without_a_terminal_nothing_is_shown_and_rich_stays_away():
+def test_without_a_terminal_nothing_is_shown_and_rich_is_not_loaded():
     done = subprocess.run([sys.executable, "-c", SCRIPT, AT_ONCE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "no bar\nresult\n", "")
 
 
 @needs_pseudo_terminals
-def test_a_command_keeps_its_document_apart_from_the_bar(tmp_path):
+def test_the_document_of_a_command_is_separate_from_the_bar(tmp_path):
     plan = tmp_path / "plan.csv"
     plan.write_text(
         "step,action,pan_steps,tilt_steps,target,experiment,point\n0,home,0,0,,,\n1,place,,,d1,,\n2,look,,,,,\n"
@@ -137,7 +137,7 @@ def test_time_left_in_words(seconds, text):
 
 
 @pytest.mark.parametrize(("blocks", "hint"), [(0, False), (1, False), (3, True)])
-def test_an_interrupted_fit_says_that_its_chain_is_kept_where_there_is_one(capsys, blocks, hint):
+def test_an_interrupted_fit_names_its_stored_chain(capsys, blocks, hint):
     with pytest.raises(KeyboardInterrupt), chain_progress("go on with --resume") as show:
         show(Progress(FITTING, 0.5, 1.0, None))
         for _ in range(blocks):

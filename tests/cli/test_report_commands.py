@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once"
 
 @pytest.fixture
 def no_page(monkeypatch):
-    """What the page shows is not what is looked at, and takes seconds."""
+    """The page takes seconds and is not tested here."""
     monkeypatch.setattr("tvsbayes.report.evidence.gather", lambda *_, **__: SimpleNamespace(criteria=()))
     page = SimpleNamespace(number="N1")
 
@@ -43,8 +43,8 @@ def test_a_campaign_becomes_a_report_in_one_go(ask, say, grid_folder, no_page):
     assert code == 0 and "removed: report.pdf, dcc.xml" in log and not any(each.exists() for each in stale)
 
 
-def test_calibrating_for_a_browser_that_is_not_there_ends_before_the_work(ask, grid_folder, tmp_path, monkeypatch):
-    """Of a scanner and of an axis; what to do gives a page."""
+def test_calibrate_without_a_browser_ends_before_the_fit(ask, grid_folder, tmp_path, monkeypatch):
+    """Scanner and axis; the remedy gives a page."""
     monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
     drawn(7, runs(2)).write(tmp_path / "axis")
     for folder in (grid_folder, tmp_path / "axis"):
@@ -56,7 +56,7 @@ def test_calibrating_for_a_browser_that_is_not_there_ends_before_the_work(ask, g
 
 
 @pytest.mark.parametrize("option", ["--laboratory", "--customer", "--country", "--customer-country"])
-def test_nobody_has_an_empty_name(ask, tmp_path, option):
+def test_empty_names_are_refused(ask, tmp_path, option):
     code, document = ask("report", tmp_path, "--dcc", option, " ")
     assert (
         code == 2 and option in document["error"]["message"] and "leave the option out" in document["error"]["remedy"]
@@ -64,8 +64,8 @@ def test_nobody_has_an_empty_name(ask, tmp_path, option):
 
 
 @pytest.mark.thorough
-def test_it_stops_where_a_fit_must_not_be_used(ask, say, grid_campaign, tmp_path, no_page):
-    """Relative counters: nothing agrees with anything."""
+def test_it_stops_at_an_unusable_fit(ask, say, grid_campaign, tmp_path, no_page):
+    """Relative counters contradict the model everywhere."""
     moves = tuple(
         replace(m, pan_steps=m.pan_steps - before.pan_steps)
         for before, m in zip((grid_campaign.moves[0], *grid_campaign.moves), grid_campaign.moves, strict=False)
@@ -87,8 +87,8 @@ def test_an_axis_becomes_a_report_in_one_go(ask, say, tmp_path, no_pictures):
 
 
 @pytest.mark.parametrize("name", ["mine.pdf", "mine.PDF"])
-def test_a_page_named_as_its_own_pdf_is_refused_before_the_work(ask, tmp_path, name):
-    """Chromium would print the page onto itself: what lay there was an empty PDF."""
+def test_a_page_named_as_its_own_pdf_is_refused_before_the_fit(ask, tmp_path, name):
+    """Chromium would overwrite the page with an empty PDF."""
     code, document = ask("report", tmp_path, "-o", tmp_path / name, "--pdf")
     assert (code, document["error"]["code"], document["error"]["remedy"]) == (2, "usage", "write -o NAME.html --pdf")
     assert not (tmp_path / name).exists()

@@ -1,4 +1,4 @@
-"""The page of a report on its way to disk: stages of the work, files."""
+"""Writing the page of a report: stages of the work, files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tvsbayes.errors import InputError
 
 @pytest.fixture
 def shown(monkeypatch):
-    """What the progress bar shows, of a page that is drawn and printed at once."""
+    """States of the progress bar for a page that is drawn and printed at once."""
     states = []
 
     @contextmanager
@@ -30,7 +30,7 @@ def shown(monkeypatch):
 
 @pytest.mark.parametrize("pdf", [False, True])
 def test_printing_is_a_stage_of_the_work(shown, tmp_path, pdf):
-    """A bar that stands at its end while a browser prints is taken for a program that hangs."""
+    """The bar does not stay at 100 % while the browser prints."""
 
     def make(job):
         job.begin(DRAWING)
@@ -46,13 +46,13 @@ def test_printing_is_a_stage_of_the_work(shown, tmp_path, pdf):
     assert page.as_json() == {"criteria": [], "number": "N1", "files": page.files}
 
 
-def test_a_missing_browser_is_known_before_the_work(tmp_path, monkeypatch):
+def test_a_missing_browser_is_refused_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
     with pytest.raises(InputError, match="--pdf needs one of"):
         written_page(tmp_path, None, True, {DRAWING: 1.0}, lambda job: pytest.fail("made"))
 
 
-def test_what_makes_a_removed_file_again_is_what_there_is(capsys):
+def test_the_commands_named_for_removed_files_exist(capsys):
     """`calibrate` has no --dcc, and an axis no certificate."""
     page = WrittenPage("N1", b"", Path("r/report.html"), {"report": "r/report.html"}, ["report.pdf", "dcc.xml"])
     page.report_removed(certificates=True)

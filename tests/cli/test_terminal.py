@@ -1,4 +1,4 @@
-"""Colours only where a terminal shows them; help with examples, completion, one spelling of --out."""
+"""Colours only on a terminal; help with examples, completion, one spelling of --out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Terminal:
 
 
 @pytest.mark.parametrize(("tty", "environment"), [(False, {}), (True, {"NO_COLOR": "1"}), (True, {"TERM": "dumb"})])
-def test_files_pipes_and_whoever_forbids_it_get_plain_text(monkeypatch, tty, environment):
+def test_files_pipes_and_no_color_get_plain_text(monkeypatch, tty, environment):
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
     for name, value in environment.items():
@@ -27,7 +27,7 @@ def test_files_pipes_and_whoever_forbids_it_get_plain_text(monkeypatch, tty, env
     assert styled("error: no such file", Terminal(tty)) == "error: no such file"
 
 
-def test_a_terminal_gets_sentences_folded_between_words_and_tables_as_they_are(monkeypatch):
+def test_a_terminal_wraps_sentences_between_words_and_not_tables(monkeypatch):
     monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "30")
     sentence, row = "one sentence of more words than fit", "a row of a table      1.25     2.50"
@@ -63,7 +63,7 @@ def test_a_terminal_gets_verdicts_in_colour_line_by_line(monkeypatch):
         ("OK (p = 0.3; false alarms 1 %)", 32),
     ],
 )
-def test_verdicts_of_an_axis_and_of_a_watch_have_their_colours_too(monkeypatch, line, colour):
+def test_verdicts_of_an_axis_and_of_a_watch_are_coloured(monkeypatch, line, colour):
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "80")
@@ -89,7 +89,7 @@ def test_a_shell_can_complete_commands():
     assert done.stdout.split() == ["calibrate"]
 
 
-def test_the_old_spelling_of_out_is_still_taken(capsys, tmp_path):
+def test_the_old_spelling_of_out_is_accepted(capsys, tmp_path):
     for option in ("-o", "--out", "--output"):
         assert run(["plan", str(tmp_path / "no rig.toml"), option, str(tmp_path / "plan.csv")]) == 2
         assert "no rig.toml" in capsys.readouterr().err

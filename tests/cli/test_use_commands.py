@@ -1,4 +1,4 @@
-"""`locate` and `steps-for` as commands, on a campaign whose results are drawn, not fitted."""
+"""`locate` and `steps-for` as commands, on a campaign with drawn instead of fitted results."""
 
 from __future__ import annotations
 
@@ -103,13 +103,13 @@ def test_counters_that_no_look_reached_are_told(ask, folder, tmp_path, capsys):
         assert run([*map(str, ("locate", folder, *options))]) == 0
         text = capsys.readouterr().out
         assert text.count("EXTRAPOLATED") == count
-        # Which axis, and what looks reached.
+        # The axis and the range of the looks.
         assert (f"pan {high + 1} lies outside {low} to {high}" in text) is bool(count) and "tilt 20 lies" not in text
     assert entries[0]["unseen"] == f"pan {low - 1} lies outside {low} to {high}" and entries[2]["unseen"] == ""
 
 
-def test_no_point_lies_behind_the_scanner(ask, folder, tmp_path, capsys):
-    """A beam turned to the back may meet the reading there: refused by name, of one point, of many and in a cloud."""
+def test_no_point_is_behind_the_scanner(ask, folder, tmp_path, capsys):
+    """A point behind the scanner is refused by name: one point, many points, a cloud."""
     back = load_calibration(folder)
     turned = next(n for n in range(2000, 4000, 10) if back.ray(n, 20).direction[0] < -0.5)
     aim = back.ray(turned, 20)
@@ -199,7 +199,7 @@ def test_points_from_a_file_keep_their_order_and_refuse_one_by_one(ask, folder, 
         ("20,1e12,70,left,up", "range", "pan_steps"),
     ],
 )
-def test_bad_points_are_refused_with_line_and_column(ask, folder, tmp_path, row, code, column):
+def test_invalid_points_are_refused_with_line_and_column(ask, folder, tmp_path, row, code, column):
     points = tmp_path / "points.csv"
     points.write_text(f"tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach\n20,100,70,left,up\n{row}\n")
     exit_code, document = ask("locate", folder, "--points", points)
@@ -308,7 +308,7 @@ def test_exports_are_read_back(folder, ask, capsys, tmp_path):
         (("--x-mm", 700, "--y-mm", 2, "--z-mm", 3, "--out", "c.h"), "--out is"),
     ],
 )
-def test_an_export_has_no_target_and_a_target_no_file(ask, folder, options, message):
+def test_an_export_takes_no_target_and_a_target_no_file(ask, folder, options, message):
     code, document = ask("steps-for", folder, *options)
     assert (code, document["error"]["code"]) == (2, "usage")
     assert document["error"]["message"].startswith(message) and "--export" in document["error"]["remedy"]
@@ -355,7 +355,7 @@ def test_a_file_of_points_becomes_a_cloud(ask, folder, tmp_path, capsys, ending)
         (("--points", "looks.csv", "--cloud", "c.xyz"), "usage", ".ply"),
     ],
 )
-def test_clouds_that_cannot_be_written_say_what_to_do(ask, folder, options, code, remedy):
+def test_clouds_that_cannot_be_written_are_refused_with_a_remedy(ask, folder, options, code, remedy):
     exit_code, document = ask("locate", folder, *options)
     assert exit_code == 2 and document["error"]["code"] == code and remedy in document["error"]["remedy"]
 
@@ -363,7 +363,7 @@ def test_clouds_that_cannot_be_written_say_what_to_do(ask, folder, options, code
 @pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("view",)])
 @pytest.mark.parametrize("name", ["moves.csv", "campaign.toml", "log.jsonl", "frames/000003_left.png"])
 def test_no_output_replaces_the_data_of_a_campaign(ask, tmp_path, command, name):
-    """Before anything is fitted, and without a campaign of one's own the name is free."""
+    """Refused before the fit; outside of a campaign folder the name is allowed."""
     (tmp_path / "frames").mkdir()
     for part in ("campaign.toml", name):
         (tmp_path / part).write_bytes(b"mine")
@@ -373,8 +373,8 @@ def test_no_output_replaces_the_data_of_a_campaign(ask, tmp_path, command, name)
 
 
 @pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("plan",)])
-def test_an_output_without_a_folder_is_refused_before_the_work(ask, tmp_path, command):
-    """Not after the fit of a campaign: this one cannot even be read."""
+def test_an_output_without_a_folder_is_refused_before_the_fit(ask, tmp_path, command):
+    """Refused before the campaign is read: this one is unreadable."""
     code, document = ask(command[0], tmp_path, *command[1:], "-o", tmp_path / "nowhere" / "out.x")
     error = document["error"]
     assert (code, error["code"], error["found"]) == (2, "write", "no such folder")

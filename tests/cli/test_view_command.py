@@ -1,4 +1,4 @@
-"""view: one file, whole or not at all, never in the place of data."""
+"""view: one complete file or none, never in place of data."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_page_runs_its_own_script_alone(folder):
     assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy and "http" not in policy
 
 
-def test_view_says_where_the_page_is_and_what_it_lacks(folder, tmp_path, capsys):
+def test_view_states_the_path_of_the_page_and_what_it_lacks(folder, tmp_path, capsys):
     out = tmp_path / "page.html"
     assert run(["view", str(folder), "--beside", str(folder), "-o", str(out)]) == 0
     printed = capsys.readouterr().out
@@ -56,7 +56,7 @@ def test_view_says_where_the_page_is_and_what_it_lacks(folder, tmp_path, capsys)
     assert not (folder / "results").exists()
 
 
-def test_view_replaces_no_data_and_leaves_nothing_half_written(folder, tmp_path, capsys, monkeypatch):
+def test_view_replaces_no_data_and_leaves_no_partial_file(folder, tmp_path, capsys, monkeypatch):
     for name in ("spots.csv", "campaign.toml", frame_name(3, "left")):
         before = (folder / name).read_bytes()
         assert run(["view", str(folder), "-o", str(folder / name)]) == 2
@@ -76,7 +76,7 @@ def test_view_replaces_no_data_and_leaves_nothing_half_written(folder, tmp_path,
     assert run(["view", str(folder)]) == 2
 
 
-def test_view_refuses_an_axis_and_what_is_no_campaign(tmp_path, capsys):
+def test_view_refuses_an_axis_and_other_folders(tmp_path, capsys):
     assert run(["new", str(tmp_path / "stage"), "--axis"]) == 0
     assert run(["view", str(tmp_path / "stage")]) == 2
     assert "not an axis" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What somebody new does wrong: each mistake is called by its name, with what to do."""
+"""Mistakes of new users: each is named, with a remedy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from support.wrong_inputs import SPOILT
 
 
 @pytest.mark.parametrize("name", SPOILT)
-def test_the_remedy_hits(say, tmp_path, name):
+def test_the_remedy_fits_the_mistake(say, tmp_path, name):
     wrong = SPOILT[name]
     folder = tmp_path / "mine"
     shutil.copytree(PAPER_TWIN, folder)

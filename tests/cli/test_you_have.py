@@ -1,4 +1,4 @@
-"""The page of files that people have prints what the commands print."""
+"""The page of foreign files shows the output of the commands."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ QUICK = [kind for kind in KINDS if kind.commands[0].quick]
 
 
 @pytest.mark.parametrize("kind", QUICK, ids=lambda kind: kind.title)
-def test_quick_commands_print_what_the_page_says(kind: Kind, tmp_path, monkeypatch):
-    """Up to the first that samples: its last digits may differ with the versions of libraries."""
+def test_output_of_quick_commands_is_that_of_the_page(kind: Kind, tmp_path, monkeypatch):
+    """Up to the first command that samples: its last digits may differ with the versions of libraries."""
     monkeypatch.chdir(tmp_path)
     part = PAGE.read_text(encoding="utf-8").split(f"\n## {kind.title}\n")[1].split("\n## ")[0]
     blocks = list(kind.blocks(quick=True))
