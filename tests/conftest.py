@@ -13,10 +13,10 @@ from pathlib import Path
 
 # Before NumPy is imported: OpenBLAS' waiting threads would take the time of XLA's (see `tvsbayes.cli.main`).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Before JAX is: what one process has compiled the other loads, and so does the next run. Keys are hashes of the code.
+# Before JAX is imported: other processes and later runs load what one has compiled. Keys are hashes of the code.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-# Commands, in this process or in another, keep theirs there too: not in the user's own folder.
+# Commands, in this process or in another, use that folder too, not the user's own.
 os.environ["TVSBAYES_CACHE"] = os.environ["JAX_COMPILATION_CACHE_DIR"]
 
 from dataclasses import dataclass, replace
@@ -86,7 +86,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileSche
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_traces():
-    """What one process has traced and compiled the other takes: it waits for a function that the first is at."""
+    """Processes share traced and compiled functions: one waits for a function that the other compiles."""
     from support.compiled_once import sharing
 
     with sharing(Path(os.environ["JAX_COMPILATION_CACHE_DIR"])):
@@ -132,7 +132,7 @@ def small_rig(mounted_rig: Rig) -> Rig:
 
 @pytest.fixture
 def ctrl_c_works():
-    """A shell's background jobs are born with SIGINT ignored, nohup's with SIGHUP; the tests of this raise them."""
+    """Background jobs of a shell ignore SIGINT, those of nohup SIGHUP; tests that raise them need the default."""
     wanted = {"SIGINT": signal.default_int_handler, "SIGHUP": signal.SIG_DFL}
     numbers = {getattr(signal, name): handler for name, handler in wanted.items() if hasattr(signal, name)}
     before = {number: signal.signal(number, handler) for number, handler in numbers.items()}

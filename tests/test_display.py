@@ -24,7 +24,7 @@ CHARACTERS = 6000
 """Of a result in a session, at most: a screen or two; a fit had 2.4 million."""
 
 
-def test_a_long_table_is_cut_and_says_where_all_of_it_is():
+def test_a_long_table_is_cut_and_says_where_the_rest_is():
     view = View("a title", ("name", "value"), [(f"row {k}", k / 3) for k in range(ROWS + 5)])
     lines = view.text().splitlines()
     assert lines[0] == "a title" and lines[1].split() == ["name", "value"] and len(lines) == ROWS + 3

@@ -1,4 +1,4 @@
-"""Errors tell place, found, allowed and remedy, and pass between processes whole."""
+"""Errors state place, found, allowed and remedy, and are pickled completely."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def test_message_tells_place_found_allowed_and_remedy():
 
 
 @pytest.mark.parametrize("kind", [TvsError, InputError, NothingToEstimate, NotConverged, DeviceFault])
-def test_errors_pass_between_processes_whole(kind):
-    """A pool that cannot unpickle its worker's error waits for ever."""
+def test_errors_are_pickled_completely(kind):
+    """A pool that cannot unpickle a worker's error never returns."""
     error = kind("code", "what was found", file="a.csv", line=3, column="u_px", found="x", allowed="y", remedy="z")
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind and again.args == error.args and vars(again) == vars(error)
@@ -43,6 +43,6 @@ def test_errors_pass_between_processes_whole(kind):
         (lambda: tvsbayes.locate(3.0, 0, 0, 60.0), "found float; wanted a calibration, of calibration_of"),
     ],
 )
-def test_from_python_an_argument_of_another_kind_is_named(called, wanted):
+def test_a_python_argument_of_the_wrong_type_is_named(called, wanted):
     with pytest.raises(TypeError, match=wanted):
         called()

@@ -1,4 +1,4 @@
-"""How far a wait has come: never backwards, to the end, and anyone who listens may stop it."""
+"""Progress of a job: never decreasing, reaching 1, stopped by a listener's exception."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROUNDING = 2.0**-50
 
 
 class Clock:
-    """A clock that somebody else turns."""
+    """A clock set by the test."""
 
     now_s = 100.0
 
@@ -26,7 +26,7 @@ class Clock:
 
 
 def followed(stages, steps):
-    """What is told of a job whose steps are (seconds that pass, stage to begin or share of the present one)."""
+    """States reported by a job whose steps are (seconds that pass, stage to begin or share of the present one)."""
     clock, states = Clock(), []
     with Job(stages, states.append, clock) as job:
         for seconds, step in steps:
@@ -47,7 +47,7 @@ def test_stages_add_up_to_the_whole():
     assert [state.share for state in again] == pytest.approx([3 / 8, 3 / 4, 3 / 4, 13 / 16, 1, 1], abs=ROUNDING)
 
 
-def test_stages_without_time_are_not_told():
+def test_stages_without_time_are_not_reported():
     states = followed({"nothing": 0.0, "all": 2.0}, [(1, "nothing"), (1, 0.5), (1, "all")])
     assert [state.doing for state in states] == ["all", "all"]
     for stages in ({}, {"nothing": 0.0}, {"back": -1.0, "forth": 3.0}):
@@ -55,7 +55,7 @@ def test_stages_without_time_are_not_told():
             Job(stages)
 
 
-def test_what_goes_backwards_is_not_told_so():
+def test_the_reported_share_never_decreases():
     states = followed({"one": 1.0, "two": 1.0}, [(1, 0.9), (1, 0.2), (1, "two"), (1, -3.0), (-9, 0.5), (1, "one")])
     check_forward(states)
     assert [state.share for state in states] == pytest.approx([0.45, 0.45, 0.5, 0.5, 0.75, 0.75, 1], abs=ROUNDING)
@@ -80,8 +80,8 @@ def test_time_left_of_an_uneven_job_rises_with_the_clock_at_most():
 
 
 @pytest.mark.parametrize("needed", [True, False])
-def test_what_was_not_needed_predicts_nothing(needed):
-    """Ten steps of a second each, after a stage of nine tenths whose result was there already."""
+def test_a_skipped_stage_predicts_no_time(needed):
+    """Ten steps of a second each, after a stage of nine tenths whose result is stored."""
     clock, states = Clock(), []
     with Job({"fit": 9.0, "work": 1.0, "more": 0.0}, states.append, clock) as job:
         if needed:
@@ -113,7 +113,7 @@ def test_a_job_within_a_job_fills_its_stage():
     check_forward(states)
 
 
-def test_nobody_listens_nothing_is_read():
+def test_without_a_listener_no_clock_is_read():
     def clock():
         calls.append(1)
         return 0.0
@@ -125,8 +125,8 @@ def test_nobody_listens_nothing_is_read():
     assert len(calls) == 1
 
 
-def test_who_listens_may_end_the_work():
-    """The exception is the listener's own, and the end is not told of a job that was ended."""
+def test_a_listener_can_stop_the_job():
+    """The listener's exception passes through; a stopped job does not report its end."""
     states = []
 
     def stop(state):
@@ -155,7 +155,7 @@ PATIENCE_SECONDS = 20.0
 
 @pytest.fixture
 def session(monkeypatch):
-    """Somebody types; lines appear at once. What they say, and an event of the first."""
+    """An interactive session without delay: its lines, and an event of the first one."""
     lines, appeared = [], threading.Event()
 
     def write(state: Progress | None) -> None:
@@ -168,7 +168,7 @@ def session(monkeypatch):
     return lines, appeared
 
 
-def test_a_session_sees_one_line_and_is_left_without(session):
+def test_a_session_shows_one_line_and_clears_it(session):
     """Also of a job inside the job, and after an exception."""
     lines, appeared = session
     with Job({"fit": 1.0, "sampling": 1.0}) as job:
@@ -185,7 +185,7 @@ def test_a_session_sees_one_line_and_is_left_without(session):
     assert lines[-1] == ""
 
 
-def test_scripts_and_whoever_listens_see_no_line(session, monkeypatch):
+def test_scripts_and_listeners_see_no_line(session, monkeypatch):
     lines, _ = session
     states = []
     with Job({"fit": 1.0}, states.append):
