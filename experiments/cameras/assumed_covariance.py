@@ -72,11 +72,11 @@ def drawn_bench(seed: int) -> Bench:
     focal, baseline = rng.uniform(700, 1600), rng.uniform(80, 300)
     cameras = []
     for _ in range(2):
-        own = focal * (1 + 0.01 * rng.standard_normal())
+        fx = focal * (1 + 0.01 * rng.standard_normal())
         middle = np.array(size) / 2 - 0.5 + 0.015 * size[0] * rng.standard_normal(2)
         k1 = rng.uniform(-0.35, 0.1)
         aspect = 1 + 1e-3 * rng.standard_normal()
-        cameras.append([own, aspect * own, *middle, k1, 0.4 * k1**2, *rng.normal(0, 5e-4, 2), 0.0])
+        cameras.append([fx, aspect * fx, *middle, k1, 0.4 * k1**2, *rng.normal(0, 5e-4, 2), 0.0])
     toe = rng.uniform(0, 0.6) * baseline / 700
     turn = rotation_matrix(rng.normal(0, 0.01, 3)) @ rotation_matrix(np.array([0, toe, 0]))
     # The right camera stands to the right whatever its turn.
@@ -84,8 +84,8 @@ def drawn_bench(seed: int) -> Bench:
     true = Stereo.of_vector(np.array([*cameras[0], *cameras[1], *rotation_vector(turn), *shift]), size)
     board, count = BOARDS[int(rng.integers(len(BOARDS)))], int(rng.integers(15, 26))
     noise, width = rng.uniform(0.05, 0.3), (board.columns - 1) * board.pitch_mm
-    seen: list[list[np.ndarray]] = [[], []]
-    while len(seen[0]) < count:
+    views: list[list[np.ndarray]] = [[], []]
+    while len(views[0]) < count:
         depth = focal * width / (size[0] * rng.uniform(0.2, 0.6))
         axis = rng.standard_normal(2)
         tilt = rng.uniform(0, 0.7) * axis / np.linalg.norm(axis)
@@ -97,9 +97,9 @@ def drawn_bench(seed: int) -> Bench:
             for points, matrix, distortion in ((left, true.M1, true.D1), (left @ true.R.T + true.T, true.M2, true.D2))
         ]
         if all(((p > 0) & (p < np.array(size) - 1)).all() for p in pixels):
-            for own, found in zip(seen, pixels, strict=True):
-                own.append(found + noise * rng.standard_normal(found.shape))
-    return Bench(true, board, np.array(seen[0]), np.array(seen[1]), noise)
+            for fx, corners in zip(views, pixels, strict=True):
+                fx.append(corners + noise * rng.standard_normal(corners.shape))
+    return Bench(true, board, np.array(views[0]), np.array(views[1]), noise)
 
 
 def by_opencv(bench: Bench, way: str) -> tuple[Stereo, float]:
@@ -107,8 +107,8 @@ def by_opencv(bench: Bench, way: str) -> tuple[Stereo, float]:
     size = bench.true.image_width, bench.true.image_height
     points = [bench.board.points_mm.astype(np.float32)] * len(bench.left)
     sides = [[np.asarray(view, np.float32) for view in side] for side in (bench.left, bench.right)]
-    own = WAYS[way] & cv2.CALIB_FIX_K3
-    alone = [cv2.calibrateCamera(points, side, size, None, None, flags=own)[1:3] for side in sides]
+    fixed = WAYS[way] & cv2.CALIB_FIX_K3
+    alone = [cv2.calibrateCamera(points, side, size, None, None, flags=fixed)[1:3] for side in sides]
     flags = WAYS[way] | (0 if way == "fixed" else cv2.CALIB_USE_INTRINSIC_GUESS)
     ends = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 300, 1e-10
     rms, m1, d1, m2, d2, r, t, *_ = cv2.stereoCalibrate(
@@ -128,23 +128,23 @@ def whiten(task: tuple[str, int]) -> dict[str, object]:
     """One bench calibrated one way: chi-square of its error under each of the covariances of `MADE`."""
     way, seed = task
     bench = drawn_bench(seed)
-    found, rms = by_opencv(bench, way)
-    difference = found.vector - bench.true.vector
+    stereo, rms = by_opencv(bench, way)
+    difference = stereo.vector - bench.true.vector
     known = Provenance(rms, len(bench.left), (bench.board.columns, bench.board.rows), bench.board.pitch_mm)
     whole = replace(known, fixed_intrinsics=way == "fixed")
     none = Provenance()
-    made = (with_assumed_covariance(found, one, none).parameter_covariance for one in (whole, known, none))
-    judgements = {name: judged(difference, one) for name, one in zip(MADE, made, strict=True)}
+    covariances = (with_assumed_covariance(stereo, one, none).parameter_covariance for one in (whole, known, none))
+    judgements = {name: judged(difference, one) for name, one in zip(MADE, covariances, strict=True)}
     return {"way": way, "seed": seed, "rms_px": rms, **judgements}
 
 
 def sets(opencv: Path) -> dict[str, tuple[Board, Views, StereoCalibration]]:
     """The public sets with this project's adjustment of each."""
-    found = {}
+    pairs = {}
     for name, folder, board in (("bumblebee2", BUMBLEBEE, Board(4, 6, 30.0)), ("opencv", opencv, Board(9, 6, 25.0))):
         views = find_views(folder, board)
-        found[name] = board, views, calibrate_stereo(views.views, board, (views.image_width, views.image_height))
-    return found
+        pairs[name] = board, views, calibrate_stereo(views.views, board, (views.image_width, views.image_height))
+    return pairs
 
 
 def poses(arguments: argparse.Namespace) -> None:
@@ -171,7 +171,7 @@ def real(arguments: argparse.Namespace) -> None:
         count, rms, size = len(views.views), done.stereo.rms_px, (views.image_width, views.image_height)
         usual = Board(*USUAL_BOARD, USUAL_PITCH_MM)
 
-        def made(
+        def covariances(
             views: int, stereo: Stereo = done.stereo, board: Board = board, rms: float = rms, usual: Board = usual
         ) -> dict[str, np.ndarray]:
             return {
@@ -190,11 +190,11 @@ def real(arguments: argparse.Namespace) -> None:
                 "independent corners": one.covariance_independent + two.covariance_independent,
                 "own": one.stereo.parameter_covariance + two.stereo.parameter_covariance,
             }
-            first, second = (made(len(half)) for half in halved)
+            first, second = (covariances(len(half)) for half in halved)
             sums |= {kind: first[kind] + second[kind] for kind in MADE}
             halves.append({kind: judged(difference, covariance) for kind, covariance in sums.items()})
         whole = {"independent corners": done.covariance_independent, "own": done.stereo.parameter_covariance}
-        sds = {kind: np.sqrt(np.diag(covariance)).tolist() for kind, covariance in (whole | made(count)).items()}
+        sds = {kind: np.sqrt(np.diag(covariance)).tolist() for kind, covariance in (whole | covariances(count)).items()}
         rows[name] = {"views": count, "rms_px": rms, "sd": sds, "halves": halves}
     REAL.parent.mkdir(parents=True, exist_ok=True)
     REAL.write_text(json.dumps(rows))
@@ -223,25 +223,25 @@ def table(arguments: argparse.Namespace) -> None:
     print(f"| calibrated | covariance from {head}")
     for way in (*WAYS, "joint or fixed"):
         some = [row for row in kept if row["way"] in way.split(" or ")]
-        for made in MADE:
-            if way in WAYS or made != "all stated":
-                print(f"| {way}, {len(some)} | {made} | {cells([row[made] for row in some])} |")
+        for which in MADE:
+            if way in WAYS or which != "all stated":
+                print(f"| {way}, {len(some)} | {which} | {cells([row[which] for row in some])} |")
     print(
         f"\nLeft out, for an RMS above {RMS_MAX_PX:g} px (a local minimum): {len(rows) - len(kept)} of {len(rows)}.\n"
     )
-    found = json.loads(REAL.read_text())
+    real = json.loads(REAL.read_text())
     print("Halves of the public sets: RMS of the difference of both calibrations, whitened. `own`: this project's")
     print("adjustment, with shared errors of corners and of the board.\n")
     print(f"| set | covariance {head}")
-    for name, row in found.items():
+    for name, row in real.items():
         for kind in row["halves"][0]:
             print(f"| {name} | {kind} | {cells([half[kind] for half in row['halves']])} |")
     print("\nSds of the whole sets over those of their own adjustment (geometric mean over the group).\n")
     print(f"| set | covariance | {' | '.join(GROUPS)} |\n|{'---|' * (len(GROUPS) + 2)}")
-    for name, row in found.items():
-        own = np.array(row["sd"]["own"])
+    for name, row in real.items():
+        first = np.array(row["sd"]["own"])
         for kind in ("independent corners", *MADE):
-            ratio = np.log(np.array(row["sd"][kind]) / own)
+            ratio = np.log(np.array(row["sd"][kind]) / first)
             print(f"| {name} | {kind} | {' | '.join(f'{np.exp(ratio[g].mean()):.2f}' for g in GROUPS.values())} |")
     guess = f"the sds of a guess are taken as good to a factor of {GUESS_FACTOR:g}"
     print(f"\n`CORRELATION_FACTOR` is {CORRELATION_FACTOR:g}; {guess}.")

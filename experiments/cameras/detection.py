@@ -76,12 +76,12 @@ def bound_px(mark, scene, sensor) -> float:
         slopes.append((ends[0] - ends[1]) / 2e-4)
     slopes += [light * x * x, light * x * y, light * y * y, np.ones(light.shape), x, y]
     mean = sensor.black_dn + response * (ambient + light)
-    seen = mean < 255
+    unsaturated = mean < 255
     variance = sensor.read_noise_dn**2 + 1 / 12 + sensor.gain_dn_per_electron * response * (ambient + light)
     variance = variance + (scene.speckle_contrast * response * light) ** 2
-    jacobian = np.stack([(response * s)[seen] for s in slopes], axis=1)
+    jacobian = np.stack([(response * s)[unsaturated] for s in slopes], axis=1)
     scale = np.linalg.norm(jacobian, axis=0)
-    information = (jacobian / scale).T @ (jacobian / scale / variance[seen][:, None])
+    information = (jacobian / scale).T @ (jacobian / scale / variance[unsaturated][:, None])
     covariance = np.linalg.inv(information) / np.outer(scale, scale)
     return float(np.sqrt((covariance[1, 1] + covariance[2, 2]) / 2))
 
@@ -116,18 +116,18 @@ def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
     learned = detection._estimated_noise(unclipped, None)
     for method in METHODS:
         if method == "fit":
-            found = [spot_fit.centre_of(patch, learned) for patch in patches]
-            learned = spot_noise.learn_noise(np.stack([one.skews for one in found if one.status == "ok"]))
-            found = [one.under(learned) for one in found]
+            centres = [spot_fit.centre_of(patch, learned) for patch in patches]
+            learned = spot_noise.learn_noise(np.stack([one.skews for one in centres if one.status == "ok"]))
+            centres = [one.under(learned) for one in centres]
             row["learned"] = [learned.gain_dn, learned.speckle_contrast]
         else:
-            found = [
+            centres = [
                 contour.contour_of(picture, camera, spot_noise.SpotNoise(speckle_contrast=contrast))
                 for picture in pictures
             ]
-        ok = [k for k, one in enumerate(found) if one.status == "ok"]
-        errors = np.array([found[k].centre_px - truth[k] for k in ok]).reshape(-1, 2)
-        stated = np.array([np.diag(found[k].covariance_px2) for k in ok]).reshape(-1, 2)
+        ok = [k for k, one in enumerate(centres) if one.status == "ok"]
+        errors = np.array([centres[k].centre_px - truth[k] for k in ok]).reshape(-1, 2)
+        stated = np.array([np.diag(centres[k].covariance_px2) for k in ok]).reshape(-1, 2)
         row[method] = {"ok": len(ok)}
         if len(ok) > 10:
             # The error that goes with where in its pixel the spot lies: what no averaging of looks removes.
@@ -159,9 +159,9 @@ def beyond_linear() -> list[tuple[float, float]]:
             offsets = radius * (nodes[:, None, None] * side[0] + nodes[None, :, None] * side[1]).reshape(-1, 3)
             starts = point + offsets
             hits = starts + ((point - starts) @ normal / (beam @ normal))[:, None] * beam
-            seen = camera.project(np.column_stack((-hits[:, 1], -hits[:, 2], hits[:, 0])))
+            pixels = camera.project(np.column_stack((-hits[:, 1], -hits[:, 2], hits[:, 0])))
             share = np.outer(weights, weights).ravel()
-            shifts.append(np.abs(share @ seen / share.sum() - mark.centre_px).max())
+            shifts.append(np.abs(share @ pixels / share.sum() - mark.centre_px).max())
             sds.append(np.sqrt(np.trace(mark.covariance_px2) / 2))
         result.append((float(np.mean(sds)), float(np.max(shifts))))
     return result
@@ -202,23 +202,23 @@ def summary(rows: list[dict]) -> str:
             ("without speckle", lambda r: not r["contrast"]),
             ("with speckle", lambda r: r["contrast"]),
         ):
-            told = [r for r in rows if chosen(r) and "rms" in r[method]]
-            ratio = np.array([r[method]["ratio"] for r in told])
-            loss = np.array([r[method]["rms"] / r["bound"] for r in told])
+            cells = [r for r in rows if chosen(r) and "rms" in r[method]]
+            ratio = np.array([r[method]["ratio"] for r in cells])
+            loss = np.array([r[method]["rms"] / r["bound"] for r in cells])
             lines.append(
-                f"- `{method}` {name}, {len(told)} cells: actual/stated sd median {np.median(ratio):.2f}, "
+                f"- `{method}` {name}, {len(cells)} cells: actual/stated sd median {np.median(ratio):.2f}, "
                 f"{ratio.min():.2f} to {ratio.max():.2f} (chance alone: +- {2 * chance:.2f}); outside 1 +- 0.10 "
                 f"{np.sum(np.abs(ratio - 1) > 0.10)}, outside 1 +- 0.25 {np.sum(np.abs(ratio - 1) > 0.25)}; "
                 f"error/bound median {np.median(loss):.2f}, {loss.min():.2f} to {loss.max():.2f}"
             )
     for method in METHODS:
-        told = [r for r in rows if "rms" in r[method]]
-        sds = [np.abs(r[method]["mean"]).max() / r[method]["rms"] * np.sqrt(r[method]["ok"]) for r in told]
-        phase = np.median([r[method]["phase"] for r in told if not r["contrast"]])
-        pixels = [np.abs(r[method]["mean"]).max() for r in told]
+        cells = [r for r in rows if "rms" in r[method]]
+        sds = [np.abs(r[method]["mean"]).max() / r[method]["rms"] * np.sqrt(r[method]["ok"]) for r in cells]
+        phase = np.median([r[method]["phase"] for r in cells if not r["contrast"]])
+        pixels = [np.abs(r[method]["mean"]).max() for r in cells]
         lines.append(
             f"- bias of `{method}`: mean error of a cell at most {max(pixels):.4f} px ({max(sds):.1f} of its standard "
-            f"errors; 2.9 expected of {2 * len(told)}); part that follows the place in the pixel, without speckle: "
+            f"errors; 2.9 expected of {2 * len(cells)}); part that follows the place in the pixel, without speckle: "
             f"{phase:.4f} px"
         )
     return "\n".join(lines)

@@ -75,9 +75,9 @@ def observed(source: str, seed: int) -> Observed:
     if source == "frames":
         with TemporaryDirectory() as place:
             folder = Path(place) / "campaign"
-            made = simulated.undetected()
-            made.write(folder)
-            write_frames(folder, made, seed)
+            twin = simulated.undetected()
+            twin.write(folder)
+            write_frames(folder, twin, seed)
             # The cameras' sd of every coordinate as a user would have it: from the pictures alone.
             campaign = replace(detect(read_campaign(folder)).campaign, path=None)
     true = project(simulated.light.points_mm, simulated.truth.stereo, simulated.truth.parameters["focal_scale"])
@@ -91,15 +91,15 @@ def one_campaign(task: tuple[str, int]) -> dict[str, object]:
     # 64 looks.
     use_compilation_cache()
     source, seed = task
-    seen = observed(source, seed)
-    errors, stated = seen.errors_px, seen.stated_px
-    known = known_truth(seen.truth)
+    looks = observed(source, seed)
+    errors, stated = looks.errors_px, looks.stated_px
+    known = known_truth(looks.truth)
     if source == "frames":
         known["pixel_scale"] = float(np.sqrt(np.mean((errors / stated) ** 2)))
     row: dict[str, object] = {
         "source": source,
         "seed": seed,
-        "looks": len(seen.campaign.spots),
+        "looks": len(looks.campaign.spots),
         "ok": len(errors),
         "median_sd_px": float(np.median(stated)),
         "rms_px": np.sqrt((errors**2).mean(0)).tolist(),
@@ -107,13 +107,13 @@ def one_campaign(task: tuple[str, int]) -> dict[str, object]:
         "rms_z": np.sqrt(((errors / stated) ** 2).mean(0)).tolist(),
     }
     try:
-        summary = summarise(fit(seen.campaign))
+        summary = summarise(fit(looks.campaign))
     except Exception as error:
         return {**row, "converged": False, "problems": [repr(error)]}
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
     row["quantities"] = {
         name: [true, one.value, one.sd, *one.interval95]
-        for name, true, one in compared(summary, {**known, **at_pose(seen.truth, seen.campaign, pose)})
+        for name, true, one in compared(summary, {**known, **at_pose(looks.truth, looks.campaign, pose)})
     }
     return {**row, "converged": summary.converged, "problems": list(summary.problems)}
 
@@ -179,8 +179,8 @@ def table(arguments: argparse.Namespace) -> None:
             cells += [marked(f"{inside} of {n}", inside >= least), marked(f"{rms:.2f}", low <= rms <= high)]
             values[source] = value, sd
         cells.append(f"{z.mean():+.2f}")
-        (drawn, drawn_sd), (seen, seen_sd) = values["centroids"], values["frames"]
-        cells += [f"{np.sqrt((((seen - drawn) / seen_sd) ** 2).mean()):.2f}", f"{np.median(seen_sd / drawn_sd):.2f}"]
+        (drawn, drawn_sd), (frame, seen_sd) = values["centroids"], values["frames"]
+        cells += [f"{np.sqrt((((frame - drawn) / seen_sd) ** 2).mean()):.2f}", f"{np.median(seen_sd / drawn_sd):.2f}"]
         print(f"| {' | '.join(cells)} |")
     print("\nFound against true centres:\n\n| coordinate | rms, px | mean, px | rms z |\n|---|---|---|---|")
     for k, name in enumerate(COORDINATES):
@@ -188,8 +188,8 @@ def table(arguments: argparse.Namespace) -> None:
         rms, mean, z = (np.array([r[key][k] for r in rows["frames"]]) for key in ("rms_px", "mean_px", "rms_z"))
         rms, z = (np.sqrt(np.average(x**2, weights=count)) for x in (rms, z))
         print(f"| {name} | {rms:.4f} | {np.average(mean, weights=count):+.4f} | {z:.3f} |")
-    drawn, seen = (np.median([r["median_sd_px"] for r in rows[source]]) for source in SOURCES)
-    print(f"\nMedian stated sd: {seen:.3f} px, centroids {drawn:.3f} px.")
+    drawn, frame = (np.median([r["median_sd_px"] for r in rows[source]]) for source in SOURCES)
+    print(f"\nMedian stated sd: {frame:.3f} px, centroids {drawn:.3f} px.")
 
 
 def rendered(folder: Path, twin: str) -> Path:
@@ -197,15 +197,15 @@ def rendered(folder: Path, twin: str) -> Path:
     place = folder / twin
     if not (place / "truth.json").exists():
         if twin == "mounted":
-            made = simulate(mounted_rig(), shipped_plan("paper"), 1)
+            drawn = simulate(mounted_rig(), shipped_plan("paper"), 1)
         else:
             twin_of_table1 = shipped_twin("paper_twin")
             campaign = twin_of_table1.campaign
             rig = replace(mounted_rig(), table=campaign.rig, stereo=campaign.stereo)
-            made = simulate(rig, shipped_plan("paper_twin"), 1, twin_of_table1.truth)
-        made = made.undetected()
-        made.write(place)
-        write_frames(place, made, 1)
+            drawn = simulate(rig, shipped_plan("paper_twin"), 1, twin_of_table1.truth)
+        drawn = drawn.undetected()
+        drawn.write(place)
+        write_frames(place, drawn, 1)
     return place
 
 
@@ -215,18 +215,18 @@ def report(place: Path, twin: str) -> None:
     truth = read_truth(place / "truth.json", campaign.stereo)
     print(f"\n## The paper's protocol, {twin}\n")
     for method in ("fit", "contour"):
-        found = detect(campaign, method)
-        noise = ", ".join(f"{side} {one.speckle_contrast:.2f}" for side, one in found.noise.items())
+        result = detect(campaign, method)
+        noise = ", ".join(f"{side} {one.speckle_contrast:.2f}" for side, one in result.noise.items())
         print(
-            f"`detect --method {method}`: {found.statuses}, median sd {found.median_sd_px:.3f} px, contrast {noise}\n"
+            f"`detect --method {method}`: {result.statuses}, median sd {result.median_sd_px:.3f} px, contrast {noise}\n"
         )
-        by_hand = classic(found.campaign).directions
-        summary = summarise(fit(found.campaign))
+        by_hand = classic(result.campaign).directions
+        summary = summarise(fit(result.campaign))
         pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
         print(
             "| quantity | truth | classic mean (sd) | 95 % type A | joint | 95 % | truth inside | z |\n|" + "---|" * 8
         )
-        for name, value, one in compared(summary, {**known_truth(truth), **at_pose(truth, found.campaign, pose)}):
+        for name, value, one in compared(summary, {**known_truth(truth), **at_pose(truth, result.campaign, pose)}):
             low, high = one.interval95
             hand, hands = by_hand.get(name.removeprefix("effective ")), "| | "
             if hand is not None:

@@ -52,9 +52,9 @@ def corner_errors(views: Sequence[View], drawn: Sequence[Scene]) -> dict[str, fl
     errors = []
     for view in views:
         true = true_corners(drawn[int(view.name)])
-        for seen, at in ((view.left, true[:, :2]), (view.right, true[:, 2:])):
-            if seen is not None:
-                errors.append(min((seen - at, seen[::-1] - at), key=lambda e: float((e**2).sum())))
+        for corners, at in ((view.left, true[:, :2]), (view.right, true[:, 2:])):
+            if corners is not None:
+                errors.append(min((corners - at, corners[::-1] - at), key=lambda e: float((e**2).sum())))
     every = np.concatenate(errors)
     return {
         "corner_sd_px": float(every.std()),
@@ -103,13 +103,13 @@ def calibrate(task: tuple[str, int], count: int = VIEWS) -> dict[str, object]:
 
 def halves(arguments: argparse.Namespace) -> None:
     """Calibrate random halves of OpenCV's pairs and compare them."""
-    found = find_views(OPENCV_PAIRS, BOARD)
-    size = (found.image_width, found.image_height)
+    views = find_views(OPENCV_PAIRS, BOARD)
+    size = (views.image_width, views.image_height)
     rng = np.random.default_rng(0)
     rows = []
     for _ in range(SPLITS):
-        order = rng.permutation(len(found.views))
-        parts = [[found.views[k] for k in order[a]] for a in (slice(0, 6), slice(6, None))]
+        order = rng.permutation(len(views.views))
+        parts = [[views.views[k] for k in order[a]] for a in (slice(0, 6), slice(6, None))]
         one, two = (calibrate_stereo(part, BOARD, size) for part in parts)
         difference = one.stereo.vector - two.stereo.vector
         rows.append(
@@ -118,7 +118,7 @@ def halves(arguments: argparse.Namespace) -> None:
                 "independent": chi2(difference, one.covariance_independent + two.covariance_independent),
             }
         )
-    whole = calibrate_stereo(found.views, BOARD, size)
+    whole = calibrate_stereo(views.views, BOARD, size)
     HALVES.parent.mkdir(parents=True, exist_ok=True)
     HALVES.write_text(json.dumps({"splits": rows, "factor": whole.correlation_factor, "rms_px": whole.stereo.rms_px}))
 
@@ -163,10 +163,10 @@ def table(arguments: argparse.Namespace) -> None:
         )
         print(f"{sum(row['outliers'] for row in some)} of {sum(row['views'] for row in some)}.")
     if HALVES.exists():
-        found = json.loads(HALVES.read_text())
-        stored, plain = (np.array([s[k] for s in found["splits"]]) / 24 for k in ("stored", "independent"))
+        pairs = json.loads(HALVES.read_text())
+        stored, plain = (np.array([s[k] for s in pairs["splits"]]) / 24 for k in ("stored", "independent"))
         words = (
-            f"OpenCV's 13 real pairs (640 x 480): rms {found['rms_px']:.3f} px, factor {found['factor']:.1f}. Split at "
+            f"OpenCV's 13 real pairs (640 x 480): rms {pairs['rms_px']:.3f} px, factor {pairs['factor']:.1f}. Split at "
         )
         words += f"random {len(stored)} times into 6 and 7 views, the two calibrations differ by\nchi2/24 = "
         words += f"{stored.mean():.2f} on average (median {np.median(stored):.2f}) under the stored covariances, by "

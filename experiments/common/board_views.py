@@ -58,8 +58,8 @@ def corners_of(scene: Scene, name: str, rng: np.random.Generator) -> View:
         # Half of the variance is shared.
         root = np.linalg.cholesky(0.5 * correlation + 0.5 * np.eye(len(grid)))
         noise = root @ noise
-    seen = corners + CORNER_SD_PX * noise
-    return View(name, seen[:, :2], seen[:, 2:])
+    pixels = corners + CORNER_SD_PX * noise
+    return View(name, pixels[:, :2], pixels[:, 2:])
 
 
 def scenes(seed: int, condition: str, count: int = VIEWS) -> list[Scene]:

@@ -30,16 +30,16 @@ def study_parser(
         n: default of `--n`; without it there is no such option.
         actions: what can be asked for, see `act`.
     """
-    made = parser(doc)
-    made.add_argument("action", choices=actions)
-    made.add_argument("--cores", type=int, nargs="+", default=[0], metavar="CORE", help="one worker is pinned to each")
-    made.add_argument("--rows", type=Path, default=rows, help="file of rows (%(default)s)")
+    cli = parser(doc)
+    cli.add_argument("action", choices=actions)
+    cli.add_argument("--cores", type=int, nargs="+", default=[0], metavar="CORE", help="one worker is pinned to each")
+    cli.add_argument("--rows", type=Path, default=rows, help="file of rows (%(default)s)")
     if n is not None:
-        made.add_argument("--n", type=int, default=n, help="how many (%(default)s)")
-    return made
+        cli.add_argument("--n", type=int, default=n, help="how many (%(default)s)")
+    return cli
 
 
-def act(made: argparse.ArgumentParser, **actions: Action) -> None:
+def act(cli: argparse.ArgumentParser, **actions: Action) -> None:
     """Do what the command line asks for."""
-    arguments = made.parse_args()
+    arguments = cli.parse_args()
     actions[arguments.action](arguments)

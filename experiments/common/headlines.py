@@ -51,8 +51,8 @@ def headlines(draws) -> dict[str, np.ndarray]:
 
 def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> dict[str, float]:
     """The same of a true rig, by the twin's formulas, over the looks of a campaign and at the pose of its fit."""
-    found = dict(zip(HEADLINES, study_job.true_headlines(truth, campaign, pose_rad).tolist(), strict=True))
-    return found | {
+    values = dict(zip(HEADLINES, study_job.true_headlines(truth, campaign, pose_rad).tolist(), strict=True))
+    return values | {
         name: float(truth.parameters[key]) for name, key in zip(MEAN_RATIOS, BLOCKS["degrees_per_step"], strict=True)
     }
 

@@ -22,9 +22,9 @@ from tvsbayes.statistics.gaussian_process import JITTER
 
 def without_padding(arrays: CampaignArrays, moves: int) -> CampaignArrays:
     """A campaign's own moves, spots and places: derivatives in reverse mode pass through every row."""
-    own = arrays.of_spots(0, int(arrays.count))
-    of_moves = jax.tree.map(lambda of_move: of_move[:moves], own.moves)
-    return CampaignArrays(of_moves, own.spots, own.gears.without_padding(), own.azimuth_convention, own.count)
+    real = arrays.of_spots(0, int(arrays.count))
+    of_moves = jax.tree.map(lambda of_move: of_move[:moves], real.moves)
+    return CampaignArrays(of_moves, real.spots, real.gears.without_padding(), real.azimuth_convention, real.count)
 
 
 def root_at_places(model: Model, gears: GearArrays) -> jax.Array:
@@ -67,19 +67,19 @@ def innovations(z: jax.Array, space: ParameterSpace, arrays: CampaignArrays) -> 
     model = space.model(z)
     every = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
     angles = jax.tree.map(lambda of_moves: of_moves[arrays.spots.move_index], every)
-    given, stood = filter_input(model, arrays, angles), look_terms(model, arrays, angles=angles)
+    start, stood = filter_input(model, arrays, angles), look_terms(model, arrays, angles=angles)
     free = jnp.stack(stood.to_states.of_many(stood.terms.residual)[2:], axis=1)
     root = root_at_places(model, arrays.gears)
-    both = [given.rows.residual[..., None], place_columns(given.slope, arrays.gears) @ root]
-    rows = eqx.tree_at(lambda r: r.residual, given.rows, jnp.concatenate(both, axis=2))
-    seen = filtered(rows, no_belief(1 + len(root)))
-    residual, load = seen.standardised[..., 0].ravel(), seen.standardised[..., 1:].reshape(-1, len(root))
+    both = [start.rows.residual[..., None], place_columns(start.slope, arrays.gears) @ root]
+    rows = eqx.tree_at(lambda r: r.residual, start.rows, jnp.concatenate(both, axis=2))
+    out = filtered(rows, no_belief(1 + len(root)))
+    residual, load = out.standardised[..., 0].ravel(), out.standardised[..., 1:].reshape(-1, len(root))
     # Least squares for the errors at places, which are N(0, 1) in units of the factor.
     factor = jnp.linalg.cholesky(jnp.eye(len(root)) + load.T @ load)
     explained = solve_triangular(factor, load.T @ residual, lower=True)
     mean = solve_triangular(factor, explained, lower=True, trans="T")
-    squares = residual @ residual - explained @ explained + jnp.sum(seen.log_variance)
-    log_density = jnp.sum(given.log_scale) - 0.5 * squares - jnp.sum(jnp.log(jnp.diagonal(factor)))
+    squares = residual @ residual - explained @ explained + jnp.sum(out.log_variance)
+    log_density = jnp.sum(start.log_scale) - 0.5 * squares - jnp.sum(jnp.log(jnp.diagonal(factor)))
     of_spots = jnp.concatenate([(residual - load @ mean).reshape(-1, 2), free], axis=1)
     return Innovations(jnp.append(of_spots, mean), log_density)
 

@@ -160,16 +160,16 @@ def nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Settin
     compile_s = time.process_time() - started
 
     def several(state, count: int, limit_s: float, label: str):
-        started = said = time.perf_counter()
+        started = printed_s = time.perf_counter()
         cpu = time.process_time()
-        seen = []
-        while len(seen) < count and time.perf_counter() - started < limit_s:
+        steps = []
+        while len(steps) < count and time.perf_counter() - started < limit_s:
             state = advance(state)
-            seen.append([np.asarray(x) for x in (state.z, state.diverging, state.num_steps, state.accept_prob)])
-            if time.perf_counter() - said > 20:
-                said = time.perf_counter()
-                print(f"{label}: {len(seen)} in {said - started:.0f} s, leapfrogs {seen[-1][2]}", flush=True)
-        return state, [np.stack(x) for x in zip(*seen, strict=True)], time.process_time() - cpu
+            steps.append([np.asarray(x) for x in (state.z, state.diverging, state.num_steps, state.accept_prob)])
+            if time.perf_counter() - printed_s > 20:
+                printed_s = time.perf_counter()
+                print(f"{label}: {len(steps)} in {printed_s - started:.0f} s, leapfrogs {steps[-1][2]}", flush=True)
+        return state, [np.stack(x) for x in zip(*steps, strict=True)], time.process_time() - cpu
 
     state, _, warmup_s = several(state, setting.warmup, np.inf, "warm-up")
     _, (z, diverging, leapfrogs, acceptance), sampling_s = several(state, setting.draws, setting.limit_s, "draws")
@@ -201,8 +201,8 @@ def blackjax_nuts(potential: Callable[[jax.Array], jax.Array], size: int, settin
         kernel = blackjax.nuts(lambda w: -potential(w), **tuned)
 
         def step(state, key):
-            state, told = kernel.step(key, state)
-            return state, (state.position, told.is_divergent, told.num_integration_steps, told.acceptance_rate)
+            state, info = kernel.step(key, state)
+            return state, (state.position, info.is_divergent, info.num_integration_steps, info.acceptance_rate)
 
         return jax.lax.scan(step, state, jax.random.split(key, setting.draws))[1]
 

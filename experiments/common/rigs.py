@@ -98,8 +98,8 @@ def unseen(campaign: Campaign) -> int:
 
 def pixels_of(campaign: Campaign, prefix: str = "") -> np.ndarray:
     """Centres (spots, 4) in the order of `PIXELS`, px; with the prefix s their sds; NaN where there is none."""
-    found = [[getattr(spot, prefix + name) for name in PIXELS] for spot in campaign.spots]
-    return np.array([[np.nan if value is None else value for value in row] for row in found])
+    rows = [[getattr(spot, prefix + name) for name in PIXELS] for spot in campaign.spots]
+    return np.array([[np.nan if value is None else value for value in row] for row in rows])
 
 
 def with_pixels(spot: Spot, pixels_px: np.ndarray) -> Spot:

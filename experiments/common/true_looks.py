@@ -78,17 +78,17 @@ class TrueLooks:
         result = {"classic": np.full_like(self.points_mm, np.nan)}
         azimuth = campaign.rig.aperture_convention == "azimuth"
         for name, simple in simple_calibrations(campaign.rig.priors, classic_of(campaign)).items():
-            found = assumed_geometry(simple, *self.counters_steps.T).points(np.array(self.readings), azimuth)
-            result[name] = found.T - self.points_mm
+            points = assumed_geometry(simple, *self.counters_steps.T).points(np.array(self.readings), azimuth)
+            result[name] = points.T - self.points_mm
         return result
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray, usable: np.ndarray, otherwise: float) -> np.ndarray:
     """d^T S^-1 d (points,) of errors (points, 3) under covariances (points, 3, 3); `otherwise` where unusable."""
-    found = np.full(len(error), otherwise)
+    distance = np.full(len(error), otherwise)
     inverse = np.linalg.inv(covariance[usable])
-    found[usable] = np.einsum("pi,pij,pj->p", error[usable], inverse, error[usable])
-    return found
+    distance[usable] = np.einsum("pi,pij,pj->p", error[usable], inverse, error[usable])
+    return distance
 
 
 def or_none(values: np.ndarray) -> list[float | None]:

@@ -22,21 +22,21 @@ OWN = ("spots.csv", "results")
 
 def listing(*places: Path) -> dict[str, str]:
     """Kind, target or hash of everything below."""
-    found = {}
+    state = {}
     for place in places:
         for folder, folders, files in os.walk(place):
             for name in (*folders, *files):
                 path = Path(folder) / name
                 mode = path.lstat().st_mode
                 if stat.S_ISLNK(mode):
-                    found[str(path)] = f"link to {path.readlink()}"
+                    state[str(path)] = f"link to {path.readlink()}"
                 elif stat.S_ISREG(mode):
                     # Sparse giants of the folder itself are told by their size.
                     large = path.stat().st_size > 5e7
-                    found[str(path)] = str(path.stat().st_size if large else hashlib.sha256(path.read_bytes()).digest())
+                    state[str(path)] = str(path.stat().st_size if large else hashlib.sha256(path.read_bytes()).digest())
                 else:
-                    found[str(path)] = str(stat.S_IFMT(mode))
-    return found
+                    state[str(path)] = str(stat.S_IFMT(mode))
+    return state
 
 
 def watched(arguments: list[str], place: Path, scratch: Path) -> dict[str, object]:

@@ -81,19 +81,19 @@ def worth_of_plan(
     knowledge: Knowledge, steps: Sequence[PlanStep], times: float = 1.0, quantity: str = "worst"
 ) -> Worth:
     """The same of a plan, taken `times` times over."""
-    found = information_of(steps, knowledge)
-    seen = found.expectation.seen
+    information = information_of(steps, knowledge)
+    visible = information.expectation.seen
     # A turn later is the same beam: the mean of the counters would be a pose half a turn away that nobody looked at.
-    angles = found.expectation.mirror_angles_rad[seen]
+    angles = information.expectation.mirror_angles_rad[visible]
     pose = np.array([np.mean((angles[:, 0] + np.pi) % (2 * np.pi) - np.pi), angles[:, 1].mean()])
-    return worth_of(knowledge, times * found.fisher, pose, round(times * seen.sum()), quantity)
+    return worth_of(knowledge, times * information.fisher, pose, round(times * visible.sum()), quantity)
 
 
-def searched_family(knowledge: Knowledge, found: Candidates | None = None, scope: Scope | None = None) -> Family:
+def searched_family(knowledge: Knowledge, pool: Candidates | None = None, scope: Scope | None = None) -> Family:
     """The planner's order of looks for the worst effective ratio, however small."""
-    found = candidates(knowledge) if found is None else found
-    seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
+    pool = candidates(knowledge) if pool is None else pool
+    looks = LookArrays(pool.looks, knowledge, False).at(knowledge.z, knowledge.space)
     target = structs.replace(parse_target(DEFAULT_TARGET), limit=UNREACHED)
-    pose = seen.mirror_angles_rad.mean(axis=0)
+    pose = looks.mirror_angles_rad.mean(axis=0)
     centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
-    return design_family(DesignProblem(knowledge, found, seen, target, centre), scope)
+    return design_family(DesignProblem(knowledge, pool, looks, target, centre), scope)

@@ -71,20 +71,20 @@ def sent(calibration: Calibration, rig: Rig, pan: int, tilt: int, sides: tuple[s
         (azimuth + 90 - prior["pan_zero_emission_deg"].value) / prior["degrees_per_step.pan"].value,
         elevation / prior["degrees_per_step.tilt"].value,
     )
-    found = []
-    for asked, back, m in zip((pan, tilt), (other.pan_steps, other.tilt_steps), nominal, strict=True):
-        middle, half = 0.5 * (asked + back), 0.5 * (asked - back)
-        found.append(round(m + factors[0] * (middle - m) + factors[1] * half))
-    return found[0], found[1]
+    steps = []
+    for ahead, back, m in zip((pan, tilt), (other.pan_steps, other.tilt_steps), nominal, strict=True):
+        middle, half = 0.5 * (ahead + back), 0.5 * (ahead - back)
+        steps.append(round(m + factors[0] * (middle - m) + factors[1] * half))
+    return steps[0], steps[1]
 
 
 def aimed(
     rig: Rig, truth: Truth, calibration: Calibration, factors=(1.0, 1.0), *, seed: int = 5, aims=AIMS, **options
 ) -> Campaign:
     """Looks of a rig whose moves say what was asked for."""
-    asked, sides = [aim[:2] for aim in aims], [aim[2] for aim in aims]
+    counters, sides = [aim[:2] for aim in aims], [aim[2] for aim in aims]
     run = simulate(rig, plan_of([sent(calibration, rig, *aim, factors) for aim in aims], sides, **options), seed, truth)
-    named = simulate(rig, plan_of(asked, sides, **options), seed, truth).campaign.moves
+    named = simulate(rig, plan_of(counters, sides, **options), seed, truth).campaign.moves
     return replace(run.campaign, moves=named)
 
 
@@ -102,20 +102,20 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     run, other = (simulate(rig, plan, each) for each in (seed, seed + 100_000))
     row: dict[str, object] = {"seed": seed}
     try:
-        found = fit(run.campaign)
-        calibration, verdicts = calibration_of(found), {}
+        joint = fit(run.campaign)
+        calibration, verdicts = calibration_of(joint), {}
         for k, world in enumerate(WORLDS):
             elsewhere = world == OTHER_MACHINE
             factors = (1.0, 1.0) if elsewhere else SCENARIOS[world][0]
             truth = other.truth if elsewhere else run.truth
             looks = aimed(rig, truth, calibration, factors, seed=1000 * seed + k)
-            said = verify_looks(found, calibration, looks, seed=seed)
-            points = said.millimetres
+            test = verify_looks(joint, calibration, looks, seed=seed)
+            points = test.millimetres
             assert points is not None
-            verdicts[world] = [said.verdict, said.world, said.worlds[said.world], said.p]
+            verdicts[world] = [test.verdict, test.world, test.worlds[test.world], test.p]
             if world == APPLIED:
                 row["mm"] = [points.before.rms, points.after.rms, points.promised95]
-                row["deg"] = [said.before.rms, said.after.rms, said.promised95]
+                row["deg"] = [test.before.rms, test.after.rms, test.promised95]
         row["verify"] = verdicts
     except TvsError as error:
         row["error"] = error.code
@@ -136,10 +136,10 @@ def table(arguments: argparse.Namespace) -> None:
     print("looks in each world.\n")
     print("| world | named, 95 % sure | KEPT | BROKEN | CANNOT TELL |\n|---|---|---|---|---|")
     for world in WORLDS:
-        told = [row["verify"][world] for row in good]
-        named = sum(own[1] == world and own[2] >= 0.95 for own in told)
-        counts = " | ".join(str(sum(own[0] == verdict for own in told)) for verdict in (KEPT, BROKEN, CANNOT_TELL))
-        print(f"| {world} | {named} of {len(told)} | {counts} |")
+        runs = [row["verify"][world] for row in good]
+        named = sum(run[1] == world and run[2] >= 0.95 for run in runs)
+        counts = " | ".join(str(sum(run[0] == verdict for run in runs)) for verdict in (KEPT, BROKEN, CANNOT_TELL))
+        print(f"| {world} | {named} of {len(runs)} | {counts} |")
     print("\nApplied, medians over rigs:\n")
     print("| | RMS before | RMS after | promised, 95 % |\n|---|---|---|---|")
     for key, unit in (("deg", "mirror angles, deg"), ("mm", "points at 1 m, mm")):

@@ -59,11 +59,11 @@ def true_axis(seed: int) -> AxisTruth:
 
 def driven(truth: AxisTruth, applied: Correction, factors: tuple[float, float], count: int, rng) -> AxisCampaign:  # type: ignore[no-untyped-def]
     """Fresh readings of an axis that is homed again and driven with a table."""
-    asked, which = fresh_moves(count, TRAVEL, rng)
-    sent = applied.moved(asked, *factors)
+    plan, which = fresh_moves(count, TRAVEL, rng)
+    sent = applied.moved(plan, *factors)
     # Before them a segment that is not read: the homing is one more.
     moves = (AxisMove(0, 0, 0.0, 0.0, "forward"), *(replace(m, move=m.move + 1, segment=1) for m in sent))
-    return read(asked, stands(truth, moves, rng)[1:], which, rng, u=READ_U)
+    return read(plan, stands(truth, moves, rng)[1:], which, rng, u=READ_U)
 
 
 def one_axis(task: tuple[int]) -> dict[str, object]:
@@ -80,21 +80,21 @@ def one_axis(task: tuple[int]) -> dict[str, object]:
         compensations = {name: compensation_of(results, wish, seed=seed) for name, wish in WISHES.items()}
     except TvsError as error:
         return {**row, "error": error.code, "seconds": time.perf_counter() - began}
-    for name, made in compensations.items():
-        applied = Correction.of(made)
+    for name, table in compensations.items():
+        applied = Correction.of(table)
         new = driven(truth, applied, (1.0, 1.0), 2 * PROMISED, rng)
         at = {m.move: m for m in new.moves}
         kept: dict[str, list[bool]] = {"forward": [], "backward": []}
         errors = np.array(
-            [float(r.value or 0) - made.offset - made.per_command * at[r.move].command for r in new.readings]
+            [float(r.value or 0) - table.offset - table.per_command * at[r.move].command for r in new.readings]
         )
-        errors = errors - errors.mean() if made.zero_free else errors
+        errors = errors - errors.mean() if table.zero_free else errors
         for reading, error in zip(new.readings, errors, strict=True):
             rising = at[reading.move].command > at[reading.move - 1].command
             side = "forward" if rising else "backward"
-            kept[side].append(bool(abs(error) <= made.promise[side].error95))
+            kept[side].append(bool(abs(error) <= table.promise[side].error95))
         row[name] = {"kept": kept, "rms": float(np.sqrt(np.mean(errors**2)))}
-        row[name] |= {side: made.promise[side].error95 for side in kept}  # type: ignore[operator]
+        row[name] |= {side: table.promise[side].error95 for side in kept}  # type: ignore[operator]
         if name != "csv":
             continue
         verdicts = {}
@@ -103,8 +103,8 @@ def one_axis(task: tuple[int]) -> dict[str, object]:
             factors = (1.0, 1.0) if other else SCENARIOS[world][0]
             with_ = true_axis(seed + 100_000) if other else truth
             fresh = driven(with_, applied, factors, VERIFIED, rng)
-            found = verify_readings(results.fit, made, fresh, seed=seed)
-            verdicts[world] = [found.verdict, found.world, found.worlds[found.world], found.p]
+            check = verify_readings(results.fit, table, fresh, seed=seed)
+            verdicts[world] = [check.verdict, check.world, check.worlds[check.world], check.p]
             if world == APPLIED:
                 which = [r.move for r in fresh.readings]
                 u = np.full(len(which), READ_U)
@@ -148,18 +148,18 @@ def table(arguments: argparse.Namespace) -> None:
     worlds_table([r["csv"]["verify"] for r in good])
 
 
-def worlds_table(found: list[dict]) -> None:
+def worlds_table(tests: list[dict]) -> None:
     """What `verify` said in each world, on axes whose table is large enough to be seen, and on the others."""
     print("| world | where it can be told | named | KEPT | BROKEN | CANNOT TELL |\n|---|---|---|---|---|---|")
-    for where, told in (("yes", True), ("no", False)):
-        rows = [v for v in found if (v["distance"] >= TELLING) == told]
+    for where, far in (("yes", True), ("no", False)):
+        rows = [v for v in tests if (v["distance"] >= TELLING) == far]
         for world in WORLDS:
             named = sum(v[world][1] == world and v[world][2] >= 0.95 for v in rows)
             counts = [sum(v[world][0] == verdict for v in rows) for verdict in (KEPT, BROKEN, "CANNOT TELL")]
             print(f"| {world} | {where} | {share(named, len(rows))} | " + " | ".join(map(str, counts)) + " |")
-    broken = sum(v[APPLIED][0] == BROKEN for v in found)
-    _, high = binomial_bounds(len(found), 0.01)
-    print(f"\nFalse BROKEN: {share(broken, len(found))}; up to {100 * high:.1f} % would be usual at 1 %.")
+    broken = sum(v[APPLIED][0] == BROKEN for v in tests)
+    _, high = binomial_bounds(len(tests), 0.01)
+    print(f"\nFalse BROKEN: {share(broken, len(tests))}; up to {100 * high:.1f} % would be usual at 1 %.")
 
 
 def main() -> None:

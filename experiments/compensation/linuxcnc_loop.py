@@ -189,22 +189,22 @@ def main() -> None:
     moves, which = up_and_down(TRAVEL, 9, 2)
     before = loop.campaign(moves, which)
     results = results_for(before, seed=SEED)
-    made = compensation_of(results, Wish("linuxcnc"), seed=SEED)
-    table = file_text(made, before)
+    comp = compensation_of(results, Wish("linuxcnc"), seed=SEED)
+    table = file_text(comp, before)
     play = float(results.summary.parameters["backlash"].value)
-    turned = file_text(structs.replace(made, table=tuple(_turned(row) for row in made.table)), before)
+    turned = file_text(structs.replace(comp, table=tuple(_turned(row) for row in comp.table)), before)
     print("# A table in LinuxCNC, applied and verified\n")
     print(
         "By `experiments.compensation.linuxcnc_loop`; LinuxCNC of the Debian package `linuxcnc-uspace`. The drawn axis"
     )
     print(f"has a play of {loop.truth.parameters['backlash']:.3f} deg; the fit found {play:.3f} deg.\n")
-    left = {side: promise.error95 for side, promise in made.promise.items()}
+    left = {side: promise.error95 for side, promise in comp.promise.items()}
     print(f"Promised: 95 % of errors at most {left['forward']:.4f} deg forward, {left['backward']:.4f} deg backward.\n")
     print(
         "| INI file | verdict | world | its probability | p | expected without, RMS deg | read, RMS deg | worst deg |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    twice = Correction.of(made)
+    twice = Correction.of(comp)
     for name, text, backlash, host in (
         ("the table", table, 0.0, None),
         ("no table", "", 0.0, None),
@@ -213,10 +213,10 @@ def main() -> None:
         ("the table, and `BACKLASH`", table, play, None),
         ("`BACKLASH` alone", "", play, None),
     ):
-        asked, which = fresh_moves(12, TRAVEL, loop.rng)
-        found = verify_readings(results.fit, made, loop.campaign(asked, which, text, backlash, host), seed=SEED)
-        cells = [name, found.verdict, found.world, f"{found.worlds[found.world]:.3f}", f"{found.p:.2g}"]
-        cells += [f"{value:.4f}" for value in (found.before.rms, found.after.rms, found.after.worst)]
+        plan, which = fresh_moves(12, TRAVEL, loop.rng)
+        check = verify_readings(results.fit, comp, loop.campaign(plan, which, text, backlash, host), seed=SEED)
+        cells = [name, check.verdict, check.world, f"{check.worlds[check.world]:.3f}", f"{check.p:.2g}"]
+        cells += [f"{value:.4f}" for value in (check.before.rms, check.after.rms, check.after.worst)]
         print("| " + " | ".join(cells) + " |", flush=True)
     path = [5.0, 20.0, 10.0, -5.0, 10.0]
     same = motor_positions(path, table, play) == motor_positions(path, table)

@@ -44,21 +44,21 @@ def template(seed: int) -> AxisCampaign:
         "transmission_error": AxisPrior(0.0, 5.0),
         "reading_scale": AxisPrior(1.0, 0.0),
     }
-    asked = WavePeriods((), ((60.0, 600.0),), True)
-    return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, asked)
+    periods = WavePeriods((), ((60.0, 600.0),), True)
+    return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, periods)
 
 
-def errors_of(made: SimulatedAxis, table: Compensation | None, span: float, seed: int) -> np.ndarray:
+def errors_of(axis: SimulatedAxis, table: Compensation | None, span: float, seed: int) -> np.ndarray:
     """Errors (40,) within one span of commands, under a table or without one."""
-    rng, campaign = np.random.default_rng([seed, 6]), made.campaign
+    rng, campaign = np.random.default_rng([seed, 6]), axis.campaign
     rate, move = float(campaign.rate or 1.0), campaign.moves[0]
     first, last = (float(f([r.time_s for r in campaign.readings])) for f in (np.min, np.max))
     begins = rng.uniform(first, max(first, last - span / rate))
     time_s = np.sort(rng.uniform(begins, begins + span / rate, READINGS))
     command = rate * time_s
-    true = made.truth.parameters
+    true = axis.truth.parameters
     # The walk up to the span is a shift: it begins with the span, creep and waves keep their own clocks.
-    still = replace(made.truth, parameters={**true, "drift_per_root_hour": 0.0, "seeing_scale": 0.0})
+    still = replace(axis.truth, parameters={**true, "drift_per_root_hour": 0.0, "seeing_scale": 0.0})
     stands = drive_of(still, move, rate, time_s, rng) - true["per_command"] * command
     walk = np.cumsum(
         true["drift_per_root_hour"] * np.sqrt(np.diff(time_s, prepend=begins) / 3600.0) * rng.standard_normal(READINGS)
@@ -75,14 +75,14 @@ def errors_of(made: SimulatedAxis, table: Compensation | None, span: float, seed
 def one_drive(task: tuple[int]) -> dict[str, object]:
     """Draw, read, fit and compensate one drive."""
     (seed,) = task
-    made = simulate_axis(template(seed), seed=seed)
-    row: dict[str, object] = {"seed": seed, "commit": commit(), "there": any(w.amplitude > 0 for w in made.truth.waves)}
+    axis = simulate_axis(template(seed), seed=seed)
+    row: dict[str, object] = {"seed": seed, "commit": commit(), "there": any(w.amplitude > 0 for w in axis.truth.waves)}
     try:
-        table = compensation_of(results_for(made.campaign, seed=seed), Wish("pec"), seed=seed)
+        table = compensation_of(results_for(axis.campaign, seed=seed), Wish("pec"), seed=seed)
     except TvsError as error:
         return {**row, "refused": error.message}
     promise, span = table.promise["forward"], table.travel_command
-    after, before = (errors_of(made, by, span, seed) for by in (table, None))
+    after, before = (errors_of(axis, by, span, seed) for by in (table, None))
     row |= {"promised": promise.error95, "inside": int(np.sum(np.abs(after) <= promise.error95))}
     row |= {"without_promised": promise.without95, "without": int(np.sum(np.abs(before) <= promise.without95))}
     return {**row, "rms": [float(np.sqrt(np.mean(e**2))) for e in (before, after)]}
@@ -96,24 +96,24 @@ def run(arguments: argparse.Namespace) -> None:
 def table(arguments: argparse.Namespace) -> None:
     """The page."""
     rows = read_rows(arguments.rows)
-    made = [row for row in rows if "promised" in row]
+    done = [row for row in rows if "promised" in row]
     there = [row for row in rows if row["there"]]
     print("# Tables of one period, of drives at constant rate\n")
     made_by = "python -m experiments.compensation.periodic_drives"
     print(f"Made by `{made_by}`, commit {commits_of(rows)}. Errors in arcsec.\n")
-    kept = sum(row["there"] for row in made)
+    kept = sum(row["there"] for row in done)
     print(
-        f"{len(rows)} drives, {len(there)} with a wave: {kept} of these got a table, {len(made) - kept} of the others."
+        f"{len(rows)} drives, {len(there)} with a wave: {kept} of these got a table, {len(done) - kept} of the others."
     )
-    low, high = (100 * bound for bound in binomial_bounds(len(made), 0.95))
-    print(f"Bounds of a share over {len(made)} independent readings: {low:.0f} to {high:.0f} %; the {READINGS}")
+    low, high = (100 * bound for bound in binomial_bounds(len(done), 0.95))
+    print(f"Bounds of a share over {len(done)} independent readings: {low:.0f} to {high:.0f} %; the {READINGS}")
     print("readings of a drive share its wave and walk.\n")
     print("| | without | with the table |\n|---|---|---|")
-    cells = [f"{100 * sum(row[k] for row in made) / (READINGS * len(made)):.1f} %" for k in ("without", "inside")]
+    cells = [f"{100 * sum(row[k] for row in done) / (READINGS * len(done)):.1f} %" for k in ("without", "inside")]
     print(f"| within the promise | {' | '.join(cells)} |")
-    rms = np.array([row["rms"] for row in made])
+    rms = np.array([row["rms"] for row in done])
     print(f"| median RMS | {np.median(rms[:, 0]):.2f} | {np.median(rms[:, 1]):.2f} |")
-    print(f"| drives with less error | | {int(np.sum(rms[:, 1] < rms[:, 0]))} of {len(made)} |")
+    print(f"| drives with less error | | {int(np.sum(rms[:, 1] < rms[:, 0]))} of {len(done)} |")
 
 
 if __name__ == "__main__":

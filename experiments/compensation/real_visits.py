@@ -88,13 +88,13 @@ def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> LeftO
     others = tuple(r for r, gone in zip(campaign.readings, out, strict=True) if not gone)
     known = replace(campaign, readings=others, stated={**campaign.stated, "home_sd": AxisPrior(0.0, 0.0)})
     results = results_for(known)
-    made = compensation_of(results, Wish(per_command=1.0))
+    compensation = compensation_of(results, Wish(per_command=1.0))
     error = value - command
     line = np.column_stack([np.ones(len(error)), side])
     solved = np.linalg.lstsq(line[~out], error[~out], rcond=None)[0]
-    columns = np.array([(row.command, row.forward, row.backward) for row in made.table]).T
+    columns = np.array([(row.command, row.forward, row.backward) for row in compensation.table]).T
     expected = np.where(side > 0, *(np.interp(command, columns[0], column) for column in columns[1:]))
-    promised = np.where(side > 0, *(made.promise[name].error95 for name in ("forward", "backward")))
+    promised = np.where(side > 0, *(compensation.promise[name].error95 for name in ("forward", "backward")))
     means = [error[(command == c) & (side == s) & ~out].mean() for c, s in zip(command[out], side[out], strict=True)]
     return LeftOut(
         before=(error - error[~out].mean())[out],
@@ -131,10 +131,10 @@ def row_of(name: str, unit: str, campaign: AxisCampaign, visits: Sequence[int]) 
 
 def main() -> None:
     """Print the page."""
-    made = parser(__doc__)
-    made.add_argument("axes", type=Path)
-    made.add_argument("rotary", type=Path)
-    arguments = made.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("axes", type=Path)
+    cli.add_argument("rotary", type=Path)
+    arguments = cli.parse_args()
     print("# Real axes: the table of the others, applied to the visit left out\n")
     print(
         "By `experiments.compensation.real_visits`. RMS of the errors of readings left out; promised: 95 %, median.\n"

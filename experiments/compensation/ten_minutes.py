@@ -52,11 +52,11 @@ class Stage:
         self.truth = draw_axis(grid, TRUE, 1.001, TRAVEL, self.rng)
 
     def log(
-        self, asked: tuple[AxisMove, ...], which: list[int], by: Correction | None = None, sign: float = 1.0
+        self, moves: tuple[AxisMove, ...], which: list[int], by: Correction | None = None, sign: float = 1.0
     ) -> bytes:
         """What is logged of moves under a table."""
-        sent = asked if by is None else by.moved(asked, sign, sign)
-        return log_bytes(read(asked, stands(self.truth, tuple(sent), self.rng), which, self.rng, u=U))
+        sent = moves if by is None else by.moved(moves, sign, sign)
+        return log_bytes(read(moves, stands(self.truth, tuple(sent), self.rng), which, self.rng, u=U))
 
 
 def main() -> None:
@@ -77,9 +77,9 @@ def main() -> None:
         print(FRESH)
         print(console("plan", "stage", "--verify", "-o", "plan.csv"))
         by = Correction.of(stored_compensation(read_axis(Path("stage"))))
-        asked, which = fresh_moves(12, TRAVEL, stage.rng)
-        Path("fresh.csv").write_bytes(stage.log(asked, which, by))
-        Path("turned.csv").write_bytes(stage.log(asked, which, by, -1.0))
+        moves, which = fresh_moves(12, TRAVEL, stage.rng)
+        Path("fresh.csv").write_bytes(stage.log(moves, which, by))
+        Path("turned.csv").write_bytes(stage.log(moves, which, by, -1.0))
         print(VERIFY)
         print(console("import", "fresh.csv", "--axis", "--to", "fresh", "--yes"))
         print(console("verify", "stage", "fresh"))

@@ -51,11 +51,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """The command line."""
-    made = parser(__doc__)
-    made.add_argument("action", choices=("run",))
-    made.add_argument("--seconds", type=int, default=600, help="how long (%(default)s)")
-    made.add_argument("--seed", type=int, default=1, help="of the first input (%(default)s)")
-    act(made, run=run)
+    cli = parser(__doc__)
+    cli.add_argument("action", choices=("run",))
+    cli.add_argument("--seconds", type=int, default=600, help="how long (%(default)s)")
+    cli.add_argument("--seed", type=int, default=1, help="of the first input (%(default)s)")
+    act(cli, run=run)
 
 
 if __name__ == "__main__":

@@ -107,11 +107,11 @@ class Observer:
             while board.laser_pin() and time.monotonic() - start < DARK_S:
                 time.sleep(0.002)
             self.dark_s = time.monotonic() - start
-        seen = TwinObserver(self.instrument, self.sd_px).observe(positioner, spot)
+        observation = TwinObserver(self.instrument, self.sd_px).observe(positioner, spot)
         if number == AT_LOOK and self.fault.order and not self.fault.lit:
             self.timer = threading.Timer(IN_MOTION_S, board.order, [self.fault.order])
             self.timer.start()
-        return seen
+        return observation
 
 
 def plan() -> list[PlanStep]:
@@ -142,11 +142,11 @@ def run_one(fault: Fault, folder: Path) -> dict:
         observer = Observer(instrument, rig.spot_sd_px, fault)
         operator, journal = SimulatedOperator(instrument), begin(folder, rig, steps, False, header)
         bench = Bench(positioner, observer, operator, instrument.clock, lambda: SIMULATED_START)
-        said, message = "", ""
+        reason, message = "", ""
         try:
-            said = Acquisition(rig, steps, journal, bench, stop=StopKey()).run().reason
+            reason = Acquisition(rig, steps, journal, bench, stop=StopKey()).run().reason
         except DeviceFault as error:
-            said, message = error.code, str(error)
+            reason, message = error.code, str(error)
         finally:
             positioner.close()
             journal.close()
@@ -158,7 +158,7 @@ def run_one(fault: Fault, folder: Path) -> dict:
     statuses = [spot.status for spot in spots]
     counts = {status: statuses.count(status) for status in dict.fromkeys(statuses)}
     return {
-        "said": said,
+        "said": reason,
         "message": message,
         "dark_s": observer.dark_s,
         "pin_at_end": pin,
@@ -206,9 +206,9 @@ def table(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """The command line."""
-    made = parser(__doc__)
-    made.add_argument("action", choices=("run", "table"))
-    act(made, run=run, table=table)
+    cli = parser(__doc__)
+    cli.add_argument("action", choices=("run", "table"))
+    act(cli, run=run, table=table)
 
 
 if __name__ == "__main__":

@@ -124,16 +124,16 @@ def build(program: Path, mutant: Mutant | None) -> bool:
 
 def run(arguments: argparse.Namespace) -> None:
     """Transcripts of the core as it is, then of every fault."""
-    made = module_of_tests("support.firmware_sessions")
+    tests = module_of_tests("support.firmware_sessions")
     ROWS.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "replay.elf"
         assert build(program, None)
         lines, sessions, start, theirs_s = 0, {}, time.monotonic(), 0.0
         for seed in range(FIRST_SEED, FIRST_SEED + 1000):
-            orders = made.random_orders(seed)
-            ours, before = made.Bench().run(orders), time.monotonic()
-            theirs = made.replay_on_processor(program, orders)
+            orders = tests.random_orders(seed)
+            ours, before = tests.Bench().run(orders), time.monotonic()
+            theirs = tests.replay_on_processor(program, orders)
             theirs_s += time.monotonic() - before
             assert theirs == ours, f"seed {seed}"
             lines, sessions[seed] = lines + len(ours), (orders, ours)
@@ -144,13 +144,13 @@ def run(arguments: argparse.Namespace) -> None:
         print(whole, flush=True)
         for mutant in MUTANTS:
             assert build(program, mutant), mutant.name
-            seen = 0
+            session = 0
             for number, (orders, ours) in enumerate(list(sessions.values())[:SESSIONS], 1):
-                if made.replay_on_processor(program, orders) != ours:
-                    seen = number
+                if tests.replay_on_processor(program, orders) != ours:
+                    session = number
                     break
-            append_row(ROWS, {"mutant": mutant.name, "seen_in_session": seen})
-            print(mutant.name, seen, flush=True)
+            append_row(ROWS, {"mutant": mutant.name, "seen_in_session": session})
+            print(mutant.name, session, flush=True)
 
 
 def table(arguments: argparse.Namespace) -> None:
@@ -172,9 +172,9 @@ def table(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """The command line."""
-    made = parser(__doc__)
-    made.add_argument("action", choices=("run", "table"))
-    act(made, run=run, table=table)
+    cli = parser(__doc__)
+    cli.add_argument("action", choices=("run", "table"))
+    act(cli, run=run, table=table)
 
 
 if __name__ == "__main__":

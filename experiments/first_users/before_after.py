@@ -103,7 +103,7 @@ class Scratch:
         for name, text in (("seen.py", SEEN), ("phone.py", PHONE), ("chain.py", CHAIN), ("two.csv", TWO_LOOKS)):
             (place / name).write_text(text)
 
-    def told(self, command: str) -> str:
+    def printed(self, command: str) -> str:
         """What a command prints, and its exit code where that is not 0."""
         done = subprocess.run(
             ["bash", "-c", command],
@@ -140,7 +140,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def of_trial(scratch: Scratch, defects: Sequence[Defect]) -> str:
     """The table of one trial."""
-    rows = [(str(d.number), d.what, code(d.command), cell(d.before), cell(scratch.told(d.command))) for d in defects]
+    rows = [(str(d.number), d.what, code(d.command), cell(d.before), cell(scratch.printed(d.command))) for d in defects]
     return table(("", "defect", "command", "before", "now"), rows)
 
 
@@ -155,7 +155,7 @@ def of_wrong_inputs(scratch: Scratch) -> str:
         shutil.copytree(shipped_data() / "twins" / "paper_twin", scratch.place / "mine")
         wrong.spoil(scratch.place / "mine")
         command = "tvsbayes " + wrong.command.replace("CAMPAIGN", "mine").replace("DATA", "data")
-        now = scratch.told(f"{command} 2>&1 | grep -a 'error\\|warning\\|what to do\\|written\\|next' | head -3")
+        now = scratch.printed(f"{command} 2>&1 | grep -a 'error\\|warning\\|what to do\\|written\\|next' | head -3")
         rows.append((name, code(command), cell(before.get(name, "as now")), cell(now)))
     return table(("mistake", "command", "before", "now"), rows)
 
@@ -168,7 +168,7 @@ def prepared(scratch: Scratch) -> None:
         "tvsbayes report trial --pdf",
         "tvsbayes simulate data/rigs/mounted/rig.toml two.csv seen --frames",
     ):
-        scratch.told(command)
+        scratch.printed(command)
     (scratch.place / "pairs").mkdir()
     for picture in sorted((scratch.place / "seen" / "frames").iterdir()):
         number, side = picture.stem.split("_")

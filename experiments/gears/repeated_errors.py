@@ -80,18 +80,18 @@ def looks_at(simulated: SimulatedCampaign, range_steps: np.ndarray, seed: int) -
 def located(calibration, looks: TrueLooks, seed: int) -> dict[str, object]:
     """Errors of located points in their sds, and how many coordinates lie in their 95 % intervals."""
     counters = looks.counters_steps
-    found = locate(calibration, counters[:, 0], counters[:, 1], looks.readings, looks.sides, seed=seed)
-    z = (found.xyz_mm - looks.points_mm) / np.sqrt(np.einsum("pii->pi", found.covariance_mm2))
-    held = np.abs(looks.points_mm - found.interval95_mm.mean(axis=1)) <= found.u95_mm
+    points = locate(calibration, counters[:, 0], counters[:, 1], looks.readings, looks.sides, seed=seed)
+    z = (points.xyz_mm - looks.points_mm) / np.sqrt(np.einsum("pii->pi", points.covariance_mm2))
+    held = np.abs(looks.points_mm - points.interval95_mm.mean(axis=1)) <= points.u95_mm
     result = {}
     for k, place in enumerate(PLACES):
-        own = slice(k * WITHIN, (k + 1) * WITHIN)
-        good = np.array([refused is None for refused in found.refused])[own]
+        part = slice(k * WITHIN, (k + 1) * WITHIN)
+        good = np.array([refused is None for refused in points.refused])[part]
         result[place] = {
             "points": int(good.sum()),
-            "z2": float(np.sum(z[own][good] ** 2)),
-            "held": int(np.sum(held[own][good])),
-            "u95_mm": float(np.median(found.u95_mm[own][good])) if good.any() else None,
+            "z2": float(np.sum(z[part][good] ** 2)),
+            "held": int(np.sum(held[part][good])),
+            "u95_mm": float(np.median(points.u95_mm[part][good])) if good.any() else None,
         }
     return result
 
@@ -111,13 +111,13 @@ def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
             result = fit(simulated.campaign, model=choice)
             true = true_headlines(simulated.truth, simulated.campaign, result.reference_pose_rad)
             posterior = sample(result, "importance", seed=seed)
-            told = posterior.convergence.importance
+            weights = posterior.convergence.importance
             calibration = calibration_of(result, posterior if posterior.converged else None, seed=seed)
             row[name] = {
                 "converged": bool(result.converged),
-                "accepted": bool(told.pareto_k < K_MAX),
-                "pareto_k": told.pareto_k,
-                "least_ess": told.least_ess.value,
+                "accepted": bool(weights.pareto_k < K_MAX),
+                "pareto_k": weights.pareto_k,
+                "least_ess": weights.least_ess.value,
                 "shift_named": any("zero" in w.text for w in weak_directions(result, moved_directions(result))),
                 "headlines": judged(posterior.draws, None, result.prior_draws, true, posterior.weights),
                 "points": located(calibration, looks_at(simulated, calibration.range_steps, seed), seed),
@@ -133,24 +133,24 @@ def accepted(rows: list[dict], name: str) -> list[dict]:
     return [row[name] for row in rows if name in row and row[name]["converged"] and row[name]["accepted"]]
 
 
-def _headlines(found: dict[str, list[dict]]) -> None:
+def _headlines(entries_of: dict[str, list[dict]]) -> None:
     """Both models' headlines."""
     print(f"| quantity | gears | RMS z | {level_titles()} | verdict |\n|" + "---|" * (len(LEVELS) + 4))
-    for name, entries in found.items():
+    for name, entries in entries_of.items():
         count = len(entries)
         print(f"| bounds at 1e-4, N = {count} | {name} | {rms_limits(count)} | {level_limits(count)} | |")
     for quantity in HEADLINES:
-        for name, entries in found.items():
-            said = verdict([entry["headlines"][quantity] for entry in entries])
-            print(f"| {quantity} | {name} | {' | '.join(said.cells)} | {said.word} |")
+        for name, entries in entries_of.items():
+            judged = verdict([entry["headlines"][quantity] for entry in entries])
+            print(f"| {quantity} | {name} | {' | '.join(judged.cells)} | {judged.word} |")
     print()
 
 
-def _points(found: dict[str, list[dict]]) -> None:
+def _points(entries_of: dict[str, list[dict]]) -> None:
     """Both models' points."""
     print("| counters | gears | points | RMS z | 95 % interval holds, % | median U95, mm |\n|---|---|---|---|---|---|")
     for place in PLACES:
-        for name, entries in found.items():
+        for name, entries in entries_of.items():
             parts = [entry["points"][place] for entry in entries]
             count = sum(part["points"] for part in parts)
             if not count:
@@ -162,9 +162,9 @@ def _points(found: dict[str, list[dict]]) -> None:
     print()
 
 
-def _effort(found: dict[str, list[dict]]) -> None:
+def _effort(entries_of: dict[str, list[dict]]) -> None:
     """Processor time and Pareto k."""
-    for name, entries in found.items():
+    for name, entries in entries_of.items():
         cpu, k = ([entry[key] for entry in entries] for key in ("cpu_s", "pareto_k"))
         named = np.mean([entry.get("shift_named", False) for entry in entries])
         print(
@@ -176,7 +176,7 @@ def _effort(found: dict[str, list[dict]]) -> None:
 
 def cases(rows: list[dict]) -> dict[str, dict[str, list[dict]]]:
     """What each model says in every world and protocol that has rigs, by title."""
-    found = {}
+    by_case = {}
     for world, size_deg in (("priors", 0.0), *WORLDS):
         for protocol in PROTOCOLS:
             chosen = [r for r in rows if (r["world"], r["size_deg"], r["protocol"]) == (world, size_deg, protocol)]
@@ -184,24 +184,24 @@ def cases(rows: list[dict]) -> dict[str, dict[str, list[dict]]]:
             for name in MODELS:
                 if entries := accepted(chosen, name):
                     tried = sum(name in row for row in chosen)
-                    told = found.setdefault(f"{world}{size}; {protocol}", {})
-                    told[name] = entries
-                    told.setdefault("tried", []).append(f"{len(entries)} of {tried} accepted with {name} gears")
-    return found
+                    case = by_case.setdefault(f"{world}{size}; {protocol}", {})
+                    case[name] = entries
+                    case.setdefault("tried", []).append(f"{len(entries)} of {tried} accepted with {name} gears")
+    return by_case
 
 
-def _overview(found: dict[str, dict[str, list[dict]]]) -> None:
+def _overview(by_case: dict[str, dict[str, list[dict]]]) -> None:
     """A line a case: the headline whose errors are farthest from their sds, and the points."""
     titles = "headlines farthest from RMS z 1", "outside the bounds", "points inside", "points outside"
     print(f"| world; protocol | gears | rigs | {' | '.join(titles)} |\n|" + "---|" * 7)
-    for title, case in found.items():
+    for title, case in by_case.items():
         for name in MODELS:
             if name not in case:
                 continue
-            said = {q: verdict([entry["headlines"][q] for entry in case[name]]) for q in HEADLINES}
+            judged = {q: verdict([entry["headlines"][q] for entry in case[name]]) for q in HEADLINES}
             rms = {q: float(np.sqrt(np.mean([e["headlines"][q]["z"] ** 2 for e in case[name]]))) for q in HEADLINES}
             worst = max(rms, key=lambda q: abs(np.log(rms[q])))
-            outside = ", ".join(q for q, v in said.items() if v.word == "OUTSIDE") or "none"
+            outside = ", ".join(q for q, v in judged.items() if v.word == "OUTSIDE") or "none"
             points = [np.array([[e["points"][p]["z2"], e["points"][p]["points"]] for e in case[name]]) for p in PLACES]
             of_points = (f"{np.sqrt(z2 / (3 * n)):.2f}" for z2, n in (part.sum(axis=0) for part in points))
             cells = f"{rms[worst]:.2f} ({worst}) | {outside} | {' | '.join(of_points)}"
@@ -211,11 +211,11 @@ def _overview(found: dict[str, dict[str, list[dict]]]) -> None:
 
 def table(arguments: argparse.Namespace) -> None:
     """The study's page."""
-    found = cases(read_rows(arguments.rows))
+    by_case = cases(read_rows(arguments.rows))
     print("# Gears that repeat their errors\n")
     print("Written by `python -m experiments.gears.repeated_errors table`; what was done stands in the script.\n")
-    _overview(found)
-    for title, case in found.items():
+    _overview(by_case)
+    for title, case in by_case.items():
         print(f"## {title}: {', '.join(case.pop('tried'))}\n")
         _headlines(case)
         _points(case)

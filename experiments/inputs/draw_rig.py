@@ -76,9 +76,9 @@ def beam_to_sheet(pan_deg: float, tilt_deg: float, sheet_mm: float) -> np.ndarra
 def arrow(axes: Axes, start: np.ndarray, end: np.ndarray, colour: str, width: float = 1.8) -> None:
     """A straight arrow between page points."""
     style = patches.ArrowStyle("-|>", head_length=0.5, head_width=0.22)
-    made = patches.FancyArrowPatch(start, end, arrowstyle=style, mutation_scale=13, shrinkA=0, shrinkB=0)
-    made.set(color=colour, linewidth=width, zorder=6, joinstyle="miter")
-    axes.add_patch(made)
+    patch = patches.FancyArrowPatch(start, end, arrowstyle=style, mutation_scale=13, shrinkA=0, shrinkB=0)
+    patch.set(color=colour, linewidth=width, zorder=6, joinstyle="miter")
+    axes.add_patch(patch)
 
 
 def curved(axes: Axes, page: np.ndarray, colour: str) -> None:

@@ -25,7 +25,7 @@ GROWTH = (
 
 def schemas() -> dict[str, dict[str, Any]]:
     """Every schema by the name of its document and version."""
-    found = {
+    documents = {
         "fit-1": ("results/fit.json of a campaign, tvsbayes-fit/1", fit_schema()),
         "axis-fit-1": ("results/fit.json of an axis folder, tvsbayes-axis-fit/1", axis_fit_schema()),
         "watch-1": ("watch --json", schema_of(Watch)),
@@ -44,7 +44,7 @@ def schemas() -> dict[str, dict[str, Any]]:
             "description": GROWTH,
             **schema,
         }
-        for name, (title, schema) in found.items()
+        for name, (title, schema) in documents.items()
     }
 
 

@@ -42,10 +42,10 @@ def rows_of(table: Path) -> list[dict[str, str]]:
 
 def looks() -> str:
     """Counters and centres of a twin in one sheet, as a spreadsheet with decimal commas saves it."""
-    seen = {row["move"]: row for row in rows_of(TWIN / "spots.csv")}
+    spots = {row["move"]: row for row in rows_of(TWIN / "spots.csv")}
     lines = ["Pan (steps);Tilt (steps);Sheet;x left;y left;x right;y right"]
     for row in rows_of(TWIN / "moves.csv"):
-        spot = seen.get(row["move"])
+        spot = spots.get(row["move"])
         pixels = [spot[f"{axis}_{side}_px"] for side in ("left", "right") for axis in "uv"] if spot else []
         cells = [spot["target"], *(f"{float(cell):.2f}".replace(".", ",") for cell in pixels)] if spot else [""] * 5
         lines.append(";".join([row["pan_steps"], row["tilt_steps"], *cells]))
@@ -147,10 +147,10 @@ def sightings() -> None:
             plan.look()
         write_plan(plan.steps, Path("plan.csv"), SIGHTING_HEAD)
         quietly("simulate", "nominal/rig.toml", "plan.csv", name, "--seed", str(SEED))
-    seen = {row["move"]: row for row in rows_of(Path("measured/sightings.csv"))}
+    rows = {row["move"]: row for row in rows_of(Path("measured/sightings.csv"))}
     lines = ["time_s,pan_steps,tilt_steps,azimuth_deg,elevation_deg,u_deg"]
     for row in rows_of(Path("measured/moves.csv")):
-        sighting = seen.get(row["move"], {})
+        sighting = rows.get(row["move"], {})
         cells = [row[name] for name in ("time_s", "pan_steps", "tilt_steps")]
         lines.append(
             ",".join([*cells, *(sighting.get(name, "") for name in ("azimuth_deg", "elevation_deg", "u_deg"))])

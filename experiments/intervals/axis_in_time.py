@@ -58,13 +58,13 @@ def template(protocol: str, seed: int) -> AxisCampaign:
             "transmission_error": AxisPrior(0.0, 5.0),
             "reading_scale": AxisPrior(1.0, 0.0),
         }
-        asked = WavePeriods((), ((60.0, 600.0),), True)
-        return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": 15.0}, asked)
+        periods = WavePeriods((), ((60.0, 600.0),), True)
+        return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": 15.0}, periods)
     stated = {"per_command": AxisPrior(0.01, 0.002)}
     if protocol == "stops":
         places = np.sort(rng.choice(np.arange(-2000.0, 2001.0, 10.0), 24, replace=False))
-        asked = WavePeriods((8.0,), ((2.5, 7.0),))
-        return AxisCampaign("deg", _stops(places, seed), (), stated, periods=asked)
+        periods = WavePeriods((8.0,), ((2.5, 7.0),))
+        return AxisCampaign("deg", _stops(places, seed), (), stated, periods=periods)
     moves = tuple(
         AxisMove(m.move, m.segment, m.time_s, m.command, m.approach) for m in _stops(np.linspace(-2000, 2000, 10), seed)
     )
@@ -78,15 +78,15 @@ def _scored(draws: np.ndarray, true: float) -> dict[str, float]:
 def one_axis(task: tuple[str, int]) -> dict[str, object]:
     """Draw, read and fit one axis."""
     protocol, seed = task
-    made = simulate_axis(template(protocol, seed), seed=seed)
-    found = fit_axis(made.campaign, tier="importance", seed=seed)
-    true, draws = made.truth.parameters, found.draws
+    axis = simulate_axis(template(protocol, seed), seed=seed)
+    fit = fit_axis(axis.campaign, tier="importance", seed=seed)
+    true, draws = axis.truth.parameters, fit.draws
     row: dict[str, object] = {"protocol": protocol, "seed": seed, "commit": commit(), "waves": []}
-    row["problems"] = list(found.missing)
+    row["problems"] = list(fit.missing)
     for name in PARAMETERS:
         if name in draws and draws[name].std() > 0 and not (protocol == "drive" and name == "backlash"):
             row[name] = _scored(draws[name], true[name])
-    samples, truths = wave_samples(found), made.truth.waves
+    samples, truths = wave_samples(fit), axis.truth.waves
     # Of a range that holds one wave, what was added to it is a false one.
     waves: list[dict[str, object]] = [
         {"there": False, "probability": sample.probability} for sample in samples[len(truths) :]

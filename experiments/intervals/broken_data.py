@@ -157,7 +157,7 @@ def table(arguments: argparse.Namespace) -> None:
         _limits(min(map(len, good.values())), "| | ")
         for name in HEADLINES:
             for by, entries in good.items():
-                found = verdict([e["values"][name] for e in entries])
+                judged = verdict([e["values"][name] for e in entries])
                 width = np.median(
                     [
                         np.sqrt(1 - r[by]["values"][name]["contraction"]) / widths[r["seed"], name]
@@ -165,7 +165,7 @@ def table(arguments: argparse.Namespace) -> None:
                         if r[by]["converged"] and (r["seed"], name) in widths
                     ]
                 )
-                print(f"| {name} | {by} | {width:.2f} | {' | '.join(found.cells)} | {found.word} |")
+                print(f"| {name} | {by} | {width:.2f} | {' | '.join(judged.cells)} | {judged.word} |")
         print()
         for r in chosen:
             for by in good:

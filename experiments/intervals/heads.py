@@ -86,5 +86,5 @@ def table(arguments: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    made = study_parser(__doc__, ROWS, 30)
-    act(made, run=run, table=table)
+    cli = study_parser(__doc__, ROWS, 30)
+    act(cli, run=run, table=table)

@@ -88,9 +88,9 @@ def joint_table(good: list[dict]) -> None:
     for name in HEADLINES + MEAN_RATIOS:
         entries = [r["joint"][name] for r in good]
         contraction = float(np.median([e["contraction"] for e in entries]))
-        found, shrunk = verdict(entries), verdict(entries, shrunk=True)
-        failed = "prior" if found.prior else ("passes" if shrunk.within else "fails")
-        print(f"| {name} | {contraction:.4f} | {' | '.join(found.cells)} | {found.word} | {failed} |")
+        judged, shrunk = verdict(entries), verdict(entries, shrunk=True)
+        failed = "prior" if judged.prior else ("passes" if shrunk.within else "fails")
+        print(f"| {name} | {contraction:.4f} | {' | '.join(judged.cells)} | {judged.word} | {failed} |")
     print()
 
 

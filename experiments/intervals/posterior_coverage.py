@@ -103,10 +103,10 @@ def coverage(good: list[dict], every: list[dict]) -> None:
     for name in ALL:
         for by in ("laplace", "posterior"):
             entries = [r[by][name] for r in good]
-            found = verdict(entries)
+            judged = verdict(entries)
             share = _share_held([r[by][name] for r in every], LEVELS[-1])
             whole = marked(f"{100 * share:.1f}", low <= share <= high)
-            print(f"| {name} | {by} | {' | '.join(found.cells)} | {found.word} | {whole} |")
+            print(f"| {name} | {by} | {' | '.join(judged.cells)} | {judged.word} | {whole} |")
         failing += not verdict(entries, shrunk=True).within
     print(f"\nWith draws shrunk about their mean by {SHRINK}: {failing} of {len(ALL)} quantities OUTSIDE.\n")
 
@@ -130,21 +130,21 @@ def workings(of: dict[str, list[dict]]) -> None:
     print("Medians with 10 % and 90 % quantiles; k, draws and weights are of importance sampling.\n")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     for protocol, rows in of.items():
-        seen = [r for r in rows if "posterior" in r]
-        if not seen:
+        done = [r for r in rows if "posterior" in r]
+        if not done:
             continue
-        told = [r["sampling"]["importance"] for r in seen]
+        runs = [r["sampling"]["importance"] for r in done]
         accepted = sum(r["converged"] and r["sampled"] for r in rows)
         cells = [protocol, str(len(rows)), str(sum(r["converged"] for r in rows))]
         cells += [f"{accepted} ({100 * accepted / len(rows):.1f} %)"]
-        cells += [_spread([t["pareto_k"] for t in told], ".2f")]
-        cells += [_spread([t["worst_pareto_k"]["value"] for t in told], ".2f")]
-        cells += [_spread([t["draws"] for t in told], ".0f"), _spread([t["effective_share"] for t in told], ".2f")]
+        cells += [_spread([t["pareto_k"] for t in runs], ".2f")]
+        cells += [_spread([t["worst_pareto_k"]["value"] for t in runs], ".2f")]
+        cells += [_spread([t["draws"] for t in runs], ".0f"), _spread([t["effective_share"] for t in runs], ".2f")]
         cells += [
-            _spread([min(r["sampling"][f"least_ess_{e}"]["value"] for e in ("bulk", "tail")) for r in seen], ".0f")
+            _spread([min(r["sampling"][f"least_ess_{e}"]["value"] for e in ("bulk", "tail")) for r in done], ".0f")
         ]
-        cells += [_spread([100 * t["heaviest_share"] for t in told], ".2f")]
-        cells += [_spread([r[f"{w}_cpu_s"] for r in seen], ".1f") for w in ("fit", "sample")]
+        cells += [_spread([100 * t["heaviest_share"] for t in runs], ".2f")]
+        cells += [_spread([r[f"{w}_cpu_s"] for r in done], ".1f") for w in ("fit", "sample")]
         print("| " + " | ".join(cells) + " |")
     print()
 

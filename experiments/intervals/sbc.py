@@ -99,9 +99,9 @@ def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
         row["problems"] = list(result.problems)
         posterior = sample(result, tier=tier, seed=seed, max_minutes=MAX_MINUTES)
         row |= {"converged": bool(posterior.converged), "problems": list(posterior.convergence.missing)}
-        told = posterior.convergence.importance
-        row |= {"cpu_s": time.process_time() - start, "draws": told.draws, "effective_share": told.effective_share}
-        row |= {"pareto_k": told.pareto_k, "worst_pareto_k": told.worst_pareto_k.value, "ess": told.least_ess.value}
+        run = posterior.convergence.importance
+        row |= {"cpu_s": time.process_time() - start, "draws": run.draws, "effective_share": run.effective_share}
+        row |= {"pareto_k": run.pareto_k, "worst_pareto_k": run.worst_pareto_k.value, "ess": run.least_ess.value}
         chosen = posterior.coordinates(DRAWS)
         errors_rad = posterior.thinned(DRAWS).place_errors_rad
         row["ranks"] = ranks(simulated, result, chosen, errors_rad)
@@ -211,12 +211,12 @@ def designs(rows: list[dict]) -> list[Design]:
     first = [r for r in of[CLEAN] if r["seed"] < FAULT_SIMULATIONS]
     wanted = [(CLEAN, of[CLEAN], "ranks"), (FEW, of[FEW], "ranks"), (SHRUNK, first, "ranks_shrunk")]
     wanted += [(JACOBIAN, of[FEW], "ranks_jacobian"), *((v, of[v], "ranks") for v in (PRIOR, CAMERA))]
-    found = []
+    parts = []
     for title, chosen, key in wanted:
         good = [r for r in chosen if r["converged"] and key in r]
         if len(good) >= 2:
-            found.append(Design(title, chosen, good, pit_values(good, key)))
-    return found
+            parts.append(Design(title, chosen, good, pit_values(good, key)))
+    return parts
 
 
 def design_row(design: Design, p: dict[str, float]) -> str:
@@ -226,12 +226,12 @@ def design_row(design: Design, p: dict[str, float]) -> str:
     lost = len(design.chosen) - len(design.good)
     # A fault has to be seen in the ranks, not in lost simulations.
     passes = failing == 0 and not (design.clean and lost > FAILURES * len(design.chosen))
-    said = "passes" if passes else "FAILS"
+    word = "passes" if passes else "FAILS"
     if len(design.chosen) < FAULT_SIMULATIONS:
-        said = "too few to judge"
+        word = "too few to judge"
     cells = (design.title, len(design.chosen), lost, len(p), f"{limit:.1e}", f"{p[least]:.1e}, {least}")
     cells += (f"{p['log-likelihood']:.1e}", f"{p['log-posterior']:.1e}", failing)
-    return f"| {' | '.join(map(str, (*cells, said, 'passes' if design.clean else 'FAILS')))} |"
+    return f"| {' | '.join(map(str, (*cells, word, 'passes' if design.clean else 'FAILS')))} |"
 
 
 def table(arguments: argparse.Namespace) -> None:
@@ -250,36 +250,36 @@ def table(arguments: argparse.Namespace) -> None:
 
 def table_tier(title: str, rows: list[dict], pictured: bool) -> None:
     """Every design of one tier; nothing of a tier that was not run."""
-    found = designs(rows)
-    if not found:
+    parts = designs(rows)
+    if not parts:
         return
     print(f"## {title}\n")
     columns = ("draws", "simulations", "not accepted", "quantities", "criterion p", "least p, of", "p log-likelihood")
     columns += ("p log-posterior", "quantities failing", "verdict", "wanted")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     p_of = {}
-    for design in found:
+    for design in parts:
         band = design.band
         p_of[design.title] = {name: band.p_value(values) for name, values in design.pit.items()}
         print(design_row(design, p_of[design.title]))
     print(f"\np = {1 / (1 + BAND_SAMPLES):.0e} is the smallest that {BAND_SAMPLES} simulated bands can give.\n")
-    for design in found:
+    for design in parts:
         if design.title in VARIANTS:
             print(f"- {design.title}: {workings(design.chosen)}")
     for r in rows:
         if not r["converged"]:
             print(f"- not accepted: {r['variant']}, seed {r['seed']}: {'; '.join(r['problems'])}")
     print()
-    for design in found:
+    for design in parts:
         if design.title == CLEAN:
             clean_part(design, p_of[CLEAN], pictured)
 
 
 def workings(rows: list[dict]) -> str:
     """Medians of what importance sampling says of itself, and the cost."""
-    seen = [r for r in rows if "draws" in r]
+    done = [r for r in rows if "draws" in r]
     k, worst, draws, share, ess, cpu = (
-        np.median([r[name] for r in seen])
+        np.median([r[name] for r in done])
         for name in ("pareto_k", "worst_pareto_k", "draws", "effective_share", "ess", "cpu_s")
     )
     return (

@@ -76,7 +76,7 @@ class Rig:
         reach = np.sum((point - on) * normal, axis=1) / np.sum(ahead * normal, axis=1)
         return on + np.where(reach > 0, reach, np.nan)[:, None] * ahead
 
-    def seen(self, spots_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, spots_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (n, 4) of both cameras, and which spots both see (n,)."""
         pixels = [camera.project(spots_mm) for camera in (self.left, self.right)]
         both = self.left.sees(pixels[0]) & self.right.sees(pixels[1])
@@ -101,14 +101,14 @@ class Calibration:
         board: inner corners by row and column, side of a square in mm.
         corners: found, of both cameras, each (views, corners, 2), px.
         fix_k3: whether k3 was held at 0.
-        found: M1 D1 M2 D2 R T.
+        matrices: M1 D1 M2 D2 R T.
         rms_px: as `cv2.stereoCalibrate` says.
     """
 
     board: tuple[int, int, float]
     corners: tuple[np.ndarray, np.ndarray]
     fix_k3: bool
-    found: dict[str, np.ndarray]
+    matrices: dict[str, np.ndarray]
     rms_px: float
 
 
@@ -123,7 +123,7 @@ class Bench:
     gears: tuple[Gear, Gear]
     looks: Looks
     pixels: np.ndarray
-    seen: np.ndarray
+    both: np.ndarray
     calibration: Calibration
     truth: dict[str, object]
 
@@ -135,11 +135,11 @@ class Bench:
             table = csv.writer(file)
             table.writerow(HEADER)
             for i, (pan, tilt) in enumerate(self.looks.counters):
-                centre = [f"{x:.2f}" for x in self.pixels[i]] if self.seen[i] else [""] * 4
+                centre = [f"{x:.2f}" for x in self.pixels[i]] if self.both[i] else [""] * 4
                 when = f"{self.looks.time_s[i]:.1f}"
                 table.writerow([i + 1, when, segments[i], pan, tilt, SHEETS[self.looks.sheet[i]], *centre])
         storage = cv2.FileStorage(str(folder / "rig_stereo.yml"), cv2.FILE_STORAGE_WRITE)
-        for key, matrix in self.calibration.found.items():
+        for key, matrix in self.calibration.matrices.items():
             storage.write(key, matrix)
         storage.write("image_width", self.rig.left.size[0])
         storage.write("image_height", self.rig.left.size[1])
@@ -168,7 +168,7 @@ def bench(seed: int, number: int) -> Bench:
     for _ in range(TRIES):
         rig = _rig(rng, traits)
         looks = _looks(rng, rig, traits, ratios)
-        _, both = rig.seen(rig.spots(*_angles(rig, looks.counters * ratios), looks.sheet))
+        _, both = rig.project(rig.spots(*_angles(rig, looks.counters * ratios), looks.sheet))
         per_sheet = np.bincount(looks.sheet[both], minlength=3)[np.unique(looks.sheet)]
         if both.sum() < max(FEWEST, LEAST_SHARE * len(both)) or per_sheet.min() < LEAST_PER_SHEET:
             continue
@@ -271,8 +271,8 @@ def _looks(rng: np.random.Generator, rig: Rig, traits: Traits, ratios: np.ndarra
         grid = _grid(columns, -(-per_sheet // columns), snake=traits.pattern == "snake")
         parts = []
         for _ in range(traits.sheets):
-            own = rng.uniform(-0.5, 0.5, (per_sheet, 2)) if traits.pattern == "random" else grid[:per_sheet]
-            parts.append(own * span + rng.uniform(-jitter, jitter, (per_sheet, 2)))
+            local = rng.uniform(-0.5, 0.5, (per_sheet, 2)) if traits.pattern == "random" else grid[:per_sheet]
+            parts.append(local * span + rng.uniform(-jitter, jitter, (per_sheet, 2)))
         places, sheet = np.concatenate(parts), np.repeat(np.arange(traits.sheets), per_sheet)
     homed = np.arange(len(places)) == 0
     if traits.second_homing:
@@ -336,7 +336,7 @@ def _observed(rng: np.random.Generator, key, traits: Traits, rig: Rig, looks: Lo
         side = int(rng.choice((-1, 1)))
         sides[axis] = SIDES[axis][side]
         wheels.append(gears[k].driven(looks.counters[:, k], looks.homed, hours, side, rng))
-    exact, both = rig.seen(rig.spots(*_angles(rig, np.column_stack(wheels)), looks.sheet))
+    exact, both = rig.project(rig.spots(*_angles(rig, np.column_stack(wheels)), looks.sheet))
     noise_px = rng.uniform(0.05, 0.3)
     pixels = exact + noise_px * rng.standard_normal(exact.shape)
     truth = true_values(rig.head, gears, looks.counters[both]) | {
@@ -381,7 +381,7 @@ def _board_views(rng: np.random.Generator, rig: Rig) -> tuple[tuple[int, int, fl
     """
     board = BOARDS[rng.integers(len(BOARDS))]
     points, count = _board(board), int(rng.integers(15, 26))
-    found: list[np.ndarray] = []
+    poses: list[np.ndarray] = []
     for _ in range(40 * count):
         vector = np.array([*rng.normal(0, 0.4, 2), rng.normal(0, 0.15)])
         share = rng.uniform(0.2, 0.6)
@@ -389,10 +389,10 @@ def _board_views(rng: np.random.Generator, rig: Rig) -> tuple[tuple[int, int, fl
         pixel = rng.uniform(0.1, 0.9, 2) * rig.left.size
         ray = np.array([*((pixel - rig.left.centre_px) / rig.left.focal_px), 1.0])
         pose = np.array([*vector, *(depth * ray)])
-        if rig.seen(points @ turned(vector).T + pose[3:])[1].all():
-            found.append(pose)
-            if len(found) == count:
-                return board, np.array(found)
+        if rig.project(points @ turned(vector).T + pose[3:])[1].all():
+            poses.append(pose)
+            if len(poses) == count:
+                return board, np.array(poses)
     return None
 
 
@@ -407,23 +407,23 @@ def _board(board: tuple[int, int, float]) -> np.ndarray:
 def _calibrated(rng: np.random.Generator, rig: Rig, board: tuple[int, int, float], poses: np.ndarray) -> Calibration:
     """Each camera by itself, then both together, as OpenCV's sample does; intrinsics kept then or refined."""
     points = _board(board)
-    exact = np.array([rig.seen(points @ turned(pose[:3]).T + pose[3:])[0] for pose in poses])
+    exact = np.array([rig.project(points @ turned(pose[:3]).T + pose[3:])[0] for pose in poses])
     corners = exact + rng.uniform(0.05, 0.25) * rng.standard_normal(exact.shape)
     fix_k3 = rig.left.lens[4] == 0.0
     flags = cv2.CALIB_FIX_K3 if fix_k3 else 0
     once = points.astype(np.float32)
     shown = [once] * len(poses)
-    seen = [[np.ascontiguousarray(view[:, part], np.float32) for view in corners] for part in (slice(2), slice(2, 4))]
+    pair = [[np.ascontiguousarray(view[:, part], np.float32) for view in corners] for part in (slice(2), slice(2, 4))]
     together = cv2.CALIB_FIX_INTRINSIC if rng.random() < 0.5 else cv2.CALIB_USE_INTRINSIC_GUESS
     ends = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 100, 1e-6)
     threads = cv2.getNumThreads()
     # Sums of several threads differ from run to run, and with them where a descent ends.
     cv2.setNumThreads(1)
     try:
-        alone = [cv2.calibrateCamera(shown, one, rig.left.size, None, None, flags=flags)[1:3] for one in seen]
-        starts = (*seen, *alone[0], *alone[1], rig.left.size)
+        alone = [cv2.calibrateCamera(shown, one, rig.left.size, None, None, flags=flags)[1:3] for one in pair]
+        starts = (*pair, *alone[0], *alone[1], rig.left.size)
         rms, *both = cv2.stereoCalibrate(shown, *starts, flags=flags | together, criteria=ends)[:7]
     finally:
         cv2.setNumThreads(threads)
-    found = dict(zip(("M1", "D1", "M2", "D2", "R", "T"), both, strict=True))
-    return Calibration(board, (corners[..., :2], corners[..., 2:]), fix_k3, found, float(rms))
+    named = dict(zip(("M1", "D1", "M2", "D2", "R", "T"), both, strict=True))
+    return Calibration(board, (corners[..., :2], corners[..., 2:]), fix_k3, named, float(rms))

@@ -25,23 +25,23 @@ def turn(axis: str, angle_deg: np.ndarray | float) -> np.ndarray:
     angle = np.radians(np.asarray(angle_deg, float))
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
-    found = np.zeros((*angle.shape, 3, 3))
-    found[..., i, i] = 1.0
-    found[..., j, j] = found[..., k, k] = np.cos(angle)
-    found[..., k, j] = np.sin(angle)
-    found[..., j, k] = -np.sin(angle)
-    return found
+    matrix = np.zeros((*angle.shape, 3, 3))
+    matrix[..., i, i] = 1.0
+    matrix[..., j, j] = matrix[..., k, k] = np.cos(angle)
+    matrix[..., k, j] = np.sin(angle)
+    matrix[..., j, k] = -np.sin(angle)
+    return matrix
 
 
 def turned(vector_rad: np.ndarray) -> np.ndarray:
     """The matrix (3, 3) of a rotation vector (3,): exp of its cross product, by the series, to rounding below 1 rad."""
     x, y, z = vector_rad
     generator = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    found = term = np.eye(3)
+    series = term = np.eye(3)
     for order in range(1, 25):
         term = term @ generator / order
-        found = found + term
-    return found
+        series = series + term
+    return series
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Head:
 
     def arm_mm(self, pan_deg: float, tilt_deg: float) -> float:
         """Signed distance of the beam from the pan axis, seen from above: positive to the right of the axis."""
-        on, ahead = (found[0, :2] for found in self.beams(np.array([pan_deg]), np.array([tilt_deg])))
+        on, ahead = (ray[0, :2] for ray in self.beams(np.array([pan_deg]), np.array([tilt_deg])))
         right = np.array([ahead[1], -ahead[0]]) / np.linalg.norm(ahead)
         return float(on @ right)
 

@@ -105,14 +105,14 @@ def tvsbayes(*words: object, fresh: bool = False) -> dict:
     return {**json.loads(out.getvalue()), "exit": code}
 
 
-def write_calibration(made: Calibration, size: tuple[int, int], file: Path) -> None:
+def write_calibration(data: Calibration, size: tuple[int, int], file: Path) -> None:
     """`stereo.json` with the covariance that the package's own calibration of the corners states."""
     from tvsbayes.cameras.boards import Board, View
     from tvsbayes.cameras.stereo_calibration import calibrate_stereo
     from tvsbayes.instrument.stereo_pair import stereo_bytes
 
-    views = [View(f"{i:02d}", left, right) for i, (left, right) in enumerate(zip(*made.corners, strict=True))]
-    file.write_bytes(stereo_bytes(calibrate_stereo(views, Board(*made.board), size, fix_k3=made.fix_k3).stereo))
+    views = [View(f"{i:02d}", left, right) for i, (left, right) in enumerate(zip(*data.corners, strict=True))]
+    file.write_bytes(stereo_bytes(calibrate_stereo(views, Board(*data.board), size, fix_k3=data.fix_k3).stereo))
 
 
 def campaign_of(files: Path, drawn: Bench | None, approach: dict[str, str], campaign: Path) -> None:
@@ -202,24 +202,24 @@ def headlines_of(document: dict, truth: dict) -> dict[str, dict[str, float | Non
     true |= {f"{CONTRAST}.{axis}": 0.0 for axis in AXES}
     true |= {f"backlash_deg.{axis}": truth["backlash_deg"][axis] for axis in AXES}
     true["effective_mirror_offset_mm"] = truth["mirror_offset_mm"]
-    found = {}
+    lines = {}
     for name in HEADLINES:
         block, _, part = name.partition(".")
         place = document.get(block, {}).get(part) if block in (RATIO, CONTRAST) else document["parameters"].get(name)
         if place is not None:
             low, high = place["interval95"]
             stated = {key: place[key] for key in ("value", "sd", "contraction")}
-            found[name] = stated | {"low": low, "high": high, "truth": true[name]}
-    return found
+            lines[name] = stated | {"low": low, "high": high, "truth": true[name]}
+    return lines
 
 
 def chances_below(campaign: Path, headlines: dict[str, dict]) -> dict[str, float]:
     """Share of the posterior below the truth of every headline, never zero or one: a draw more on each side."""
     from tvsbayes.inference.stored_posterior import load_posterior
 
-    found = load_posterior(campaign, anyway=True)
-    count = len(found.weights)
-    below = {name: found.weights @ (found.by_name[name] < entry["truth"]) for name, entry in headlines.items()}
+    draws = load_posterior(campaign, anyway=True)
+    count = len(draws.weights)
+    below = {name: draws.weights @ (draws.by_name[name] < entry["truth"]) for name, entry in headlines.items()}
     return {name: float((count * share + 1) / (count + 2)) for name, share in below.items()}
 
 
@@ -267,17 +267,17 @@ def classes(rows: Sequence[Row]) -> None:
     columns += ("CPU s", "CPU / imports", "95 %, %", "RMS z")
     print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     for name, chosen in CLASSES.items():
-        own = [row for row in rows if chosen(row)]
-        if not own:
+        some = [row for row in rows if chosen(row)]
+        if not some:
             continue
-        counts = [sum(row["answer"] == answer for row in own) for answer in ANSWERS]
-        first = sum(row["answer"] == "accepted" and row["tier"] == "importance" for row in own)
-        cells = [name, str(len(own)), f"{100 * sum(counts[:2]) / len(own):.1f}", f"{100 * first / len(own):.1f}"]
-        cells += [*map(str, counts), _cell(_of(own, "pareto_k"), ".2f"), _cell(_of(own, "effective"), ".0f", np.min)]
-        timed = [row for row in own if "cpu_s" in row]
+        counts = [sum(row["answer"] == answer for row in some) for answer in ANSWERS]
+        first = sum(row["answer"] == "accepted" and row["tier"] == "importance" for row in some)
+        cells = [name, str(len(some)), f"{100 * sum(counts[:2]) / len(some):.1f}", f"{100 * first / len(some):.1f}"]
+        cells += [*map(str, counts), _cell(_of(some, "pareto_k"), ".2f"), _cell(_of(some, "effective"), ".0f", np.min)]
+        timed = [row for row in some if "cpu_s" in row]
         multiples = np.array([row["cpu_s"] / row["import_cpu_s"] for row in timed])
         cells += [_cell(_of(timed, "cpu_s"), ".1f"), _cell(multiples, ".1f")]
-        parts = [judged([row for row in own if row["answer"] in ANSWERED], headline)[:2] for headline in HEADLINES]
+        parts = [judged([row for row in some if row["answer"] in ANSWERED], headline)[:2] for headline in HEADLINES]
         z, held = (np.concatenate(part) for part in zip(*parts, strict=True))
         cells += [f"{100 * held.mean():.1f}", f"{np.sqrt(np.mean(z**2)):.2f}"] if len(z) else ["", ""]
         print(f"| {' | '.join(cells)} |")
@@ -321,7 +321,7 @@ def run(arguments: argparse.Namespace) -> None:
         tasks = [(arguments.seed, None, str(i)) for i in range(arguments.n)]
     else:
         place = arguments.folder.resolve()
-        tasks = [(None, str(place), found.parent.name) for found in sorted(place.glob("*/truth.json"))]
+        tasks = [(None, str(place), file.parent.name) for file in sorted(place.glob("*/truth.json"))]
     one = one_fresh_bench if arguments.fresh else one_bench
     run_rows(one, tasks, arguments.rows, KEYS, range(arguments.jobs))
 
@@ -329,7 +329,7 @@ def run(arguments: argparse.Namespace) -> None:
 def page(arguments: argparse.Namespace) -> None:
     """The page."""
     rows = read_rows(arguments.rows)
-    drawn, given = ([row for row in rows if (row["folder"] is None) == own] for own in (True, False))
+    drawn, other = ([row for row in rows if (row["folder"] is None) == part] for part in (True, False))
     print("# Benches that share nothing with the package\n")
     print("Written by `python -m experiments.intervals.strangers page`; what is in it and how it was made stands in")
     print(f"the script. **!** marks a figure outside its two-sided bounds at {BOUND:.0e} for that number of benches.\n")
@@ -347,11 +347,11 @@ def page(arguments: argparse.Namespace) -> None:
         coverage(drawn)
         print("### Not accepted\n")
         listed([row for row in drawn if row["answer"] != "accepted"])
-    for folder in dict.fromkeys(row["folder"] for row in given):
-        own = [row for row in given if row["folder"] == folder]
-        print(f"## {len(own)} benches of a folder, {Path(folder).name}\n")
-        listed(own)
-        coverage(own)
+    for folder in dict.fromkeys(row["folder"] for row in other):
+        part = [row for row in other if row["folder"] == folder]
+        print(f"## {len(part)} benches of a folder, {Path(folder).name}\n")
+        listed(part)
+        coverage(part)
 
 
 def main() -> None:

@@ -42,7 +42,7 @@ def main() -> None:
         "classic": simple_calibration(priors, classic(campaign)),
     }
     pan, tilt = (np.linspace(*ends, 5).round() for ends in calibration.range_steps)
-    found = error_map(calibration, pan, tilt, RANGES_MM, simple=simple)
+    errors_mm = error_map(calibration, pan, tilt, RANGES_MM, simple=simple)
     print(
         title_and_figure(
             __file__, "Expected error of a located point", PICTURE, "RMS error by range, and maps at 500 mm"
@@ -51,10 +51,10 @@ def main() -> None:
     print("Written by `python -m experiments.millimetres.error_map`; paper twin, what was done stands in the script.\n")
     print("| range, mm | nominal | classic | joint | poses where all three find a point |\n|---|---|---|---|---|")
     for k, reach in enumerate(RANGES_MM):
-        valid = found.valid[..., k]
+        valid = errors_mm.valid[..., k]
         cells = []
         for name in ESTIMATOR_STYLE:
-            errors = found.rms_mm[name][..., k][valid]
+            errors = errors_mm.rms_mm[name][..., k][valid]
             cells.append(f"{np.sqrt(np.mean(errors**2)):.1f}" if errors.size else "-")
         print(f"| {reach:.0f} | {' | '.join(cells)} | {valid.sum()} of {valid.size} |")
     print("\nRMS distance in mm over 5 x 5 poses within the counters of the campaign.\n")
@@ -65,22 +65,22 @@ def main() -> None:
     for index in np.argsort(-parts.share):
         if parts.share[index] >= 0.001:
             print(f"| {parts.causes[index]} | {100 * parts.share[index]:.1f} |")
-    draw(found)
+    draw(errors_mm)
 
 
-def draw(found: ErrorMap) -> None:
+def draw(mapped: ErrorMap) -> None:
     """RMS error against range, and over the counters at 500 mm."""
     with page_figure(PICTURE, 3.2, width_in=10.0) as figure:
         axes = figure.subplots(1, 3)
         for name, (colour, marker) in ESTIMATOR_STYLE.items():
-            curve = [np.sqrt(np.nanmean(found.rms_mm[name][..., k] ** 2)) for k in range(len(RANGES_MM))]
+            curve = [np.sqrt(np.nanmean(mapped.rms_mm[name][..., k] ** 2)) for k in range(len(RANGES_MM))]
             axes[0].semilogy(RANGES_MM, curve, color=colour, marker=marker, markersize=4, label=name)
         axes[0].set(xlabel="range, mm", ylabel="RMS error, mm", title="against range")
         axes[0].legend()
         reach = RANGES_MM.index(500.0)
         for axis, name in zip(axes[1:], ("classic", "joint"), strict=True):
-            errors = found.rms_mm[name][..., reach].T
-            counters = (found.pan_steps, found.tilt_steps)
+            errors = mapped.rms_mm[name][..., reach].T
+            counters = (mapped.pan_steps, mapped.tilt_steps)
             image = axis.pcolormesh(*counters, errors, shading="nearest", cmap=colour_map(SEQUENTIAL))
             figure.colorbar(image, ax=axis, label="mm")
             axis.set(xlabel="pan, steps", ylabel="tilt, steps", title=f"{name}, at 500 mm")

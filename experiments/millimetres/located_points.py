@@ -70,26 +70,26 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
         return {**row, "problem": repr(error)}
     looks = looks_at(simulated, calibration, seed)
     counters, points = looks.counters_steps, looks.points_mm
-    found = locate(calibration, counters[:, 0], counters[:, 1], looks.readings, looks.sides, seed=seed)
-    error = found.xyz_mm - points
-    hit = np.abs(points - found.interval95_mm.mean(axis=1)) <= found.u95_mm
+    located = locate(calibration, counters[:, 0], counters[:, 1], looks.readings, looks.sides, seed=seed)
+    error = located.xyz_mm - points
+    hit = np.abs(points - located.interval95_mm.mean(axis=1)) <= located.u95_mm
     # Points that were refused have no error and no covariance: they lie in no ellipsoid.
-    good = np.array([refused is None for refused in found.refused])
-    distance2 = squared_distance(error, found.covariance_mm2, good, np.inf)
-    z = error / np.sqrt(np.einsum("pii->pi", found.covariance_mm2))
+    good = np.array([refused is None for refused in located.refused])
+    distance2 = squared_distance(error, located.covariance_mm2, good, np.inf)
+    z = error / np.sqrt(np.einsum("pii->pi", located.covariance_mm2))
     errors = {"joint": error, **looks.errors_of_others_mm(simulated.campaign)}
     for k, kind in enumerate(KINDS):
         distances = or_none(np.array([np.linalg.norm(e[k]) for e in errors.values()]))
         row[kind] = {
-            "refused": found.refused[k] is not None,
+            "refused": located.refused[k] is not None,
             "hit": hit[k].tolist(),
             "z": or_none(z[k]),
             "ellipsoid": bool(distance2[k] <= ELLIPSOID),
-            "validated": bool(found.validation.validated[k].all()),
-            "u95_mm": or_none(found.u95_mm[k]),
+            "validated": bool(located.validation.validated[k].all()),
+            "u95_mm": or_none(located.u95_mm[k]),
             "error_mm": dict(zip(errors, distances, strict=True)),
         }
-    usable = [k for k in range(2, 2 + WITHIN) if found.refused[k] is None]
+    usable = [k for k in range(2, 2 + WITHIN) if located.refused[k] is None]
     row["within"] = {
         "points": len(usable),
         "hits": hit[usable].sum(axis=0).tolist(),

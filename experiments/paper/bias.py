@@ -122,16 +122,16 @@ def cell(rows: list[dict], axis: str, estimator: str) -> dict[str, float]:
     # The two directions of an axis share a rig: the rig is the unit.
     means = np.array([np.mean([e["error"] for e in pair]) for pair in entries])
     every = [e for pair in entries for e in pair]
-    found = {
+    figures = {
         "n": len(entries),
         "mean": 100 * means.mean(),
         "se": 100 * means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else np.nan,
         "rms": 100 * np.sqrt(np.mean([e["error"] ** 2 for e in every])),
     }
-    found |= {name: 100 * np.mean([e[name] for e in every]) for name in insides}
+    figures |= {name: 100 * np.mean([e[name] for e in every]) for name in insides}
     if estimator == "joint":
-        found["rms_z"] = float(np.sqrt(np.mean([e["z"] ** 2 for e in every])))
-    return found
+        figures["rms_z"] = float(np.sqrt(np.mean([e["z"] ** 2 for e in every])))
+    return figures
 
 
 def table(arguments: argparse.Namespace) -> None:

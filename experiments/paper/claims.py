@@ -44,9 +44,9 @@ CHOSEN = ("left", "up")
 PLAIN, FOURFOLD = "the paper's 96 experiments", "the same four times over"
 
 
-def row(claim: str, stated: str, found: str, verdict: str, script: str = "paper.claims") -> None:
+def row(claim: str, stated: str, computed: str, verdict: str, script: str = "paper.claims") -> None:
     """A line of the table."""
-    print(f"| {claim} | {stated} | {found} | `python -m experiments.{script}` | {verdict} |")
+    print(f"| {claim} | {stated} | {computed} | `python -m experiments.{script}` | {verdict} |")
 
 
 def first() -> None:
@@ -54,13 +54,13 @@ def first() -> None:
     page = COVERAGE.read_text()
     section = page.split("## paper: ")[1].split("## mixed")[0]
     rigs = int(section.split()[0])
-    found = re.findall(r"^\| (left|right|up|down) \| ([\d.]+) % \| ([\d.]+) % \| ([-+][\d.]+) \|$", section, re.M)
+    rows = re.findall(r"^\| (left|right|up|down) \| ([\d.]+) % \| ([\d.]+) % \| ([-+][\d.]+) \|$", section, re.M)
     cells = []
-    for name, type_a, _, _ in found:
+    for name, type_a, _, _ in rows:
         hits = round(float(type_a) / 100 * rigs)
         ends = stats.binomtest(hits, rigs).proportion_ci(0.95)
         cells.append(f"{name} {float(type_a):.1f} % ({100 * ends.low:.1f} to {100 * ends.high:.1f})")
-    low = min(float(r[1]) for r in found) <= 7.0 <= max(float(r[1]) for r in found)
+    low = min(float(r[1]) for r in rows) <= 7.0 <= max(float(r[1]) for r in rows)
     text = f"{rigs} rigs: {', '.join(cells)}"
     row(
         "1. classic 95 % type A interval, one \\|N\\|, holds the truth",
@@ -71,7 +71,7 @@ def first() -> None:
     )
     # Median of a half-normal of scale 0.5 deg over 200 steps of 0.06 deg.
     expected = -100 * 0.5 * stats.halfnorm.median() / 200 / 0.06
-    errors = ", ".join(f"{name} {error} %" for name, _, _, error in found)
+    errors = ", ".join(f"{name} {error} %" for name, _, _, error in rows)
     row(
         "1. after a reversal k is off by -b/N",
         f"median rig {expected:.1f} % for pan",
@@ -128,8 +128,8 @@ def third(chosen, stereo) -> None:
             means.append(np.array([ratios[direction == d].mean() for d in np.unique(direction)]))
         return dict(zip(np.unique(direction), 100 * (means[1] / means[0] - 1), strict=True))
 
-    found = shift(chosen.pixels, chosen.steps, chosen.axis, chosen.direction, stereo)
-    text = ", ".join(f"{d} {found[d]:+.2f} %" for d in DIRECTIONS)
+    shifts = shift(chosen.pixels, chosen.steps, chosen.axis, chosen.direction, stereo)
+    text = ", ".join(f"{d} {shifts[d]:+.2f} %" for d in DIRECTIONS)
     plain = replace(stereo, D1=np.zeros(5), D2=np.zeros(5))
     slope, depth = np.tan(np.radians([18.53, 18.53, 30.41, 30.41])), np.array([175.0, 275.0, 275.0, 175.0])
     points = np.column_stack((depth, -100.0 + depth * slope, np.zeros(4)))
@@ -138,7 +138,7 @@ def third(chosen, stereo) -> None:
         seen = project(points, cameras)[None]
         moved = shift(seen, np.array([200]), np.array(["pan"]), np.array(["left"]), cameras)
         example.append(f"{moved['left']:+.2f} %")
-    size = [abs(v) for v in found.values()]
+    size = [abs(v) for v in shifts.values()]
     holds = "holds" if min(size) >= 0.25 and max(size) <= 0.55 else "common to all repeats: holds; larger than stated"
     row(
         "3. 0.5 % of focal length shifts k, in all repeats alike, by",
@@ -240,16 +240,16 @@ def plans() -> dict[str, tuple]:
 def parts_of_plans() -> dict[str, dict[str, Parts]]:
     """By campaign and direction."""
     knowledge = prior_knowledge(mounted_rig())
-    told = known(knowledge, ("backlash_deg.pan", "backlash_deg.tilt"))
+    exact = known(knowledge, ("backlash_deg.pan", "backlash_deg.tilt"))
     contrasts = known(knowledge, ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt"))
     results: dict[str, dict[str, Parts]] = {}
     for name, parts in plans().items():
-        found = [information_of(part, knowledge) for part in parts]
-        fisher, pose = sum(f.fisher for f in found), found[0].pose_rad
-        spots = sum(int(f.expectation.seen.sum()) for f in found)
+        informations = [information_of(part, knowledge) for part in parts]
+        fisher, pose = sum(f.fisher for f in informations), informations[0].pose_rad
+        spots = sum(int(f.expectation.seen.sum()) for f in informations)
         for quantity in CHOSEN:
             w = worth_of(knowledge, fisher, pose, spots, quantity)
-            without = worth_of(told, fisher, pose, spots, quantity)
+            without = worth_of(exact, fisher, pose, spots, quantity)
             one_ratio = worth_of(contrasts, fisher, pose, spots, quantity)
             u = float(w.u[0])
             results.setdefault(name, {})[quantity] = Parts(
@@ -268,11 +268,11 @@ def parts_of_plans() -> dict[str, dict[str, Parts]]:
 def cameras_of_the_twin() -> dict[str, float]:
     """Share of stereo and focal scale in the variance of the fitted twin's ratios, percent, by direction."""
     causes = headline_causes(fit(twin_campaign("paper_twin")))
-    found = {}
+    shares = {}
     for q in CHOSEN:
         part = causes.contribution[causes.quantities.index(f"effective_deg_per_step.{q}")] ** 2
-        found[q] = 100 * sum(part[causes.names.index(c)] for c in CAMERAS) / part.sum()
-    return found
+        shares[q] = 100 * sum(part[causes.names.index(c)] for c in CAMERAS) / part.sum()
+    return shares
 
 
 def fifth(results: dict[str, dict[str, Parts]]) -> None:

@@ -47,12 +47,12 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
     """Table 1 beside the twin's, and the twin again."""
     folder = shipped_data() / "twins" / "paper_twin"
     campaign = read_campaign(folder)
-    found = classic(campaign).directions
+    directions = classic(campaign).directions
     print("| direction | n, paper | mean | sd | n, twin | mean | sd | (mean - paper's) / u | sd / paper's |")
     print("|---|---|---|---|---|---|---|---|---|")
     for name in DIRECTIONS:
         n, mean, sd = paper[name]
-        r = found[name]
+        r = directions[name]
         # Both means scatter: u^2 = s^2/24 of either.
         apart = (r.mean_deg_per_step - mean) / np.hypot(sd / np.sqrt(n), r.u_type_a_deg_per_step)
         twin = f"{r.n} | {r.mean_deg_per_step:.6f} | {r.sd_deg_per_step:.6f}"
@@ -75,7 +75,7 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
         low, middle, high = np.quantile(sds[:, k], (0.025, 0.5, 0.975))
         apart = (paper[name][1] - means[:, k].mean()) / spread
         scatter = f"{middle:.6f} ({low:.6f} to {high:.6f})"
-        type_a = middle / np.sqrt(found[name].n)
+        type_a = middle / np.sqrt(directions[name].n)
         print(f"| {name} | {means[:, k].mean():.6f} | {spread:.6f} | {type_a:.6f} | {apart:+.1f} | {scatter} |")
     print(
         "\nUp and down scatter more than their u of type A says: pan stands still for all 48 of them, so that one stop"
@@ -83,7 +83,7 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
     print(f"error of pan ({truth.parameters['stop_sd_deg.left']:.2f} deg) is common to all and turns the azimuth.")
     true = truth.effective_deg_per_step(campaign)
     shown = ", ".join(f"{name} {true[name]:.5f}" for name in DIRECTIONS)
-    interval = {name: found[name].interval95_type_a for name in DIRECTIONS}
+    interval = {name: directions[name].interval95_type_a for name in DIRECTIONS}
     held = [name for name in DIRECTIONS if interval[name][0] <= true[name] <= interval[name][1]]
     print(f"\nTrue effective ratios over the looks, deg/step: {shown}. The twin's own 95 % intervals of type A")
     print(f"hold {len(held)} of these 4{': ' + ', '.join(held) if held else ''}.")
@@ -92,9 +92,9 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
 def worked_example(paper: dict[str, tuple[int, float, float]]) -> None:
     """Equation (5) of the printed angles, and the whole chain on four points that have them."""
     with (shipped_data() / "reference" / "worked_example.toml").open("rb") as file:
-        given = tomllib.load(file)
-    first, last, steps = given["theta_i_deg"], given["theta_f_deg"], given["steps"]
-    printed = given["deg_per_step_printed"]
+        example = tomllib.load(file)
+    first, last, steps = example["theta_i_deg"], example["theta_f_deg"], example["steps"]
+    printed = example["deg_per_step_printed"]
     quotient = ratio_deg_per_step(first, last, steps)
     stereo = mounted_rig().stereo
     # Points 1 to 4: before the move on the near and the far sheet, after it on the far and the near one.

@@ -91,10 +91,10 @@ def forget_sides(campaign: Campaign) -> Campaign:
     return replace(campaign, moves=tuple(replace(m, **first) if m.pan_approach else m for m in campaign.moves))
 
 
-def effective_ratios(found: JointFit) -> dict[str, list[float]]:
+def effective_ratios(joint: JointFit) -> dict[str, list[float]]:
     """Mode, sd and 95 % interval of the effective ratio of every direction, all ways of homing weighed."""
-    told = summarise(found).effective if found.converged else {}
-    return {d: [e.value, e.sd, *e.interval95] for d, e in told.items() if e is not None}
+    rows = summarise(joint).effective if joint.converged else {}
+    return {d: [e.value, e.sd, *e.interval95] for d, e in rows.items() if e is not None}
 
 
 def one_row(task: tuple[str, str, int]) -> dict[str, object]:
@@ -118,20 +118,20 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
         except Exception as error:
             row["models"][model] = {"converged": False, "problems": [repr(error)]}
             continue
-        draws, found = result.draws.physical, {"converged": bool(result.converged), "problems": list(result.problems)}
-        found["log_evidence"], found["chi2"] = result.log_evidence, result.chi2
-        found["homing_side"] = result.homing_side
+        draws, entry = result.draws.physical, {"converged": bool(result.converged), "problems": list(result.problems)}
+        entry["log_evidence"], entry["chi2"] = result.log_evidence, result.chi2
+        entry["homing_side"] = result.homing_side
         for axis in AXES:
             for quantity in ("ratio_contrast_deg_per_step", "backlash_deg"):
                 column = draws[:, INDEX[f"{quantity}.{axis}"]]
                 ends = np.quantile(column, (0.025, 0.975)).tolist()
                 mode = float(result.mode.physical[INDEX[f"{quantity}.{axis}"]])
-                found[f"{quantity}.{axis}"] = [mode, float(column.std()), *ends]
+                entry[f"{quantity}.{axis}"] = [mode, float(column.std()), *ends]
         if model == "both":
-            found["effective"] = effective_ratios(result)
+            entry["effective"] = effective_ratios(result)
         equal = draws[:, INDEX["degrees_per_step.tilt"]] / draws[:, INDEX["degrees_per_step.pan"]]
-        found["tilt over pan"] = [float(equal.mean()), float(equal.std())]
-        row["models"][model] = found
+        entry["tilt over pan"] = [float(equal.mean()), float(equal.std())]
+        row["models"][model] = entry
     return {
         **row,
         "truth": {n: v for n, v in truth.parameters.items() if "step" in n},
@@ -152,10 +152,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 def weight_log10(row) -> float | None:
     """log10 of the Bayes factor of play against literal ratios; None where a fit failed."""
-    found = row["models"]
-    if not (found["play"]["converged"] and found["ratios"]["converged"]):
+    pair = row["models"]
+    if not (pair["play"]["converged"] and pair["ratios"]["converged"]):
         return None
-    return (found["play"]["log_evidence"] - found["ratios"]["log_evidence"]) / np.log(10)
+    return (pair["play"]["log_evidence"] - pair["ratios"]["log_evidence"]) / np.log(10)
 
 
 def drift_deg() -> tuple[float, float]:
@@ -237,8 +237,8 @@ def table(arguments: argparse.Namespace) -> None:
                 continue
             weights = [w for w in map(weight_log10, chosen) if w is not None]
             right = np.array(weights) * (1 if kind == "lost motion" else -1)
-            told, misled = int(np.sum(right > TOLD_LOG10)), int(np.sum(right < -TOLD_LOG10))
-            cells = [f"{told}", f"{len(weights) - told - misled}", f"{misled}", f"{np.sum(right < -AGAINST_LOG10)}"]
+            sure, misled = int(np.sum(right > TOLD_LOG10)), int(np.sum(right < -TOLD_LOG10))
+            cells = [f"{sure}", f"{len(weights) - sure - misled}", f"{misled}", f"{np.sum(right < -AGAINST_LOG10)}"]
             cells.append(f"{np.median(weights):+.0f} ({min(weights):+.0f} to {max(weights):+.0f})" if weights else "-")
             both = [r["models"]["both"] for r in chosen if r["models"]["both"]["converged"]]
             held = [

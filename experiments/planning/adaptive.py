@@ -73,45 +73,45 @@ class Beside(Replanning):
         last: is told every fit.
     """
 
-    def __init__(self, *given: Any, last: Last, **more: Any):
-        super().__init__(*given, **more)
+    def __init__(self, *arguments: Any, last: Last, **more: Any):
+        super().__init__(*arguments, **more)
         self._last = last
 
     def _begin(self, looks: int) -> None:
         self._looks = looks
         target = parse_target(f"u(worst) <= {self.target:g} deg/step")
         try:
-            found = fit(read_campaign(self.folder))
-            proposed = next_looks(found, mounted_rig(), target, looks_next(looks), confirm_below=self.confirm_below)
+            joint = fit(read_campaign(self.folder))
+            proposed = next_looks(joint, mounted_rig(), target, looks_next(looks), confirm_below=self.confirm_below)
         except NotConverged:
             return
-        self._last.fit, self._last.sampled = found, proposed.confirmed
+        self._last.fit, self._last.sampled = joint, proposed.confirmed
         self.latest = self._read(proposal_of(proposed, looks))
 
 
-def laplace_sds(found: JointFit) -> np.ndarray:
+def laplace_sds(joint: JointFit) -> np.ndarray:
     """Laplace sds of the four effective ratios."""
-    return np.asarray(found.draws.effective_deg_per_step).std(axis=0)
+    return np.asarray(joint.draws.effective_deg_per_step).std(axis=0)
 
 
 def ended(
-    campaign: Campaign, found: JointFit, sampled: Confirmation | None, truth: Truth, minutes: float
+    campaign: Campaign, joint: JointFit, sampled: Confirmation | None, truth: Truth, minutes: float
 ) -> dict[str, object]:
     """What a run arrived at: the ratios beside their truth over the same looks, by Laplace and by the posterior."""
     true = truth.effective_deg_per_step(campaign) or {}
-    told: dict[str, object] = {"minutes": minutes, "looks": len(campaign.spots)}
-    value, sd = np.asarray(found.mode.effective_deg_per_step), laplace_sds(found)
-    sampled = sampled or confirmation(found)
+    row: dict[str, object] = {"minutes": minutes, "looks": len(campaign.spots)}
+    value, sd = np.asarray(joint.mode.effective_deg_per_step), laplace_sds(joint)
+    sampled = sampled or confirmation(joint)
     moved = [d for d in DIRECTIONS if d in true]
     places = [DIRECTIONS.index(d) for d in moved]
     errors = np.array([value[k] - true[d] for k, d in zip(places, moved, strict=True)])
-    told["laplace"] = {"u": float(sd.max()), "z": (errors / sd[places]).tolist()}
+    row["laplace"] = {"u": float(sd.max()), "z": (errors / sd[places]).tolist()}
     ratios = sampled.effective_deg_per_step
     held = [ratios[d].interval95[0] <= true[d] <= ratios[d].interval95[1] for d in moved]
     z = [(ratios[d].value - true[d]) / ratios[d].sd for d in moved]
     u = max(ratio.sd for ratio in ratios.values())
-    told["importance"] = {"u": u, "z": z, "held": held, "accepted": sampled.accepted}
-    return told
+    row["importance"] = {"u": u, "z": z, "held": held, "accepted": sampled.accepted}
+    return row
 
 
 def adapted(seed: int, folder: Path) -> dict[str, object]:
@@ -127,9 +127,9 @@ def adapted(seed: int, folder: Path) -> dict[str, object]:
     events = [record.event for record in journal.records]
     if last.fit is None or len(last.fit.campaign.spots) < len(campaign.spots):
         last = Last(fit(campaign))
-    told = ended(campaign, last.fit, last.sampled, truth, plan_minutes(rig, steps[: row + 1]))
-    asked = [dict(record.data) for record in journal.records if record.event == "confirmed"]
-    return {**told, "met": outcome.reason == "target met", "changes": events.count("adapted"), "confirmed": asked}
+    end = ended(campaign, last.fit, last.sampled, truth, plan_minutes(rig, steps[: row + 1]))
+    tests = [dict(record.data) for record in journal.records if record.event == "confirmed"]
+    return {**end, "met": outcome.reason == "target met", "changes": events.count("adapted"), "confirmed": tests}
 
 
 def first_looks(campaign: Campaign, count: int) -> Campaign:
@@ -151,8 +151,8 @@ def fixed(seed: int, folder: Path, plan: tuple[PlanStep, ...]) -> dict[str, obje
 
     def worst(number: int) -> float:
         """Largest Laplace sd of the ratios with so many looks."""
-        found = fits[number] = fits.get(number) or fit(first_looks(whole, sizes[number]))
-        return float(laplace_sds(found).max()) if found.converged else float("inf")
+        joint = fits[number] = fits.get(number) or fit(first_looks(whole, sizes[number]))
+        return float(laplace_sds(joint).max()) if joint.converged else float("inf")
 
     low, end = -1, len(sizes) - 1
     while end - low > 1:
@@ -185,8 +185,8 @@ def one_run(task: tuple[str, int]) -> dict[str, object]:
     start = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "run"
-        told = adapted(seed, folder) if name == ADAPTIVE else fixed(seed, folder, shipped_plan(name))
-    return {"plan": name, "seed": seed, **told, "cpu_s": time.process_time() - start}
+        row = adapted(seed, folder) if name == ADAPTIVE else fixed(seed, folder, shipped_plan(name))
+    return {"plan": name, "seed": seed, **row, "cpu_s": time.process_time() - start}
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -214,19 +214,19 @@ def table(arguments: argparse.Namespace) -> None:
     print(f"Rigs drawn anew, target u(worst) <= {TARGET:g} deg/step by the sampled posterior (importance sampling); by")
     print("Laplace alone, which ends a run earlier, where it says so.\n")
     print("| plan | ended by | rigs | target met | minutes, median (10 to 90 %) | looks, median |\n|" + "---|" * 6)
-    for (name, stop), own in groups.items():
-        middle, low, high = np.quantile([o["minutes"] for o in own], [0.5, 0.1, 0.9])
-        spread, looks = f"{middle:.1f} ({low:.1f} to {high:.1f})", np.median([o["looks"] for o in own])
-        print(f"| {name} | {stop} | {len(own)} | {sum(o['met'] for o in own)} | {spread} | {looks:.0f} |")
+    for (name, stop), runs in groups.items():
+        middle, low, high = np.quantile([o["minutes"] for o in runs], [0.5, 0.1, 0.9])
+        spread, looks = f"{middle:.1f} ({low:.1f} to {high:.1f})", np.median([o["looks"] for o in runs])
+        print(f"| {name} | {stop} | {len(runs)} | {sum(o['met'] for o in runs)} | {spread} | {looks:.0f} |")
     print("\nFinal 95 % intervals with the truth in them; in brackets 95 % of the counts. The four directions of a rig")
     print("are no independent trials, left and right least of all: beside them rigs on which all four hold (81 % if")
     print("they were independent, 95 % if they were one).\n")
     print("| plan | ended by | intervals | of directions | of rigs, all four | rms z |\n|" + "---|" * 6)
-    for (name, stop), own in groups.items():
+    for (name, stop), runs in groups.items():
         for tier in ("importance", "laplace"):
-            if tier in own[0]:
+            if tier in runs[0]:
                 word = "posterior" if tier == "importance" else "Laplace"
-                print(f"| {name} | {stop} | {word} | {' | '.join(coverage([o[tier] for o in own]))} |")
+                print(f"| {name} | {stop} | {word} | {' | '.join(coverage([o[tier] for o in runs]))} |")
     confirmed_part([row for row in rows if row["plan"] == ADAPTIVE])
 
 
@@ -235,27 +235,27 @@ def label(name: str) -> str:
     return "`--adapt`" if name == ADAPTIVE else f"{name}.csv"
 
 
-def coverage(told: list[dict]) -> list[str]:
+def coverage(rows: list[dict]) -> list[str]:
     """How many directions and how many rigs have the truth in their intervals, and the rms of z."""
-    z = [np.array(each["z"]) for each in told]
-    held = [np.array(each.get("held", np.abs(own) <= NORMAL_95)) for each, own in zip(told, z, strict=True)]
+    z = [np.array(each["z"]) for each in rows]
+    held = [np.array(each.get("held", np.abs(err) <= NORMAL_95)) for each, err in zip(rows, z, strict=True)]
     directions = np.concatenate(held)
     rms = np.sqrt(np.mean(np.concatenate(z) ** 2))
-    whole = sum(bool(own.all()) for own in held)
+    whole = sum(bool(err.all()) for err in held)
     return [share(int(directions.sum()), len(directions)), share(whole, len(held)), f"{rms:.2f}"]
 
 
 def confirmed_part(rows: list[dict]) -> None:
     """How often the posterior was asked, what it said, how far it was from Laplace."""
-    asked = [event for row in rows for event in row["confirmed"]]
-    if not asked:
+    tests = [event for row in rows for event in row["confirmed"]]
+    if not tests:
         return
-    ratios = [e["importance_u_deg_per_step"] / e["laplace_u_deg_per_step"] for e in asked if e["accepted"]]
+    ratios = [e["importance_u_deg_per_step"] / e["laplace_u_deg_per_step"] for e in tests if e["accepted"]]
     low, middle, high = np.quantile(ratios, [0.1, 0.5, 0.9])
-    refused = sum(not e["reached"] for e in asked)
-    unusable = sum(not e["accepted"] for e in asked)
+    refused = sum(not e["reached"] for e in tests)
+    unusable = sum(not e["accepted"] for e in tests)
     early = sum(not row["confirmed"][0]["reached"] for row in rows if row["confirmed"])
-    print(f"\n`--adapt` sampled the posterior {len(asked)} times on {len(rows)} rigs; {refused} times it said that the")
+    print(f"\n`--adapt` sampled the posterior {len(tests)} times on {len(rows)} rigs; {refused} times it said that the")
     print(f"target is not reached ({unusable} of them because its weights could not be used), on {early} rigs at the")
     print(f"first time. Its worst u over Laplace's: {middle:.2f} in the median ({low:.2f} to {high:.2f}).")
 

@@ -57,12 +57,12 @@ SEED = 58
 
 def planned_family(knowledge: Knowledge) -> Family:
     """The planner's order of looks for the worst effective ratio; searched once, then kept."""
-    found = candidates(knowledge)
+    pool = candidates(knowledge)
     if not PLANNED.exists():
         PLANNED.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(PLANNED, picks=searched_family(knowledge, found).picks)
+        np.savez(PLANNED, picks=searched_family(knowledge, pool).picks)
     with np.load(PLANNED) as kept:
-        return Family(knowledge, found, kept["picks"], False)
+        return Family(knowledge, pool, kept["picks"], False)
 
 
 def plan_and_rig(name: str) -> tuple[tuple[PlanStep, ...], Rig]:

@@ -69,9 +69,9 @@ class Session:
 
 def session(knowledge: Knowledge, steps: Sequence[PlanStep]) -> Session:
     """What a plan tells before anything is measured."""
-    found = information_of(steps, knowledge)
-    at = sensitivity(TARGET, knowledge.z, knowledge.space, knowledge.rig.table, found.pose_rad)
-    return Session(knowledge, found, at, at.value(covariance_of(knowledge.precision + found.fisher)))
+    information = information_of(steps, knowledge)
+    at = sensitivity(TARGET, knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad)
+    return Session(knowledge, information, at, at.value(covariance_of(knowledge.precision + information.fisher)))
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,10 @@ class Comparison:
     rows: dict[str, str] = field(default_factory=dict)
     planned: dict[int, Session] = field(default_factory=dict)
 
-    def add(self, name: str, found: Session, times: int = 1) -> None:
+    def add(self, name: str, one: Session, times: int = 1) -> None:
         """A point of a curve: the session taken `times` times."""
-        value = found.at.value(covariance_of(found.knowledge.precision + times * found.information.fisher))
-        self.curves.setdefault(name, []).append(Point(times * found.information.minutes, value, times * found.spots))
+        value = one.at.value(covariance_of(one.knowledge.precision + times * one.information.fisher))
+        self.curves.setdefault(name, []).append(Point(times * one.information.minutes, value, times * one.spots))
 
 
 def compared(knowledge: Knowledge, family: Family) -> Comparison:
@@ -102,9 +102,9 @@ def compared(knowledge: Knowledge, family: Family) -> Comparison:
     result = Comparison()
     for repeats in REPEATS:
         for name, protocol in (("paper", paper_protocol), ("mixed", mixed_protocol)):
-            found = session(knowledge, protocol(repeats))
-            result.add(name, found)
-            result.rows[name] = found.row(name)
+            first = session(knowledge, protocol(repeats))
+            result.add(name, first)
+            result.rows[name] = first.row(name)
     grid = session(knowledge, grid_protocol())
     result.rows["grid"] = grid.row("grid")
     for times in (1, 2, 4):
@@ -130,8 +130,8 @@ def second_session(first: Session) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for label, allowed in (("more of the same range", ~away), ("with the beams a full turn away", np.ones_like(away))):
         part = replace(shown, rows=np.where(allowed[:, None, None], shown.rows, 0.0))
-        asked = DesignProblem(sharp, wide, part, replace(TARGET, limit=UNREACHED), first.at)
-        more = design_family(asked, Scope(largest=16))
+        problem = DesignProblem(sharp, wide, part, replace(TARGET, limit=UNREACHED), first.at)
+        more = design_family(problem, Scope(largest=16))
         for n in (2, 4, 8, 16):
             after = information_of(more.arranged(n).steps, sharp)
             covariance = covariance_of(sharp.precision + after.fisher)

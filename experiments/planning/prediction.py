@@ -130,8 +130,8 @@ def table(arguments: argparse.Namespace) -> None:
         verdict = "within" if bounds[0] <= result.assurance <= bounds[1] else "OUTSIDE"
         sizes = f"{stated['experiments']} | {stated['looks']} | {stated['minutes']:.1f}"
         counted = f"{100 * result.assurance:.1f} % of {n} | {100 * low:.0f}-{100 * high:.0f} %"
-        said = f"{100 * a:.1f} +- {100 * se:.1f} %"
-        print(f"| {name} | {sizes} | {said} | {counted} | {100 * bounds[0]:.0f}-{100 * bounds[1]:.0f} % | {verdict} |")
+        share = f"{100 * a:.1f} +- {100 * se:.1f} %"
+        print(f"| {name} | {sizes} | {share} | {counted} | {100 * bounds[0]:.0f}-{100 * bounds[1]:.0f} % | {verdict} |")
     failed = [r for r in rows if not r["converged"]]
     seconds = np.median([r["seconds"] for r in rows])
     print(f"\n{len(rows)} rows, median {seconds:.1f} s; {len(failed)} fits failed.")

@@ -77,10 +77,10 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     moves, read = template(protocol, seed)
     drawn = simulate_axis(moves, seed=seed)
     kept = tuple(r for r in drawn.campaign.readings if r.move in read)
-    found = fit_axis(AxisCampaign("deg", drawn.campaign.moves, kept, moves.stated), tier="importance", seed=seed)
-    row: dict[str, object] = {"protocol": protocol, "seed": seed, "problems": list(found.missing)}
+    result = fit_axis(AxisCampaign("deg", drawn.campaign.moves, kept, moves.stated), tier="importance", seed=seed)
+    row: dict[str, object] = {"protocol": protocol, "seed": seed, "problems": list(result.missing)}
     for name in QUANTITIES:
-        draws, true = found.draws[name], drawn.truth.parameters[name]
+        draws, true = result.draws[name], drawn.truth.parameters[name]
         row[name] = {"z": float((draws.mean() - true) / draws.std()), "below": float(np.mean(draws < true))}
     return row
 
@@ -95,12 +95,12 @@ def run(arguments: argparse.Namespace) -> None:
     """Rows of held-out positions of every table in a folder."""
     HELD.unlink(missing_ok=True)
     for file in tables_of(arguments.folder):
-        found = hold_out_positions(axis_of(file))
-        for p in found.positions:
+        held = hold_out_positions(axis_of(file))
+        for p in held.positions:
             z, classic_z = (p.mean - p.predicted) / p.u, (p.mean - p.classic_predicted) / p.classic_u
             row = {"axis": file.stem, "position": p.position, "direction": p.direction, "end": p.end}
             append_row(HELD, {**row, "z": z, "classic_z": classic_z, "rows": p.rows, "inside": p.inside})
-        print(file.stem, f"{found.rms_z:.2f}", *found.warnings)
+        print(file.stem, f"{held.rms_z:.2f}", *held.warnings)
 
 
 def _rms(z: list[float]) -> str:
@@ -161,8 +161,8 @@ def figure(_: argparse.Namespace) -> None:
     """Z of every inner position that was left out, by axis, for both models."""
     rows = [row for row in read_rows(HELD) if not row["end"]]
     names = list(dict.fromkeys(row["axis"] for row in rows))
-    with page_figure(FIGURE, 3.0, width_in=7.2) as made:
-        axes = made.subplots()
+    with page_figure(FIGURE, 3.0, width_in=7.2) as page:
+        axes = page.subplots()
         axes.axhspan(-1.96, 1.96, color=BLUE, alpha=0.15, linewidth=0)
         for shift, key, colour, label in (
             (-0.12, "z", BLUE, "processes of position"),
@@ -179,12 +179,12 @@ def figure(_: argparse.Namespace) -> None:
 
 def main() -> None:
     """Do what the command line asks for."""
-    made = parser(__doc__)
-    made.add_argument("action", choices=("run", "simulate", "table", "figure"))
-    made.add_argument("folder", type=Path, nargs="?", help="of tables, for run")
-    made.add_argument("--n", type=int, default=100, help="drawn axes of each protocol (%(default)s)")
-    made.add_argument("--cores", type=int, nargs="+", default=[0], metavar="CORE")
-    arguments = made.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("action", choices=("run", "simulate", "table", "figure"))
+    cli.add_argument("folder", type=Path, nargs="?", help="of tables, for run")
+    cli.add_argument("--n", type=int, default=100, help="drawn axes of each protocol (%(default)s)")
+    cli.add_argument("--cores", type=int, nargs="+", default=[0], metavar="CORE")
+    arguments = cli.parse_args()
     {"run": run, "simulate": simulate, "table": table, "figure": figure}[arguments.action](arguments)
 
 

@@ -14,10 +14,10 @@ from tvsbayes.single_axis.axis_campaign import write_axis
 
 def main() -> None:
     """Write every folder."""
-    made = parser(__doc__)
-    made.add_argument("folder", type=Path)
-    made.add_argument("out", type=Path)
-    arguments = made.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("folder", type=Path)
+    cli.add_argument("out", type=Path)
+    arguments = cli.parse_args()
     for table in tables_of(arguments.folder):
         write_axis(axis_of(table), arguments.out / table.stem)
         print(arguments.out / table.stem)

@@ -52,7 +52,7 @@ class Beam:
 
 def parts_of(picture: np.ndarray, rows: int, columns: int) -> list[Centre]:
     """Spots of the parts of a picture, in the pixels of the whole."""
-    found = []
+    parts = []
     for row in range(rows):
         for column in range(columns):
             part = find_spot(np.ascontiguousarray(picture[row::rows, column::columns]))
@@ -60,13 +60,13 @@ def parts_of(picture: np.ndarray, rows: int, columns: int) -> list[Centre]:
                 step = np.array([columns, rows])
                 centre = part.centre_px * step + [column, row]
                 part = Centre(part.status, centre, part.covariance_px2 * np.outer(step, step))
-            found.append(part)
-    return found
+            parts.append(part)
+    return parts
 
 
-def deviations(found: Sequence[Centre]) -> np.ndarray:
+def deviations(spots: Sequence[Centre]) -> np.ndarray:
     """Z (n, 2) of centres about their mean, of those that are ok."""
-    ok = [one.located for one in found if one.status == "ok"]
+    ok = [one.located for one in spots if one.status == "ok"]
     if len(ok) < 2:
         return np.empty((0, 2))
     centres = np.array([one.centre_px for one in ok])
@@ -162,9 +162,9 @@ def report(folder: Path) -> None:
 
 def main() -> None:
     """Print the page of a folder of pictures."""
-    made = parser(__doc__)
-    made.add_argument("folder", type=Path, nargs="?", default=BEAMS)
-    report(made.parse_args().folder)
+    cli = parser(__doc__)
+    cli.add_argument("folder", type=Path, nargs="?", default=BEAMS)
+    report(cli.parse_args().folder)
 
 
 if __name__ == "__main__":

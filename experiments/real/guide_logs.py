@@ -41,12 +41,12 @@ NEAR = 0.03
 
 def campaign_of(run: GuideRun, file: str) -> AxisCampaign:
     """What `import --axis --run N` writes."""
-    found = readings_of_run(run, file, {})
-    if found.drive is None or found.drive.period_between is None:
+    readings = readings_of_run(run, file, {})
+    if readings.drive is None or readings.drive.period_between is None:
         raise SystemExit(f"{file}: no drive at constant rate, or too short")
-    stated = {name: AxisPrior(value, u) for name, (value, u) in found.drive.priors.items()}
-    asked = WavePeriods((), (found.drive.period_between,), True)
-    return AxisCampaign("arcsec", found.moves, found.readings, stated, {"rate": found.drive.rate}, asked)
+    stated = {name: AxisPrior(value, u) for name, (value, u) in readings.drive.priors.items()}
+    periods = WavePeriods((), (readings.drive.period_between,), True)
+    return AxisCampaign("arcsec", readings.moves, readings.readings, stated, {"rate": readings.drive.rate}, periods)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -58,14 +58,14 @@ def run(arguments: argparse.Namespace) -> None:
             if len(logged.frames) < FRAMES_MIN or (file.name, logged.number) in done:
                 continue
             began = time.process_time()
-            found = fit_axis(campaign_of(logged, file.name), tier="importance")
-            summary = summarise_axis(found)
+            result = fit_axis(campaign_of(logged, file.name), tier="importance")
+            summary = summarise_axis(result)
             row = {
                 "file": file.name,
                 "run": logged.number,
                 "mount": logged.mount,
                 "frames": summary.readings,
-                "span_s": float(found.rows.time_s[-1] - found.rows.time_s[0]),
+                "span_s": float(result.rows.time_s[-1] - result.rows.time_s[0]),
                 "problems": list(summary.problems),
                 "periods": [plain(one) for one in summary.periods],
                 "cpu_s": time.process_time() - began,
@@ -131,10 +131,10 @@ def table(_: argparse.Namespace) -> None:
 
 def main() -> None:
     """Do what the command line asks for."""
-    made = parser(__doc__)
-    made.add_argument("action", choices=("run", "table"))
-    made.add_argument("folder", type=Path, nargs="?", help="of logs, for run")
-    arguments = made.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("action", choices=("run", "table"))
+    cli.add_argument("folder", type=Path, nargs="?", help="of logs, for run")
+    arguments = cli.parse_args()
     {"run": run, "table": table}[arguments.action](arguments)
 
 

@@ -42,14 +42,14 @@ def columns(path: Path) -> np.ndarray:
 def sighted(rows: np.ndarray, height: float) -> np.ndarray:
     """Azimuth and elevation (n, 2), deg, of the optical axis: the point's direction, less where the picture has it."""
     off = (2 * rows[:, 2:4] - CENTRE_PX) / FOCAL_PX
-    seen = np.stack([np.ones(len(rows)), -off[:, 0], -off[:, 1]], axis=1)
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    rays = np.stack([np.ones(len(rows)), -off[:, 0], -off[:, 1]], axis=1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     to = np.column_stack([rows[:, 4:6], np.full(len(rows), -height)])
     to /= np.linalg.norm(to, axis=1, keepdims=True)
     # A camera without roll: z of the point after the turn about the elevation axis, then the azimuth that is left.
-    level = np.arcsin(np.clip(to[:, 2] / np.hypot(seen[:, 0], seen[:, 2]), -1, 1)) - np.arctan2(seen[:, 2], seen[:, 0])
-    ahead = seen[:, 0] * np.cos(level) - seen[:, 2] * np.sin(level)
-    turn = np.arctan2(to[:, 1], to[:, 0]) - np.arctan2(seen[:, 1], ahead)
+    level = np.arcsin(np.clip(to[:, 2] / np.hypot(rays[:, 0], rays[:, 2]), -1, 1)) - np.arctan2(rays[:, 2], rays[:, 0])
+    ahead = rays[:, 0] * np.cos(level) - rays[:, 2] * np.sin(level)
+    turn = np.arctan2(to[:, 1], to[:, 0]) - np.arctan2(rays[:, 1], ahead)
     return np.degrees(np.stack([turn, level], axis=1))
 
 
@@ -97,17 +97,17 @@ def servo(file: Path) -> None:
             stdout=subprocess.DEVNULL,
         )
         words = [*tvsbayes, "fit", str(folder), "--quick", "--json"]
-        found = json.loads(subprocess.run(words, check=True, capture_output=True).stdout)
+        document = json.loads(subprocess.run(words, check=True, capture_output=True).stdout)
     print(
         f"\n## `{file.name}`, {len(columns(file))} stops, all from below\n\n| quantity | value | 95 % |\n|---|---|---|"
     )
-    parameters = found["parameters"]
+    parameters = document["parameters"]
     for name in ("per_command", "backlash", "transmission_error", "stop_sd.forward"):
-        one = found["per_command"]["forward"] if name == "per_command" else parameters[name]
+        one = document["per_command"]["forward"] if name == "per_command" else parameters[name]
         low, high = one["interval95"]
         print(f"| `{name}` | {one['value']:.4f} ({one['sd']:.4f}) | {low:.4f} to {high:.4f} |")
-    told = 1 - (parameters["backlash"]["sd"] / parameters["backlash"]["prior_sd"]) ** 2
-    print(f"\nOf what the prior leaves open of the play the readings take away {100 * max(told, 0):.0f} %.")
+    reduction = 1 - (parameters["backlash"]["sd"] / parameters["backlash"]["prior_sd"]) ** 2
+    print(f"\nOf what the prior leaves open of the play the readings take away {100 * max(reduction, 0):.0f} %.")
 
 
 TEXT = """# Two small pan-tilt heads
@@ -125,9 +125,9 @@ tilt's curve, a linkage, is an error by position several times what the prior ex
 
 def main() -> None:
     """See the module."""
-    made = parser(__doc__)
-    made.add_argument("folder", type=Path)
-    folder = made.parse_args().folder
+    cli = parser(__doc__)
+    cli.add_argument("folder", type=Path)
+    folder = cli.parse_args().folder
     print(TEXT)
     camera(columns(folder / "camera.csv"))
     for axis in ("pan", "tilt"):

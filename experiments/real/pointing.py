@@ -53,15 +53,15 @@ def small_angles(stars: tuple[Star, ...]) -> tuple[np.ndarray, np.ndarray, np.nd
     encoder, true = (np.array([getattr(star, name) for star in stars]) for name in ("encoder_deg", "true_deg"))
     elevation, azimuth = np.radians(true[:, 0]), np.radians(AZIMUTH_FROM_DEG - true[:, 1])
     off = ((encoder[:, 1] - true[:, 1]) + 180.0) % 360.0 - 180.0
-    seen = ARCSEC * np.concatenate([off * np.cos(elevation), true[:, 0] - encoder[:, 0]])
+    offsets = ARCSEC * np.concatenate([off * np.cos(elevation), true[:, 0] - encoder[:, 0]])
     se, ce, sa, ca, none = *(f(elevation) for f in (np.sin, np.cos)), np.sin(azimuth), np.cos(azimuth), 0 * azimuth
     # Columns IA IE AN AW CA NPAE TF TX; azimuth times cos(elevation) above, elevation below.
     upper = [-ce, none, -sa * se, -ca * se, none - 1, -se, none, none]
     lower = [none, none + 1, -ca, sa, none, none, -ce, -ce / se]
     design = np.concatenate([np.stack(upper, axis=1), np.stack(lower, axis=1)])
-    terms, _, _, _ = np.linalg.lstsq(design, seen, rcond=None)
-    left = seen - design @ terms
-    variance = left @ left / (len(seen) - len(terms))
+    terms, _, _, _ = np.linalg.lstsq(design, offsets, rcond=None)
+    left = offsets - design @ terms
+    variance = left @ left / (len(offsets) - len(terms))
     return terms, np.sqrt(variance * np.diag(np.linalg.inv(design.T @ design))), left.reshape(2, -1).T
 
 
@@ -74,10 +74,10 @@ def predicted(campaign: Campaign) -> dict[str, object]:
     """Every second star left out of the joint fit and predicted by it: z, and arcsec, of both angles."""
     spots = ordered_spots(campaign)
     out = np.arange(len(spots)) % 2 == 1
-    found = fit(campaign, without={spot.spot for spot, left in zip(spots, out, strict=True) if left})
+    model = fit(campaign, without={spot.spot for spot, left in zip(spots, out, strict=True) if left})
     rng, draws = np.random.default_rng(3), PREDICTED_DRAWS
-    physical, errors = np.asarray(found.draws.physical)[:draws], np.asarray(found.draws.place_errors_rad)[:draws]
-    again = looks_again(found, found.draws_z[:draws], physical, errors, rng)[:, out, 1:3]
+    physical, errors = np.asarray(model.draws.physical)[:draws], np.asarray(model.draws.place_errors_rad)[:draws]
+    again = looks_again(model, model.draws_z[:draws], physical, errors, rng)[:, out, 1:3]
     mean, sd = again.mean(axis=0), again.std(axis=0)
     return {"z": (-mean / sd).ravel().tolist(), "rms": rms_arcsec(np.degrees(mean)), "stars": int(out.sum())}
 
@@ -89,8 +89,8 @@ def night(file: Path) -> dict[str, object]:
     campaign = campaign_of(stars, file.stem)
     classic = pointing_model(campaign)
     by_name = {n: (v, e) for n, v, e in zip(classic.names, classic.value, classic.standard_error, strict=True)}
-    found = fit(campaign)
-    posterior = sample(found, "importance")
+    model = fit(campaign)
+    posterior = sample(model, "importance")
     weights, draws = posterior.weights.ravel(), posterior.by_name
 
     def stated(name: str, sign: int = 1) -> tuple[float, float]:
@@ -106,29 +106,29 @@ def night(file: Path) -> dict[str, object]:
         "classic_rms": ARCSEC * classic.rms_deg,
         "joint": {n: stated(*term) for n, term in TERMS.items()},
         "gears": {name: stated(name) for name in GEARS},
-        "weak": _weak(found),
+        "weak": _weak(model),
         "answer": posterior.convergence.answer,
-        "problems": list(found.problems),
+        "problems": list(model.problems),
         "left_out": predicted(campaign),
         "cpu_s": time.process_time() - began,
     }
 
 
-def _weak(found) -> list[str]:
+def _weak(model) -> list[str]:
     """Weak directions in words."""
     from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
 
-    return [weak.text for weak in weak_directions(found, moved_directions(found))]
+    return [weak.text for weak in weak_directions(model, moved_directions(model))]
 
 
 def between(folder: Path) -> dict[str, object]:
     """Night one's least-squares terms on night two: arcsec before, after, and after with zeros of its own."""
     one, two = (campaign_of(read_stars(file).stars, file.stem) for file in sorted(folder.glob("*.dat"))[:2])
-    taught, own = pointing_model(one), pointing_model(two)
+    taught, new = pointing_model(one), pointing_model(two)
     rows = sightings_of(ordered_spots(two))
-    bare = PointingModel((), np.zeros(0), np.zeros(0), np.zeros((0, 2)), {**own.known, **dict.fromkeys(own.names, 0.0)})
+    bare = PointingModel((), np.zeros(0), np.zeros(0), np.zeros((0, 2)), {**new.known, **dict.fromkeys(new.names, 0.0)})
     off, raw = taught.off_deg(two, rows), bare.off_deg(two, rows)
-    return {"file": "between", "before": rms_arcsec(raw), "after": rms_arcsec(off), "own": rms_arcsec(own.residual_deg)}
+    return {"file": "between", "before": rms_arcsec(raw), "after": rms_arcsec(off), "own": rms_arcsec(new.residual_deg)}
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -184,11 +184,11 @@ def table(_: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    made = parser(__doc__)
-    parts = made.add_subparsers(required=True)
+    cli = parser(__doc__)
+    parts = cli.add_subparsers(required=True)
     running = parts.add_parser("run", help="fit every table of a folder")
     running.add_argument("folder", type=Path)
     running.set_defaults(act=run)
     parts.add_parser("table", help="print the page").set_defaults(act=table)
-    chosen = made.parse_args()
+    chosen = cli.parse_args()
     chosen.act(chosen)

@@ -58,12 +58,12 @@ def opencv_joint(views: Sequence[View], board: Board, size: tuple[int, int]) -> 
     """OpenCV's calibration from the same corners."""
     points = [board.points_mm.astype(np.float32)] * len(views)
     sides = [[np.asarray(getattr(view, side), np.float32) for view in views] for side in ("left", "right")]
-    alone = [cv2.calibrateCamera(points, seen, size, None, None)[1:3] for seen in sides]
+    alone = [cv2.calibrateCamera(points, one, size, None, None)[1:3] for one in sides]
     ends = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 300, 1e-12
-    found = cv2.stereoCalibrate(
+    joint = cv2.stereoCalibrate(
         points, *sides, *alone[0], *alone[1], size, flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=ends
     )
-    return Joint(float(found[0]), float(np.linalg.norm(found[6])))
+    return Joint(float(joint[0]), float(np.linalg.norm(joint[6])))
 
 
 def against(one: StereoCalibration, other: StereoCalibration) -> Halves:
@@ -102,15 +102,15 @@ def spoiled(views: Sequence[View], board: Board) -> dict[str, list[View]]:
     }
 
 
-def said(views: Sequence[View], board: Board, size: tuple[int, int]) -> str:
+def row_of(views: Sequence[View], board: Board, size: tuple[int, int]) -> str:
     """A row: what comes of views."""
     try:
-        found = calibrate_stereo(views, board, size)
+        calibration = calibrate_stereo(views, board, size)
     except TvsError as error:
         return f"| refused: {error.message} | | | |"
-    names = [", ".join(part) or "none" for part in (found.excluded, found.reordered)]
-    baseline = f"{np.linalg.norm(found.stereo.T):.2f} ({found.baseline_sd_mm:.2f})"
-    return f"| {found.stereo.rms_px:.3f} | {baseline} | {names[0]} | {names[1]} |"
+    names = [", ".join(part) or "none" for part in (calibration.excluded, calibration.reordered)]
+    baseline = f"{np.linalg.norm(calibration.stereo.T):.2f} ({calibration.baseline_sd_mm:.2f})"
+    return f"| {calibration.stereo.rms_px:.3f} | {baseline} | {names[0]} | {names[1]} |"
 
 
 def draw(splits: Sequence[Halves], named: Halves) -> None:
@@ -134,11 +134,11 @@ def draw(splits: Sequence[Halves], named: Halves) -> None:
         right.legend()
 
 
-def report(found: Views, board: Board, folder: Path) -> None:
+def report(boards: Views, board: Board, folder: Path) -> None:
     """The page."""
-    size = (found.image_width, found.image_height)
+    size = (boards.image_width, boards.image_height)
     shipped = folder == PAIRS
-    views = pairs_of(found.views)
+    views = pairs_of(boards.views)
     ours, theirs = calibrate_stereo(views, board, size), opencv_joint(views, board, size)
     baseline = float(np.linalg.norm(ours.stereo.T))
     if shipped:
@@ -156,7 +156,7 @@ def report(found: Views, board: Board, folder: Path) -> None:
     print(
         f"board {board.columns} x {board.rows}, squares of {board.pitch_mm:g} mm. Found in one picture only: ", end=""
     )
-    print(f"{len(found.views) - len(views)}; no board: {', '.join(found.without_board) or 'none'}.\n")
+    print(f"{len(boards.views) - len(views)}; no board: {', '.join(boards.without_board) or 'none'}.\n")
     print("| | rms px | baseline mm |\n|---|---|---|")
     print(f"| `stereo` | {ours.stereo.rms_px:.5f} | {baseline:.3f}, u {ours.baseline_sd_mm:.3f} |")
     print(f"| cv2.stereoCalibrate {cv2.__version__} | {theirs.rms_px:.5f} | {theirs.baseline_mm:.3f} |")
@@ -184,16 +184,16 @@ def report(found: Views, board: Board, folder: Path) -> None:
             draw(splits, named)
     print("| pairs | rms px | baseline mm (u) | left out | put into another order |\n|---|---|---|---|---|")
     for what, changed in spoiled(views, board).items():
-        print(f"| {what} {said(changed, board, size)}")
+        print(f"| {what} {row_of(changed, board, size)}")
 
 
 def main() -> None:
     """Print the page of a set of pairs."""
-    made = parser(__doc__)
-    made.add_argument("folder", type=Path, nargs="?", default=PAIRS)
-    made.add_argument("--board", default="4x6", help="inner corners (%(default)s)")
-    made.add_argument("--pitch-mm", type=float, default=30.0, help="side of a square (%(default)s)")
-    arguments: argparse.Namespace = made.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("folder", type=Path, nargs="?", default=PAIRS)
+    cli.add_argument("--board", default="4x6", help="inner corners (%(default)s)")
+    cli.add_argument("--pitch-mm", type=float, default=30.0, help="side of a square (%(default)s)")
+    arguments: argparse.Namespace = cli.parse_args()
     board = Board.named(arguments.board, arguments.pitch_mm)
     report(find_views(arguments.folder, board), board, arguments.folder)
 

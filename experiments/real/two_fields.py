@@ -77,13 +77,13 @@ def real_rows() -> None:
     print("|" + "---|" * (6 + len(MOVED_PX)))
     for path in sorted(BEAMS.glob("*.png")):
         picture = read_image(path)
-        seen = bare(picture)
-        if seen.status != "ok" or seen.lines_px is None:
+        spot = bare(picture)
+        if spot.status != "ok" or spot.lines_px is None:
             continue
-        shift, sds = seen.lines_px[0], np.sqrt(np.diag(seen.located.covariance_px2))
+        shift, sds = spot.lines_px[0], np.sqrt(np.diag(spot.located.covariance_px2))
         # Two halves; the first's deviation from their mean is minus half of odd less even.
         halves = -np.sqrt(2) * deviations(parts_of(picture, 2, 1))[0]
-        cells = [path.stem, f"{100 * gain_of_odd_rows(picture, seen.located.centre_px):.1f} %"]
+        cells = [path.stem, f"{100 * gain_of_odd_rows(picture, spot.located.centre_px):.1f} %"]
         cells += [f"{shift[0]:+.3f}, {shift[1]:+.3f}", f"{halves[0]:+.1f}, {halves[1]:+.1f}"]
         cells += [", ".join(f"{z:+.1f}" for z in shift / sds / 2), f"{sds[1]:.4f}"]
         for by in MOVED_PX:
@@ -108,12 +108,12 @@ def twin_row() -> None:
         if number % 2:
             # Every other one as of a monochrome camera whose pixels are photosites: no demosaicing mixes lines.
             picture = mono_picture(mark, contrast, number)
-        seen = bare(picture, SpotNoise(Sensor().gain_dn_per_electron, contrast))
-        if seen.status == "ok" and seen.lines_px is not None:
+        spot = bare(picture, SpotNoise(Sensor().gain_dn_per_electron, contrast))
+        if spot.status == "ok" and spot.lines_px is not None:
             good += 1
-            widened_spots += bool(widened([seen]).lines)
-            inverse = np.linalg.inv(4 * seen.located.covariance_px2)
-            chi2.append((number % 2, float(np.einsum("ki,ij,kj->", seen.lines_px, inverse, seen.lines_px)) / 4))
+            widened_spots += bool(widened([spot]).lines)
+            inverse = np.linalg.inv(4 * spot.located.covariance_px2)
+            chi2.append((number % 2, float(np.einsum("ki,ij,kj->", spot.lines_px, inverse, spot.lines_px)) / 4))
     of_mono = np.mean([value for mono, value in chi2 if mono])
     of_colour = np.mean([value for mono, value in chi2 if not mono])
     print(f"\n{SPOTS} pictures of spots that were read at once, half of them monochrome: {good} ok,")

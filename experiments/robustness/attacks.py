@@ -59,10 +59,10 @@ class Run:
     """`acquire --simulate` in a process of its own; what it says goes to a file beside its folder."""
 
     def __init__(self, rows: int, out: Path, *options: str):
-        self.out, self.said, steps = out, out.with_suffix(".txt"), out.with_suffix(".csv")
+        self.out, self.log, steps = out, out.with_suffix(".txt"), out.with_suffix(".csv")
         steps.write_text("".join((RIG / "planned.csv").read_text().splitlines(keepends=True)[: rows + 1]))
         words = ["acquire", str(RIG / "rig.toml"), str(steps), str(out), "--simulate", "--seed", "3", *options]
-        with self.said.open("wb") as stream:
+        with self.log.open("wb") as stream:
             self.child = subprocess.Popen([*COMMAND, *words], stdout=stream, stderr=stream, cwd=ROOT)
         resource.prlimit(self.child.pid, resource.RLIMIT_NOFILE, (FILES_MAX, FILES_MAX))
 
@@ -96,10 +96,10 @@ def sent(port: int, request: bytes) -> tuple[int, bytes]:
 
 def http(port: int, path: str, body: bytes | None = None, method: str = "", **headers: str) -> bytes:
     """A request with a good Host, unless another is given; "" leaves a header out."""
-    given = {"Host": f"127.0.0.1:{port}", "Connection": "close"} | {k.replace("_", "-"): v for k, v in headers.items()}
-    given |= {} if body is None or "Content-Length" in given else {"Content-Length": str(len(body))}
+    fields = {"Host": f"127.0.0.1:{port}", "Connection": "close"} | {k.replace("_", "-"): v for k, v in headers.items()}
+    fields |= {} if body is None or "Content-Length" in fields else {"Content-Length": str(len(body))}
     lines = [f"{method or ('GET' if body is None else 'POST')} {path} HTTP/1.1"]
-    return "\r\n".join([*lines, *(f"{k}: {v}" for k, v in given.items() if v), "", ""]).encode() + (body or b"")
+    return "\r\n".join([*lines, *(f"{k}: {v}" for k, v in fields.items() if v), "", ""]).encode() + (body or b"")
 
 
 def requests(port: int, key: str, watcher: str) -> list[tuple[bytes, Sequence[int]]]:
@@ -111,7 +111,7 @@ def requests(port: int, key: str, watcher: str) -> list[tuple[bytes, Sequence[in
     paths = ("/../live", "/%2e%2e/live", "/..%2flive", "/%c0%ae%c0%ae/live", "//live", "/live/", "/live%00")
     paths += ("/log.jsonl", "/frames/000001_left.png", "/live.html%00.js", "http://evil/x", "/\\..\\live")
     tokens = (b"", b'{"token": "no"}', b'{"token": null}', b'["token"]', b'{"token": "\\ud800"}')
-    asked = (b"", b"no", b"[]", b"7", b'{"what": "fire"}', b'{"what": {"what": "stop"}}')
+    bodies = (b"", b"no", b"[]", b"7", b'{"what": "fire"}', b'{"what": {"what": "stop"}}')
     raw = f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: close\r\n".encode()
     return [
         *((http(port, "/live", X_Tvsbayes_Key=k), (403,)) for k in ("", "wrong", " ", "\u00fc")),
@@ -124,7 +124,7 @@ def requests(port: int, key: str, watcher: str) -> list[tuple[bytes, Sequence[in
         *((http(port, path, **mine), (400, 403, 404)) for path in paths),
         (http(port, "/live", method="OPTIONS", Origin="http://evil"), (403,)),
         (http(port, "/live", Origin="http://evil", Upgrade="websocket"), (403,)),
-        *((http(port, "/ask", body, **mine), (400,)) for body in asked),
+        *((http(port, "/ask", body, **mine), (400,)) for body in bodies),
         (http(port, "/ask", b'{"what": "stop"}'), (403,)),
         (http(port, "/ask", b'{"what": "stop"}', X_Tvsbayes_Key=watcher), (403,)),
         (http(port, "/ask", b"5", **chunked | {"Content_Length": "1"}), (400,)),
@@ -144,7 +144,7 @@ def attacked(place: Path) -> list[str]:
     alone.looked(LATE)
     peak_alone, codes = alone.memory_mb("VmHWM"), [alone.child.wait(LONGEST_S)]
     run = Run(ATTACKED, place / "attacked", "--live", "--no-browser")
-    link = run.until(lambda: re.search(r"http://127\.0\.0\.1:(\d+)/#(\S+)", run.said.read_text()))
+    link = run.until(lambda: re.search(r"http://127\.0\.0\.1:(\d+)/#(\S+)", run.log.read_text()))
     port, token = int(link[1]), json.dumps({"token": link[2]}).encode()
     key, watcher = (json.loads(sent(port, http(port, "/key", token))[1])["key"] for _ in range(2))
     waits: list[float] = []
@@ -263,7 +263,7 @@ def damaged(place: Path, what: str) -> str:
         kept = numbers(folder)
         earlier = "".join(f", earlier rows in {path.name}" for path in folder.glob("spots.*-1.csv"))
         outcome = f"goes on, {len(acknowledged & kept)} of {len(acknowledged)} looks kept{earlier}"
-    traceback = " TRACEBACK" * ("Traceback" in run.said.read_text() + checked.stderr)
+    traceback = " TRACEBACK" * ("Traceback" in run.log.read_text() + checked.stderr)
     return f"| {what} | {checked.returncode} | {code} | {outcome}{traceback} |"
 
 

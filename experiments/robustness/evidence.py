@@ -66,13 +66,13 @@ def held(inside: int, n: int) -> tuple[str, bool]:
 
 def classic_coverage(rows: list[dict]) -> tuple[str, bool]:
     """Share of classic type A intervals with the truth, by protocol; the claim is that they fail."""
-    found = {}
+    shares = {}
     for protocol in sorted({r["protocol"] for r in rows}):
         entries = [e for r in rows if r["protocol"] == protocol for e in (r.get("classic") or {}).values()]
         if entries:
-            found[protocol] = np.mean([e["type_a"][0] <= e["true"] <= e["type_a"][1] for e in entries])
-    text = "holds it in " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.items())
-    return text, all(share < binomial_bounds(300, LEVEL)[0] for share in found.values())
+            shares[protocol] = np.mean([e["type_a"][0] <= e["true"] <= e["type_a"][1] for e in entries])
+    text = "holds it in " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
+    return text, all(share < binomial_bounds(300, LEVEL)[0] for share in shares.values())
 
 
 def joint_coverage(rows: list[dict]) -> tuple[str, bool]:
@@ -99,11 +99,11 @@ def protocol_coverage(protocol: str, rigs: int, accepted: list[dict]) -> tuple[s
     if not accepted:
         return f"{protocol}, none of {rigs} rigs accepted: nothing to judge", False
     low, high = binomial_bounds(len(accepted), LEVEL)
-    entries = {name: [found[name] for found in accepted] for name in HEADLINES}
+    entries = {name: [values[name] for values in accepted] for name in HEADLINES}
     shares = {
-        name: float(np.mean([abs(e["pit"] - 0.5) <= LEVEL / 2 for e in found]))
-        for name, found in entries.items()
-        if np.median([e["contraction"] for e in found]) >= LEAST_CONTRACTION
+        name: float(np.mean([abs(e["pit"] - 0.5) <= LEVEL / 2 for e in values]))
+        for name, values in entries.items()
+        if np.median([e["contraction"] for e in values]) >= LEAST_CONTRACTION
     }
     worst, best = min(shares, key=shares.get), max(shares, key=shares.get)
     text = f"{protocol}, {len(accepted)} of {rigs} rigs accepted: {100 * shares[worst]:.1f} % ({worst}) to "
@@ -132,7 +132,7 @@ def coverage_with_gears(rows: list[dict]) -> tuple[str, bool]:
     parts = []
     for protocol in dict.fromkeys(r["protocol"] for r in rows):
         every = [r["repeating"] for r in rows if r["world"] == "priors" and r["protocol"] == protocol]
-        good = [found["headlines"] for found in every if found["accepted"]]
+        good = [row["headlines"] for row in every if row["accepted"]]
         parts.append(protocol_coverage(protocol, len(every), good))
     return together(parts)
 
@@ -166,12 +166,12 @@ def ranks(rows: list[dict], variant: str) -> tuple[str, bool | None]:
 
 def planted_in_sampler(rows: list[dict]) -> tuple[str, bool]:
     """Whether each planted fault of the calibration test fails it."""
-    parts, seen = [], True
+    parts, all_fail = [], True
     for variant in ("prior x3", "camera dropped"):
         text, passes = ranks(rows, variant)
         parts.append(f"{variant}: {text}")
-        seen &= not passes
-    return "; ".join(parts), seen
+        all_fail &= not passes
+    return "; ".join(parts), all_fail
 
 
 def cameras(rows: list[dict]) -> tuple[str, bool]:
@@ -217,10 +217,8 @@ def plans(rows: list[dict]) -> tuple[str, bool]:
 
 def device(rows: list[dict]) -> tuple[str, bool]:
     """Sessions with faults, kills and journal changes of the slow tests."""
-    found = rows[0]
-    return f"{found['passed']} slow tests passed, {found['failed']} failed; {'; '.join(found['lines'])}", not found[
-        "failed"
-    ]
+    row = rows[0]
+    return f"{row['passed']} slow tests passed, {row['failed']} failed; {'; '.join(row['lines'])}", not row["failed"]
 
 
 def planted(rows: list[dict]) -> tuple[str, bool]:
@@ -381,9 +379,9 @@ def run_device(arguments: argparse.Namespace) -> None:
     kept = [f"{sessions} sessions with faults"] if sessions else []
     kept += [line for line in lines if re.match(r"\d+ kills|\d+ (changes|bytes|flips)", line)]
     counts = {word: int(n) for n, word in re.findall(r"(\d+) (passed|failed)", lines[-1] if lines else "")}
-    found = {"passed": counts.get("passed", 0), "failed": counts.get("failed", 0) + (done.returncode not in (0, 1))}
+    totals = {"passed": counts.get("passed", 0), "failed": counts.get("failed", 0) + (done.returncode not in (0, 1))}
     DEVICE.parent.mkdir(parents=True, exist_ok=True)
-    DEVICE.write_text(json.dumps({**found, "lines": kept, "tail": lines[-5:]}) + "\n")
+    DEVICE.write_text(json.dumps({**totals, "lines": kept, "tail": lines[-5:]}) + "\n")
     print(DEVICE.read_text())
 
 
@@ -408,9 +406,9 @@ def computed(line: Line) -> str | None:
         figure, holds = line.figure(rows)
     except FileNotFoundError:
         return None
-    made = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC)
+    written = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC)
     word = {True: "yes", False: "NO", None: "-"}[holds]
-    return f"| {line.claim} | {figure} | {word} | {made.date()} | {commit_at(made)} | `{line.command}` |"
+    return f"| {line.claim} | {figure} | {word} | {written.date()} | {commit_at(written)} | `{line.command}` |"
 
 
 def table(arguments: argparse.Namespace) -> None:

@@ -49,11 +49,11 @@ class Nodes(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Scripts that are no data, frames, handlers, links to code."""
-        given = dict(attrs)
-        data = tag == "script" and given.get("type") == "application/json"
+        attributes = dict(attrs)
+        data = tag == "script" and attributes.get("type") == "application/json"
         self.live += tag in ("script", "iframe", "object", "embed") and not data
-        self.live += sum(name.startswith("on") for name in given)
-        self.live += any((given.get(n) or "").strip().lower().startswith("javascript:") for n in ("href", "src"))
+        self.live += sum(name.startswith("on") for name in attributes)
+        self.live += any((attributes.get(n) or "").strip().lower().startswith("javascript:") for n in ("href", "src"))
 
 
 def live_nodes(page: Path) -> int:
@@ -70,10 +70,10 @@ def folders_module() -> ModuleType:
 
 def build(folder: Path, name: str) -> None:
     """A good folder, spoilt as the crafted one of this name is; without a name whole."""
-    made = folders_module()
-    made.good_folder(folder)
-    if name in made.CRAFTED:
-        made.CRAFTED[name].edit(folder)
+    folders = folders_module()
+    folders.good_folder(folder)
+    if name in folders.CRAFTED:
+        folders.CRAFTED[name].edit(folder)
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,8 @@ def forked(arguments: list[str]) -> tuple[int, str, float, int]:
                 os._exit(code)
         _, status, usage = os.wait4(child, 0)
         stream.seek(0)
-        said = stream.read().decode(errors="replace")
-    return os.waitstatus_to_exitcode(status), said, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
+        text = stream.read().decode(errors="replace")
+    return os.waitstatus_to_exitcode(status), text, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
 
 
 COMMAND_OF = {
@@ -179,24 +179,24 @@ class Chunk:
     """Mutations in a row of one good folder, and what came of them.
 
     Attributes:
-        made: the module that makes folder and mutations.
+        module: makes folder and mutations.
         folder: the good one.
         numbers: of the mutations.
-        found: by target.
+        outcomes: by target.
         defects: in words.
         sample: bytes of one mutation of each target and end (whether it was read).
     """
 
-    made: ModuleType
+    module: ModuleType
     folder: Path
     numbers: range
-    found: dict[str, dict]
+    outcomes: dict[str, dict]
     defects: list[str]
     sample: dict[tuple[str, bool], bytes]
 
     def keep(self, outcome, seconds: float) -> None:
         """One mutation."""
-        row = self.found[outcome.target]
+        row = self.outcomes[outcome.target]
         row["slowest_s"] = max(row["slowest_s"], seconds)
         row["read" if outcome.error is None else "refused"] += 1
         if outcome.error is not None:
@@ -208,19 +208,19 @@ class Chunk:
 
     def mutate(self) -> None:
         """All mutations in this process, then a few with Python's allocations traced."""
-        names = list(self.made.TARGETS)
+        names = list(self.module.TARGETS)
         following, before = self.numbers.start, time.process_time()
         while following < self.numbers.stop:
             try:
-                for outcome in self.made.mutations(self.folder, range(following, self.numbers.stop), SEED):
+                for outcome in self.module.mutations(self.folder, range(following, self.numbers.stop), SEED):
                     seconds, before = time.process_time() - before, time.process_time()
                     following = outcome.number + 1
                     self.keep(outcome, seconds)
             except Exception as error:  # whatever else comes out is a defect
                 self.defects.append(f"mutation {following} ({names[following % len(names)]}): {error!r}"[:300])
                 following += 1
-        for outcome in self.made.mutations(self.folder, self.numbers[:TRACED], SEED, traced=True):
-            row = self.found[outcome.target]
+        for outcome in self.module.mutations(self.folder, self.numbers[:TRACED], SEED, traced=True):
+            row = self.outcomes[outcome.target]
             row["peak_bytes"] = max(row["peak_bytes"], outcome.peak_bytes or 0)
 
     def through_commands(self) -> dict[str, object]:
@@ -231,31 +231,31 @@ class Chunk:
         start = self.numbers.start // CHUNK * PER_CHUNK
         for k in range(start, start + min(PER_CHUNK, len(kinds))):
             target, read = kinds[k % len(kinds)]
-            path, table_of_spots = self.folder / self.made.TARGETS[target].file, self.folder / "spots.csv"
+            path, table_of_spots = self.folder / self.module.TARGETS[target].file, self.folder / "spots.csv"
             kept = {path: path.read_bytes(), table_of_spots: table_of_spots.read_bytes()}
             path.write_bytes(self.sample[target, read])
             command = COMMAND_OF.get(target, "classic @").replace("@", str(self.folder))
-            code, said, seconds, peak = forked(shlex.split(command))
+            code, text, seconds, peak = forked(shlex.split(command))
             for place, data in kept.items():
                 place.write_bytes(data)
             codes[code] += 1
             worst_s, worst_bytes = max(worst_s, seconds), max(worst_bytes, peak)
-            if code not in EXIT_CODES or "Traceback" in said or "\x1b" in said:
-                self.defects.append(f"command {command.split()[0]} on {target}: exit {code}: {said[-200:]!r}")
+            if code not in EXIT_CODES or "Traceback" in text or "\x1b" in text:
+                self.defects.append(f"command {command.split()[0]} on {target}: exit {code}: {text[-200:]!r}")
         return {"codes": codes, "command_s": worst_s, "command_bytes": worst_bytes}
 
 
 def run_chunk(numbers: range) -> dict[str, object]:
     """Mutations in process, and one of each kind and end through the commands."""
-    made = folders_module()
+    folders = folders_module()
     nothing = {"read": 0, "refused": 0, "slowest_s": 0.0, "peak_bytes": 0}
     with tempfile.TemporaryDirectory() as scratch:
-        found = {name: {**nothing, "codes": Counter()} for name in made.TARGETS}
-        chunk = Chunk(made, made.good_folder(Path(scratch) / "c"), numbers, found, [], {})
+        outcomes = {name: {**nothing, "codes": Counter()} for name in folders.TARGETS}
+        chunk = Chunk(folders, folders.good_folder(Path(scratch) / "c"), numbers, outcomes, [], {})
         chunk.mutate()
         own_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         commands = chunk.through_commands()
-    row = {"first": numbers.start, "n": len(numbers), "seed": SEED, "targets": found, "defects": chunk.defects}
+    row = {"first": numbers.start, "n": len(numbers), "seed": SEED, "targets": outcomes, "defects": chunk.defects}
     return {**row, "own_bytes": own_peak, **commands}
 
 
@@ -285,11 +285,11 @@ def table(arguments: argparse.Namespace) -> None:
     chunks = read_rows(MUTATIONS)
     defects = [defect for chunk in chunks for defect in chunk["defects"]]
     codes: Counter = sum((Counter(chunk["codes"]) for chunk in chunks), Counter())
-    own, through = (max(chunk[k] for chunk in chunks) / 1e6 for k in ("own_bytes", "command_bytes"))
+    mem, through = (max(chunk[k] for chunk in chunks) / 1e6 for k in ("own_bytes", "command_bytes"))
     listed = ", ".join(f"{code}: {count}" for code, count in sorted(codes.items()))
     print(
         f"\n## Mutations\n\n{sum(c['n'] for c in chunks)} seeded mutations (seed {SEED}) in process: {len(defects)} "
-        f"defects; most memory of the process {own:.0f} MB. {codes.total()} of them through the commands, in processes "
+        f"defects; most memory of the process {mem:.0f} MB. {codes.total()} of them through the commands, in processes "
         f"forked from one: exit codes {listed}; at most {max(c['command_s'] for c in chunks):.1f} s and "
         f"{through:.0f} MB.\n"
     )

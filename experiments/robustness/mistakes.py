@@ -177,12 +177,12 @@ def good_campaigns(seeds: int) -> dict[str, Campaign]:
     """The shipped twins and simulated campaigns."""
     data = shipped_data()
     rig = read_rig(data / "rigs" / "mounted" / "rig.toml")
-    found = {name: read_campaign(data / "twins" / name) for name in ("paper_twin", "grid_twin")}
+    campaigns = {name: read_campaign(data / "twins" / name) for name in ("paper_twin", "grid_twin")}
     for plan in PLANS:
         steps = read_plan(data / "rigs" / "mounted" / f"{plan}.csv")
         for seed in range(seeds):
-            found[f"{plan} {seed}"] = simulate(rig, steps, seed=1000 + seed, aperture=seed % 2 == 0).campaign
-    return found
+            campaigns[f"{plan} {seed}"] = simulate(rig, steps, seed=1000 + seed, aperture=seed % 2 == 0).campaign
+    return campaigns
 
 
 UNLIKE: dict[str, dict[str, Prior]] = {
@@ -280,19 +280,19 @@ def cuts_of(campaign: Campaign, rng: np.random.Generator) -> list[int]:
 def sound_table(count: int) -> list[str]:
     """How often sound campaigns are accused, whole and cut, by rig."""
     rigs = _rigs()
-    found = {name: Counter[str]() for name in rigs}
+    counts = {name: Counter[str]() for name in rigs}
     kinds: Counter[str] = Counter()
     for number in range(count):
         name, campaign = sound_campaign(number, rigs)
-        said = {k: implausible(cut(campaign, k)) for k in cuts_of(campaign, np.random.default_rng([8, number]))}
-        all_of_it = [finding for findings in said.values() for finding in findings]
+        findings_of = {k: implausible(cut(campaign, k)) for k in cuts_of(campaign, np.random.default_rng([8, number]))}
+        all_of_it = [finding for findings in findings_of.values() for finding in findings]
         kinds.update(f"{f.code}, {'certain' if f.certain else 'doubt'}, {name}" for f in all_of_it)
-        found[name].update(
+        counts[name].update(
             campaigns=1,
-            asked=len(said),
+            asked=len(findings_of),
             accused=any(f.certain for f in all_of_it),
             doubted=bool(all_of_it),
-            doubts=sum(map(bool, said.values())),
+            doubts=sum(map(bool, findings_of.values())),
         )
     lines = [
         f"{count} sound campaigns, each whole and cut at every look up to {FIRST_LOOKS} and {CUTS} later ones:",
@@ -301,7 +301,7 @@ def sound_table(count: int) -> list[str]:
     columns = ("campaigns", "asked", "accused", "doubted", "doubts")
     lines.append("| rig | campaigns | asked | campaigns accused (certain) | campaigns doubted | cuts doubted |")
     lines.append("|---|---|---|---|---|---|")
-    rows = {**found, "all": sum(found.values(), Counter())}
+    rows = {**counts, "all": sum(counts.values(), Counter())}
     lines += [f"| {name} | {' | '.join(str(row[c]) for c in columns)} |" for name, row in rows.items()]
     return lines + [""] * bool(kinds) + [f"said of sound ones, {n} times: {kind}" for kind, n in kinds.most_common()]
 
@@ -312,8 +312,8 @@ def others_table(folders: Sequence[Path]) -> list[str]:
     for folder in folders:
         campaign, cells = read_campaign(folder), []
         for name in ("none", "pan sign", "tilt sign", "spots one move early"):
-            said = implausible(MISTAKES[name][0](campaign, np.random.default_rng(1)))
-            cells.append(", ".join(f"{f.code}{' (certain)' * f.certain}" for f in said) or "-")
+            findings = implausible(MISTAKES[name][0](campaign, np.random.default_rng(1)))
+            cells.append(", ".join(f"{f.code}{' (certain)' * f.certain}" for f in findings) or "-")
         lines.append(f"| {folder.name} | {' | '.join(cells)} |")
     return lines
 
@@ -324,10 +324,10 @@ def table(seeds: int, sound: int) -> str:
     lines = [f"{len(good)} campaigns: 2 shipped twins, {seeds} simulated ones of each plan ({', '.join(PLANS)})", ""]
     lines += ["| mistake | warned of | by its name | certain |", "|---|---|---|---|"]
     for name, (change, words) in MISTAKES.items():
-        said = [implausible(change(c, np.random.default_rng(k))) for k, c in enumerate(good.values())]
-        named = sum(bool(words and re.search(words, "\n".join(f.sentence for f in found))) for found in said)
-        certain = sum(any(f.certain for f in found) for found in said)
-        lines.append(f"| {name} | {sum(map(bool, said))} | {named if words else '-'} | {certain} |")
+        answers = [implausible(change(c, np.random.default_rng(k))) for k, c in enumerate(good.values())]
+        named = sum(bool(words and re.search(words, "\n".join(f.sentence for f in findings))) for findings in answers)
+        certain = sum(any(f.certain for f in findings) for findings in answers)
+        lines.append(f"| {name} | {sum(map(bool, answers))} | {named if words else '-'} | {certain} |")
     return "\n".join([*lines, "", *sound_table(sound)]).rstrip() + "\n"
 
 

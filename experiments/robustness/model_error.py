@@ -125,9 +125,9 @@ def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
         row |= {"converged": fit.converged, "problems": list(fit.problems), "suspects": len(fit.suspect_spots)}
         row["fit_s"] = time.process_time() - start
         start = time.process_time()
-        found = validate(fit)
+        validation = validate(fit)
         row["validate_s"] = time.process_time() - start
-        row["validation"] = plain(found)
+        row["validation"] = plain(validation)
         row["grouped"] = sorted({c.name for c in residual_causes(stop_residuals(fit)) if c.suspicious})
         row["values"] = judged(
             fit.draws, fit.mode, fit.prior_draws, true_headlines(truth, campaign, fit.reference_pose_rad)

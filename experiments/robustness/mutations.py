@@ -63,8 +63,8 @@ def mutmut(root: Path, *words: str) -> str:
     command = [sys.executable, "-m", "mutmut", *words]
     ended = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
     if ended.returncode:
-        said = ended.stdout[-3000:] + ended.stderr
-        raise RuntimeError(f"mutmut {' '.join(words)} ended with {ended.returncode}:\n{said}")
+        output = ended.stdout[-3000:] + ended.stderr
+        raise RuntimeError(f"mutmut {' '.join(words)} ended with {ended.returncode}:\n{output}")
     return ended.stdout
 
 
@@ -147,9 +147,9 @@ def table(arguments: argparse.Namespace) -> int:
 
 def main() -> None:
     """The command."""
-    made = parser(__doc__)
-    made.add_argument("--rows", type=Path, default=ROWS)
-    commands = made.add_subparsers(required=True)
+    cli = parser(__doc__)
+    cli.add_argument("--rows", type=Path, default=ROWS)
+    commands = cli.add_subparsers(required=True)
     for command in (run, table):
         one = commands.add_parser(command.__name__, help=command.__doc__)
         one.set_defaults(command=command)
@@ -157,7 +157,7 @@ def main() -> None:
             one.add_argument("module", help="path from the root")
             one.add_argument("--tests", nargs="+", help="paths from the root")
             one.add_argument("--processes", type=int, default=2, help="mutants at a time (%(default)s)")
-    arguments = made.parse_args()
+    arguments = cli.parse_args()
     raise SystemExit(arguments.command(arguments))
 
 

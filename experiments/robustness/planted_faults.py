@@ -99,12 +99,12 @@ def attempt(root: Path, fault: Fault) -> dict[str, object]:
 
 def digests(root: Path) -> dict[str, str]:
     """Of what an outcome depends on, by the sentence: the fault in its module, the file of its test."""
-    sources, found = Sources(root), {}
+    sources, digest_of = Sources(root), {}
     for fault in FAULTS:
         _, text = fault.change.planted(sources, fault.place)
         files = [(root / name.partition("::")[0]).read_text(encoding="utf-8") for name in tests_of(fault.test, root)]
-        found[fault.sentence] = hashlib.sha256(repr((text, fault.test, files)).encode()).hexdigest()[:16]
-    return found
+        digest_of[fault.sentence] = hashlib.sha256(repr((text, fault.test, files)).encode()).hexdigest()[:16]
+    return digest_of
 
 
 def valid_rows(path: Path, root: Path = ROOT) -> dict[str, dict]:
@@ -145,33 +145,33 @@ def run(arguments: argparse.Namespace) -> int:
                 print(f"{row['sentence']}: {word} ({row['seconds']:.0f} s)", flush=True)
                 rows[row["sentence"]] = {**row, "digest": now[row["sentence"]], "commit": revision}
                 append_row(arguments.rows, rows[row["sentence"]])
-    seen = sum(rows[fault.sentence]["failed"] for fault in chosen)
-    print(f"{seen} of {len(chosen)} seen")
-    return len(chosen) - seen
+    caught = sum(rows[fault.sentence]["failed"] for fault in chosen)
+    print(f"{caught} of {len(chosen)} seen")
+    return len(chosen) - caught
 
 
 def table(arguments: argparse.Namespace) -> int:
     """The Markdown table of what was run at the present state of the package and its tests."""
-    found = valid_rows(arguments.rows)
-    done = [found[fault.sentence] for fault in FAULTS if fault.sentence in found]
-    seen = sum(row["failed"] for row in done)
+    rows = valid_rows(arguments.rows)
+    done = [rows[fault.sentence] for fault in FAULTS if fault.sentence in rows]
+    caught = sum(row["failed"] for row in done)
     commits = ", ".join(sorted({row["commit"] for row in done}))
     print("# Planted faults\n")
     print(f"Written by `python -m experiments.robustness.planted_faults table` on {datetime.date.today()}", end=" ")
     print(f"from runs at commit {commits}.\n")
-    print(f"**{seen} of {len(FAULTS)} faults seen** by the default test that the list names", end="")
-    print(f", {len(done) - seen} survive, {len(FAULTS) - len(done)} not run;", end=" ")
+    print(f"**{caught} of {len(FAULTS)} faults seen** by the default test that the list names", end="")
+    print(f", {len(done) - caught} survive, {len(FAULTS) - len(done)} not run;", end=" ")
     minutes = sum(row["seconds"] for row in done) / 60
     print(f"{minutes:.0f} minutes of one process. A fault is planted by name: what", end=" ")
     print("a definition returns, takes, reads or checks is changed in its syntax tree.")
     print("\n| fault | place | change | test that fails | s |\n|---|---|---|---|---|")
     for fault in FAULTS:
         verdict, seconds = "not run", ""
-        if row := found.get(fault.sentence):
+        if row := rows.get(fault.sentence):
             verdict = f"`{row['first'].removeprefix('tests/')}`" if row["failed"] else "**SURVIVED**"
             seconds = f"{row['seconds']:.0f}"
         print(f"| {fault.sentence} | `{fault.place}` | `{fault.change!r}` | {verdict} | {seconds} |")
-    return len(FAULTS) - seen
+    return len(FAULTS) - caught
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -183,9 +183,9 @@ def check(arguments: argparse.Namespace) -> int:
 
 def main() -> None:
     """The command; exit code 1 where a fault survives or the list does not fit the tree."""
-    made = parser(__doc__)
-    made.add_argument("--rows", type=Path, default=ROWS)
-    commands = made.add_subparsers(required=True)
+    cli = parser(__doc__)
+    cli.add_argument("--rows", type=Path, default=ROWS)
+    commands = cli.add_subparsers(required=True)
     for command in (run, table, check):
         one = commands.add_parser(command.__name__, help=command.__doc__.splitlines()[0])
         one.set_defaults(command=command)
@@ -193,7 +193,7 @@ def main() -> None:
             one.add_argument("--only", default="", help="regular expression found in sentence, place or test")
             one.add_argument("--again", action="store_true", help="rows that are there count for nothing")
             one.add_argument("--processes", type=int, default=2, help="each with a copy of the tree (%(default)s)")
-    arguments = made.parse_args()
+    arguments = cli.parse_args()
     raise SystemExit(bool(arguments.command(arguments)))
 
 

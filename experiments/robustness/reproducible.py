@@ -64,11 +64,11 @@ def exact(values) -> list[str]:
 
 def numbers_of(found_fit: JointFit) -> dict[str, list[str]]:
     """What a fit hands out."""
-    found = {"z": exact(found_fit.z)}
+    numbers = {"z": exact(found_fit.z)}
     for name, values in headlines(found_fit.draws).items():
-        found[f"{name}, mean"] = exact(np.mean(values))
-        found[f"{name}, sd"] = exact(np.std(values))
-    return found
+        numbers[f"{name}, mean"] = exact(np.mean(values))
+        numbers[f"{name}, sd"] = exact(np.std(values))
+    return numbers
 
 
 def file_of(name: str) -> Path:
@@ -113,18 +113,18 @@ def run(name: str, cold: bool, short: bool) -> None:
 def studied(rig: Rig, plan: Sequence[PlanStep], scratch: Path) -> dict[str, object]:
     """Rows of a study by engine, without their seconds."""
     job = StudyJob(rig, plan, parse_target(DEFAULT_TARGET), SEED)
-    found: dict[str, object] = {}
+    results: dict[str, object] = {}
     for engine in ("serial", "processes", "dask"):
         rows = StudyRows(scratch / f"{engine}.jsonl")
         try:
             study(job, CAMPAIGNS, rows, engine=engine, workers=1)
         except Exception as error:
-            found[engine] = f"not run: {str(error)[:100]}"
+            results[engine] = f"not run: {str(error)[:100]}"
             continue
-        found[engine] = {
+        results[engine] = {
             i: {k: v for k, v in row.as_json().items() if k != "seconds"} for i, row in sorted(rows.of(job.key).items())
         }
-    return found
+    return results
 
 
 def values_of(texts: list[str]) -> np.ndarray:
@@ -169,21 +169,21 @@ def table() -> None:
         f"{time.strftime('%Y-%m-%d')}, commit {commit()}, {platform.machine()}. Every run is compared with `{first}`.\n"
     )
     print("| run | Python | cache | campaign and `check` | fit | chain | CPU s |\n|---|---|---|---|---|---|---|")
-    for name, found in runs.items():
-        same = all(found[k] == base[k] for k in ("campaign", "check"))
-        verdicts = (compared(base["fit"], found["fit"]), chains(base, found)) if name != first else ("-", "-")
-        cells = (name, found["python"], "empty" if found["cold"] else "kept", "same bytes" if same else "OTHER BYTES")
-        print(f"| {' | '.join((*cells, *verdicts))} | {found['cpu_s']:.0f} |")
+    for name, one in runs.items():
+        same = all(one[k] == base[k] for k in ("campaign", "check"))
+        verdicts = (compared(base["fit"], one["fit"]), chains(base, one)) if name != first else ("-", "-")
+        cells = (name, one["python"], "empty" if one["cold"] else "kept", "same bytes" if same else "OTHER BYTES")
+        print(f"| {' | '.join((*cells, *verdicts))} | {one['cpu_s']:.0f} |")
     print("\nSpots in another order, in the same process: ", end="")
-    print("; ".join(f"`{name}`: {compared(found['fit'], found['shuffled'])}" for name, found in runs.items()) + ".\n")
-    for name, found in runs.items():
-        for engine, rows in found.get("study", {}).items():
-            serial = found["study"]["serial"]
+    print("; ".join(f"`{name}`: {compared(one['fit'], one['shuffled'])}" for name, one in runs.items()) + ".\n")
+    for name, one in runs.items():
+        for engine, rows in one.get("study", {}).items():
+            serial = one["study"]["serial"]
             same = (
                 rows if isinstance(rows, str) else f"{len(rows)} rows, " + ("the same" if rows == serial else "OTHER")
             )
             print(f"- study, run `{name}`, engine {engine}: {same}")
-    versions = {json.dumps(found["versions"], sort_keys=True) for found in runs.values()}
+    versions = {json.dumps(one["versions"], sort_keys=True) for one in runs.values()}
     print(f"\nPackages: {'; '.join(sorted(versions))}.")
     print(
         f"\nTolerance: {TOLERANCE_SD:g} of a posterior sd. Levenberg-Marquardt stops at a step far below it, sums of "
@@ -193,14 +193,14 @@ def table() -> None:
 
 def main() -> None:
     """See the module."""
-    made = parser(__doc__)
-    commands = made.add_subparsers(dest="what", required=True)
+    cli = parser(__doc__)
+    commands = cli.add_subparsers(dest="what", required=True)
     one = commands.add_parser("run")
     one.add_argument("name")
     one.add_argument("--cold", action="store_true")
     one.add_argument("--short", action="store_true")
     commands.add_parser("table")
-    arguments = made.parse_args()
+    arguments = cli.parse_args()
     if arguments.what == "run":
         run(arguments.name, arguments.cold, arguments.short)
     else:

@@ -103,10 +103,10 @@ def one_case(task: tuple[str, str]) -> dict[str, object]:
 def by_nuts(joint: JointFit, setting: Setting) -> dict[str, object]:
     """NUTS of a posterior: what it says of itself and of every quantity."""
     with jax.enable_x64(True):
-        found = hamiltonian(joint, setting)
-    run, rhat = found.run, max(row["rhat"] for row in found.rows.values())
+        nuts = hamiltonian(joint, setting)
+    run, rhat = nuts.run, max(row["rhat"] for row in nuts.rows.values())
     missing = [f"R-hat {rhat:.4f}"] if rhat > RHAT_LIMIT else []
-    row = {"rhat": rhat, "ess": min(row["ess_bulk"] for row in found.rows.values()), "quantities": found.rows}
+    row = {"rhat": rhat, "ess": min(row["ess_bulk"] for row in nuts.rows.values()), "quantities": nuts.rows}
     row |= {"warmup_s": run.warmup_s, "sampling_s": run.sampling_s, "leapfrogs": run.leapfrogs}
     return row | {"divergences": run.divergences, "accepted": not missing, "missing": missing}
 
@@ -115,22 +115,22 @@ def summary(posterior: Posterior) -> dict[str, dict[str, float]]:
     """Mean and sd with their Monte Carlo errors, of every free parameter and headline."""
     names = [NAMES[i] for i in np.flatnonzero(posterior.fit.free)]
     names += [name for name in headline_names(posterior.fit) if name not in names]
-    found = posterior.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
-    fields = zip(names, found.mean, found.sd, found.mcse_mean, found.mcse_sd, strict=True)
+    table = posterior.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
+    fields = zip(names, table.mean, table.sd, table.mcse_mean, table.mcse_sd, strict=True)
     keys = ("mean", "sd", "mean_mcse", "sd_mcse")
     return {name: dict(zip(keys, map(float, values), strict=True)) for name, *values in fields}
 
 
 def average(each: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
     """Of independent runs: means, variances and squared errors averaged."""
-    found = {}
+    means = {}
     for name in each[0]:
         of = {key: np.array([run[name][key] for run in each]) for key in each[0][name]}
         errors = {key: np.sqrt(np.mean(of[key] ** 2) / len(each)) for key in ("mean_mcse", "sd_mcse")}
-        found[name] = {
+        means[name] = {
             k: float(v) for k, v in {"mean": of["mean"].mean(), "sd": np.sqrt(np.mean(of["sd"] ** 2)), **errors}.items()
         }
-    return found
+    return means
 
 
 def compare(one: Mapping[str, Mapping[str, float]], other: Mapping[str, Mapping[str, float]]) -> str:
@@ -144,11 +144,11 @@ def compare(one: Mapping[str, Mapping[str, float]], other: Mapping[str, Mapping[
             error = np.hypot(one[n][f"{key}_mcse"], other[n][f"{key}_mcse"])
             errors[f"{key} of {n}"] = abs(one[n][key] - other[n][key]) / error
     cells = [str(len(shared))]
-    cells += [f"{found[worst]:.2f} `{worst}`" for found in (mean, sd) for worst in [max(found, key=found.get)]]
+    cells += [f"{gaps[worst]:.2f} `{worst}`" for gaps in (mean, sd) for worst in [max(gaps, key=gaps.get)]]
     worst = max(errors, key=errors.get)
     cells += [f"{np.median(list(errors.values())):.2f}, {errors[worst]:.2f} {worst}"]
     limits = (("mean", mean, MEAN_WANTED), ("sd", sd, SD_WANTED))
-    beyond = [errors[f"{key} of {n}"] for key, found, wanted in limits for n in shared if found[n] > wanted]
+    beyond = [errors[f"{key} of {n}"] for key, gaps, wanted in limits for n in shared if gaps[n] > wanted]
     verdict = "OUTSIDE" if max(beyond, default=0.0) > CHANCE else "undecided" if beyond else "within"
     return " | ".join([*cells, verdict])
 
@@ -207,10 +207,10 @@ def first_cells(row: dict | None) -> list[str]:
     """Of tier 1."""
     if row is None:
         return [""] * 8
-    told = row["sampling"]["importance"]
-    worst, least = told["worst_pareto_k"], told["least_ess"]
-    cells = [str(row["spots"]), f"{told['pareto_k']:.2f}", f"{worst['value']:.2f} `{worst['quantity']}`"]
-    cells += [str(told["draws"]), f"{told['effective_share']:.2f}", f"{least['value']:.0f} `{least['quantity']}`"]
+    run = row["sampling"]["importance"]
+    worst, least = run["worst_pareto_k"], run["least_ess"]
+    cells = [str(row["spots"]), f"{run['pareto_k']:.2f}", f"{worst['value']:.2f} `{worst['quantity']}`"]
+    cells += [str(run["draws"]), f"{run['effective_share']:.2f}", f"{least['value']:.0f} `{least['quantity']}`"]
     return [*cells, "yes" if row["accepted"] else "NO", f"{row['cpu_s']:.1f}"]
 
 
@@ -218,10 +218,10 @@ def chain_cells(row: dict | None) -> list[str]:
     """Of tier 2, which ends after tier 1."""
     if row is None:
         return [""] * 6
-    told = row["sampling"]
-    cells = [f"{told['steps']} of {told['walkers']}", f"{told['least_ess_bulk']['value']:.0f}"]
-    cells += [f"{told['worst_rhat']['value']:.4f}"]
-    cells += [f"{told['agreement']['worst']['value']:.2f}" if told["agreement"] else ""]
+    run = row["sampling"]
+    cells = [f"{run['steps']} of {run['walkers']}", f"{run['least_ess_bulk']['value']:.0f}"]
+    cells += [f"{run['worst_rhat']['value']:.4f}"]
+    cells += [f"{run['agreement']['worst']['value']:.2f}" if run["agreement"] else ""]
     return [*cells, "yes" if row["accepted"] else "NO", f"{row['cpu_s']:.1f}"]
 
 

@@ -88,13 +88,13 @@ def explicit_density(campaign: Campaign, joint: JointFit):
         errors, log_prior = [], -0.5 * jnp.sum(theta["z"] ** 2)
         for axis, name in enumerate(("pan", "tilt")):
             drawn = theta[name] * jnp.sqrt(variance_at_mode[drawn_at[axis], axis])
-            own = variance[drawn_at[axis], axis]
-            log_prior -= 0.5 * jnp.sum(drawn**2 / own + jnp.log(own))
+            spread = variance[drawn_at[axis], axis]
+            log_prior -= 0.5 * jnp.sum(drawn**2 / spread + jnp.log(spread))
             errors.append(drawn[place[axis]])
         pose = jnp.stack([angles[0] + errors[0], angles[1] + errors[1], middle + theta["range_mm"]])
         towards = jnp.zeros_like(pose).at[2].set(1.0)
-        seen, slope = jax.jvp(lambda p: observe(model, p, arrays.azimuth_convention)[:4], (pose,), (towards,))
-        residual, slope = (jnp.einsum("sij,js->si", spots.whitening, v) for v in (spots.pixels.T - seen, slope))
+        predicted, slope = jax.jvp(lambda p: observe(model, p, arrays.azimuth_convention)[:4], (pose,), (towards,))
+        residual, slope = (jnp.einsum("sij,js->si", spots.whitening, v) for v in (spots.pixels.T - predicted, slope))
         s = model.noise.pixel_scale
         value = -0.5 * jnp.sum(residual**2) / s**2 - 4 * count * jnp.log(s)
         value += 0.5 * jnp.sum(jnp.log(jnp.sum(slope**2, axis=1)))
@@ -126,9 +126,9 @@ def whitening(density, z: np.ndarray, covariance: np.ndarray, latent: int):
     information = -np.asarray(curve(at))
     values, vectors = np.linalg.eigh(information[known:, known:])
     assert values.min() > 0, "no maximum"
-    own, root = vectors / np.sqrt(values), np.linalg.cholesky(covariance)
-    follow = -own @ (own.T @ information[known:, :known])
-    return np.asarray(at), np.block([[root, np.zeros((known, latent))], [follow @ root, own]])
+    axes, root = vectors / np.sqrt(values), np.linalg.cholesky(covariance)
+    follow = -axes @ (axes.T @ information[known:, :known])
+    return np.asarray(at), np.block([[root, np.zeros((known, latent))], [follow @ root, axes]])
 
 
 def main() -> None:
@@ -144,8 +144,8 @@ def main() -> None:
     with jax.enable_x64(True):
         density, parts = explicit_density(campaign, joint)
         latent = parts["range_mm"].stop - len(free)
-        found = whitening(density, joint.z[free], joint.covariance[np.ix_(free, free)], latent)
-        centre, root = (jnp.asarray(x) for x in found)
+        linear = whitening(density, joint.z[free], joint.covariance[np.ix_(free, free)], latent)
+        centre, root = (jnp.asarray(x) for x in linear)
         kernel = NUTS(
             potential_fn=lambda e: -density(centre + root @ e), adapt_mass_matrix=False, target_accept_prob=0.97
         )
@@ -161,10 +161,10 @@ def main() -> None:
         begin = jnp.asarray(generator.standard_normal((CHAINS, len(root))))
         chains.run(jax.random.key(2), init_params=begin, extra_fields=("diverging",))
         draws = np.asarray(chains.get_samples(group_by_chain=True))
-        z = (found[0] + draws @ found[1].T)[..., parts["z"]]
+        z = (linear[0] + draws @ linear[1].T)[..., parts["z"]]
     sizes = {name: part.stop - part.start for name, part in parts.items()}
     divergences = int(np.sum(chains.get_extra_fields()["diverging"]))
-    own = posterior.z[..., free]
+    ours = posterior.z[..., free]
     rhat = array_stats.rhat(z, method="rank", **AXES)
     ess = array_stats.ess(z, method="bulk", **AXES)
     print("# Stop errors and ranges: sampled one by one, or integrated out\n")
@@ -180,7 +180,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|")
     for k, index in enumerate(free):
-        a, b = own[..., k], z[..., k]
+        a, b = ours[..., k], z[..., k]
         cells = [f"{(a.mean() - b.mean()) / b.std():+.3f}", f"{100 * (a.std() / b.std() - 1):+.1f}"]
         for probability in QUANTILES.values():
             error = np.hypot(*(float(array_stats.mcse(x, method="quantile", prob=probability, **AXES)) for x in (a, b)))

@@ -158,8 +158,8 @@ def main() -> None:
     # What the tests ask importance sampling about; gears that repeat their errors are `agreement.py`'s.
     joint = fit(campaign, model=ModelChoice(perfect_gears=True))
     setting = Setting(options.chains, options.warmup, options.draws, options.seed, options.limit)
-    found = hamiltonian(joint, setting, shear=not options.speed)
-    run, rows = found.run, found.rows
+    nuts = hamiltonian(joint, setting, shear=not options.speed)
+    run, rows = nuts.run, nuts.rows
     worst = min(rows, key=lambda name: rows[name]["ess_bulk"])
     ess = rows[worst]["ess_bulk"]
     print(

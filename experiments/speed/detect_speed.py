@@ -46,13 +46,13 @@ def measure(folder: Path, turns: int) -> None:
     )
     print("| threads | what | frames/s (wall) | frames per CPU second |\n|---|---|---|---|")
     for workers in (cores, 1):
-        seen: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
+        runs: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
         for _ in range(turns):
             for name, job in jobs.items():
                 wall, cpu = time.perf_counter(), time.process_time()
                 job(workers)
-                seen[name].append((len(paths) / (time.perf_counter() - wall), len(paths) / (time.process_time() - cpu)))
-        rates = {name: np.median(values, axis=0) for name, values in seen.items()}
+                runs[name].append((len(paths) / (time.perf_counter() - wall), len(paths) / (time.process_time() - cpu)))
+        rates = {name: np.median(values, axis=0) for name, values in runs.items()}
         for name, (wall, cpu) in rates.items():
             print(f"| {workers} | `{name}` | {wall:.1f} | {cpu:.1f} |")
         share = rates["detect"] / rates["cv2.imread"]

@@ -53,12 +53,12 @@ def stage_residuals(z, args) -> LinearResidual:
     columns = innovations(lin, arrays, no_belief(1 + z.size + places)).standardised.reshape(-1, 1 + z.size + places)
     prior = jnp.where(fixed.held, z - fixed.value, z)
     # The errors at places are least squares in every step.
-    own = jnp.concatenate([columns[:, : 1 + z.size], jnp.zeros((places, 1 + z.size))])
+    whole = jnp.concatenate([columns[:, : 1 + z.size], jnp.zeros((places, 1 + z.size))])
     repeated = columns[:, 1 + z.size :] @ root
     across = jnp.linalg.qr(jnp.concatenate([repeated, jnp.eye(places)]))[0]
-    own = own - across @ (across.T @ own)
-    jacobian = jnp.where(fixed.held, 0.0, own[:, 1:])
-    return LinearResidual(jnp.append(own[:, 0], prior), jnp.concatenate([jacobian, jnp.eye(z.size)]))
+    whole = whole - across @ (across.T @ whole)
+    jacobian = jnp.where(fixed.held, 0.0, whole[:, 1:])
+    return LinearResidual(jnp.append(whole[:, 0], prior), jnp.concatenate([jacobian, jnp.eye(z.size)]))
 
 
 @dataclass
@@ -120,6 +120,6 @@ def last_stage(campaign: Campaign) -> LastStage:
     compiling_s = time.process_time() - begun
     for inflation in ANNEALING[1:]:
         start = problem.least_squares(start, inflation)
-    own = without_padding(problem.arrays, len(campaign.moves))
-    args = problem.space, own, Fixed(problem.held, start, np.array(1.0))
+    arrays = without_padding(problem.arrays, len(campaign.moves))
+    args = problem.space, arrays, Fixed(problem.held, start, np.array(1.0))
     return LastStage(start, args, problem.arrays, compiling_s, {"residuals": 0, "Jacobians": 0})

@@ -110,10 +110,10 @@ def main() -> None:
     pan, tilt, reading = points(calibration, 3)
     whole = shortest(lambda: peer(calibration, pan[0], tilt[0], reading[0]), 3)
     means = np.array([peer(calibration, pan[0], tilt[0], reading[0], seed).mean(axis=0) for seed in range(REPEATS)])
-    found = [locate(calibration, pan[0], tilt[0], reading[0], draws=DRAWS, seed=seed) for seed in range(REPEATS)]
-    own = np.array([f.xyz_mm[0] for f in found])
-    error = np.sqrt((means.var(axis=0, ddof=1) + own.var(axis=0, ddof=1)) / REPEATS)
-    gap = np.max(np.abs(means.mean(axis=0) - own.mean(axis=0)) / error)
+    located = [locate(calibration, pan[0], tilt[0], reading[0], draws=DRAWS, seed=seed) for seed in range(REPEATS)]
+    alone = np.array([f.xyz_mm[0] for f in located])
+    error = np.sqrt((means.var(axis=0, ddof=1) + alone.var(axis=0, ddof=1)) / REPEATS)
+    gap = np.max(np.abs(means.mean(axis=0) - alone.mean(axis=0)) / error)
     print(f"\nPeer, NumPy one draw at a time: {60 / whole:.3g} points/min at {DRAWS} draws. Over {REPEATS} seeds the")
     print(f"means of both differ by {gap:.1f} Monte Carlo errors in the worst coordinate.\n")
     for name, call in {

@@ -75,13 +75,13 @@ def commands() -> None:
             "plan RIG": (*COMMAND, "plan", rig, "--json"),
             "plan RIG --given CAMPAIGN (fitted)": (*COMMAND, "plan", rig, "--given", str(twin), "--json"),
         }
-        seen: dict[str, list[float]] = {name: [] for name in jobs}
+        seconds: dict[str, list[float]] = {name: [] for name in jobs}
         for turn in range(REPEATS + 1):
             for name, job in jobs.items():
                 cpu = child_cpu(*job)
                 # The first turn may compile.
-                seen[name] += [cpu] if turn else []
-    medians = {name: float(np.median(values)) for name, values in seen.items()}
+                seconds[name] += [cpu] if turn else []
+    medians = {name: float(np.median(values)) for name, values in seconds.items()}
     print("| from process start, caches warm | CPU s, median | times the import |\n|---|---|---|")
     for name, cpu in medians.items():
         print(f"| {name} | {cpu:.1f} | {cpu / medians['import of jax, optimistix, scipy.stats']:.1f} |", flush=True)
@@ -101,9 +101,9 @@ def exact(knowledge: Knowledge) -> None:
 
 def many_instruments(knowledge: Knowledge, generator: np.random.Generator) -> None:
     """Looks at drawn instruments, and what fits of designs of them report."""
-    found = candidates(knowledge)
-    picks = generator.choice(generator.permutation(len(found.looks))[:DISTINCT], 4 * DESIGNS[-1])
-    family = Family(knowledge, found, picks, False)
+    pool = candidates(knowledge)
+    picks = generator.choice(generator.permutation(len(pool.looks))[:DISTINCT], 4 * DESIGNS[-1])
+    family = Family(knowledge, pool, picks, False)
     instruments = draw_instruments(knowledge, INSTRUMENTS, 0)
     assurance = Assurance(family, parse_target(DEFAULT_TARGET), instruments, 0)
     arrays, looks = assurance.arrays, len(assurance.looks)

@@ -85,21 +85,21 @@ def one_rig(seed: int) -> dict[str, object]:
     use_compilation_cache()
     rig = mounted_rig()
     first = simulate(rig, FIRST_DAY, seed)
-    found = fit(first.campaign)
-    row: dict[str, object] = {"seed": seed, "converged": found.converged}
-    if not found.converged:
+    result = fit(first.campaign)
+    row: dict[str, object] = {"seed": seed, "converged": result.converged}
+    if not result.converged:
         return row
-    planned = watch_plan(found)
-    noise = noise_draws(found, NOISE_DRAWS, 0)
+    planned = watch_plan(result)
+    noise = noise_draws(result, NOISE_DRAWS, 0)
     # The same for all days of a rig, and the dearest part of each.
     watched_looks.noise_draws = lambda *_: noise
     rng, days = np.random.default_rng([seed, 24]), []
     changes = [(NOTHING, 0.0, first.truth)] * SAME_DAYS
     changes += [(c.what, t, changed(first.truth, c, t, rng)) for c in CHANGES for t in SIZES]
     for number, (what, times, truth) in enumerate(changes):
-        days.append(day(found, first.campaign, truth, what, times, 1000 * (seed + 1) + number, planned.steps))
+        days.append(day(result, first.campaign, truth, what, times, 1000 * (seed + 1) + number, planned.steps))
     taken = simulate(rig, planned.steps, 1000 * (seed + 1), truth=first.truth).campaign
-    departure = WatchedLooks(found, taken).departure(noise.centre)
+    departure = WatchedLooks(result, taken).departure(noise.centre)
     limit = null_distribution(departure, 0).limit
     row["stated"] = {"1": [c.power for c in planned.changes], "4": powers(departure, limit, 0, 4.0)}
     row["looks"], row["needed"] = planned.looks, [c.looks_needed for c in planned.changes]
@@ -107,18 +107,18 @@ def one_rig(seed: int) -> dict[str, object]:
 
 
 def day(
-    found: JointFit, first: Campaign, truth: Truth, what: str, times: float, seed: int, steps: tuple[PlanStep, ...]
+    result: JointFit, first: Campaign, truth: Truth, what: str, times: float, seed: int, steps: tuple[PlanStep, ...]
 ) -> dict[str, object]:
     """One second day, watched, and looked at the classic way with as many looks."""
     rig = mounted_rig()
-    seen = watch(found, simulate(rig, steps, seed, truth=truth).campaign)
-    named = seen.moved[0].what if seen.moved else ""
+    test = watch(result, simulate(rig, steps, seed, truth=truth).campaign)
+    named = test.moved[0].what if test.moved else ""
     direction = "up" if what.endswith("tilt") else "left"
     # Of all four directions; only this one is compared.
-    repeats = max(2, seen.looks // LOOKS_PER_EXPERIMENT)
+    repeats = max(2, test.looks // LOOKS_PER_EXPERIMENT)
     other = simulate(rig, four_point_protocol(repeats=repeats, steps=(100, 200)), seed + 500, truth=truth).campaign
-    told = {"verdict": seen.verdict, "p": seen.p, "p_all": seen.p_all, "named": named}
-    return {"what": what, "times": times, **told, "classic": classic_alarm(first, other, direction)}
+    entries = {"verdict": test.verdict, "p": test.p, "p_all": test.p_all, "named": named}
+    return {"what": what, "times": times, **entries, "classic": classic_alarm(first, other, direction)}
 
 
 def one_task(task: tuple[int]) -> dict[str, object]:
@@ -156,17 +156,17 @@ def table(arguments: argparse.Namespace) -> None:
         *((c.what, t, f"{t * c.size:g} {c.unit}", n) for n, c in enumerate(CHANGES) for t in SIZES),
     ]
     for what, times, size, number in groups:
-        own = [d for d in days if d["what"] == what and d["times"] == times]
-        moved = [d for d in own if d["named"]]
+        chosen = [d for d in days if d["what"] == what and d["times"] == times]
+        moved = [d for d in chosen if d["named"]]
         stated = FALSE_ALARM_RATE if number is None else np.mean([r["stated"][f"{times:g}"][number] for r in rows])
         right = sum(d["named"].split(":")[0] == what.split(":")[0] for d in moved)
         named = f"{right} of {len(moved)}" if number is not None else ""
-        alarms = share(sum(d["classic"] for d in own), len(own))
-        print(f"| {what} | {size} | {share(len(moved), len(own))} | {100 * stated:.1f} % | {named} | {alarms} |")
+        alarms = share(sum(d["classic"] for d in chosen), len(chosen))
+        print(f"| {what} | {size} | {share(len(moved), len(chosen))} | {100 * stated:.1f} % | {named} | {alarms} |")
     same = [d for d in days if d["what"] == NOTHING]
     low = sum(d["p_all"] < FALSE_ALARM_RATE for d in same)
-    told = "All residuals together (`p_all`, a warning) fell below 1 % on"
-    print(f"\n{told} {share(low, len(same))} of the unchanged days.")
+    sentence = "All residuals together (`p_all`, a warning) fell below 1 % on"
+    print(f"\n{sentence} {share(low, len(same))} of the unchanged days.")
     print("\n| change | rigs on which some number of looks is enough | median of these numbers |")
     print("|---|---|---|")
     for number, change in enumerate(CHANGES):

@@ -109,7 +109,7 @@ def test_noiseless_spots_triangulate_onto_their_beams(drawn):
         points = (flat[:3] / flat[3]).T
         on, ahead = rig.head.beams(*stage)
         local = (points - rig.shift_mm) @ rig.rotation
-        inside = rig.seen(spots)[1]
+        inside = rig.project(spots)[1]
         # 1e-10 of the focal length at a parallax of 0.1 and 1 m.
         assert np.linalg.norm(np.cross(local - on, ahead), axis=1)[inside].max(initial=0.0) < 1e-5
 
@@ -162,7 +162,7 @@ def test_benches_follow_from_seed_and_number(drawn, tmp_path):
 
 def test_benches_lie_inside_their_ranges(drawn):
     for one in drawn:
-        assert strange_bench.FEWEST <= one.seen.sum() <= 410 and one.seen.mean() > 0.65
+        assert strange_bench.FEWEST <= one.both.sum() <= 410 and one.both.mean() > 0.65
         depths = [point[2] for point, _ in one.rig.sheets]
         assert 290 < min(depths) and max(depths) < 1210
         assert 80 <= np.linalg.norm(one.rig.right.shift_mm) < 305 and 690 < one.rig.left.focal_px[0] < 1620
@@ -174,9 +174,9 @@ def test_benches_lie_inside_their_ranges(drawn):
 def test_a_calibration_errs_as_its_corners_do(drawn):
     """OpenCV's parameters lie near the truth and not on it."""
     for one in drawn:
-        off = one.calibration.found["M1"][0, 0] / one.rig.left.focal_px[0] - 1
+        off = one.calibration.matrices["M1"][0, 0] / one.rig.left.focal_px[0] - 1
         assert 0 < abs(off) < 0.01
-        angle = cv2.Rodrigues(one.calibration.found["R"] @ one.rig.right.rotation.T)[0]
+        angle = cv2.Rodrigues(one.calibration.matrices["R"] @ one.rig.right.rotation.T)[0]
         assert 0 < np.linalg.norm(angle) < 0.03
 
 
@@ -185,9 +185,9 @@ def test_commands_take_a_bench_as_its_owner_has_it(drawn, tmp_path):
     one.write(tmp_path / "bench")
     strangers.campaign_of(tmp_path / "bench", one, one.truth["approach"], tmp_path / "campaign")
     spots = (tmp_path / "campaign" / "spots.csv").read_text().splitlines()
-    assert sum(",ok" in line for line in spots) == one.seen.sum() == strangers._looks_seen(tmp_path / "bench/looks.csv")
+    assert sum(",ok" in line for line in spots) == one.both.sum() == strangers._looks_seen(tmp_path / "bench/looks.csv")
     pair = parse_stereo((tmp_path / "campaign" / "stereo.json").read_bytes(), "stereo.json")
-    assert pair.assumed and np.allclose(pair.T, one.calibration.found["T"].ravel())
+    assert pair.assumed and np.allclose(pair.T, one.calibration.matrices["T"].ravel())
 
 
 def answer(**entries: object) -> str:

@@ -75,11 +75,11 @@ class Sources:
         Raises:
             NoPlace: there is none, or there are several.
         """
-        found = [whole for whole in self._modules if f".{whole}".endswith(f".{name}")]
-        if len(found) != 1:
-            raise NoPlace(f"{name} stands for {len(found)} definitions: {', '.join(found) or 'none'}")
-        path = self._modules[found[0]]
-        return [one for one in _definitions(path, self._prefixes[path]) if one.name == found[0]][-1]
+        names = [whole for whole in self._modules if f".{whole}".endswith(f".{name}")]
+        if len(names) != 1:
+            raise NoPlace(f"{name} stands for {len(names)} definitions: {', '.join(names) or 'none'}")
+        path = self._modules[names[0]]
+        return [one for one in _definitions(path, self._prefixes[path]) if one.name == names[0]][-1]
 
 
 def _expression(text: str) -> ast.expr:
@@ -128,8 +128,8 @@ class Change(ast.NodeTransformer):
         return node
 
     def __repr__(self) -> str:
-        given = (f"{value!r}" for name, value in vars(self).items() if name != "count")
-        return f"{type(self).__name__}({', '.join(given)})"
+        arguments = (f"{value!r}" for name, value in vars(self).items() if name != "count")
+        return f"{type(self).__name__}({', '.join(arguments)})"
 
 
 class Constant(Change):
@@ -160,8 +160,8 @@ class Argument(Change):
         if not isinstance(node, ast.FunctionDef):
             return
         if self.name in {arg.arg for arg in ast.walk(node.args) if isinstance(arg, ast.arg)}:
-            given = _with(self.expression, value=ast.Name(self.name, ast.Load()))
-            new = ast.Assign([ast.Name(self.name, ast.Store())], given)
+            value = _with(self.expression, value=ast.Name(self.name, ast.Load()))
+            new = ast.Assign([ast.Name(self.name, ast.Store())], value)
             node.body.insert(int(ast.get_docstring(node) is not None), self.changed(new))
 
 
@@ -198,8 +198,8 @@ class Local(Change):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         if self.name not in {ast.unparse(part) for target in targets for part in ast.walk(target)}:
             return node
-        given = _with(self.expression, value=_expression(self.name))
-        return [node, self.changed(ast.parse(f"{self.name} = {ast.unparse(given)}").body[0])]
+        value = _with(self.expression, value=_expression(self.name))
+        return [node, self.changed(ast.parse(f"{self.name} = {ast.unparse(value)}").body[0])]
 
     visit_Assign = visit_AugAssign = visit_AnnAssign = _follow
 
@@ -231,8 +231,8 @@ class Call(Change):
         self.generic_visit(node)
         if _last_name(node.func) != self.name:
             return node
-        given = {f"arg{k}": argument for k, argument in enumerate(node.args)}
-        return self.changed(_with(self.expression, value=node, function=node.func, **given))
+        arguments = {f"arg{k}": argument for k, argument in enumerate(node.args)}
+        return self.changed(_with(self.expression, value=node, function=node.func, **arguments))
 
 
 class Keyword(Change):
@@ -287,10 +287,10 @@ class Uncalled:
         whole = re.compile(rf"^\w[\w:*& ]* {re.escape(name)}\([^;]*?\) {{\n.*?^}}", re.MULTILINE | re.DOTALL)
         for path in sources.firmware:
             text = path.read_text(encoding="utf-8")
-            for found in whole.finditer(text):
-                body, count = re.subn(rf"^\s*{re.escape(self.called)}\([^;]*\);\n", "", found[0], flags=re.MULTILINE)
+            for match in whole.finditer(text):
+                body, count = re.subn(rf"^\s*{re.escape(self.called)}\([^;]*\);\n", "", match[0], flags=re.MULTILINE)
                 if count:
-                    return path, text[: found.start()] + body + text[found.end() :]
+                    return path, text[: match.start()] + body + text[match.end() :]
         raise NoPlace(f"no function {name} of the firmware calls {self.called}")
 
     def __repr__(self) -> str:

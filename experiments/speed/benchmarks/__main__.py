@@ -49,25 +49,25 @@ INSTALL = "pip install -c .ci/constraints.txt -e '.[bench,test]'"
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     listed = "\n".join(f"  {name:10s} {part.about}" for name, part in PARTS.items())
-    made = argparse.ArgumentParser(
+    cli = argparse.ArgumentParser(
         prog="python -m experiments.speed.benchmarks",
         description=f"{__doc__}\nparts:\n{listed}\n\nThe peers come with the extra bench: {INSTALL}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help="default: all")
-    made.add_argument("--repeats", type=int, default=5, help="turns of each contender (5); costly cases take fewer")
-    made.add_argument(
+    cli.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help="default: all")
+    cli.add_argument("--repeats", type=int, default=5, help="turns of each contender (5); costly cases take fewer")
+    cli.add_argument(
         "--sizes",
         type=int,
         nargs="+",
         default=[100, 1_000, 10_000],
         help="spots in the part scaling (100 1000 10000; 100000 takes ten minutes or more by itself)",
     )
-    made.add_argument("--limit", type=float, default=480.0, help="seconds after which a size counts as too long (480)")
-    made.add_argument("--table", action="store_true", help="measure nothing, write the table from the rows there are")
-    made.add_argument("--fresh", action="store_true", help="set the rows aside and measure anew")
-    made.add_argument("--worker", choices=PARTS, help=argparse.SUPPRESS)
-    return made
+    cli.add_argument("--limit", type=float, default=480.0, help="seconds after which a size counts as too long (480)")
+    cli.add_argument("--table", action="store_true", help="measure nothing, write the table from the rows there are")
+    cli.add_argument("--fresh", action="store_true", help="set the rows aside and measure anew")
+    cli.add_argument("--worker", choices=PARTS, help=argparse.SUPPRESS)
+    return cli
 
 
 def absent(parts: list[str]) -> dict[str, list[str]]:

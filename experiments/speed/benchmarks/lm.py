@@ -42,8 +42,8 @@ def measure(bench: Bench, kinds: Sequence[str] = (STAGE, EXACT)) -> None:
             def row(_: int) -> dict[str, object]:
                 stage.calls.update(residuals=0, Jacobians=0)
                 best, cost = timed(work)
-                seen = dict(stage.calls) if stage.calls["residuals"] else {}
-                return {**cost, "chi2": float(np.sum(stage.residuals(best) ** 2)), **seen}
+                calls = dict(stage.calls) if stage.calls["residuals"] else {}
+                return {**cost, "chi2": float(np.sum(stage.residuals(best) ** 2)), **calls}
 
             return row
 
@@ -57,9 +57,9 @@ def measure(bench: Bench, kinds: Sequence[str] = (STAGE, EXACT)) -> None:
                 if name == OURS and kind == EXACT:
                     first_s = time.process_time() - begun
             bench.interleaved(kind, {name: once(work) for name, work in contenders.items()})
-            told = [r["values"]["cpu_s"] for r in bench.rows if (r["case"], r["contender"]) == (kind, OURS)]
+            seconds = [r["values"]["cpu_s"] for r in bench.rows if (r["case"], r["contender"]) == (kind, OURS)]
             if missing_compilation(bench, kind):
-                bench.keep(COMPILATION, compiled(kind), 0, {"cpu_s": first_s - float(np.median(told))})
+                bench.keep(COMPILATION, compiled(kind), 0, {"cpu_s": first_s - float(np.median(seconds))})
 
 
 def compiled(kind: str) -> str:
@@ -115,6 +115,6 @@ def remarks(rows: Sequence[Mapping]) -> list[str]:
         if reached:
             least = min(reached.values())
             above = [f"{name} (+{cost - least:.1f})" for name, cost in reached.items() if cost > least + COST]
-            said = f"above it, and no fair comparison of speed: {'; '.join(above)}" if above else "all reached it"
-            lines.append(f"{kind}: least chi-square {least:.2f}, to be reached within {COST:g}: {said}.")
+            verdict = f"above it, and no fair comparison of speed: {'; '.join(above)}" if above else "all reached it"
+            lines.append(f"{kind}: least chi-square {least:.2f}, to be reached within {COST:g}: {verdict}.")
     return lines

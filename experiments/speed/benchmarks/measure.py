@@ -118,12 +118,12 @@ def command_cost(
         subprocess.TimeoutExpired: it ran longer than `limit_s` and was killed.
     """
     with tempfile.TemporaryDirectory() as place:
-        said = Path(place) / "cost.json"
-        launcher = [sys.executable, "-S", str(Path(__file__).with_name("child.py")), str(said), str(limit_s)]
+        report = Path(place) / "cost.json"
+        launcher = [sys.executable, "-S", str(Path(__file__).with_name("child.py")), str(report), str(limit_s)]
         done = subprocess.run(
             [*launcher, *command], env=environment, cwd=ROOT, capture_output=True, text=True, errors="replace"
         )
-        cost = json.loads(said.read_text())
+        cost = json.loads(report.read_text())
     if cost.pop("late"):
         raise subprocess.TimeoutExpired(command, limit_s)
     if code := cost.pop("code"):
@@ -147,13 +147,13 @@ def cpu_model() -> str:
 
 def versions() -> dict[str, str]:
     """Of Python and every package that takes part; a package that is not there is left out."""
-    found = {"Python": platform.python_version()}
+    version_of = {"Python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = importlib.metadata.version(name)
+            version_of[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return found
+    return version_of
 
 
 def rows_path() -> Path:
@@ -187,8 +187,8 @@ def table(case: Case, rows: Sequence[Mapping]) -> list[str]:
         cells = [name]
         for column in columns:
             values = [v[column.key] for v in of.values() if v.get(column.key) is not None]
-            told = [v for v in values if not isinstance(v, str)]
-            cells.append(spread(told, column.form) if told else (values[0] if values else ""))
+            numbers = [v for v in values if not isinstance(v, str)]
+            cells.append(spread(numbers, column.form) if numbers else (values[0] if values else ""))
         if case.ratio:
             ours = chosen.get(case.ours, {})
             both = [

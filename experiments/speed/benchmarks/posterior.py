@@ -67,26 +67,26 @@ class Contenders:
     def ours(self, seed: int) -> dict[str, object]:
         """Both tiers, until their own limits are met."""
         posterior, cost = timed(lambda: sample(self.joint, seed=seed, max_minutes=30.0))
-        told = self.worst(posterior.z)
-        rate = told["ess"] / cost["cpu_s"]
-        return {**cost, **told, "converged": posterior.converged, "rate": rate, "trusted_s": cost["cpu_s"]}
+        figures = self.worst(posterior.z)
+        rate = figures["ess"] / cost["cpu_s"]
+        return {**cost, **figures, "converged": posterior.converged, "rate": rate, "trusted_s": cost["cpu_s"]}
 
     def weighted(self, seed: int) -> dict[str, object]:
         """Importance sampling, until its own limits are met."""
         posterior, cost = timed(lambda: sample(self.joint, "importance", seed=seed))
         free = posterior.z[0][:, np.flatnonzero(self.joint.free)]
         ess = float(np.min(weighted_summary(free, posterior.weights[0]).ess_mean))
-        told = {"ess": ess, "converged": posterior.converged, "rate": ess / cost["cpu_s"]}
-        return {**cost, **told, "trusted_s": cost["cpu_s"]}
+        figures = {"ess": ess, "converged": posterior.converged, "rate": ess / cost["cpu_s"]}
+        return {**cost, **figures, "trusted_s": cost["cpu_s"]}
 
     def stretched(self, _: int) -> dict[str, object]:
         """Emcee's default move."""
-        found = stretch(self.joint, self.walkers, self.path)
-        rate = found.ess / found.cpu_s
+        run = stretch(self.joint, self.walkers, self.path)
+        rate = run.ess / run.cpu_s
         return {
-            "ess": found.ess,
-            "cpu_s": found.cpu_s,
-            "wall_s": found.wall_s,
+            "ess": run.ess,
+            "cpu_s": run.cpu_s,
+            "wall_s": run.wall_s,
             "rate": rate,
             "trusted_s": TRUSTED / rate,
         }
@@ -108,15 +108,15 @@ class Contenders:
             run = sampler(potential, route.index.size, Setting(CHAINS, WARMUP, DRAWS, seed))
             shape = run.draws.shape
             z = np.asarray(jax.jit(jax.vmap(z_of))(jnp.asarray(run.draws.reshape(-1, shape[-1]))))
-            told = self.worst(z.reshape(*shape[:2], -1))
+            figures = self.worst(z.reshape(*shape[:2], -1))
             before_s = built["cpu_s"] + run.warmup_s
             cpu_s = before_s + run.sampling_s
             return {
-                **told,
+                **figures,
                 "cpu_s": cpu_s,
-                "rate": told["ess"] / cpu_s,
-                "trusted_s": before_s + run.sampling_s * TRUSTED / told["ess"],
-                "sampling_rate": told["ess"] / run.sampling_s,
+                "rate": figures["ess"] / cpu_s,
+                "trusted_s": before_s + run.sampling_s * TRUSTED / figures["ess"],
+                "sampling_rate": figures["ess"] / run.sampling_s,
                 "compile_s": run.compile_s,
                 "leapfrogs": run.leapfrogs,
                 "divergences": run.divergences,
@@ -171,8 +171,8 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
 
 def remarks(rows: Sequence[Mapping]) -> list[str]:
     """Did ours converge?"""
-    told = []
+    lines = []
     for name in (OURS, FIRST_TIER):
-        seen = [r["values"]["converged"] for r in rows if r["contender"] == name]
-        told.append(f"`{name}` met its own limits of convergence in {sum(seen)} of {len(seen)} runs.")
-    return told
+        converged = [r["values"]["converged"] for r in rows if r["contender"] == name]
+        lines.append(f"`{name}` met its own limits of convergence in {sum(converged)} of {len(converged)} runs.")
+    return lines

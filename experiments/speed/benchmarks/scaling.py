@@ -50,15 +50,15 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
 
 def remarks(rows: Sequence[Mapping]) -> list[str]:
     """Exponents between neighbouring sizes and over all."""
-    told = sorted(
+    sized = sorted(
         (r["values"] for r in rows if not isinstance(r["values"].get("first_s"), str)), key=lambda v: v["spots"]
     )
-    twice = [v["first_s"] - v["warm_s"] for v in told if v["warm_s"] < v["first_s"]]
-    if len(told) < 2 or not twice:
+    twice = [v["first_s"] - v["warm_s"] for v in sized if v["warm_s"] < v["first_s"]]
+    if len(sized) < 2 or not twice:
         return []
     compiling = float(np.median(twice))
-    seconds = [v["warm_s"] if v["warm_s"] < v["first_s"] else v["first_s"] - compiling for v in told]
-    spots, memory = [v["spots"] for v in told], [v["rss_mib"] for v in told]
+    seconds = [v["warm_s"] if v["warm_s"] < v["first_s"] else v["first_s"] - compiling for v in sized]
+    spots, memory = [v["spots"] for v in sized], [v["rss_mib"] for v in sized]
 
     def exponents(values: Sequence[float]) -> str:
         return ", ".join(f"{p:.2f}" for p in np.diff(np.log(values)) / np.diff(np.log(spots)))

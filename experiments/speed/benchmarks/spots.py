@@ -43,11 +43,11 @@ class Frames:
     def judged(self, centres_px: np.ndarray, cost: dict[str, float]) -> dict[str, object]:
         """A row of found centres (pictures, 2), NaN where none was found."""
         errors = centres_px - self.true_px
-        seen = np.isfinite(errors).all(axis=1)
-        errors = errors[seen]
+        detected = np.isfinite(errors).all(axis=1)
+        errors = errors[detected]
         return {
             **self.per_frame(cost),
-            "ok": int(seen.sum()),
+            "ok": int(detected.sum()),
             "rms_px": float(np.sqrt(np.mean(errors**2))),
             "median_px": float(np.median(np.abs(errors))),
             "max_px": float(np.abs(errors).max()),
@@ -61,8 +61,8 @@ class Frames:
         """`tvsbayes detect` on one thread."""
 
         def row(_: int) -> dict[str, object]:
-            found, cost = timed(lambda: detection.detect(self.campaign, method, workers=1))
-            return self.judged(pixels_of(found.campaign).reshape(-1, 2), cost)
+            detected, cost = timed(lambda: detection.detect(self.campaign, method, workers=1))
+            return self.judged(pixels_of(detected.campaign).reshape(-1, 2), cost)
 
         return row
 
@@ -77,8 +77,8 @@ class Frames:
         def row(_: int) -> dict[str, object]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                found, cost = timed(lambda: [photutils_centre(path, kind) for path in self.paths])
-            return self.judged(np.array(found), cost)
+                centres, cost = timed(lambda: [photutils_centre(path, kind) for path in self.paths])
+            return self.judged(np.array(centres), cost)
 
         return row
 
@@ -107,9 +107,9 @@ def photutils_centre(path: str, kind: str) -> np.ndarray:
 def rendered(folder: Path) -> Frames:
     """48 looks of a drawn rig."""
     twin = simulate(mounted_rig(), small_plan(("d1", "d3")), SEED)
-    made = twin.undetected()
-    made.write(folder)
-    write_frames(folder, made, SEED)
+    frames = twin.undetected()
+    frames.write(folder)
+    write_frames(folder, frames, SEED)
     true = project(twin.light.points_mm, twin.truth.stereo, twin.truth.parameters["focal_scale"])
     campaign = read_campaign(folder)
     names = [f"{spot.spot:06d}_{side}.png" for spot in campaign.spots for side in ("left", "right")]

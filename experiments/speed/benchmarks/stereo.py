@@ -63,8 +63,8 @@ def rig(seed: int) -> DrawnRig:
 def ours(seed: int) -> dict[str, object]:
     """`tvsbayes stereo`."""
     drawn = rig(seed)
-    found, cost = timed(lambda: calibrate_stereo(drawn.views, BOARD, drawn.size))
-    return drawn.judged(found.stereo, found.stereo.rms_px, cost)
+    calibration, cost = timed(lambda: calibrate_stereo(drawn.views, BOARD, drawn.size))
+    return drawn.judged(calibration.stereo, calibration.stereo.rms_px, cost)
 
 
 def opencv(together: bool) -> Work:

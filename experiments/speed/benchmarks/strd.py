@@ -83,14 +83,14 @@ class Problems:
 
     def solved(self, solve: Solve) -> dict[tuple[str, int], np.ndarray]:
         """Every problem from both starts, NaN where a solver gave up."""
-        found = {}
+        solutions = {}
         for name, problem in self.of.items():
             for start in (0, 1):
                 try:
-                    found[name, start] = solve(name, problem.starts[start])
+                    solutions[name, start] = solve(name, problem.starts[start])
                 except (ValueError, np.linalg.LinAlgError):
-                    found[name, start] = np.full(problem.certified.size, np.nan)
-        return found
+                    solutions[name, start] = np.full(problem.certified.size, np.nan)
+        return solutions
 
     def row_of(self, solve: Solve) -> Work:
         """All problems, timed and compared with the certified values."""
@@ -98,16 +98,16 @@ class Problems:
         def row(_: int) -> dict[str, object]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)
-                found, cost = timed(lambda: self.solved(solve))
-                told = {key: self.digits(key[0], value) for key, value in found.items()}
-            parameters, errors = np.array(list(told.values())).T
+                solutions, cost = timed(lambda: self.solved(solve))
+                digits = {key: self.digits(key[0], value) for key, value in solutions.items()}
+            parameters, errors = np.array(list(digits.values())).T
             return {
                 **cost,
                 "good": int(np.sum(parameters >= DIGITS)),
                 "least": float(parameters.min()),
                 "median": float(np.median(parameters)),
                 "least_error": float(errors.min()),
-                "failed": [f"{name} start {start + 1}" for (name, start), d in told.items() if d[0] < DIGITS],
+                "failed": [f"{name} start {start + 1}" for (name, start), d in digits.items() if d[0] < DIGITS],
             }
 
         return row

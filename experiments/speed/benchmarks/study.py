@@ -38,8 +38,8 @@ def measure(bench: Bench) -> None:
             job = StudyJob(mounted_rig(), small_plan(("d1", "d3")), parse_target(DEFAULT_TARGET), repeat)
             times: list[float] = []
 
-            def told(state: Progress) -> None:
-                # Beginning and end of the wait are told as well, and no campaign twice.
+            def report(state: Progress) -> None:
+                # Beginning and end of the wait are reported as well, and no campaign twice.
                 if round(state.share * campaigns) > len(times):
                     times.append(time.perf_counter())
 
@@ -51,7 +51,7 @@ def measure(bench: Bench) -> None:
                     StudyRows(Path(folder) / "rows.jsonl"),
                     engine=name.split(",")[0],
                     workers=workers,
-                    progress=told,
+                    progress=report,
                 )
                 whole = time.perf_counter() - begun
             # Every worker's first campaign carries its start and the reading of compiled functions.
