@@ -463,13 +463,15 @@ def _why_not_stored(campaign: Campaign) -> str:
     hashes, stored = input_hashes(campaign), record.provenance
     changed_inputs = [INPUT_NAMES[name] for name in INPUT_NAMES if stored.inputs.get(name) != hashes[name]]
     version = stored.versions["tvsbayes"]
-    if changed_inputs == [INPUT_NAMES["rig"]] and version != provenance(hashes, 0).versions["tvsbayes"]:
-        return f"results/ are of tvsbayes {escaped(version, 40)}, which modelled less of the rig, or of another [rig]"
+    of_older = f"results/ are of tvsbayes {escaped(version, 40)}, which modelled less of the rig"
+    is_older = version != provenance(hashes, 0).versions["tvsbayes"]
+    if is_older and changed_inputs == [INPUT_NAMES["rig"]]:
+        return f"{of_older}, or of another [rig]"
     if changed_inputs:
         return f"results/ are of other {', '.join(changed_inputs)}"
     if not record.summary.converged:
         return "results/ are of a fit that did not converge"
-    return "results/ lack what this command needs"
+    return of_older if is_older else "results/ lack what this command needs"
 
 
 def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> JointFit:

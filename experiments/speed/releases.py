@@ -22,12 +22,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from experiments.common.command_line import act, parser
-from experiments.common.rows import OUTPUT, ROOT, git
+from experiments.common.releases import BEFORE, NAME_BEFORE, environment_of, tree_before
+from experiments.common.rows import OUTPUT, ROOT
 from experiments.speed import ledger
 from experiments.speed.benchmarks.measure import command_cost, cpu_model, state
 
-BEFORE = "0b6041ba"
-"""The commit of 0.2.0."""
 MEASURED = OUTPUT / "releases.json"
 FEATURES = (
     ("answers", "accepted or NOT CONVERGED", "accepted, rough or laplace, by the Monte Carlo error of every headline"),
@@ -67,26 +66,21 @@ def _counted(tree: Path) -> dict[str, int]:
 
 def measure(_: argparse.Namespace) -> None:
     """Both trees in turn."""
-    with tempfile.TemporaryDirectory() as place:
-        folder, trees = Path(place), {"0.2.0": Path(place) / "before", state(): ROOT}
-        git("worktree", "add", "--detach", str(trees["0.2.0"]), BEFORE)
-        try:
-            shutil.copytree(ROOT / "data" / "twins" / "paper_twin", folder / "twin")
-            ledger.write_axis(folder)
-            costs: dict[str, dict[str, list[float]]] = {name: {} for name in trees}
-            for _repeat in range(ledger.REPEATS + 1):
-                for name, tree in trees.items():
-                    cache = str(folder / f"cache {tree.name}")
-                    environment = {**os.environ, "PYTHONPATH": str(tree), "TVSBAYES_CACHE": cache}
-                    for command, words in ledger.COMMANDS.items():
-                        line = ("/usr/bin/env", "-C", str(folder), sys.executable, "-m", "tvsbayes", *words)
-                        cost = command_cost(line, environment)[1]["cpu_s"]
-                        costs[name].setdefault(command, []).append(cost)
-            # The first run of each fills its cache.
-            least = {name: {command: min(each[1:]) for command, each in of.items()} for name, of in costs.items()}
-            counted = {name: _counted(tree) for name, tree in trees.items()}
-        finally:
-            git("worktree", "remove", "--force", str(trees["0.2.0"]))
+    with tempfile.TemporaryDirectory() as place, tree_before(Path(place) / "before") as before:
+        folder, trees = Path(place), {NAME_BEFORE: before, state(): ROOT}
+        shutil.copytree(ROOT / "data" / "twins" / "paper_twin", folder / "twin")
+        ledger.write_axis(folder)
+        costs: dict[str, dict[str, list[float]]] = {name: {} for name in trees}
+        for _repeat in range(ledger.REPEATS + 1):
+            for name, tree in trees.items():
+                environment = environment_of(tree, folder / f"cache {tree.name}")
+                for command, words in ledger.COMMANDS.items():
+                    line = ("/usr/bin/env", "-C", str(folder), sys.executable, "-m", "tvsbayes", *words)
+                    cost = command_cost(line, environment)[1]["cpu_s"]
+                    costs[name].setdefault(command, []).append(cost)
+        # The first run of each fills its cache.
+        least = {name: {command: min(each[1:]) for command, each in of.items()} for name, of in costs.items()}
+        counted = {name: _counted(tree) for name, tree in trees.items()}
     MEASURED.parent.mkdir(parents=True, exist_ok=True)
     MEASURED.write_text(json.dumps({"processor": cpu_model(), "cpu_s": least, "counted": counted}, indent=1))
 

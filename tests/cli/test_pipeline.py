@@ -83,6 +83,7 @@ def test_the_reason_for_a_new_fit_is_printed(grid_folder, monkeypatch):
             "results/ are of tvsbayes 0.0.9, which modelled less of the rig, or of another [rig]",
         ),
         ((False, now, {}), "results/ are of a fit that did not converge"),
+        ((True, "0.0.9", {}), "results/ are of tvsbayes 0.0.9, which modelled less of the rig"),
         ((True, now, {}), "results/ lack what this command needs"),
     ):
         keep(case[0], case[1], **case[2])

@@ -41,6 +41,42 @@ def test_what_was_kept_is_taken_up(kept):
     np.testing.assert_array_equal(results.fit.w, fit.w)
 
 
+def rewritten(folder, change):
+    """Write `fit.json` as `change` leaves its keys; returns what it was."""
+    file = folder / "results" / "fit.json"
+    whole = file.read_bytes()
+    keys = json.loads(whole)
+    change(keys)
+    file.write_text(json.dumps(keys))
+    return whole
+
+
+def test_a_sample_without_an_answer_was_accepted(kept):
+    """0.2.0 wrote no `answer`: a sampled fit that had converged was an accepted one."""
+    folder, _ = kept
+    file = folder / "results" / "fit.json"
+    for estimator, answer in (("posterior", "accepted"), ("laplace", "laplace")):
+        whole = rewritten(folder, lambda keys, made=estimator: (keys.pop("answer"), keys.update(estimator=made)))
+        try:
+            assert results_for(read_axis(folder)).summary.answer == answer
+        finally:
+            file.write_bytes(whole)
+
+
+def test_results_that_modelled_less_are_fitted_anew(kept, monkeypatch):
+    """0.2.0 knew no creep: its draws have fewer coordinates, which is no damage."""
+    folder, fit = kept
+    file, told = folder / "results" / "fit.json", []
+    name = fit.model.coordinates.names[-1]
+    whole = rewritten(folder, lambda keys: keys["parameters"].pop(name))
+    monkeypatch.setattr("tvsbayes.single_axis.axis_record.fit_axis", lambda *_, **__: fit)
+    try:
+        assert results_for(read_axis(folder), notify=told.append).fit is fit
+    finally:
+        file.write_bytes(whole)
+    assert told == ["results/ are of a version which modelled less of the axis: fitting first (weighted draws) ..."]
+
+
 def test_strata_have_the_band_of_all_draws(kept):
     """The band that a page draws, beside draws of every equal draw of the scales."""
     fit = kept[1]

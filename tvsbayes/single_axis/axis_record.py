@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from msgspec import Meta, field
+from msgspec import Meta, field, structs
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate, TvsError, escaped, refusal
@@ -458,6 +458,7 @@ def _stored_w(folder: Path, names: int, remedy: str) -> np.ndarray:
 
 
 FITTING_FIRST = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
+MODELLED_LESS = "results/ are of a version which modelled less of the axis: fitting first (weighted draws) ..."
 
 
 def results_for(
@@ -467,7 +468,9 @@ def results_for(
     seed: int = 0,
     notify: Callable[[str], None] = lambda _: None,
 ) -> AxisResults:
-    """The results in `results/` if they belong to these data and converged; else those of a fit by weighted draws.
+    """The results in `results/` if they belong to these data and this model and converged; else those of a new fit.
+
+    The fit is one by weighted draws.
 
     Args:
         campaign: from `read_axis`.
@@ -480,16 +483,22 @@ def results_for(
         InputError: stored results are damaged.
         NotConverged: the fit did not converge.
     """
-    document = stored_document(campaign, "fit.json", (AXIS_FIT_FORMAT,), axis_hashes(campaign))
+    document, why = stored_document(campaign, "fit.json", (AXIS_FIT_FORMAT,), axis_hashes(campaign)), FITTING_FIRST
     if document is not None and document.values.get("converged") is True and campaign.path is not None:
         remedy = "run `tvsbayes fit` again"
         hold_to_schema(document, axis_fit_schema(), remedy)
         summary = read_record(AxisSummary, document, remedy, held=True)
+        if "answer" not in document.values and summary.estimator == "posterior":
+            # 0.2.0 had accepted samples only.
+            summary = structs.replace(summary, answer="accepted")
         origin = read_record(Provenance, document, remedy, held=True)
         model = model_of(campaign, more)
-        w = _stored_w(campaign.path, len(model.coordinates.names), remedy)
-        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed))
-    notify(FITTING_FIRST)
+        names = model.coordinates.names
+        if summary.parameters.keys() >= {name for name in names if not name.startswith("wave_")}:
+            w = _stored_w(campaign.path, len(names), remedy)
+            return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed))
+        why = MODELLED_LESS
+    notify(why)
     fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
     if fit.error is not None:
         raise fit.error
