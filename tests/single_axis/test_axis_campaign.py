@@ -1,4 +1,4 @@
-"""Axis folders: what is read back, what is refused and how."""
+"""Axis folders: round trip and refusals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def folder(path, toml=TOML, moves=MOVES, readings=READINGS):
     return path
 
 
-def test_what_is_written_is_read_back(tmp_path):
+def test_an_axis_folder_round_trips(tmp_path):
     moves = runs(1)
     axis = campaign(moves, [0.01 * m.command + 0.1 for m in moves], 0.002, per_command=AxisPrior(0.01, 0.001))
     write_axis(axis, tmp_path / "a")
@@ -76,7 +76,7 @@ def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):
         ({"readings": READINGS.replace("0.1,0.01,ok", "nan,0.01,ok")}, "readings.csv", 2, "value", "number"),
     ],
 )
-def test_refusals_say_where_and_what_to_do(tmp_path, change, file, line, column, code):
+def test_refusals_state_place_and_remedy(tmp_path, change, file, line, column, code):
     with pytest.raises(InputError) as caught:
         read_axis(folder(tmp_path / "a", **change))
     error = caught.value
@@ -84,7 +84,7 @@ def test_refusals_say_where_and_what_to_do(tmp_path, change, file, line, column,
     assert error.found and error.allowed and error.remedy
 
 
-def test_the_hash_follows_what_counts(tmp_path):
+def test_the_hash_covers_the_data_alone(tmp_path):
     one = read_axis(folder(tmp_path / "a"))
     other = read_axis(folder(tmp_path / "b", TOML + 'name = "x"\n', MOVES, READINGS.replace("0.01,ok", "0.010,ok")))
     assert axis_hashes(one) == axis_hashes(other)

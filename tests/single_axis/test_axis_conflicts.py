@@ -1,4 +1,4 @@
-"""Priors of an axis that its readings contradict: named, with what the readings say; honest ones never."""
+"""Priors of an axis that the readings contradict are named with the value of the readings; correct priors are not."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def played(ratio: float = RATIO, **stated: AxisPrior) -> AxisCampaign:
     ],
 )
 def test_a_prior_that_the_readings_contradict_is_named(name, prior, value):
-    """The error and the play by position stretch to bear a wrong prior, so the posterior alone shows nothing."""
+    """Error and play by position absorb a wrong prior, so the posterior alone does not show it."""
     summary = summarise_axis(fit_axis(played(**{name: prior}), tier="importance"))
     [conflict] = [text for text in summary.prior_conflicts if text.startswith(f"{name} = ")]
     assert float(conflict.split(" = ")[1].split("(")[0]) == pytest.approx(value, rel=0.1)
@@ -47,8 +47,8 @@ def test_a_prior_that_the_readings_contradict_is_named(name, prior, value):
     assert "verdict: usable\n" not in text + "\n"
 
 
-def test_a_fit_that_a_prior_keeps_from_converging_names_it():
-    """The ratio stated per full step, commands counted in microsteps."""
+def test_a_prior_that_prevents_convergence_is_named():
+    """The ratio is stated per full step, commands are counted in microsteps."""
     fit = fit_axis(played(per_command=AxisPrior(16 * RATIO, 0.001), creep=AxisPrior(0.0, 0.0)), tier="importance")
     assert fit.error is not None
     assert "per_command = 0.0100" in fit.error.remedy and "value = 0.16" in fit.error.remedy
@@ -66,8 +66,8 @@ def test_scales_far_beyond_their_priors_are_named():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_honest_priors_are_not_accused(seed):
-    """More seeds were tried by hand; a wrong alarm comes once in thousands of honest axes."""
+def test_correct_priors_are_not_named(seed):
+    """A false alarm occurs once in thousands of axes with correct priors."""
     moves = (runs(2), random_moves(seed, 40, 2))[seed % 2]
     tight = {"per_command": AxisPrior(0.01, 1e-6), "backlash": AxisPrior(0.1, 0.005)}
     axis = drawn(seed, moves, **tight).campaign

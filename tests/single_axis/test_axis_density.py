@@ -1,4 +1,4 @@
-"""Sampling of an axis: what is integrated out in one pass is what it is given the scales; a lost search is found."""
+"""Sampling of an axis: the quantities integrated out agree with the dense solution; a bad start reaches the mode."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def belt():
     return replace(campaign(moves, values), unit="mm")
 
 
-def test_one_wild_reading_does_not_lose_the_mode():
-    """The search from the scatter of repeats ends far away, in a density lower by hundreds.
+def test_one_outlier_does_not_lose_the_mode():
+    """A search started at the scatter of repeats ends at a log density lower by hundreds.
 
-    The answer is narrower than the reading could turn the line, its distance over the travel.
+    The interval is narrower than the slope that the reading could cause, its distance over the travel.
     """
     mode = find_mode(model_of(belt()))
     assert mode.missing == () and mode.log_density > -100
@@ -39,14 +39,14 @@ def test_one_wild_reading_does_not_lose_the_mode():
     assert high - low < WILD / 1000
 
 
-def test_draws_of_the_line_have_the_moments_that_it_has_given_the_scales():
-    """Inverted alone, with the places that no row knows apart, it comes out the same; points beyond reach have none."""
+def test_draws_of_the_line_have_its_moments_given_the_scales():
+    """Solved without the places that no row informs it is the same; points outside the bounds have no density."""
     model = model_of(drawn(5, random_moves(5)).campaign)
     w = np.random.default_rng(2).standard_normal((6, len(model.coordinates.names)))
     functionals = headline_functionals(model, w)
     mean, sd = model.linear(w).of(functionals)
     posterior = model.posterior(w, functionals)
-    # Solved with other right-hand sides beside it the same number comes out in another order of sums.
+    # Other right-hand sides in the same solution change the order of sums.
     np.testing.assert_allclose(posterior.log_density, model.log_density(w), atol=1e-8)
     # Of numbers of some 1e3 the differences of the two ways round in the seventh digit of an sd.
     np.testing.assert_allclose(posterior.linear.mean, mean, atol=1e-6 * float(sd.max()))
@@ -56,8 +56,8 @@ def test_draws_of_the_line_have_the_moments_that_it_has_given_the_scales():
 
 
 @pytest.mark.thorough
-def test_both_answers_of_a_short_time_are_given_and_said():
-    """A chain without time is no answer, and the weighted draws before it are; of a single round they are rough."""
+def test_a_short_time_gives_weighted_draws_and_says_so():
+    """A chain without time gives no answer; the weighted draws before it do, rough after a single round."""
     axis = drawn(1).campaign
     fit = fit_axis(axis, max_minutes=1e-9)
     assert fit.error is None and fit.tier == "importance" and fit.answer in ("accepted", "rough")
@@ -66,7 +66,7 @@ def test_both_answers_of_a_short_time_are_given_and_said():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("tier", ["importance", "emcee"])
-def test_errors_of_the_headlines_are_within_what_is_accepted(tier):
+def test_errors_of_the_headlines_are_within_the_limits(tier):
     fit = fit_axis(drawn(3, random_moves(5, 60)).campaign, tier=tier, seed=2)
     assert fit.answer == "accepted" and fit.tier == tier and fit.missing == ()
     errors = fit.sample.convergence.monte_carlo_error

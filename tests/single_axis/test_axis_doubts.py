@@ -1,4 +1,4 @@
-"""What is odd about an axis' data: counts of other steps, a ratio that they do not have, single wild readings."""
+"""Doubts about an axis' data: counts in other steps, a stated ratio that is wrong, single outliers."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def test_a_segment_counted_in_other_steps_is_named():
 
 
 @pytest.mark.parametrize("value", [16 * RATIO, -RATIO])
-def test_a_stated_ratio_that_the_readings_do_not_have_is_named(value):
+def test_a_wrong_stated_ratio_is_named(value):
     [doubt] = doubts(logged(per_command=AxisPrior(value, 0.001)))
     assert f"per_command = {value:g}" in doubt and "0.012499" in doubt and "campaign.toml" in doubt
     assert doubts(logged(per_command=AxisPrior(RATIO, 1e-5))) == []
 
 
 @pytest.mark.parametrize("stated", [True, False], ids=["u stated", "u unknown"])
-def test_wild_readings_are_named_and_their_neighbours_not(stated):
+def test_outliers_are_named_and_their_neighbours_not(stated):
     whole = logged()
     readings = [r if stated else replace(r, u=0.0) for r in whole.readings]
     for at in (31, 60):
@@ -69,8 +69,8 @@ def test_wild_readings_are_named_and_their_neighbours_not(stated):
         assert "readings.csv" in text and "1.5" in text and "status" in text
 
 
-def test_a_single_wild_stop_is_named_where_each_was_read_once():
-    """By one line through the others that it does not bend; a stop that play may hold back is not judged."""
+def test_a_single_outlier_is_named_among_stops_read_once():
+    """By a line through the other stops; a stop within the play is not assessed."""
     moves = [AxisMove(k, 0, 60.0 * k, c, "" if k else "forward") for k, c in enumerate([*range(6), *range(4, -1, -1)])]
     stands = [250.0 * m.command - (6.0 if k > 5 else 0.0) + (-1) ** k for k, m in enumerate(moves)]
     log = campaign(moves, stands)
@@ -84,7 +84,7 @@ def test_a_single_wild_stop_is_named_where_each_was_read_once():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_drawn_axes_raise_no_doubt(seed):
+def test_simulated_axes_raise_no_doubt(seed):
     moves = random_moves(seed, 40, 4) if seed % 2 else runs(2)
     axis = drawn(seed, moves, per_command=AxisPrior(0.01, 1e-6), backlash=AxisPrior(0.0, 1.0)).campaign
     assert data_doubts(axis, rows_of(axis)) == []

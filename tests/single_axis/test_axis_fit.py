@@ -1,4 +1,4 @@
-"""Fits of drawn axes: the truth comes back, both tiers agree, everything held fixed works too."""
+"""Fits of simulated axes: the truth is recovered, both tiers agree, all parameters may be fixed."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tvsbayes.single_axis.axis_record import summarise_axis
 
 
 @pytest.mark.thorough
-def test_truths_lie_where_the_fit_says():
-    """Six drawn axes of two protocols; a sum of squares that 1 in 1e4 sets of honest z exceeds."""
+def test_truths_lie_within_the_stated_uncertainty():
+    """Six simulated axes of two protocols; the bound on the sum of squares is exceeded by 1 in 1e4 sets of normal z."""
     z = []
     for seed in range(3):
         for moves in (runs(3), random_moves(seed, 40, 2)):
@@ -47,7 +47,7 @@ def test_both_tiers_agree_and_a_seed_gives_the_same():
 
 
 class OtherRun(ensemble.Run):
-    """The chain of emcee by the name of another tier."""
+    """The chain of emcee under the name of another tier."""
 
     tier = "other"
 
@@ -88,7 +88,7 @@ def test_play_swallows_short_legs():
     assert draws.std() < 0.2
 
 
-def test_a_search_that_lost_its_way_is_not_converged():
+def test_a_search_that_ends_elsewhere_is_not_converged():
     """Legs of a few commands, a play of three: a search ended at half of the true ratio, 26 in log density too low."""
     rng = np.random.default_rng(5)
     commands = rng.integers(0, 5, 30).tolist()
@@ -98,7 +98,7 @@ def test_a_search_that_lost_its_way_is_not_converged():
         y = min(max(y, c - 1.5), c + 1.5)
         values.append(y + 0.05 * rng.standard_normal())
     fit = fit_axis(campaign(moves, values, backlash=AxisPrior(0.0, 10.0)), sampled=False)
-    # Whichever way it goes: an approximation that passes for converged holds the truth.
+    # In either case: an approximation reported as converged covers the truth.
     ratio = fit.draws["per_command"]
     assert fit.error is not None or abs(ratio.mean() - 1.0) < 4 * ratio.std()
     assert fit.mode.missing == fit.missing == summarise_axis(fit).problems
@@ -115,7 +115,7 @@ def test_readings_without_a_density_are_not_converged(scales):
     assert "no density" in fit.error.message and not summarise_axis(fit).converged
 
 
-def test_what_the_data_cannot_tell_is_said():
+def test_undetermined_quantities_are_named():
     moves = [AxisMove(k, 0, 60.0 * k, 100.0 * k, "" if k else "forward") for k in range(4)]
     summary = summarise_axis(fit_axis(campaign(moves, [0.0, 1.0, 2.1, 3.0]), tier="importance"))
     text = " ".join(summary.weak_directions)
@@ -124,7 +124,7 @@ def test_what_the_data_cannot_tell_is_said():
     assert summary.classic.backlash is None and summary.classic.iso230 is None
 
 
-def test_a_reversal_of_the_wrong_sign_is_said():
+def test_a_reversal_of_the_wrong_sign_is_reported():
     moves = runs(3)
     side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
     rng = np.random.default_rng(2)
@@ -138,12 +138,12 @@ def test_a_reversal_of_the_wrong_sign_is_said():
 def test_a_constant_is_held(name, value):
     axis = drawn(2, None, **{name: AxisPrior(value, 0.0)}).campaign
     fit = fit_axis(AxisCampaign("deg", axis.moves, axis.readings, axis.stated), tier="importance")
-    # What rounding leaves of a variance that is zero.
+    # Rounding of a variance that is zero.
     np.testing.assert_allclose(fit.draws[name], value, atol=1e-10)
 
 
 def test_places_read_one_after_the_other_are_weak():
-    """Place and time are one: said, until gears that keep step and a warm machine are stated."""
+    """Place and time are confounded, which is reported until equal ratios and no creep are stated."""
     commands = [c + beside for c in (0.0, 1000.0, 2000.0, 3000.0) for beside in (-300.0, 0.0, 300.0, 0.0) * 2]
     moves = [AxisMove(k, 0, 120.0 * k, c, "" if k else "forward") for k, c in enumerate(commands)]
     values = [0.01 * m.command + 0.003 * (k % 3) for k, m in enumerate(moves)]

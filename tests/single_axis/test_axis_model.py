@@ -1,4 +1,4 @@
-"""The density of an axis against dense matrices, rows left out too; the law without processes."""
+"""The density of an axis against dense matrices, with held-out rows too; the model without processes."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_filter_is_the_dense_gaussian(seed):
         total, residual = dense(model, w[k : k + 1])
         sign, log_det = np.linalg.slogdet(2 * np.pi * total)
         wanted = -0.5 * (log_det + residual @ np.linalg.solve(total, residual))
-        # 36 rows of condition 1e10: differences of the two ways of solving.
+        # 36 rows of condition 1e10: the two solutions differ by rounding.
         assert sign > 0 and values[k] == pytest.approx(wanted, rel=1e-8, abs=1e-5)
 
 
@@ -83,7 +83,7 @@ def test_rows_left_out_are_the_conditional_of_the_dense_gaussian():
     np.testing.assert_allclose(mean[0], predicted, atol=1e-6)
 
 
-def test_places_that_no_row_depends_on_are_predicted_from_those_that_rows_do():
+def test_places_without_rows_are_predicted_from_places_with_rows():
     """Against the conditional of the process, given the posterior at the places of the rows."""
     commands = np.array([-1500.0, 37.0, 1200.0])
     plain, model = model_of(a_campaign()), model_of(a_campaign(), commands)
@@ -121,13 +121,13 @@ def test_without_processes_it_is_the_least_squares_line():
     solved = np.linalg.lstsq(design, values, rcond=None)[0]
     columns = [axis_model.OFFSET, axis_model.SLOPE, axis_model.BACKLASH]
     sd = 0.004 * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-    # The priors of a travel and of the ratio still pull, by less than a hundredth of an sd.
+    # The priors of travel and ratio shift the result by less than a hundredth of an sd.
     np.testing.assert_allclose(linear.mean[0, columns], solved, atol=float(0.01 * sd.max()), rtol=1e-6)
     u = np.sqrt(np.diag(linear.covariance[0])[columns])
     np.testing.assert_allclose(u, sd, rtol=0.01)
 
 
-def test_nodes_do_what_all_positions_do(monkeypatch):
+def test_nodes_agree_with_all_positions(monkeypatch):
     axis = drawn(5).campaign
     exact = model_of(axis)
     w = np.zeros((1, len(exact.coordinates.names)))
@@ -138,7 +138,7 @@ def test_nodes_do_what_all_positions_do(monkeypatch):
     assert rough.log_likelihood(w)[0] == pytest.approx(exact.log_likelihood(w)[0], rel=2e-4)
 
 
-def test_a_turned_reading_turns_the_answer():
+def test_a_negated_reading_negates_the_answer():
     axis = drawn(6).campaign
     turned = campaign(axis.moves, [-float(r.value or 0.0) for r in axis.readings], axis.readings[0].u)
     straight = campaign(axis.moves, [float(r.value or 0.0) for r in axis.readings], axis.readings[0].u)

@@ -1,4 +1,4 @@
-"""An axis whose stops were all reached from one side: its play is what the prior says, and so it is shown."""
+"""An axis whose stops were all reached from one side: its play is that of the prior and is marked as such."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
 
 @pytest.fixture(scope="module")
 def summary() -> AxisSummary:
-    """Forward all the way, from a start that nobody knows the side of."""
+    """Forward moves only, from a start of unknown side."""
     moves = [AxisMove(k, 0, 60.0 * k, 400.0 * k, "" if k else "unknown") for k in range(20)]
     rng = np.random.default_rng(3)
     values = [0.0125 * m.command - 0.04 * (k > 0) + 0.004 * rng.standard_normal() for k, m in enumerate(moves)]
     return summarise_axis(fit_axis(campaign(moves, values, 0.003, backlash=AxisPrior(0.1, 2.0)), sampled=False))
 
 
-def test_a_play_that_cannot_be_told_is_its_prior(summary):
+def test_an_undetermined_play_is_its_prior(summary):
     play = summary.parameters["backlash"]
     assert (play.value, play.sd, play.contraction) == (0.1, 2.0, 0.0)
     assert play.interval95 == pytest.approx((0.1 - 3.92, 0.1 + 3.92), abs=0.01)
@@ -32,7 +32,7 @@ def test_a_play_that_cannot_be_told_is_its_prior(summary):
     assert any("backlash is not determined" in text for text in summary.weak_directions)
 
 
-def test_shares_told_lie_between_zero_and_one_hundred(summary):
+def test_printed_shares_lie_between_zero_and_one_hundred(summary):
     wider = structs.replace(summary.parameters["ratio_contrast"], contraction=-1.0)
     hardly = structs.replace(wider, contraction=-0.001)
     shown = parameter_table(
@@ -50,7 +50,7 @@ def test_weak_directions_are_counted_in_words(summary):
     ("target", "unit"),
     [("per_command", "mm per command"), ("effective_per_command", "mm per command"), ("backlash", "mm")],
 )
-def test_a_plan_says_the_unit_of_its_target_with_both_digits(target, unit):
+def test_a_plan_prints_its_target_with_unit_and_two_digits(target, unit):
     stop = NextStop(100.0, "forward", None, 0.000005, 0.000002, 0.000002)
     text = axis_plan_text(AxisPlan(target, 0.000007, (stop,), 1.0), "mm")
     assert f"now u = 0.0000070 {unit}\n" in text and "0.0000050" in text

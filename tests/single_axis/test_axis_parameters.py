@@ -1,4 +1,4 @@
-"""Coordinates with standard normal priors: medians and tails of what they stand for."""
+"""Coordinates with standard normal priors: medians and tails of the parameters."""
 
 from __future__ import annotations
 

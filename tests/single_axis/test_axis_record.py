@@ -1,4 +1,4 @@
-"""Results of an axis in its folder: taken up again, or refused by what is damaged."""
+"""Results of an axis in its folder: reused, or refused with the name of the damaged part."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def kept(tmp_path_factory):
     return folder, fit
 
 
-def test_what_was_kept_is_taken_up(kept):
+def test_stored_results_of_an_axis_are_reused(kept):
     folder, fit = kept
     messages = []
     results = results_for(read_axis(folder), notify=messages.append)
@@ -78,7 +78,7 @@ def test_results_that_modelled_less_are_fitted_anew(kept, monkeypatch):
 
 
 def test_strata_have_the_band_of_all_draws(kept):
-    """The band that a page draws, beside draws of every equal draw of the scales."""
+    """The band of a page against draws of every equally weighted draw of the scales."""
     fit = kept[1]
     commands = fit.rows.positions
     every = drawn_deviations(fit, commands, np.random.default_rng(1))
@@ -136,8 +136,8 @@ def test_a_damaged_seed_is_refused(kept, seed):
     assert (caught.value.code, caught.value.column) == ("schema", "seed") and caught.value.remedy
 
 
-def test_the_mean_play_of_the_positions_read_holds_the_truth_and_is_surer_than_that_of_all():
-    """Twelve drawn axes whose play varies by position: in 99 % of cases the RMS of twelve z is 0.51 to 1.54."""
+def test_the_mean_play_of_the_positions_read_covers_the_truth_with_a_smaller_u():
+    """Twelve simulated axes whose play varies by position: in 99 % of cases the RMS of twelve z is 0.51 to 1.54."""
     z, ratio = [], []
     for seed in range(100, 112):
         axis = drawn(seed, runs(2))

@@ -1,4 +1,4 @@
-"""Moves with readings as arrays: averages, sides, the play operator, what is refused."""
+"""Moves with readings as arrays: averages, sides, the play operator, refusals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def line(commands, k=0.01):
 
 
 def test_play_is_the_clip_of_the_definition():
-    """Y = clip(y, q - b/2, q + b/2), stop by stop; share and anchor say the same place."""
+    """Y = clip(y, q - b/2, q + b/2), stop by stop; share and anchor give the same place."""
     moves = random_moves(3, 60)
     rows = rows_of(campaign(moves, line([m.command for m in moves])))
     for backlash in (0.0, 3.0, 9.0, 25.0):
@@ -37,7 +37,7 @@ def test_play_is_the_clip_of_the_definition():
 
 
 @pytest.mark.parametrize("k", [0.01, -4.0])
-def test_play_of_many_backlashes_is_that_of_each_and_keeps_the_way_to_its_anchor(k):
+def test_play_of_many_backlashes_is_that_of_each_with_its_anchor(k):
     moves = random_moves(4, 40)
     rows = rows_of(campaign(moves, line([m.command for m in moves], k)))
     backlashes = np.array([0.0, 0.3, 12.0, 26.0]) * abs(k) * 100
@@ -71,7 +71,7 @@ def test_an_unknown_side_is_known_after_a_long_leg():
     rows = rows_of(campaign(moves, line([m.command for m in moves])))
     places = play_places(rows, np.array([2.0]))
     np.testing.assert_allclose(places.spread[0], [1.0, 0.75, 0.0, 0.0], atol=1e-12)
-    # Also of plays that every known leg would take up.
+    # Also for plays that every known leg would clear.
     np.testing.assert_allclose(play_places(rows, np.array([0.1, 0.2])).spread[:, 0], [0.05, 0.1], atol=1e-12)
 
 
@@ -86,7 +86,7 @@ def test_readings_of_a_move_are_averaged_by_their_u():
     assert (rows.count[5], rows.count[6]) == (2, 1)
 
 
-def test_readings_repeated_at_a_stop_say_how_well_they_are_read():
+def test_repeated_readings_at_a_stop_estimate_their_scatter():
     """Squares 0.02 and 0.08 with 1 + 2 degrees of freedom, pooled; a row of n readings has an n-th of it."""
     moves = runs(1)
     values = line([m.command for m in moves])
@@ -121,7 +121,7 @@ def test_angles_that_wrap_are_refused():
 
 
 @pytest.mark.parametrize("unit", DEGREES)
-def test_in_every_unit_of_angles_that_an_import_knows_a_turn_is_a_turn(unit):
+def test_a_turn_is_recognised_in_every_unit_of_angles(unit):
     moves = tuple(AxisMove(k, 0, 0.0, 20.0 * k, "" if k else "forward") for k in range(30))
     values = [(m.command + 100) % 360 / DEGREES[unit] for m in moves]
     readings = tuple(Reading(k, k, value) for k, value in enumerate(values))
@@ -159,7 +159,7 @@ def test_as_many_moves_as_a_fit_takes(monkeypatch):
 
 @pytest.mark.parametrize("k", [0.01, -4.0])
 def test_the_reversal_is_that_of_least_squares(k):
-    """Forward stops stand half a reversal behind: by differences of the sides' means, at the same commands."""
+    """Forward stops lag by half a reversal: by differences of the sides' means at the same commands."""
     moves = runs(3)[1:]
     command = np.array([m.command for m in moves])
     side = np.sign(np.diff(command, prepend=command[0] - 1))
@@ -176,7 +176,7 @@ def test_the_reversal_is_that_of_least_squares(k):
     assert backlash == pytest.approx(0.7, abs=5 * u)
 
 
-def test_without_two_sides_no_reversal_is_told_and_every_leg_is_long():
+def test_without_two_sides_there_is_no_reversal_and_every_leg_is_long():
     moves = [AxisMove(k, 0, 0.0, c, "" if k else "forward") for k, c in enumerate((0.0, 1.0, 2.0, 4.0))]
     rows = rows_of(campaign(moves, [0.0, 1.1, 1.9, 4.0]))
     assert reversal_of(rows) == (0.0, np.inf) and legs_are_long(rows)
@@ -186,7 +186,7 @@ def test_without_two_sides_no_reversal_is_told_and_every_leg_is_long():
 
 @pytest.mark.parametrize(("shortest", "noise", "long"), [(2.5, 0.0, True), (1.5, 0.0, False), (2.5, 0.1, False)])
 def test_legs_are_long_by_the_reversal_and_its_uncertainty(shortest, noise, long):
-    """Twice the reversal of 1 and ten of its standard errors have to fit."""
+    """A long leg exceeds twice the reversal of 1 plus ten of its standard errors."""
     commands = [0.0, *([20.0, 20.0 - shortest, 0.0] * 6)]
     side = np.sign(np.diff(commands, prepend=-1))
     moves = [AxisMove(k, 0, 0.0, c, "" if k else "forward") for k, c in enumerate(commands)]
@@ -210,11 +210,11 @@ def test_repeats_at_one_stop_share_its_error():
     moves = [AxisMove(k, 0, 10.0 * k, c, "" if k else "forward") for k, c in enumerate((0.0, 0.0, 9.0, 9.0, 0.0))]
     values = [0.1, 0.1, 1.0, 1.0, 0.1]
     assert rows_of(campaign(moves, values, 0.01)).redrawn.tolist() == [True, False, True, False, True]
-    # Where nobody knows how well a reading is read, the scatter of stops covers it.
+    # Without a known scatter of readings, the scatter of stops includes it.
     assert rows_of(campaign(moves, values)).redrawn.all()
 
 
-def test_figures_of_the_whole_axis_have_the_words_of_the_standard():
+def test_figures_of_the_whole_axis_have_the_terms_of_the_standard():
     """Keys of `fit.json`, in order; a reversal of 0.2 everywhere without scatter is one without spread."""
     moves = runs(3)
     side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]

@@ -32,7 +32,7 @@ def test_the_line_is_that_of_least_squares():
     np.testing.assert_allclose(stated, [solved[1], u[1], solved[2], u[2], scatter], rtol=1e-9)
 
 
-def test_what_rows_of_one_side_cannot_tell_is_zero():
+def test_rows_of_one_side_give_zero_reversal():
     rows = rows_with(2)
     forward = fit_line(rows, rows.side > 0)
     slope, offset = np.polyfit((rows.command - rows.command.mean())[rows.side > 0], rows.value[rows.side > 0], 1)
@@ -44,7 +44,7 @@ def test_what_rows_of_one_side_cannot_tell_is_zero():
 
 
 def test_runs_are_deviations_from_the_line_by_position_and_side():
-    """Both ends beyond the places are read from one side; of uneven runs the missing ones are not a number."""
+    """Both ends are read from one side; missing runs are NaN."""
     rows = rows_with(3)
     left_out = np.zeros(len(rows.value), dtype=bool)
     left_out[np.flatnonzero((rows.command == 500.0) & (rows.side > 0))[0]] = True

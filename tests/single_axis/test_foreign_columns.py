@@ -1,4 +1,4 @@
-"""What columns of a table of an axis hold, beyond their names."""
+"""Contents of the columns of an axis table, beyond their names."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_columns_of_runs(names, runs):
     assert list(run_columns(dict.fromkeys(names, ("1.0",))).values()) == runs
 
 
-def test_runs_side_by_side_follow_each_other():
+def test_runs_in_columns_are_joined_in_order():
     """Forward up, backward down, whatever the order of the rows; lines are those of the file."""
     wide = table(
         **{"Position": ("10", "0"), "Backward 1 (mm)": ("b10", "b0"), "Forward 1 (mm)": ("1", "2")},
@@ -80,7 +80,7 @@ def test_a_column_that_is_actual_less_target_is_no_uncertainty(name, cells, text
 
 
 def test_readings_that_are_deviations_are_asked_for():
-    """Those of a gear of 1 to 100 lie on a line, and go through."""
+    """Readings of a gear of 1 to 100 lie on a line and are accepted."""
     commands = [str(k) for k in range(0, 100, 10)]
     loose = table(target_mm=commands, actual_mm=[str(0.001 * (k * 7 % 10)) for k in range(10)])
     with pytest.raises(InputError, match="--deviations"):

@@ -1,4 +1,4 @@
-"""A table of an axis as a logger writes it becomes moves and readings."""
+"""The table of a logger becomes moves and readings."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_dates_in_utc_are_times():
 
 
 @pytest.mark.parametrize("names", [("step", "target", "mm"), ("steps", "position", "x"), ("steps", "mm", "deg")])
-def test_what_could_be_either_is_left_open(names):
+def test_ambiguous_columns_are_left_open(names):
     assert "value" not in map_axis_columns(names).columns
     assert map_axis_columns(names, {"value": names[1]}).columns["value"] == names[1]
 
@@ -48,7 +48,7 @@ def test_degrees_of_a_thermometer_are_no_reading():
 
 @pytest.mark.parametrize(("unit", "turn"), [("deg", 360.0), ("rad", 2 * np.pi), ("turn", 1.0)])
 def test_whole_turns_that_an_encoder_leaves_out_are_added(unit, turn):
-    """Forward over three turns and back, past a refused reading; what is no angle, or does not jump, stays."""
+    """Forward over three turns and back, past a refused reading; other units and readings without jumps stay."""
     commands = [*range(0, 1200, 50), *range(1150, -1, -50)]
     angles = [turn * (0.9 + command / 360) for command in commands]
     moves = tuple(AxisMove(k, 0, float(k), float(c), "" if k else "forward") for k, c in enumerate(commands))
@@ -117,7 +117,7 @@ def test_a_german_date_beside_german_names(tmp_path):
 
 @pytest.mark.parametrize("name", ["homed", "Homed?", "run", "run_id", "Referenziert", "homing no"])
 def test_homings_are_not_dropped(tmp_path, name):
-    """Readings before and after a homing would pass for one segment."""
+    """Readings before and after a homing would be taken for one segment."""
     marks = ("0", "0", "1", "0") if "ed" in name.lower() else ("1", "1", "2", "2")
     rows = [f"{mark},{10 * k},{k}.5" for k, mark in enumerate(marks)]
     assert [m.segment for m in readings_of(*table(tmp_path, f"{name},steps,encoder", *rows)).moves] == [0, 0, 1, 1]
@@ -126,7 +126,7 @@ def test_homings_are_not_dropped(tmp_path, name):
 @pytest.mark.parametrize(
     ("row", "column"), [("x,1,ok,forward", "steps"), ("0,,ok,forward", "angle"), ("0,1,ok,cw", "side")]
 )
-def test_cells_that_say_nothing_are_refused_with_their_column(tmp_path, row, column):
+def test_cells_without_meaning_are_refused_with_their_column(tmp_path, row, column):
     with pytest.raises(InputError) as refused:
         readings_of(*table(tmp_path, "steps,angle,status,side,sd", f"{row},"))
     assert (refused.value.line, refused.value.column) == (2, column)
@@ -137,7 +137,7 @@ def test_a_negative_uncertainty_is_refused_as_check_does(tmp_path):
         readings_of(*table(tmp_path, "steps,angle,sd", "0,1,-0.1"))
 
 
-def test_statuses_are_such_as_our_own_reader_takes(tmp_path):
+def test_statuses_are_accepted_by_the_campaign_reader(tmp_path):
     series = readings_of(*table(tmp_path, "steps;encoder;ok", "0;0,5;1", "100;1,5;-", "200;;+ slipped"))
     assert [reading.status for reading in series.readings] == ["ok", "refused: -", "refused: + slipped"]
     assert "status: 2 readings left out by column ok: - 1, + slipped 1" in series.assumed
@@ -148,7 +148,7 @@ def test_statuses_are_such_as_our_own_reader_takes(tmp_path):
     "name, cells", (("Temperature", (20.0, 21.5)), ("Temp (°F)", (68.0, 70.7)), ("temp_K", (293.15, 294.65)))
 )
 def test_temperatures_are_those_of_the_moves(tmp_path, name, cells):
-    """Of the row that ends a move, none where a cell is empty or a move is put in; deg C whatever the column says."""
+    """From the row that ends a move; none for an empty cell or an inserted move; deg C whatever the column's unit."""
     rows = (f"0,0.1,{cells[0]},below", "10,1.1,,below", f"10,1.0,{cells[1]},above")
     series = readings_of(*table(tmp_path, f"command,value,{name},direction", *rows))
     assert [move.command for move in series.moves] == [0.0, 10.0, 10.5, 10.0]

@@ -1,4 +1,4 @@
-"""A guide log whose mount is known gives back how that mount moved; what is not tracking is left out and counted."""
+"""A guide log of a known mount gives the motion of that mount; frames without tracking are left out and counted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Frame,Time,mount,dx,dy,RARawDistance,DECRawDistance,RAGuideDistance,DECGuideDist
 
 
 def motion_of(time_s: float) -> float:
-    """Of the star before an axis that nobody corrects, arcsec of the axis, positive to the west: the axis lags."""
+    """Of the star against an uncorrected axis, arcsec of the axis, positive to the west: the axis lags."""
     return 8.0 * math.sin(2 * math.pi * time_s / 480.0) + 0.01 * time_s
 
 
@@ -55,7 +55,7 @@ def motions(series):
     return times, SIDEREAL_ARCSEC_PER_S * times - np.array([reading.value for reading in ok])
 
 
-# Raw distances are written to 1e-4 px, values to 1e-4 arcsec; what is summed are pulses, whole ms and exact.
+# Raw distances are written to 1e-4 px, values to 1e-4 arcsec; the summed pulses are whole ms and exact.
 ROUNDED = 0.5e-4 * PIXEL / COSINE + 0.5e-4 + 1e-6
 
 
@@ -85,7 +85,7 @@ def test_a_rate_at_the_declination_of_the_run_is_recognised():
     assert any("at the run's declination" in text and "guide speed is 6.1, -22 %" in text for text in series.assumed)
 
 
-def test_what_is_stated_counts_before_the_log():
+def test_stated_values_replace_those_of_the_log():
     (run,) = read_runs(night(pulse_rate=9.0), "log.txt")
     times, motion = motions(readings_of_run(run, "log.txt", {"pulse_arcsec_per_s": 9.0}))
     assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
@@ -105,7 +105,7 @@ EVENTS = {
 }
 
 
-def test_dithers_settling_drops_and_pauses_are_left_out_and_no_jump_is_bridged():
+def test_dithers_settling_drops_and_pauses_are_left_out_and_split_the_series():
     """Each stretch has a zero of its own; within it the motion is that of the mount."""
     (run,) = read_runs(night(events=EVENTS), "log.txt")
     series = readings_of_run(run, "log.txt", {})
@@ -127,7 +127,7 @@ def test_dithers_settling_drops_and_pauses_are_left_out_and_no_jump_is_bridged()
 
 
 def test_several_runs_calibrations_and_empty_logs():
-    """A header repeats, a run without a frame is none, steps of a calibration are no frames."""
+    """Headers repeat, runs without frames are skipped, calibration steps are no frames."""
     empty = HEADER.format(norm="") + "Guiding Ends at 2026-01-02 20:00:00\n"
     calibration = "Calibration Begins at 2026-01-02 20:30:00\nDirection,Step,dx,dy,x,y,Dist\nWest,0,0,0,1,2,0\n"
     log = "PHD2 version 2.6.14 [Windows], Log version 2.5.\n" + empty + calibration + night(50) + "\n" + night(20)[:-80]
@@ -148,7 +148,7 @@ def test_several_runs_calibrations_and_empty_logs():
         ("Dec = 40.0 deg", "Dec = 89.3 deg", "a declination of 89.3 deg", "nearer to the equator"),
     ],
 )
-def test_what_the_log_does_not_state_is_asked_for(old, new, message, remedy):
+def test_values_missing_in_the_log_are_asked_for(old, new, message, remedy):
     (run,) = read_runs(night(20).replace(old, new), "log.txt")
     with pytest.raises(InputError, match=message) as refused:
         readings_of_run(run, "log.txt", {})

@@ -1,4 +1,4 @@
-"""Positions left out: predicted within their u on drawn axes, and beside the classic where errors repeat."""
+"""Hold-out of positions: predicted within their u on simulated axes, beside the classic line where errors repeat."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tvsbayes.single_axis.held_out_positions import hold_out_positions
 pytestmark = pytest.mark.thorough
 
 
-def test_positions_are_predicted_and_the_first_edition_is_too_sure():
-    """Errors by position ten times the scatter: independent stops are too sure, processes are not."""
+def test_positions_are_predicted_and_independent_stops_underestimate_u():
+    """Errors by position are ten times the scatter: independent stops understate u, processes do not."""
     stated = {
         "backlash": AxisPrior(0.0, 0.1),
         "stop_sd": AxisPrior(0.003, 0.0),
@@ -38,13 +38,13 @@ def test_positions_are_predicted_and_the_first_edition_is_too_sure():
     assert np.sqrt(np.mean(np.square(classic))) > 1.7
 
 
-def test_two_positions_leave_no_line():
+def test_two_positions_are_too_few():
     moves = runs(3, (0.0, 1000.0), 0.0)
     with pytest.raises(NothingToEstimate):
         hold_out_positions(campaign(moves, [0.01 * m.command for m in moves]))
 
 
-def test_weighted_draws_of_one_fit_say_what_fits_without_a_position_say(monkeypatch):
+def test_weighted_draws_of_one_fit_agree_with_fits_without_a_position(monkeypatch):
     axis = drawn(11, runs(3), backlash=AxisPrior(0.0, 0.1)).campaign
     refitted = hold_out_positions(axis).positions
     monkeypatch.setattr(held_out_positions, "REFITTED_MAX", 0)
@@ -55,7 +55,7 @@ def test_weighted_draws_of_one_fit_say_what_fits_without_a_position_say(monkeypa
         assert one.u == pytest.approx(other.u, rel=0.25)
 
 
-def test_many_positions_are_thinned_in_words(monkeypatch):
+def test_many_positions_are_thinned_with_a_warning(monkeypatch):
     monkeypatch.setattr(held_out_positions, "POSITIONS_MAX", 4)
     hold_out = hold_out_positions(drawn(11, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign)
     assert len({p.position for p in hold_out.positions}) == 4 and "evenly" in hold_out.warnings[0]

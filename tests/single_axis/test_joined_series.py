@@ -1,4 +1,4 @@
-"""Series that were logged apart are joined in time: a value is logged only when it changes."""
+"""Series of separate logs are joined by time; a value is logged only when it changes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def drive() -> list[str]:
 
 
 @pytest.mark.parametrize("names", [(COMMAND, READ), ("m1.VAL", "m1.RBV"), ("bench:counter", "bench:ssi")])
-def test_a_reading_gets_the_command_of_its_time(names):
+def test_readings_get_the_command_of_their_time(names):
     """Interpolated in motion; one from outside of the commands' times is left out."""
     text = "\n".join(drive()).replace(COMMAND, names[0]).replace(READ, names[1])
     assert is_camonitor(text) and not is_camonitor("time_s,steps,angle\n0,1,2\n")
@@ -50,8 +50,8 @@ def test_a_reading_gets_the_command_of_its_time(names):
     assert "20 commands interpolated in time, 1 readings outside left out" in table.kind
 
 
-def test_a_command_that_stands_is_held():
-    """Between two motions, 59 s apart, nothing changed: half way is no half of the way."""
+def test_a_constant_command_is_held():
+    """Between two motions, 59 s apart, the command is constant and not interpolated."""
     times = np.array([0.0, 0.1, 0.2, 0.3, 60.0, 60.1])
     commands = Series(times, np.array([0.0, 1.0, 2.0, 3.0, 3.0, 9.0]))
     values, interpolated = command_at(commands, np.array([0.15, 30.0, 60.05, 60.1, 0.1]))
@@ -60,7 +60,7 @@ def test_a_command_that_stands_is_held():
     assert command_at(jump, np.array([30.0]))[0] == pytest.approx([2.0])
 
 
-def test_a_pair_that_nobody_can_name_is_asked_for():
+def test_an_ambiguous_pair_is_asked_for():
     text = "\n".join(drive()).replace(COMMAND, "A").replace(READ, "B")
     with pytest.raises(InputError, match=r"A \(201 values\), B \(22 values\)") as refused:
         camonitor_table(text, "log", {})
@@ -124,7 +124,7 @@ def test_what_angle_calibrate_saves():
         (b"\x1f\x8bxx", "a damaged gzip file"),
         (json.dumps(klipper()[2]).encode() + b"\x03", "series angle:my_sensor"),
         (b"[angle a]\ncalibrate = 1.0\n", "a calibration of 1 angles"),
-        # Long, so that a search which tries every division of it does not end.
+        # Long, so that a search over every division of it would not end.
         (b"[angle a]\nsensor_type: a1333\n" + 60 * b"#*# nothing more\n", "a calibration of 0 angles"),
         (
             b"\x03".join(
@@ -140,8 +140,8 @@ def test_broken_logs_of_klipper_are_refused(data, message):
         klipper_table(data, "log")
 
 
-def test_a_command_logged_once_a_move_stands_until_the_next():
-    """Every 10 s a setpoint, the axis read 5 s later: nothing moved meanwhile."""
+def test_a_command_logged_once_a_move_is_held_until_the_next():
+    """A setpoint every 10 s, the axis read 5 s later: no motion in between."""
     times = np.arange(0.0, 50.0, 10.0)
     commands = Series(times, np.array([0.0, 10.0, 20.0, 10.0, 0.0]))
     values, interpolated = command_at(commands, times + 5.0)

@@ -1,4 +1,4 @@
-"""What to read next, and drawn axes."""
+"""Plans of further stops, and simulated axes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
 
 @pytest.mark.parametrize("target", ["per_command", "effective_per_command", "backlash"])
 def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
-    """Not at that given the scales, which is less: their means differ. Places between the rows change neither."""
+    """The u given the scales is smaller because means differ between draws. Places between the rows change neither."""
     mean, sd = fitted.linear.of(headline_functionals(fitted.model, fitted.w)[[HEADLINE_DRAWS.index(target)]])
     u_fit = np.sqrt(np.mean(sd**2))
     plan = plan_next(fitted, target, count=1)
@@ -48,7 +48,7 @@ def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
 
 @pytest.mark.thorough
 def test_stops_lower_a_play_that_is_sampled_and_none_that_is_held():
-    """Where moves may be shorter than the play it is no linear quantity."""
+    """The play is no linear quantity where moves may be shorter than it."""
     axis = drawn(4, runs(1)).campaign
     fit = fit_axis(axis, tier="importance")
     assert fit.model.play_is_sampled
@@ -61,8 +61,8 @@ def test_stops_lower_a_play_that_is_sampled_and_none_that_is_held():
         plan_next(held, "backlash", count=1)
 
 
-def test_actions_name_commands_with_all_their_digits():
-    """Microsteps of a long axis run into millions."""
+def test_actions_print_all_digits_of_commands():
+    """Microsteps of a long axis reach millions."""
     stop = NextStop(1234567.0, "forward", 1111111.0, 1.0, 0.1, 0.1)
     assert stop.actions == ["move 1111111", "move 1234567", "read"]
 
@@ -87,7 +87,7 @@ def test_a_stop_to_be_read_is_no_jump_by_a_turn(turned):
     assert plan.next[0].gain > 0
 
 
-def test_a_last_reading_of_no_use_takes_nothing_from_the_gains(turned):
+def test_an_unusable_last_reading_does_not_change_the_gains(turned):
     lost = Reading(len(turned.readings), len(turned.moves) - 1, None, 0.0, "no light")
     fit = fit_axis(replace(turned, readings=(*turned.readings, lost)), sampled=False)
     plan, whole = plan_next(fit, count=1), plan_next(fit_axis(turned, sampled=False), count=1)
@@ -104,7 +104,7 @@ def test_a_stop_to_be_read_moves_neither_line_nor_reversal(turned, direction):
     np.testing.assert_allclose([*more.line, reversal_of(more)[0]], [*rows.line, reversal_of(rows)[0]], atol=1e-9)
 
 
-def test_what_is_drawn_is_read_back_and_repeats_by_seed(tmp_path):
+def test_simulated_axes_round_trip_and_repeat_by_seed(tmp_path):
     one, other = drawn(9), drawn(9)
     assert one.campaign.readings == other.campaign.readings != drawn(10).campaign.readings
     one.write(tmp_path / "a")
@@ -121,7 +121,7 @@ def test_an_axis_without_a_ratio_is_refused():
     assert "per_command" in caught.value.remedy
 
 
-def test_a_reading_of_zero_says_how_far_a_command_goes():
+def test_exact_readings_give_the_distance_of_a_command():
     moves = runs(1, (0.0, 100.0), 0.0)
     simulated = simulate_axis(campaign(moves, [0.02 * m.command for m in moves]))
     # A line through points that lie on it.

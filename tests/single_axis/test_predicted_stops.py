@@ -1,4 +1,4 @@
-"""Readings of further moves: predicted as drawn axes give them, and joined to what the fit knows."""
+"""Prediction of the readings of further moves, against simulated axes and with the posterior of the fit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.predicted_stops import DRAWS, predicted_stops
 
 
-def test_further_readings_lie_where_they_are_predicted():
+def test_further_readings_agree_with_their_prediction():
     fit = results().fit
     commands, read = to_and_fro(np.linspace(-17.3, 17.3, 6))
     prediction = predicted_stops(fit, commands, read, np.full(len(read), 0.002))
@@ -44,7 +44,7 @@ def test_draws_have_the_moments_of_the_mixture_and_its_density():
 
 
 def test_the_scatter_of_homings_is_spread_evenly():
-    """Its draws are those of the fit at even ranks; of its prior where one homing was read."""
+    """Its draws are those of the fit at even ranks; those of the prior where one homing was read."""
     known, once = results().fit, fit_axis(drawn(1, runs(2)).campaign, tier="importance")
     prior, at = once.model.priors["home_sd"], (np.arange(DRAWS) + 0.5) / DRAWS
     of_prior = prior.value * np.exp(prior.u * ndtri(at))

@@ -1,4 +1,4 @@
-"""Waves: coordinates whose density is the prior's, order of those that share a range, columns; drives against dense."""
+"""Waves: coordinates with the prior's density, order within a range, columns; drives against dense matrices."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RATE, PERIOD, AMPLITUDE = 15.0, 240.0, 3.0
 
 
 def drive(seed: int, amplitude: float, periods: WavePeriods, count: int = 160, span: float = 1600.0) -> AxisCampaign:
-    """A drive that was read for a while, with noise of sd 1 and a wave."""
+    """A drive with readings of noise sd 1 and a wave."""
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(0.0, span, count))
     values = RATE * times + amplitude * np.cos(2 * np.pi * times / PERIOD - 1.0) + rng.standard_normal(count)
@@ -60,7 +60,7 @@ def test_quantiles_of_a_table_invert_its_integral():
     np.testing.assert_allclose(np.exp(table.log_density(x)), slope, rtol=1e-3)
 
 
-def test_the_prior_of_a_wave_is_the_prior_whatever_its_tables():
+def test_the_prior_of_a_wave_does_not_depend_on_its_tables():
     """Drawn by the tables and weighted: half have no wave, s is half-normal, the period log-uniform."""
     low, high = 2.0, 2.0 * np.exp(2.0)
     table = TabulatedDensity(a_table().at + np.log(low), a_table().density)
@@ -79,7 +79,7 @@ def test_the_prior_of_a_wave_is_the_prior_whatever_its_tables():
 
 
 def test_waves_that_share_a_range_are_counted_once():
-    """Over all states the prior adds up to that of waves that are told apart."""
+    """Over all states the prior adds up to that of distinguishable waves."""
     wave = replace(Wave.fixed("seconds", 2.0, 1.0), high=20.0, log_period=a_table())
     pair = [replace(wave, peak=4.0), replace(wave, peak=11.0)]
     rng = np.random.default_rng(2)
@@ -93,7 +93,7 @@ def test_waves_that_share_a_range_are_counted_once():
     assert set(np.round(np.exp(order), 12)) == {0.0, 1.0, 2.0}
 
 
-def test_columns_are_averaged_over_their_width():
+def test_columns_are_averages_over_their_width():
     # A record so long that a wave does not change within the width.
     period, width, still = np.array([3.0]), 1.2, WaveRecord(0.0, 1e9)
     x = np.array([0.3, 5.0, 8.8])
@@ -133,13 +133,13 @@ def test_a_drive_is_the_dense_gaussian():
         residual = rows.value - rows.line[0] - rows.line[1] * model.middle - g
         _, log_det = np.linalg.slogdet(2 * np.pi * total)
         wanted = -0.5 * (log_det + residual @ np.linalg.solve(total, residual))
-        # 40 rows of condition 1e10: differences of the two ways of solving.
+        # 40 rows of condition 1e10: the two solutions differ by rounding.
         assert density[k] == pytest.approx(wanted, rel=1e-6, abs=1e-3)
 
 
 @pytest.mark.thorough
 def test_readings_in_motion_are_averaged_without_losing_the_wave():
-    """4000 readings become few rows, and say of period and amplitude what they should."""
+    """4000 readings become few rows, with the expected uncertainties of period and amplitude."""
     axis = drive(4, AMPLITUDE, WavePeriods((), ((100.0, 800.0),), True), 4000, 4000.0)
     summary = summarise_axis(fit_axis(axis, tier="importance"))
     assert not summary.problems
@@ -154,7 +154,7 @@ def test_readings_in_motion_are_averaged_without_losing_the_wave():
 
 
 @pytest.mark.thorough
-def test_no_wave_is_claimed_of_noise():
+def test_noise_gives_no_wave():
     fit = fit_axis(drive(6, 0.0, WavePeriods((), ((100.0, 800.0),), True)), tier="importance")
     [estimate] = summarise_axis(fit).periods
     assert not fit.missing and estimate.probability < 0.5
@@ -196,8 +196,8 @@ def test_a_stated_period_of_position():
     assert estimate.phase_deg.interval95[0] < np.degrees(2.0) < estimate.phase_deg.interval95[1]
 
 
-def test_what_is_not_asked_for_changes_nothing():
-    """Without times no creep; without periods no wave: the coordinates are those of before."""
+def test_without_times_or_periods_the_coordinates_are_unchanged():
+    """Without times there is no creep, without periods no wave."""
     moves = [replace(move, time_s=0.0) for move in random_moves(1)]
     axis = campaign(moves, [0.01 * m.command for m in moves], 0.001)
     model = model_of(axis)
@@ -205,7 +205,7 @@ def test_what_is_not_asked_for_changes_nothing():
     assert not {"creep_minutes", "seeing_s", "drift_per_root_hour"} & set(model.coordinates.names)
 
 
-def test_periods_that_lie_apart_are_named():
+def test_separate_periods_are_named():
     period = np.concatenate([np.full(70, 3.7), np.full(30, 12.4)])
     groups = separate_periods(period)
     assert [(group.mean, group.share) for group in groups] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
@@ -233,15 +233,15 @@ def test_a_second_harmonic_that_is_stronger_than_the_first_is_named():
 
 @pytest.mark.thorough
 def test_a_period_at_the_end_of_its_range_is_doubted():
-    """A wave of 240 s asked for below 228 s is given there, and said to lie at the end; one inside is not."""
+    """A wave of 240 s with a range below 228 s is reported at the end of the range; one inside has no remark."""
     for high, doubted in ((0.95 * PERIOD, True), (700.0, False)):
         periods = WavePeriods(between=((60.0, high),), in_seconds=True)
         summary = summarise_axis(fit_axis(drive(4, 5.0, periods), tier="importance"))
         assert any("lies at the end of the range" in t for t in summary.warnings) == doubted, (high, summary.periods)
 
 
-def test_a_search_that_gets_lost_begins_anew_within_bounds(monkeypatch):
-    """A long record with sharp waves sent it far out: there, and here by force, the bounded one finds the mode."""
+def test_a_search_that_diverges_restarts_within_bounds(monkeypatch):
+    """A long record with narrow waves makes a search diverge, as forced here; the bounded one finds the mode."""
     model = model_of(drive(4, AMPLITUDE, WavePeriods((PERIOD,), (), True)))
     there, search = find_mode(model), axis_mode._search
 
