@@ -1,4 +1,4 @@
-"""Commands of commands.md that run on what is shipped print what the page says."""
+"""Commands of commands.md that run on shipped data print the output on the page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OTHERS = {"import", "detect", "stereo", "doctor", "watch", "compensate", "verify
 
 
 def folder_of(place: Path) -> Path:
-    """What the page works on: the rig file of the mounted rig with its grid, the twin of the paper as `mine`."""
+    """The folder of the page: the rig file of the mounted rig with its grid, the twin of the paper as `mine`."""
     rig = ROOT / "data" / "rigs" / "mounted"
     for name in ("rig.toml", "stereo.json", "grid.csv"):
         shutil.copy(rig / name, place)
@@ -38,12 +38,12 @@ def test_every_command_of_the_page_is_run_or_named_here():
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_commands_without_a_fit_print_what_the_page_says(name, tmp_path, monkeypatch, capsys):
+def test_commands_without_a_fit_print_the_output_of_commands_md(name, tmp_path, monkeypatch, capsys):
     place = tmp_path if name == "new" else folder_of(tmp_path)
     follow(of(name), place, monkeypatch, capsys, errors_too=True)
 
 
 @pytest.mark.slow
-def test_commands_that_fit_print_what_the_page_says(tmp_path, monkeypatch, capsys):
+def test_commands_that_fit_print_the_output_of_commands_md(tmp_path, monkeypatch, capsys):
     with caching_in(tmp_path / "cache"):
         follow(of(*FITTING), folder_of(tmp_path), monkeypatch, capsys, errors_too=True)

@@ -66,7 +66,7 @@ def looks():
 def test_beam_of_the_test_vector(nominal, looks):
     origin, direction, _ = looks(with_values(nominal, **VECTOR), [[PAN_RAD, TILT_RAD, RANGE_MM]])
     printed = [5.371658918, -29.176887333, -0.940368833]
-    # The design rounded from these digits: half a unit of the last one and no more.
+    # The design is rounded from these digits: half a unit of the last one at most.
     assert np.abs(origin[0] - printed).max() <= LAST_9 * 1.01
     assert np.abs(direction[0] - [0.981182562588, 0.177188586189, 0.076713648059]).max() <= LAST_12 * 1.01
 
@@ -185,7 +185,7 @@ def test_frame_s_looks_along_x(mounted_rig):
 
 
 def test_every_name_has_its_unit():
-    """A float that crosses a border says its unit; ratios and scales have none."""
+    """A float of a module's interface has its unit in its name; ratios and scales have none."""
     units = ("_deg", "_mm", "_rad", "_minutes", "deg_per_step", "degrees_per_step")
     without = [n for n in NAMES if not any(u in n for u in units)]
     assert [n for n in without if not n.startswith("stereo.")] == ["pixel_scale", "focal_scale"]

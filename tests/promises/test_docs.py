@@ -1,4 +1,4 @@
-"""The documents keep their promises: links, tables of commands and parameters, map of modules, examples, the site."""
+"""Documents: links, tables of commands and parameters, map of modules, examples, the site."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_command_begins_with_its_commonest_use(name):
 
 
 def test_long_pages_are_two_thirds_of_what_they_were():
-    """In words: of those of version 0.2.0."""
+    """In words, compared with version 0.2.0."""
     for page, words in {"commands": 7204, "formulation": 7183}.items():
         assert len(read(f"data/docs/{page}.md").split()) <= words * 2 / 3, page
 
@@ -118,12 +118,12 @@ def options_of(name: str) -> set[str]:
 
 
 def test_options_named_in_the_table_of_commands_exist():
-    """And every command's help fits a terminal of 80 columns, with a summary that is not cut off in the list."""
+    """Every command's help fits a terminal of 80 columns, and its summary is complete in the list."""
     rows = re.findall(r"^\| `([\w-]+)(.*)$", section(COMMANDS, "Commands"), flags=re.MULTILINE)
     named = 0
     for name, row in rows:
         wanted = set(re.findall(r"(?<![\w`])--[a-z][\w-]*|(?<=`)--[a-z][\w-]*", row))
-        # What stands behind a backquoted name of another command belongs to that one.
+        # Options behind the backquoted name of another command belong to that one.
         assert wanted <= options_of(name), (name, wanted - options_of(name))
         named += len(wanted)
     assert named > 10
@@ -267,7 +267,7 @@ def examples(page: str, language: str) -> str:
 
 @pytest.fixture(scope="module")
 def followed() -> dict[str, object]:
-    """Names that the page's examples leave behind, and how many of them failed to print what stands there."""
+    """Names defined by the page's examples, and the number of examples with other output than printed."""
     fit, fitted = tvsbayes.fit, []
     cwd = Path.cwd()
     os.chdir(ROOT)
@@ -286,7 +286,7 @@ def followed() -> dict[str, object]:
 
 
 @pytest.mark.thorough
-def test_python_examples_do_what_they_say(followed):
+def test_python_examples_give_the_printed_output(followed):
     assert followed["results"].attempted >= 20
     assert not followed["results"].failed, followed["report"]
 
@@ -326,8 +326,8 @@ def test_site_is_built_without_a_warning(tmp_path):
         ("data/docs/compensation.md", "experiments.compensation.ten_minutes"),
     ],
 )
-def test_a_page_that_a_script_prints_is_what_it_prints(page, script):
-    """Whole, fits included; last digits may differ with the processor."""
+def test_a_page_printed_by_a_script_is_current(page, script):
+    """The whole page, fits included; last digits may differ with the processor."""
     done = subprocess.run([sys.executable, "-m", script], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (difference := first_difference(done.stdout, read(page))) is None, difference

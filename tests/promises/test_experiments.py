@@ -1,4 +1,4 @@
-"""Experiments: found by question, no work at import, no question built on another, no name that shadows a package."""
+"""Experiments: grouped by question, no work at import, no imports between questions, no name that shadows a package."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_the_index_names_every_script_and_only_scripts():
 
 
 def test_an_answer_of_the_index_is_a_line():
-    """Of a page's width, links apart: the details stand on the page."""
+    """At most the width of a page, links apart; details are on the page."""
     rows = [line.split(" | ") for line in (FOLDER / "README.md").read_text(encoding="utf-8").splitlines()]
     answers = [re.sub(r"(?:; )?\[[^\]]*\]\([^)]*\)", "", row[1]) for row in rows if len(row) == 4]
     assert len(answers) > 40 and [answer for answer in answers if len(answer) > 120] == []
@@ -111,7 +111,7 @@ def test_figures_have_one_style():
     assert modules == {"experiments.common.figures", "experiments.inputs.draw_rig"}
 
 
-def test_every_picture_stands_on_a_page():
+def test_every_picture_is_on_a_page():
     pages = {MODULES[name].with_suffix(".md") for name in DRAWS if name != "experiments.common.figures"}
     pictures = {path for path in FOLDER.rglob("*.png") if "output" not in path.relative_to(FOLDER).parts}
     assert {path.with_suffix(".md") for path in pictures} <= pages

@@ -1,6 +1,6 @@
-"""Campaign folders from strangers: every one is read or refused with its place, never a traceback.
+"""Hostile campaign folders: every one is read or refused with its place, never a traceback.
 
-The rows are threats to readers of TOML, JSON, CSV and paths; what is allowed stands in data/docs/campaign-files.md.
+The rows are threats to readers of TOML, JSON, CSV and paths; data/docs/campaign-files.md states what is allowed.
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ def test_a_hostile_folder_is_refused_with_its_place(folder, name):
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_what_is_no_file_is_refused(folder, tmp_path, file):
+def test_anything_but_a_file_is_refused(folder, tmp_path, file):
     path = folder / file
     content = path.read_bytes()
 
@@ -263,7 +263,7 @@ def test_no_folder_and_a_file_in_its_place(folder):
         assert caught.value.code == "missing-file" and caught.value.message.isprintable()
 
 
-def test_a_link_to_the_folder_is_fine(folder, tmp_path):
+def test_a_link_to_the_folder_is_accepted(folder, tmp_path):
     (tmp_path / "link").symlink_to(folder)
     assert read_campaign(tmp_path / "link").moves == small_campaign().moves
 
@@ -283,12 +283,12 @@ def test_random_mutations_are_read_or_refused(good):
             refused[outcome.target] += 1
             message = outcome.error.message
             assert message.isprintable() and message.encode() and len(message) < 1200, message
-    # A changed digit or a changed name may pass; a test whose mutations never bite would always pass.
+    # A changed digit or name may pass; without refused mutations the test would be empty.
     assert all(10 < count for count in refused.values()), refused
 
 
-def test_mutations_take_no_memory_to_speak_of(good):
-    """The files hold 0.1 MB; what reads them may take a hundred times as much, no more."""
+def test_mutations_take_little_memory(good):
+    """The files hold 0.1 MB; reading them may take a hundred times as much."""
     peaks = [outcome.peak_bytes for outcome in mutations(good, range(130), 7, traced=True)]
     assert max(peaks) < 20 * MEGABYTE
 
@@ -299,7 +299,7 @@ def place_of(good: Path, tmp_path: Path) -> Path:
 
 
 def outside(tmp_path: Path) -> dict[str, bytes]:
-    """What stands beside the folder."""
+    """Files beside the folder."""
     files = (path for path in (tmp_path / "in").rglob("*") if path.is_file())
     inside = tmp_path / "in" / "c"
     return {str(path): path.read_bytes() for path in files if not path.is_relative_to(inside)}
@@ -331,8 +331,8 @@ ARCHIVES = [name for name, crafted in CRAFTED.items() if crafted.threat == "pick
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
-def test_archives_of_strangers_take_neither_memory_nor_commands(good, tmp_path, monkeypatch, name):
-    """Of 0.5 kB NumPy's own reader makes gigabytes, of 1 kB zipfile does."""
+def test_hostile_archives_use_no_memory_and_run_no_commands(good, tmp_path, monkeypatch, name):
+    """NumPy's own reader would make gigabytes of 0.5 kB, zipfile of 1 kB."""
     folder = place_of(good, tmp_path)
     monkeypatch.chdir(tmp_path)
     CRAFTED[name].edit(folder)
@@ -369,7 +369,7 @@ def test_arrays_come_back_as_they_were_written(tmp_path):
 
 
 def test_results_are_not_written_through_a_link(good, tmp_path):
-    """A stranger's `results` may lead into somebody's home."""
+    """A hostile `results` may link into a home directory."""
     folder = place_of(good, tmp_path)
     assert output_place(folder, "results", "overlay") == folder / "results" / "overlay"
     CRAFTED["results folder links outside"].edit(folder)
@@ -397,7 +397,7 @@ def test_a_log_is_capped_in_events_and_entries(good, tmp_path):
     assert not (tmp_path / "repaired").exists()
 
 
-def test_a_full_journal_says_so_and_stays_readable(tmp_path, monkeypatch):
+def test_a_full_journal_is_reported_and_stays_readable(tmp_path, monkeypatch):
     monkeypatch.setattr("tvsbayes.acquisition.journal.LOG_EVENTS_MAX", 3)
     journal = Journal.create(tmp_path / "run")
     for step in range(2):
@@ -420,7 +420,7 @@ def test_a_frame_named_twice_is_read_once(good, tmp_path):
     assert done.lost_frames == ["frames/000000_left.png"]
 
 
-def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeypatch):
+def test_a_report_does_not_use_the_fit_of_other_data(good, tmp_path, monkeypatch):
     """`fit.json` of other data beside `draws.npz` of these: fit again, never combine."""
     folder = place_of(good, tmp_path)
     data = read_campaign(folder)

@@ -1,4 +1,4 @@
-"""Which package may import which, and what an import may load or change."""
+"""Imports between packages, and what an import may load or change."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_tests_of_a_module_are_those_that_import_it():
     assert "tests/head/test_chain.py" in files and "tests/head/test_pointing_table.py" not in files
 
 
-def test_every_module_has_its_room():
+def test_every_module_is_in_a_listed_package():
     assert {room(name) for name in MODULES} == set(ORDER)
     assert all(name.count(".") <= 1 for name in MODULES), "packages are of depth two"
     for path in PACKAGE.glob("*/__init__.py"):
@@ -97,12 +97,12 @@ def test_imports_point_downwards(inner):
 
 
 def test_no_cycles(inner):
-    """Also inside a package, where no order of packages forbids one."""
+    """Also inside a package, where the order of packages does not forbid them."""
     assert not [name for name in inner if name in reachable(inner, name)]
 
 
 def test_traces_belong_to_all_that_a_module_imports(inner):
-    """Of whatever is compiled: what decides a trace decides its name in the cache."""
+    """For every compiled function: what determines a trace determines its name in the cache."""
     from tvsbayes.model.compiled import sources_of
 
     for name in ("estimators.likelihood", "estimators.annealed_stage", "model.headlines", "planning.looks"):
@@ -113,14 +113,14 @@ def test_traces_belong_to_all_that_a_module_imports(inner):
         assert modules == {name} | reachable(inner, name) and len(modules) < len(MODULES) / 2
 
 
-def test_hardware_is_imported_by_those_who_drive_it(inner):
+def test_only_drivers_import_hardware_packages(inner):
     for name, others in inner.items():
         hardware = {room(other) for other in others} & set(HARDWARE) - {room(name)}
         assert hardware <= HARDWARE_USERS.get(room(name), set()), name
 
 
 def test_without_jax():
-    """Nothing that runs on the JAX-free side reaches JAX, neither at the top nor in functions."""
+    """No module of the JAX-free side imports JAX, neither at the top nor in functions."""
     imports = {name: imported(running(parsed(name))) for name in MODULES}
     graph = inside(imports)
     for name in MODULES:
@@ -159,7 +159,7 @@ def test_importing_the_estimator_changes_no_jax_setting():
 
 
 def test_readers_load_no_jax():
-    """Nor does what a report asks: comparisons load it where they fit and refit."""
+    """A report does not either: comparisons load it where they fit."""
     modules = [name for name in MODULES if room(name) in JAX_FREE_PACKAGES or name in JAX_FREE_MODULES]
     assert set(JAX_FREE_MODULES) <= set(modules)
     listed = ", ".join(f"tvsbayes.{name}" for name in modules)

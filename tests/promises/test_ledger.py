@@ -1,4 +1,4 @@
-"""The last entry of the ledger of speed and coverage is within its bounds, and the bounds can be missed."""
+"""The last entry of the ledger of speed and coverage is within its bounds, and the bounds can fail."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_command_of_twice_the_cost_is_named(name):
 
 
 @pytest.mark.parametrize(("what", "count"), [("axes", "held"), ("benches", "held"), ("benches", "answered")])
-def test_missed_intervals_are_named(what, count):
+def test_intervals_out_of_bounds_are_named(what, count):
     worse = copy.deepcopy(ENTRIES[-1])
     worse["intervals"][what][count] = int(0.7 * worse["intervals"][what][count])
     assert len(problems(worse)) == 1

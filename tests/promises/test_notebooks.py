@@ -1,4 +1,4 @@
-"""The notebooks are executed, small and of no particular machine; their cells run as they stand."""
+"""The notebooks are executed, small and free of machine paths; their cells run unchanged."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ def cells(path: Path, kind: str) -> list[dict]:
 
 
 def code_of(path: Path) -> str:
-    """What the cells run, without the commands of the notebook itself."""
+    """Code of the cells, without the commands of the notebook itself."""
     source = "\n".join("".join(cell["source"]) for cell in cells(path, "code"))
     return "\n".join(line for line in source.splitlines() if not line.startswith("%"))
 
 
-def test_there_are_two_and_the_documents_lead_there():
+def test_there_are_two_and_the_documents_link_them():
     assert [path.stem for path in NOTEBOOKS] == ["first_calibration", "own_data"]
     text = (ROOT / "data" / "docs" / "python.md").read_text(encoding="utf-8")
     assert all(f"(notebooks/{path.name})" in text for path in NOTEBOOKS)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_are_executed_small_and_of_no_machine(path):
+def test_notebooks_are_executed_small_and_free_of_machine_paths(path):
     text = path.read_text(encoding="utf-8")
     assert len(text) < BYTES_MAX and not MACHINE.search(text)
     code = cells(path, "code")
@@ -51,7 +51,7 @@ def test_notebooks_are_executed_small_and_of_no_machine(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_run_as_they_stand(path, tmp_path, monkeypatch):
+def test_notebooks_run_unchanged(path, tmp_path, monkeypatch):
     pytest.importorskip("pandas")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}

@@ -1,4 +1,4 @@
-"""Files of version 0.1.0 (tests/data/of-0.1.0): read as they are, or refused in words that say what to do."""
+"""Files of version 0.1.0 (tests/data/of-0.1.0): read unchanged, or refused with a remedy."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ XYZ_MM, VARIANCES_MM2 = (472.08922526253093, 72.1765596120374, 10.95684578052224
 """What 0.1.0 said of counters 20 and 5 and a reading of 70 deg; variances to six digits."""
 
 
-def test_a_campaign_is_what_it_was():
-    """Its text in the hashes too: digests of 0.1.0 stay those of the same moves, looks and cameras."""
+def test_an_old_campaign_is_read_unchanged():
+    """Hashes included: digests of 0.1.0 stay those of the same moves, looks and cameras."""
     campaign = read_campaign(OLD / "campaign")
     provenance = read_fit(OLD / "campaign" / "results" / "fit.json").provenance
     now = input_hashes(campaign)
@@ -39,7 +39,7 @@ def test_a_campaign_is_what_it_was():
 
 
 @pytest.mark.parametrize("name", ["campaign", "calibration.json"])
-def test_a_calibration_points_where_it_did(name):
+def test_an_old_calibration_gives_the_same_points(name):
     calibration = tvsbayes.load_calibration(OLD / name)
     point = calibration.locate(20, 5, 70.0)
     np.testing.assert_allclose(point.xyz_mm, XYZ_MM, rtol=AS_PRINTED)
@@ -49,7 +49,7 @@ def test_a_calibration_points_where_it_did(name):
     assert not calibration.gears.size, "0.1.0 knew no errors of the gears"
 
 
-def test_results_are_read_and_a_new_fit_says_why(monkeypatch):
+def test_old_results_are_read_and_the_reason_of_a_new_fit_is_given(monkeypatch):
     monkeypatch.setattr("tvsbayes.results.fit_record.version", lambda _: "0.2.0")
     monkeypatch.setattr("tvsbayes.pipeline.compile_for", lambda _: None)
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
@@ -72,8 +72,8 @@ def test_a_chain_is_refused_by_its_format():
     assert "another version of tvsbayes: tvsbayes-chain/4" in error.message and "run without --resume" in error.remedy
 
 
-def test_an_interrupted_run_goes_on(tmp_path, say):
-    """The journal of 0.1.0 knows its rig by one SHA-256, of a text without the errors of the gears."""
+def test_an_interrupted_old_run_is_resumed(tmp_path, say):
+    """The journal of 0.1.0 identifies its rig by one SHA-256 of a text without the errors of the gears."""
     run = shutil.copytree(OLD / "run", tmp_path / "run")
     verification = verify(run)
     assert verification.records == 61 and verification.stopped is None

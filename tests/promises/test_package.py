@@ -1,4 +1,4 @@
-"""Wheel and source distribution of this tree: what is inside, and that an installed package finds all it ships."""
+"""Wheel and source distribution of this tree: contents, and access to shipped files after installation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow
 
 
 def run(*command: object, **options: object) -> str:
-    """Standard output of a command that must end well."""
+    """Standard output of a command that must succeed."""
     done = subprocess.run([*map(str, command)], capture_output=True, text=True, timeout=1200, **options)
     assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
     return done.stdout
@@ -62,7 +62,7 @@ def built(tmp_path_factory) -> dict[str, Path]:
     return {**archives, "again": next(from_source.glob("*.whl"))}
 
 
-def test_distributions_hold_what_belongs_in_them(built):
+def test_distributions_have_the_expected_contents(built):
     assert built[".whl"].name == f"tvsbayes-{VERSION}-py3-none-any.whl"
     assert built[".gz"].name == f"tvsbayes-{VERSION}.tar.gz"
     for kind, limit in SIZES_MAX.items():

@@ -1,4 +1,4 @@
-"""The list of planted faults fits the tree: an entry that finds no place would plant nothing. None is planted here."""
+"""The list of planted faults fits the tree: every entry has its place and test. No fault is planted here."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_every_fault_finds_its_place_and_its_test():
         ("Core::loop", changes.Uncalled("watch"), "  watch(now);\n", ""),
     ],
 )
-def test_a_change_goes_where_its_names_stand(sources, tmp_path, place, change, before, after):
+def test_a_change_applies_where_its_names_are(sources, tmp_path, place, change, before, after):
     path, text = change.planted(sources, place)
     whole = changes.ast.unparse(changes.ast.parse(MODULE)) + "\n" if path.suffix == ".py" else path.read_text()
     assert whole.count(before) == 1 and text == whole.replace(before, after)
@@ -83,7 +83,7 @@ def test_a_name_of_two_definitions_is_refused(sources, tmp_path):
 
 
 def test_a_fault_is_planted_in_a_copy_and_taken_out_again(tmp_path):
-    """In a package of one module, which has the place of an entry of the list."""
+    """In a package of one module with the place of an entry of the list."""
     fault = next(fault for fault in FAULTS if fault.place == "laser_path.followed")
     (tmp_path / "tvsbayes" / "model").mkdir(parents=True)
     copy = tmp_path / "tvsbayes" / "model" / "laser_path.py"

@@ -1,4 +1,4 @@
-"""What `tvsbayes` itself offers: names that load on demand and collide with nothing."""
+"""Public names of `tvsbayes`: loaded on demand, without collisions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_completion_and_figures_work_after_a_plain_import():
 
 
 def test_a_campaign_of_any_kind_is_read(tmp_path):
-    """An axis by its format line; what is no campaign by the strict reader, which says what is missing."""
+    """An axis by its format line; any other folder by the strict reader, which names what is missing."""
     write_axis(drawn(4, runs(2)).campaign, tmp_path / "stage")
     assert isinstance(tvsbayes.read_campaign(tmp_path / "stage"), AxisCampaign)
     assert isinstance(tvsbayes.read_campaign(PAPER_TWIN), tvsbayes.Campaign)
@@ -43,11 +43,11 @@ def test_a_campaign_of_any_kind_is_read(tmp_path):
 
 
 def test_no_public_name_is_that_of_a_package():
-    """An attribute of the package that is also a module would be one or the other, by what was imported last."""
+    """An attribute that is also a module would depend on the last import."""
     assert not set(tvsbayes.__all__) & {module.name for module in pkgutil.iter_modules(tvsbayes.__path__)}
 
 
-def test_names_are_where_type_checkers_look_for_them():
+def test_type_checkers_see_the_names():
     for name, home in tvsbayes._HOME.items():
         assert getattr(importlib.import_module(f"tvsbayes.{home}"), name) is getattr(tvsbayes, name)
 

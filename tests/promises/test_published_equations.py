@@ -1,4 +1,4 @@
-"""The paper's equations as printed: where they are right, and the branch that jumps."""
+"""The paper's equations as printed: where they hold, and the discontinuous branch."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_published_point_is_where_the_rays_meet(beta_deg):
 
 @pytest.mark.parametrize(("B", "C", "y_mm"), [(90, 70, -100.0), (95, 70, -163.3), (110, 50, -253.2)])
 def test_published_y_is_the_table(B, C, y_mm):
-    """A table of published points by paper eq. (1) to (3), printed to 0.1 mm."""
+    """Published points by paper eq. (1) to (3), printed to 0.1 mm."""
     assert published_point(float(B), float(C), 0.0, A_MM)[1] == pytest.approx(y_mm, abs=0.05)
 
 

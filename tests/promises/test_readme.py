@@ -1,4 +1,4 @@
-"""The README's promises that a machine can check: size, set-up commands, printed answer, versions."""
+"""Checks of the README: size, set-up commands, printed answer, versions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_first_screen_has_two_set_up_commands_and_the_printed_answer():
     assert commands[0].endswith("tvsbayes demo")
     assert "-c .ci/constraints.txt" in commands[1]
     assert "joint  holds truth     truth" in README.split("\n## ")[0]
-    # The first command installs what is newest, not what is pinned.
+    # The first command installs the newest versions, not the pinned ones.
     assert "Last digits may differ with library versions." in README.split("\n## ")[0]
 
 
@@ -27,7 +27,7 @@ def test_readme_is_short_and_warns_of_the_laser():
     assert "808 nm laser is invisible and likely class 3B" in README
 
 
-def test_pictures_stand_where_they_explain():
+def test_pictures_are_beside_their_text():
     """The demo's in the README, the instrument's beside its axes."""
     conventions = (ROOT / "data" / "docs" / "conventions.md").read_text(encoding="utf-8")
     assert re.search(r"!\[[^]]+\]\(data/tutorial/demo\.svg\)", README.split("\n## ")[0])
@@ -35,7 +35,7 @@ def test_pictures_stand_where_they_explain():
 
 
 def test_constraints_pin_every_direct_dependency():
-    """A missing pin would test whatever the day brings."""
+    """A dependency without a pin would be tested at a varying version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines = (ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = dict(line.split("==") for line in lines if not line.startswith("#"))

@@ -1,4 +1,4 @@
-"""What is shipped under data/: rigs in view, twins that keep their promises, reference values, templates."""
+"""Shipped data: rigs with all spots in view, twins as documented, reference values, templates."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def table_1() -> dict[str, tuple[float, float, int]]:
 
 
 def test_the_package_has_all_of_data_but_the_real_pictures():
-    """Each folder by name: one that is left out of the list would be missing from an installed package."""
+    """Each folder by name: a folder missing in the list would be missing from an installed package."""
     project = tomllib.loads((DATA.parent / "pyproject.toml").read_text(encoding="utf-8"))
     listed = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     folders = {path.name for path in DATA.iterdir() if path.is_dir()} - {"real"}
@@ -83,7 +83,7 @@ def test_paper_twin_reproduces_table_1():
         assert row.sd_deg_per_step == pytest.approx(sd, rel=0.20), direction
 
 
-def test_paper_twin_has_equal_gears_and_says_what_is_assumed():
+def test_paper_twin_has_equal_gears_and_states_its_assumptions():
     """True contrasts 0; cleared directions show k, reversed ones k - b/N; truth and README say so."""
     campaign = twin("paper_twin")
     truth = read_truth(DATA / "twins" / "paper_twin" / "truth.json", campaign.stereo)
@@ -200,8 +200,8 @@ def test_distortion_stays_invertible_over_the_image():
             assert (1 + 3 * k1 * r2 + 5 * k2 * r2**2 + 7 * k3 * r2**3 > 0).all()
 
 
-def test_make_twins_writes_what_is_shipped():
-    """Calibration, paper twin (at its seed) and grid twin come out of the experiment again."""
+def test_make_twins_writes_the_shipped_twins():
+    """The experiment gives the calibration, the paper twin (at its seed) and the grid twin again."""
     rig = mounted()
     stereo = make_twins.stated_stereo()
     # Another processor rounds differently. Half a unit in the last place on every pixel, which the difference quotients
@@ -220,12 +220,12 @@ def test_make_twins_writes_what_is_shipped():
 
 
 def test_schemas_are_those_of_the_records():
-    """Anyone who changes a record runs `python -m experiments.inputs.make_schemas`."""
+    """After a change of a record run `python -m experiments.inputs.make_schemas`."""
     shipped = {path.name: path.read_text(encoding="utf-8") for path in (DATA / "schemas").iterdir()}
     assert shipped == make_schemas.files()
 
 
-def test_truth_file_that_is_none(tmp_path):
+def test_invalid_truth_file_is_refused(tmp_path):
     """A truth.json without its entries is bad input, not a traceback."""
     path = tmp_path / "truth.json"
     whole = json.loads((DATA / "twins" / "paper_twin" / "truth.json").read_text(encoding="utf-8"))
@@ -236,7 +236,7 @@ def test_truth_file_that_is_none(tmp_path):
 
 
 def test_simulated_campaign_survives_writing(tmp_path):
-    """What is written is what is read: moves, spots, header and truth."""
+    """Moves, spots, header and truth are read as written."""
     rig = mounted()
     simulated = simulate(rig, PROTOCOLS["grid"](), 3, aperture=True)
     simulated.write(tmp_path / "campaign")

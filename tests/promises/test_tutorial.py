@@ -1,4 +1,4 @@
-"""The tutorial prints what the commands print; the drawing of the instrument turns every axis as the code does."""
+"""The tutorial shows the output of the commands; the drawing of the instrument has the signs of the code."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ QUICK = ("simulate", "check", "classic", "new")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Where the page's commands run: a folder with `data/`, as the root of a clone."""
+    """Working folder of the page's commands: a folder with `data/`, as the root of a clone."""
     clone = tmp_path_factory.mktemp("clone")
     (clone / "data").symlink_to(ROOT / "data")
     return clone
 
 
-def test_commands_without_a_fit_print_what_the_page_says(folder, monkeypatch, capsys):
+def test_commands_without_a_fit_print_the_output_of_the_tutorial(folder, monkeypatch, capsys):
     steps = [step for step in shown(TEXT) if step.arguments[0] in QUICK]
     assert {step.arguments[0] for step in steps} == set(QUICK)
     follow(steps, folder, monkeypatch, capsys)
 
 
-def test_python_examples_print_what_the_page_says(folder, monkeypatch):
+def test_python_examples_print_the_output_of_the_tutorial(folder, monkeypatch):
     monkeypatch.chdir(folder)
     code = "\n".join(re.findall(r"```pycon\n(.*?)```", TEXT, flags=re.DOTALL))
     example = doctest.DocTestParser().get_doctest(code, {}, "tutorial", "README.md", 0)
@@ -47,7 +47,7 @@ def test_python_examples_print_what_the_page_says(folder, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_whole_page_prints_what_it_says(tmp_path, monkeypatch, capsys):
+def test_all_commands_print_the_output_of_the_tutorial(tmp_path, monkeypatch, capsys):
     (tmp_path / "data").symlink_to(ROOT / "data")
     steps = shown(TEXT)
     wanted = {"fit", "compare", "steps-for", "locate", "plan", "report"}
@@ -103,7 +103,7 @@ def test_picture_from_above_obeys_the_conventions(drawing):
     assert np.linalg.norm(aperture - drawing.T_SP_MM) == pytest.approx(drawing.BASELINE_MM, abs=1e-9)
 
 
-def test_oblique_picture_is_a_view_and_not_its_mirror_image(drawing):
+def test_oblique_picture_is_no_mirror_image(drawing):
     """Two page axes and the direction to the viewer are right-handed; z points up, mirror 2 lies right of mirror 1."""
     page = drawing.seen_obliquely(np.eye(3))
     viewer = drawing.VIEWER / np.linalg.norm(drawing.VIEWER)
@@ -120,7 +120,7 @@ HALF_POINT = 0.5
 """Of the picture's lines, pt: less than the thinnest is long; another matplotlib may set text a little otherwise."""
 
 
-def test_shipped_picture_is_what_the_script_draws(drawing, tmp_path, monkeypatch):
+def test_shipped_picture_is_that_of_the_script(drawing, tmp_path, monkeypatch):
     picture = tmp_path / "rig.svg"
     monkeypatch.setattr(drawing, "OUT", picture)
     monkeypatch.setattr("sys.argv", ["draw_rig"])
@@ -138,7 +138,7 @@ def test_shipped_picture_is_what_the_script_draws(drawing, tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-def test_the_way_without_an_instrument_ends_as_its_page_says(tmp_path, monkeypatch, capsys):
+def test_the_steps_without_an_instrument_end_with_the_numbers_of_the_page(tmp_path, monkeypatch, capsys):
     """Six commands of instrument.md, then the sentence below them: looks, minutes, ratio, interval, truth."""
     page = (ROOT / "data" / "docs" / "instrument.md").read_text(encoding="utf-8")
     block, sentence = re.search(r"```sh\n(tvsbayes plan .*?)```\s+(The plan holds .*?)\n\n", page, re.DOTALL).groups()

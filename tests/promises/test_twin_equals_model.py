@@ -1,6 +1,6 @@
 """The digital twin (NumPy, own formulas) and the estimators' model (JAX) are the same physics.
 
-A hundred true rigs drawn from the shipped mounted rig, every prior quantity anew, with transmission errors.
+A hundred true rigs drawn from all priors of the shipped mounted rig, with transmission errors.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def test_aperture_angle(truths, values, convention):
 
 
 def test_headlines_of_a_fit(mounted_rig):
-    """What a fit reports at any point of parameter space is the twin's headline for the rig of that point."""
+    """The headlines of a fit at any point of parameter space are the twin's for the rig of that point."""
     errors = {f"{name}.{axis}": Prior(0.0, 0.1, "half-normal") for name in GEAR_ERRORS for axis in AXES}
     rig = replace(mounted_rig, truth={**mounted_rig.truth, **errors})
     plan = grid_protocol(targets=("d1",), pan_steps=range(-60, 241, 60), tilt_steps=(-60, 0, 70))
@@ -182,7 +182,7 @@ def test_headlines_of_a_fit(mounted_rig):
             places = Places(*map(jnp.asarray, (at.steps, at.on_tilt, np.ones(len(at.steps), bool))))
             seen_line = SeenLine(np.radians(pose_deg), places, line_share(at, used))
             true = np.array([*(p[name] for name in RIG_NAMES), *truth.stereo.vector])
-            # What the priors hold fixed is at its value here, as in the rig that the point stands for.
+            # Fixed parameters have their prior value, as in the rig of the point.
             z = coordinates_of(space, true)[None]
             repeated = np.radians(np.concatenate([error_deg, play_deg]))[None]
             headlines = jax.tree.map(lambda x: np.asarray(x)[0], derived_quantities(z, repeated, space, seen_line))
@@ -221,7 +221,7 @@ def test_headlines(truths, values, poses_rad):
 def test_errors_that_repeat_drift_and_scatter(mounted_rig):
     """Chi-square of six campaigns at their truths: repeated errors, drifting zeros, scattered looks as the twin's.
 
-    The estimators integrate them out; without their scales the same campaigns stand off by far more than chance.
+    The estimators integrate them out; without their scales chi-square is far beyond chance.
     """
     scales = {"transmission_error_deg": 0.05, "play_variation_deg": 0.05, "drift_deg_per_root_hour": 0.05}
     scales |= {"look_scatter_deg": 0.05}

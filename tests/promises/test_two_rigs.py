@@ -1,4 +1,4 @@
-"""The two rigs of experiments/paper/two_rigs.py: both machines read Table 1, and the weight of evidence is one."""
+"""The two rigs of experiments/paper/two_rigs.py: both agree with Table 1, and the weight of evidence is one."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from tvsbayes.twin.simulated_campaign import simulate
 
 
 @pytest.mark.parametrize("kind", RIGS)
-def test_both_machines_read_table_1(kind):
+def test_both_rigs_agree_with_table_1(kind):
     """Solved by a shortcut on nominal sheets; here the whole twin runs, gears with play included, without noise."""
     rig = mounted_rig()
     truth = solved(kind, rig, 0)
