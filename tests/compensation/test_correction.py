@@ -1,4 +1,4 @@
-"""What is added to a command: by side, between lines, beyond the ends, rounded."""
+"""Corrections of commands: by side, between lines, beyond the ends, rounded."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ def test_factors_of_the_common_part_and_of_the_play():
     np.testing.assert_allclose(COARSE.sent(command, side, 1.0, -1.0), [4.9, 5.3], atol=1e-12)
 
 
-def test_commands_are_rounded_to_what_is_carried_out():
+def test_commands_are_rounded_to_the_resolution():
     rounded = Correction(COARSE.command, COARSE.forward, COARSE.backward, 0.25)
     np.testing.assert_allclose(rounded.sent(np.array([5.0]), np.array([1])), [5.25], atol=1e-12)
 
 
-def test_moves_get_the_correction_of_the_side_they_arrive_from():
+def test_moves_get_the_correction_of_their_direction():
     moves = [AxisMove(0, 0, 0.0, 0.0, "forward"), AxisMove(1, 0, 1.0, 10.0), AxisMove(2, 0, 2.0, 0.0)]
     assert np.allclose([m.command for m in COARSE.moved(moves)], [0.2, 10.4, -0.2], atol=1e-12)
 
 
-def test_every_command_is_read_once_from_each_side_in_runs_that_add_up():
+def test_every_command_is_read_once_from_each_side():
     run = cycles(np.array([0.0, 1.0, 2.0]), 0.5, 2.0, 2)
     assert sorted(zip(run.index.tolist(), run.side.tolist(), strict=True)) == [
         (k, s) for k in range(3) for s in (-1, 1)
     ]
     at = [run.moves[k].command for k in run.read]
     assert at == [[0.0, 1.0, 2.0][k] for k in run.index]
-    # From the side that is said, and twice over the whole way within the hours.
+    # From the stated side, and twice over the whole travel within the time.
     steps = np.diff([m.command for m in run.moves])
     assert all(np.sign(steps[k - 1]) == side for k, side in zip(run.read, run.side, strict=True))
     assert run.moves[-1].time_s == 7200.0 and max(at) == 2.0

@@ -1,4 +1,4 @@
-"""Files for controllers: what stands in them, in which sense, and what a compiler and LinuxCNC's rule make of it."""
+"""Files for controllers: contents, sense, and results of a compiler and of LinuxCNC's rule."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def lines_of(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("target", FORMATS)
-def test_every_file_says_of_what_it_is_in_which_sense_and_that_nothing_is_applied(target):
+def test_every_file_states_source_sense_and_that_nothing_is_applied(target):
     text = written(target)
     for word in ("tvsbayes of a test", "applied to nothing", "sense:", "promise, arriving backward", "since homing"):
         assert word in text, word

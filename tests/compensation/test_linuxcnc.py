@@ -1,4 +1,4 @@
-"""A table in LinuxCNC itself: what it sends to the motor is what the table adds, by side, and nothing twice."""
+"""A table in LinuxCNC itself: the motor command has the correction of its side once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PATH = [5.0, 17.0, 10.0, -5.0, 10.0]
 
 @pytest.mark.slow
 @pytest.mark.skipif(not installed(), reason="no linuxcnc: apt-get install --no-install-recommends linuxcnc-uspace")
-def test_motor_gets_what_the_table_adds():
+def test_motor_command_has_the_correction_of_the_table():
     result = table("linuxcnc")
     text = FORMATS["linuxcnc"].write(result, Origin("a test", "0" * 64))
     wanted = Correction.of(result).sent(np.array(PATH), np.sign(np.diff([0.0, *PATH])))

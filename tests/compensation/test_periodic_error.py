@@ -1,4 +1,4 @@
-"""A drive at constant rate: the table takes off the wave of its worm, and the promise says what is left."""
+"""A drive at constant rate: the table removes the wave of its worm, and the promise states the remainder."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def results() -> AxisResults:
 
 
 @pytest.mark.thorough
-def test_the_table_takes_off_the_wave_within_the_promise():
+def test_the_table_removes_the_wave_within_the_promise():
     result = compensation_of(results(), Wish("pec"))
     assert result.settings["period_command"] == pytest.approx(PERIOD)
     command = RATE * np.linspace(100.0, 1100.0, 500)
@@ -55,7 +55,7 @@ def test_the_table_takes_off_the_wave_within_the_promise():
     assert np.quantile(np.abs(left), 0.95) <= promise.causes["table"] + promise.causes["format"]
     assert np.std(left) < 0.1 * np.std(before)
     assert promise.error95 < 0.4 * promise.without95
-    # Beside the wave stand noise of 0.3, seeing, walk and creep of the zero.
+    # Besides the wave there are noise of 0.3, seeing, walk and creep of the zero.
     assert promise.without95 == pytest.approx(float(np.quantile(np.abs(before), 0.95)), rel=0.2)
 
 
@@ -76,7 +76,7 @@ def test_other_formats_need_stops_and_a_rate_is_not_in_the_table():
         compensation_of(results(), Wish("pec", per_command=1.0))
 
 
-def test_the_file_repeats_and_says_how_to_see_what_is_left():
+def test_the_file_is_periodic_and_names_the_verification():
     result = compensation_of(results(), Wish("pec"))
     text = FORMATS["pec"].write(result, Origin("tvsbayes of a mount", "0" * 64))
     rows = np.array([line.split(",") for line in text.splitlines() if line[0].isdigit()], dtype=float)
@@ -87,7 +87,7 @@ def test_the_file_repeats_and_says_how_to_see_what_is_left():
     assert ", 200 s; phase 0 at command 0, 0 s after the log begins" in text and text.count("promise, ") == 1
 
 
-def test_the_text_says_the_size_of_what_repeats_and_what_shows_the_rest():
+def test_the_text_states_the_periodic_error_and_the_verification():
     """A drive has no sides and no stops: neither a row for each nor a verification by them."""
     result = compensation_of(results(), Wish("pec"))
     text = compensation_text(result)

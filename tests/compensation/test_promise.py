@@ -1,4 +1,4 @@
-"""The promise: kept by the axis that it was made of, wider where a format holds less, refused where nothing is sure."""
+"""The promise: kept by its axis, wider for formats that hold less, refused without an accepted result."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_format_that_holds_less_leaves_more():
 CASES = {"csv": {}, "grblhal": {"in_force": 250.0}, "grbl": {"in_force": 250.0}}
 
 
-def test_what_rounding_costs_is_in_the_promise():
+def test_rounding_is_in_the_promise():
     fine, coarse = table(), table("csv", resolution=0.05)
     for side in ("forward", "backward"):
         # A rounding of 0.05 mm scatters by 0.05 / sqrt(12) = 0.014 mm.
@@ -69,7 +69,7 @@ def test_nominal_is_what_is_stated_or_one_or_the_fit():
     assert table().per_command == 1.0
     result = table("csv", per_command=1.01)
     assert result.per_command == 1.01
-    # The table then takes off the ratio too: 0.8 % of 40 mm.
+    # The table then corrects the ratio too: 0.8 % of 40 mm.
     assert result.table[-1].add_forward - result.table[0].add_forward == pytest.approx(0.32, abs=0.1)
 
 
@@ -96,14 +96,14 @@ def test_time_and_travel_since_homing_are_the_longest_segment():
         (Wish("pec", period=4.0), "eight positions"),
     ],
 )
-def test_wishes_that_cannot_be_met_are_refused(wish, message):
+def test_impossible_options_of_a_table_are_refused(wish, message):
     with pytest.raises(InputError) as refused:
         compensation_of(results(), wish)
     assert message in f"{refused.value.message} {refused.value.allowed}"
 
 
 def test_a_play_that_was_never_read_is_no_setting():
-    """Of stops from one side alone, grblHAL's play is left as it is, and the promise says why."""
+    """With stops from one side alone grblHAL's play is unchanged, and the promise states the reason."""
     whole = results().fit.campaign
     first = [move for move in whole.moves if move.segment == 0]
     turn = int(np.argmax([move.command for move in first]))

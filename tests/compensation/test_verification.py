@@ -1,4 +1,4 @@
-"""What became of a table, told by twelve readings; when nothing can be told; which readings tell soonest."""
+"""Verdict on a table by twelve readings; cases without a verdict; choice of the readings."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tvsbayes.results.compensation_record import (
     ],
 )
 def test_every_world_is_named(factors, world):
-    """Also where it befell the play alone, as a lost reversal or a backlash setting beside the table do."""
+    """Also for the play alone, as by a lost reversal or a backlash setting besides the table."""
     check = verify_readings(results().fit, table(), fresh(3, factors))
     assert check.world == world and check.worlds[world] > 0.95
     assert check.verdict == (KEPT if world == APPLIED else BROKEN)
@@ -57,7 +57,7 @@ def test_sizes_are_those_of_the_readings():
 
 
 def test_with_one_homing_errors_are_given_without_their_shift_too():
-    """The prior of the next homing dominates all others then; the zero of a dial gauge is set anew as well."""
+    """The prior of the next homing then dominates all others; the zero of a dial gauge is reset as well."""
     new = fresh(3)
     assert verify_readings(results().fit, table(), new).shift_free is None
     shifted = replace(new, readings=tuple(replace(reading, value=reading.value + 0.05) for reading in new.readings))
@@ -79,7 +79,7 @@ def test_another_axis_is_none_of_the_worlds():
     assert (check.verdict, check.world) == (BROKEN, OTHER_MACHINE)
 
 
-def test_a_table_too_small_to_be_seen_cannot_be_told():
+def test_a_table_below_the_noise_has_no_verdict():
     """Three readings of 0.5 mm uncertainty: every world explains them."""
     new = fresh(3)
     blurred = replace(new, readings=tuple(replace(r, u=0.5) for r in new.readings[:3]))
@@ -87,7 +87,7 @@ def test_a_table_too_small_to_be_seen_cannot_be_told():
     assert check.verdict == CANNOT_TELL and check.needed != 0
 
 
-def test_what_lies_outside_or_takes_longer_is_said():
+def test_readings_outside_and_long_times_are_reported():
     commands, read = to_and_fro(np.array([-15.0, 1.0, 23.0]))
     slow = tuple(replace(m, time_s=100 * m.time_s) for m in commands)
     check = verify_readings(results().fit, table(), driven(true_axis(), slow, read, 4, by=Correction.of(table())))
@@ -103,7 +103,7 @@ def test_other_units_and_missing_tables_are_refused(tmp_path):
 
 @pytest.mark.thorough
 def test_grblhal_may_begin_in_either_half_of_the_play():
-    """One shift of all readings by half the play is no fault of a format that leaves the zero open."""
+    """A shift of all readings by half the play is allowed for a format without a defined zero."""
     result = table("grblhal", in_force=250.0)
     commands, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
     new = driven(true_axis(), commands, read, 5, by=Correction.of(result))
@@ -116,7 +116,7 @@ def test_python_verifies_in_one_call():
     assert verify_axis(results().fit.campaign, fresh(3), made=table()).verdict == KEPT
 
 
-def test_plan_spreads_its_stops_and_knows_whether_they_tell():
+def test_plan_spreads_its_stops_and_states_whether_they_are_enough():
     plan = plan_verification(results().fit, table())
     assert plan.enough and len(plan.stops) >= 6 and {side for _, side in plan.stops} == {-1, 1}
     assert np.ptp([command for command, _ in plan.stops]) > 30
