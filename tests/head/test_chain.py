@@ -1,4 +1,4 @@
-"""The chain of a pan-tilt head: TPOINT's terms are its first order, the twin's rotation matrices are all of it."""
+"""The chain of a pan-tilt head: to first order TPOINT's terms, in full the twin's rotation matrices."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_first_order_is_tpoint(name):
     turned = np.angle(np.exp(1j * (np.arctan2(direction.y, direction.x) - AZIMUTH)))
     raised = np.arctan2(direction.z, np.hypot(direction.x, direction.y)) - ELEVATION
     by_azimuth, by_elevation = POINTING[name](AZIMUTH, ELEVATION)
-    # Near the horizon the cotangent is held: a 1e-5th of it at 15 deg.
+    # Near the horizon the cotangent is bounded, a change of 1e-5 at 15 deg.
     held = 2e-5 * SMALL_RAD / np.tan(ELEVATION) if name.startswith("tangent") else 0.0
     allowed = SQUARES * (SMALL_RAD / np.cos(ELEVATION)) ** 2 + held
     assert np.all(np.abs(turned - SMALL_RAD * by_azimuth) <= allowed)
@@ -70,7 +70,7 @@ def truths():
     rig = Rig(table, None, {**table.priors, **wide}, {}, {}, {}, {})
     rng = np.random.default_rng(50)
     drawn = [draw_truth(rig, rng) for _ in range(40)]
-    # The twin's cotangent is not held at the horizon.
+    # The twin's cotangent is not bounded at the horizon.
     return [replace(truth, parameters={**truth.parameters, "tangent_flexure_deg": 0.0}) for truth in drawn]
 
 
@@ -97,7 +97,7 @@ def test_twin_and_model_are_the_same_optics(truths):
 @pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("azimuth_zero_deg", [0.0, 180.0])
-def test_headlines_count_on_around_the_circle_and_through_the_zenith(azimuth_zero_deg):
+def test_headlines_are_continuous_around_the_circle_and_through_the_zenith(azimuth_zero_deg):
     """Pan over 300 deg, tilt from 20 to 130: model and twin have the line over all of it, that of the gears."""
     rng, plan = np.random.default_rng(52), PlanBuilder()
     plan.home()

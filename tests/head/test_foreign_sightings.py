@@ -1,4 +1,4 @@
-"""Tables of moves and sightings: names of columns, units, encoders, and what a table does not say."""
+"""Tables of moves and sightings: names of columns, units, encoders, missing information."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_zero_far_from_the_default_is_stated(azimuth_deg, zeros):
 
 
 def test_encoders_in_radians_become_counters():
-    """A scale known to a hundredth; whole turns as they stand."""
+    """A scale known to a hundredth; whole turns are kept."""
     pan = [-0.5, 0.0, 7.0]
     columns = {"enc az [rad]": pan, "enc el [rad]": [0.1, 0.2, 0.3], "az": [331.0, 0.0, 41.0], "el": [6.0, 11.0, 17.0]}
     log = understood({name: [str(cell) for cell in cells] for name, cells in columns.items()}, u_deg=0.002)
@@ -96,7 +96,7 @@ def test_encoders_in_radians_become_counters():
     assert log.priors["degrees_per_step.tilt"].value == STEP_DEG
 
 
-def test_a_counter_that_counts_the_other_way_is_named_and_turned():
+def test_a_reversed_counter_is_named_and_negated():
     columns = {
         "pan_steps": [str(-pan) for pan, _ in STEPS],
         "tilt_steps": [str(tilt) for _, tilt in STEPS],
@@ -109,7 +109,7 @@ def test_a_counter_that_counts_the_other_way_is_named_and_turned():
     assert "--flip" not in " ".join(turned.assumed)
 
 
-def test_angles_of_a_joint_that_falls_are_turned_and_others_are_not():
+def test_angles_of_a_downward_joint_are_negated():
     """As on most robots: a tilt joint about +y looks down where its angle grows."""
     columns = {
         "pan cmd [rad]": ["-0.5", "0.0", "0.7", "1.0"],

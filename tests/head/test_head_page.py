@@ -1,4 +1,4 @@
-"""The page on heads: its way from a URDF to `verify` prints what it says."""
+"""The page on heads: its commands from a URDF to `verify` print the output on the page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PAGE = Path(__file__).resolve().parents[2] / "data" / "docs" / "head.md"
 
 
 @pytest.mark.slow
-def test_the_way_from_a_urdf_to_verify_prints_what_the_page_says(tmp_path, monkeypatch, capsys):
+def test_commands_from_a_urdf_to_verify_print_the_output_of_the_page(tmp_path, monkeypatch, capsys):
     part = PAGE.read_text(encoding="utf-8").split("\n## From a URDF to `verify`\n")[1].split("\n## ")[0]
     blocks = re.findall(r"```(\w+)\n(.*?)```", part, flags=re.DOTALL)
     assert {kind for kind, _ in blocks} == {"xml", "console", "sh"}

@@ -1,4 +1,4 @@
-"""A head whose fit is known: its model corrected, fresh looks verified and watched, what to look at next."""
+"""A head with a known fit: corrected model, verification and watch of fresh looks, next looks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def head_rig() -> Rig:
 
 
 def rounds() -> tuple[PlanStep, ...]:
-    """Every place twice, in orders of their own."""
+    """Every place twice, in two orders."""
     rng, plan = np.random.default_rng(7), PlanBuilder()
     plan.home()
     for _ in range(2):
@@ -70,7 +70,7 @@ def known_head(tmp_path_factory):
 
 
 def test_the_map_exists_at_scales_far_from_the_mode(known_head):
-    """Where sightings are far better than stated their scatter alone is left."""
+    """Sightings far better than stated leave only their scatter."""
     path = transport(fit(read_campaign(known_head[0])))
     noise = 6 * np.random.default_rng(0).standard_t(4, size=(768, path.noise))
     assert np.all(np.isfinite(path.conditional(noise).factor))
@@ -85,7 +85,7 @@ def test_truth_is_read_back_with_the_constants_that_a_head_leaves_out():
 
 
 def fresh(truth, steps, folder, seed=5, counters=lambda pan, tilt: (pan, tilt)):
-    """Looks of the same head; its campaign says other counters than the motors got where they were not corrected."""
+    """Looks of the same head; without the correction its campaign has other counters than the motors got."""
     plan = [
         replace(step, **dict(zip(("pan_steps", "tilt_steps"), counters(step.pan_steps, step.tilt_steps), strict=True)))
         if step.action == "move"
@@ -109,7 +109,7 @@ def direction(head, pan_deg, tilt_deg):
     return np.degrees([np.arctan2(beam[1], beam[0]), np.arcsin(beam[2])])
 
 
-def test_a_model_is_corrected_and_says_so(ask, known_head, tmp_path):
+def test_a_model_is_corrected_and_marked(ask, known_head, tmp_path):
     folder, truth = known_head
     out = tmp_path / "new.urdf"
     code, document = ask("compensate", folder, "--to", "urdf", "-o", out)
@@ -133,7 +133,7 @@ def test_a_model_is_corrected_and_says_so(ask, known_head, tmp_path):
 
 
 @pytest.mark.parametrize("applied", [True, False])
-def test_fresh_looks_say_whether_the_calibration_acts(ask, known_head, tmp_path, applied):
+def test_fresh_looks_show_whether_the_calibration_is_applied(ask, known_head, tmp_path, applied):
     """Not applied: the motors get the counters of the nominal head for the directions that were meant."""
     folder, truth = known_head
     assert ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")[0] == 0
@@ -156,7 +156,7 @@ def test_fresh_looks_say_whether_the_calibration_acts(ask, known_head, tmp_path,
     assert ask("verify", folder, looks, "--distance-mm", "500")[0] == 2
 
 
-def test_what_moved_is_named(ask, say, known_head, tmp_path):
+def test_the_moved_part_is_named(ask, say, known_head, tmp_path):
     folder, truth = known_head
     plan = rounds()
     code, document = ask("watch", folder, fresh(truth, plan, tmp_path / "still"))

@@ -32,7 +32,7 @@ LST: {hours}:{minutes:02d}:00.0
 
 
 def table(count, turns=1.0, seed=3):
-    """Stars all round and up to 89 deg, azimuth over so many turns; encoders are stated within one."""
+    """Stars at all azimuths and up to 89 deg, azimuth over several turns; encoders are within one."""
     rng = np.random.default_rng(seed)
     pan = rng.uniform(-180 * turns, 180 * turns, count)
     tilt = np.concatenate([[89.0], rng.uniform(15, 85, count - 1)])
@@ -54,8 +54,8 @@ def table(count, turns=1.0, seed=3):
     ]
 
 
-def test_terms_of_a_table_over_its_wraps(tmp_path):
-    """The sidereal clock passes midnight, azimuth its end; a pole is no special place."""
+def test_terms_of_a_table_with_wraps(tmp_path):
+    """The sidereal clock passes midnight and azimuth its end; the pole is included."""
     path = tmp_path / "night.dat"
     path.write_text("".join(table(40, turns=1.4)))
     campaign = campaign_of(read_stars(path).stars, "night")
@@ -69,8 +69,8 @@ def test_terms_of_a_table_over_its_wraps(tmp_path):
     assert model.rms_deg < 1e-5
 
 
-def test_a_long_night_stays_within_its_turns(tmp_path):
-    """By the shorter way from star to star 400 of them would wind the axis up by many turns."""
+def test_azimuth_of_a_long_night_stays_within_its_turns(tmp_path):
+    """The shorter way from star to star would add many turns over 400 stars."""
     path = tmp_path / "night.dat"
     path.write_text("".join(table(400)))
     steps = [move.pan_steps for move in campaign_of(read_stars(path).stars, "night").moves]

@@ -1,4 +1,4 @@
-"""A head in a URDF: terms of its joints, refusals, and the file there and back, read by a parser that is not ours."""
+"""A head in a URDF: terms of its joints, refusals, and the round trip through an independent parser."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def test_terms_of_joints_are_those_of_the_chain():
         assert np.allclose(beam_of(head.terms, math.degrees(pan), -math.degrees(tilt)), sight, atol=ROUNDING)
 
 
-def test_a_nominal_head_comes_back_as_it_was():
-    """But for the properties."""
+def test_a_nominal_head_round_trips():
+    """Except for the properties."""
     head = head_joints(UNIT, "unit.urdf", BY_NAME)
     written = model(head).urdf(head).decode()
     kept = [line for line in written.splitlines() if "xacro" not in line]
@@ -128,7 +128,7 @@ def test_without_a_model_there_are_properties():
     assert '<xacro:property name="head_pan_steps_per_rad" value="' in text
     document = model(head).document(head)
     assert np.shape(document["covariance"]) == (len(document["names"]),) * 2
-    # A joint that falls where elevation grows counts down.
+    # A joint that turns down where elevation grows counts down.
     assert document["joints"]["tilt"]["steps_per_rad"] < 0 < document["joints"]["pan"]["steps_per_rad"]
     assert set(document["names"]) <= SIGHTING_HEAD.documented | set(TERMS)
 
@@ -150,7 +150,7 @@ def test_without_a_model_there_are_properties():
         (b'"continuous"', b'"fixed"', {}, "joints that turn: tilt_joint"),
     ],
 )
-def test_refusals_teach(old, new, names, message):
+def test_refusals_of_a_urdf_state_a_remedy(old, new, names, message):
     data = UNIT.replace(old, new)
     if message is None:
         assert head_joints(data, "unit.urdf", BY_NAME).names["pan"] == "first", "the only two that turn"
