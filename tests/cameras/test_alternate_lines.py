@@ -1,4 +1,4 @@
-"""Even and odd rows of a beam: a gain moves nothing, a shift is found, said and stated; good pictures stay the same."""
+"""Even and odd rows of a beam: a gain has no effect, a shift is detected and reported; good pictures are unchanged."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ def fields(
 
 @pytest.mark.parametrize("sd", [3.0, 14.0])
 @pytest.mark.parametrize("columns", [False, True])
-def test_a_shift_is_measured_and_stated(sd, columns):
-    """As pixels are (3 px) and in blocks of three (14 px): 0.5 px along v and half of it along u."""
+def test_a_shift_is_measured_with_its_uncertainty(sd, columns):
+    """Full resolution (3 px) and blocks of three (14 px): 0.5 px along v and half of it along u."""
     spot = find_spot(fields(sd, 0.5, 0.06, 1, columns=columns), KNOWN)
     true = np.array([0.25, 0.5])
     shift = spot.lines_px[int(columns)]
-    # The stated uncertainty of the whole without the shift is some 0.01 sd; twice that for the difference, four of it.
+    # The uncertainty of the centre without the shift is some 0.01 sd; twice that for the difference, four of it.
     noise = np.sqrt(np.diag(spot.covariance_px2 - np.outer(shift, shift) / 12))
     assert (np.abs(shift - true) < 8 * noise).all() and (noise < 0.03).all()
     sds = np.sqrt(np.diag(spot.covariance_px2))
     assert (sds >= np.abs(shift) / np.sqrt(12)).all()
-    # The whole lies between both.
+    # The centre lies between both.
     assert (np.abs(spot.centre_px - PLACE - true / 2) < 5 * noise + 0.03 * true).all()
 
 
 @pytest.mark.parametrize("sd", [3.0, 14.0])
-def test_a_gain_of_the_odd_rows_moves_nothing(sd):
-    """6 %, as in a real camera: no finding, and chi-square of the difference as noise has it."""
+def test_a_gain_of_the_odd_rows_causes_no_shift(sd):
+    """6 %, as in a real camera: no finding, and chi-square of the difference is that of noise."""
     chi2 = []
     for seed in range(30):
         spot = find_spot(fields(sd, 0.0, 0.06, seed), KNOWN)
@@ -63,7 +63,7 @@ def test_a_gain_of_the_odd_rows_moves_nothing(sd):
     assert 0.5 < np.mean(chi2) < 3.5
 
 
-def test_good_pictures_stay_as_they_are():
+def test_good_pictures_are_unchanged():
     """Forty pictures of the twin, half of them with speckle: the same covariance to the bit."""
     rng = np.random.default_rng(5)
     for number in range(40):
@@ -74,8 +74,8 @@ def test_good_pictures_stay_as_they_are():
         assert (find_spot(frame, noise).covariance_px2 == without.covariance_px2).all()
 
 
-def test_small_differences_that_all_looks_share_are_found_together():
-    """Each within chance alone; forty of mean square 9 are not, forty of 2.25 are left to the noise's own error."""
+def test_small_common_differences_are_detected_over_all_looks():
+    """One alone is insignificant; 40 of mean square 9 are significant, 40 of 2.25 are within the noise's error."""
     covariances = [np.diag([0.01, 0.04])] * 40
     rng = np.random.default_rng(7)
     signs = rng.choice([-1.0, 1.0], (40, 2, 2))
@@ -92,7 +92,7 @@ def test_small_differences_that_all_looks_share_are_found_together():
     assert widened([Centre("no-spot")]).lines == ()
 
 
-def test_one_look_alone_is_widened_alone():
+def test_a_shift_in_one_look_widens_that_look():
     shifts = [np.zeros((2, 2))] * 30
     shifts[4] = np.array([[0.0, 0.0], [2.0, 0.0]])
     result = widening(shifts, [0.01 * np.eye(2)] * 30)
@@ -100,7 +100,7 @@ def test_one_look_alone_is_widened_alone():
     assert np.flatnonzero(result.added_px2.any(axis=(1, 2))).tolist() == [4]
 
 
-def test_detect_says_which_camera_reads_in_fields(tmp_path):
+def test_detect_names_the_camera_that_reads_in_fields(tmp_path):
     """Six looks; the left camera's odd rows come later, the beam has moved by 0.4 px."""
     rng = np.random.default_rng(11)
     spots = [spot_row(k, 0, "d1", k // 4, k % 4 + 1, *[None] * 8, 50.0 + k, "undetected") for k in range(6)]

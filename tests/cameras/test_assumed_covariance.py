@@ -1,4 +1,4 @@
-"""The covariance of a calibration that came without one: one adjustment's information, and OpenCV's actual errors."""
+"""The assumed covariance of a calibration without one: against a bundle adjustment and OpenCV's actual errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def mounted() -> Stereo:
 
 
 def corners(stereo: Stereo, pose: np.ndarray, board: Board = BOARD) -> tuple[np.ndarray, np.ndarray]:
-    """Where both cameras see the corners, by OpenCV."""
+    """Pixels of the corners in both cameras, by OpenCV."""
     left = board.points_mm @ rotation_matrix(pose[:3]).T + pose[3:]
     still = np.zeros(3)
     cameras = (left, stereo.M1, stereo.D1), (left @ stereo.R.T + stereo.T, stereo.M2, stereo.D2)
@@ -54,7 +54,7 @@ def corners(stereo: Stereo, pose: np.ndarray, board: Board = BOARD) -> tuple[np.
 
 
 def test_information_is_that_of_the_bundle_adjustment(mounted):
-    """Of the same views, to the curvature that noise of 1e-3 px leaves in the adjustment's own linearisation."""
+    """From the same views, up to the curvature of the adjustment at noise of 1e-3 px."""
     poses = placed_boards(mounted, BOARD)["opencv"]
     rng = np.random.default_rng(3)
     views = []
@@ -68,7 +68,7 @@ def test_information_is_that_of_the_bundle_adjustment(mounted):
     np.testing.assert_allclose(covariance / np.outer(sds, sds), expected / np.outer(sds, sds), atol=1e-4)
 
 
-def test_boards_are_seen_whole_by_both_cameras(mounted):
+def test_boards_are_completely_in_both_pictures(mounted):
     boards = placed_boards(mounted, BOARD)
     assert {name: len(poses) for name, poses in boards.items()} == {"bumblebee2": 11, "opencv": 13}
     size = np.array([mounted.image_width, mounted.image_height])
@@ -86,7 +86,7 @@ def test_covariance_scales_as_a_calibration(mounted):
     fewer = calibration_covariance(mounted, BOARD, 80, 0.2) * 4 * share[1] / share[0]
     np.testing.assert_allclose(fewer, covariance, rtol=1e-9)
     sd = np.sqrt(np.diag(calibration_covariance(mounted, replace(BOARD, pitch_u_mm=0.25), 20, 0.2) - covariance))[21:]
-    # Differences of variances: their digits are those of the larger one.
+    # Differences of variances have the rounding of the larger one.
     np.testing.assert_allclose(sd, 0.01 * np.abs(mounted.T), rtol=1e-6, atol=1e-6)
     joint, fixed, either = (calibration_covariance(mounted, BOARD, 20, 0.2, way) for way in (False, True, None))
     np.testing.assert_allclose(either, (joint + fixed) / 2, rtol=1e-9)
@@ -116,7 +116,7 @@ def drawn(seed: int) -> tuple[Stereo, list[np.ndarray]]:
 
 
 def by_opencv(true: Stereo, poses: list[np.ndarray], seed: int, fixed: bool) -> tuple[Stereo, float]:
-    """What cv2.stereoCalibrate makes of noisy corners, all free from each camera's own calibration or R and T alone."""
+    """cv2.stereoCalibrate of noisy corners, all parameters free after each camera's own calibration, or only R, T."""
     rng = np.random.default_rng([seed, 46])
     views = [corners(true, pose) for pose in poses]
     sides = [
@@ -176,7 +176,7 @@ def test_a_stated_uncertainty_replaces_that_of_its_group(mounted):
         stereo_bytes(stereo)
     matrix = plain.parameter_covariance
     sds = np.sqrt(np.diag(matrix))[GROUPS["rotation"]]
-    # The sds that it has change nothing; units span ten powers of ten.
+    # Its own sds change nothing; units span ten powers of ten.
     scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
     np.testing.assert_allclose(with_marginal(matrix, GROUPS["rotation"], sds) / scale, matrix / scale, atol=1e-9)
     # A group that is known exactly leaves the conditional covariance of the others.
@@ -186,7 +186,7 @@ def test_a_stated_uncertainty_replaces_that_of_its_group(mounted):
     np.testing.assert_allclose(tiny[np.ix_(rest, rest)] / scale[np.ix_(rest, rest)], expected, atol=1e-6)
 
 
-def test_what_was_stated_goes_before_the_file_and_that_before_what_is_usual(mounted, tmp_path):
+def test_stated_values_precede_the_file_and_the_file_precedes_defaults(mounted, tmp_path):
     files = exported(mounted, "opencv")
     files["intrinsics.yml"] += b"avg_reprojection_error: 0.41\nnr_of_frames: 17\nboard_width: 8\nboard_height: 5\n"
     for name, data in files.items():
@@ -211,7 +211,7 @@ def test_what_was_stated_goes_before_the_file_and_that_before_what_is_usual(moun
     assert CORRELATION_FACTOR >= 1
 
 
-def test_cameras_that_share_no_view_are_refused(mounted):
+def test_cameras_without_a_common_field_are_refused(mounted):
     away = replace(mounted, R=rotation_matrix(np.array([0, 2.8, 0])))
     with pytest.raises(InputError, match="do not see one board together"):
         with_assumed_covariance(away, Provenance(), Provenance())
@@ -219,7 +219,7 @@ def test_cameras_that_share_no_view_are_refused(mounted):
         calibration_covariance(mounted, Board(3, 3, 25.0), 0, 0.2)
 
 
-def test_command_takes_what_is_known(mounted, tmp_path, capsys):
+def test_command_takes_the_stated_uncertainties(mounted, tmp_path, capsys):
     for name, data in exported(mounted, "opencv").items():
         (tmp_path / name).write_bytes(data)
     named = [part for name in ("intrinsics.yml", "extrinsics.yml") for part in ("--import", str(tmp_path / name))]
@@ -232,7 +232,7 @@ def test_command_takes_what_is_known(mounted, tmp_path, capsys):
     )
     stereo = read_stereo(tmp_path / "stereo.json")
     assert stereo.assumed_from == document["assumed_from"] and stereo.rms_px == 0.21
-    # The shipped pair's own sds, of 20 views at another noise, within the factor that is stated of a guess twice.
+    # The shipped pair's own sds, of 20 views at another noise, within twice the stated factor of a guess.
     assert run(["stereo", "--import", str(tmp_path / "stereo.json"), "--u-rotation-mrad", "1", "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert abs(again["parameters"]["stereo.rotation_rad.y"]["sd"] - 1e-3) < 1e-12
@@ -245,7 +245,7 @@ def test_command_takes_what_is_known(mounted, tmp_path, capsys):
     assert run(["stereo", str(tmp_path), "--board", "9x6", "--pitch-mm", "25", "--rms-px", "0.2", "--json"]) == 2
 
 
-def test_a_fit_says_how_much_comes_from_it(mounted):
+def test_a_fit_states_its_share_of_the_variance(mounted):
     row = BudgetRow("stereo calibration", "deg", None, 0.1, "B", "normal", None, 1.0, 0.1, 0.62)
     other = structs.replace(row, share=0.01)
     tables = [

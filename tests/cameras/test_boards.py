@@ -1,4 +1,4 @@
-"""Which pictures are a pair, where the corners are, in an order that both cameras share."""
+"""Pairs of pictures, positions of corners, and an order common to both cameras."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_cameras_of_two_picture_sizes(tmp_path, proportion):
     assert views.right_image_size == (width // 2, height // 2) and not views.other_size
     for view, pose in zip(views.views, POSES[:3], strict=True):
         corners = np.hstack([view.left, view.right])
-        # A corner of a picture of half the size is found half as well.
+        # A corner of a picture of half the size is found with twice the error.
         assert min(np.abs(order - true_corners(pose)).max() for order in (corners, corners[::-1])) < 2 * FOUND_PX
 
 
@@ -102,7 +102,7 @@ def test_wide_frames_are_split(tmp_path, six, six_views, swap):
 
 
 @pytest.mark.parametrize("columns, rows, quarters", ((7, 6, 2), (7, 5, 2), (6, 6, 1), (6, 6, 2), (6, 6, 3)))
-def test_turned_corner_orders_are_mended(tmp_path, monkeypatch, columns, rows, quarters):
+def test_turned_corner_orders_are_corrected(tmp_path, monkeypatch, columns, rows, quarters):
     """By colour (7 x 6), by direction (7 x 5), by both (6 x 6): a finder that starts at another corner."""
     board = Board(columns, rows, 25.0)
     write_pair(tmp_path, "1", pictures(POSES[0], board))
@@ -125,7 +125,7 @@ def test_turned_corner_orders_are_mended(tmp_path, monkeypatch, columns, rows, q
         np.testing.assert_array_equal(getattr(mended.views[0], side), getattr(straight.views[0], side))
 
 
-def test_mirrored_corner_orders_are_mended(monkeypatch):
+def test_mirrored_corner_orders_are_corrected(monkeypatch):
     """A finder that counts rows from right to left: x would turn into y the wrong way round."""
     grey = pictures(POSES[0])[0]
     straight, _ = boards.find_corners(grey, BOARD)
@@ -138,7 +138,7 @@ def test_mirrored_corner_orders_are_mended(monkeypatch):
     np.testing.assert_array_equal(boards.find_corners(grey, BOARD)[0], straight)
 
 
-def test_colours_decide_for_a_camera_on_its_head(tmp_path):
+def test_colours_decide_for_an_inverted_camera(tmp_path):
     """The right picture turned by 180 degrees: direction alone would pair the wrong corners."""
     left, right = pictures(POSES[0])
     write_pair(tmp_path, "1", [left, right[::-1, ::-1]])
@@ -148,7 +148,7 @@ def test_colours_decide_for_a_camera_on_its_head(tmp_path):
     assert min(np.abs(order - true_corners(POSES[0])).max() for order in (corners, corners[::-1])) < FOUND_PX
 
 
-def test_other_finder_steps_in_by_name(six, monkeypatch, tmp_path):
+def test_other_finder_is_used_and_reported(six, monkeypatch, tmp_path):
     write_pair(tmp_path, "1", pictures(POSES[0]))
     monkeypatch.setattr(boards, "_find_classic", lambda grey, board: None)
     views = find_views(tmp_path, BOARD)
@@ -167,7 +167,7 @@ def test_large_pictures_are_searched_in_a_smaller_copy(monkeypatch, share):
     picture = pictures(POSES[0])[0][:-3, :-1]
     corners, fallback = find_corners(np.ascontiguousarray(picture), BOARD, "sector")
     assert not fallback
-    # A finder of one picture cannot know a half turn.
+    # One picture does not determine a half turn.
     true = true_corners(POSES[0])[:, :2]
     assert min(np.abs(order - true).max() for order in (corners, corners[::-1])) < FOUND_PX
 
@@ -220,7 +220,7 @@ def test_all_pictures_that_cannot_be_used_are_named_at_once(tmp_path, kind):
         find_views(tmp_path, BOARD)
 
 
-def test_no_pictures_is_said(tmp_path):
+def test_a_folder_without_pictures_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(NothingToEstimate, match="no checkerboard picture"):
         find_views(tmp_path, BOARD)
@@ -234,7 +234,7 @@ def test_impossible_boards_are_refused(text):
         Board.named(text, 25.0)
 
 
-def test_board_reads_and_measures_itself():
+def test_board_is_parsed_and_has_its_measures():
     board = Board.named("9 X 6", 25.0, 0.01)
     assert (board.columns, board.rows, board.corners) == (9, 6, 54)
     np.testing.assert_allclose(board.points_mm.mean(0), 0, atol=1e-12)
@@ -245,8 +245,8 @@ def test_board_reads_and_measures_itself():
             replace(board, **bad)
 
 
-def test_corners_that_the_refining_gives_back_get_a_wider_window():
-    """A board at 65 degrees: with the narrow window cornerSubPix returns a corner as it came, 2.5 px off."""
+def test_corners_left_unrefined_get_a_wider_window():
+    """A board at 65 degrees: with the narrow window cornerSubPix returns a corner unchanged, 2.5 px off."""
     pose = np.array([-0.387, 1.073, 0.189, -11.453, 19.857, 477.414])
     right = true_corners(pose)[:, 2:]
     corners, by_fallback = find_corners(pictures(pose)[1], BOARD)
@@ -265,7 +265,7 @@ def greys() -> list[np.ndarray]:
     ]
 
 
-def test_the_size_of_a_board_is_seen(greys):
+def test_the_size_of_a_board_is_detected(greys):
     size = max(BOARD.columns, BOARD.rows), min(BOARD.columns, BOARD.rows)
     assert [inner_corners(grey) for grey in greys] == [size] * 2
     reason, remedy = why_no_board(greys, BOARD.columns + 1, BOARD.rows)
@@ -275,7 +275,7 @@ def test_the_size_of_a_board_is_seen(greys):
 
 
 def test_the_size_of_a_board_is_searched_in_a_smaller_copy(greys, monkeypatch):
-    """Of 20 million pixels a search by sectors takes gigabytes."""
+    """At 20 million pixels a search by sectors takes gigabytes."""
     sizes, search = [], boards.cv2.findChessboardCornersSBWithMeta
     monkeypatch.setattr(
         boards.cv2,

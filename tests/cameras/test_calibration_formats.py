@@ -1,4 +1,4 @@
-"""Calibrations of other tools: round trips, units, the assumed covariance, and what a stranger's YAML may not do."""
+"""Calibrations of other tools: round trips, units, the assumed covariance, hostile YAML."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def close(pair: Stereo, stereo: Stereo, rotation_atol: float = 1e-12) -> None:
 
 @pytest.mark.parametrize("form", ("opencv", "ros"))
 @pytest.mark.parametrize("backwards", (False, True))
-def test_what_is_exported_is_imported_again(mounted, tmp_path, form, backwards):
+def test_exported_files_are_imported_again(mounted, tmp_path, form, backwards):
     """Every digit of matrices and distortion; R and T of ROS through rectification to rounding."""
     paths = written(tmp_path, exported(mounted, form))
     result = read_calibration(paths[::-1] if backwards else paths)
@@ -86,7 +86,7 @@ def test_ros_export_is_in_metres(mounted):
     assert abs(-right[0, 3] / right[0, 0] - np.linalg.norm(mounted.T) / 1000) < 1e-12
 
 
-def test_opencv_reads_what_is_exported(mounted, tmp_path):
+def test_opencv_reads_exported_files(mounted, tmp_path):
     values = {"M1": mounted.M1, "D2": mounted.D2[None], "R": mounted.R, "T": mounted.T[:, None]}
     read = []
     for path in written(tmp_path, exported(mounted, "opencv")):
@@ -101,7 +101,7 @@ def test_opencv_reads_what_is_exported(mounted, tmp_path):
 
 
 @pytest.mark.parametrize("header", (b"%YAML:1.0\n---\n", b"%YAML 1.2\n---\n", b""))
-def test_what_opencv_writes_is_read(mounted, tmp_path, header):
+def test_files_written_by_opencv_are_read(mounted, tmp_path, header):
     """Its own writer, one file, with the headers of 4.x and 5.x."""
     path = tmp_path / "pair.yml"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
@@ -116,8 +116,8 @@ def test_what_opencv_writes_is_read(mounted, tmp_path, header):
     close(read_calibration([path], (1280, 720)).stereo, mounted)
 
 
-def test_what_opencv_writes_as_json_is_read(mounted, tmp_path):
-    """One file or two, by its own writer; a JSON without its matrices is still our own format or refused."""
+def test_json_written_by_opencv_is_read(mounted, tmp_path):
+    """One file or two, by its own writer; a JSON without its matrices is the native format or refused."""
     inner = {"M1": mounted.M1, "D1": mounted.D1[None], "M2": mounted.M2, "D2": mounted.D2[None]}
     outer = {"R": mounted.R, "T": mounted.T[:, None]}
 
@@ -151,7 +151,7 @@ def test_opencv_lengths_need_their_unit(mounted, tmp_path):
 
 
 def test_millimetres_taken_for_metres_are_doubted(mounted, tmp_path):
-    """85 mm would be 85 m; nothing is refused, for nobody forbids a hall."""
+    """85 mm would be 85 m; it is a warning, since a large set-up is possible."""
     result = read_calibration(written(tmp_path, exported(mounted, "opencv")), unit_mm=1000.0)
     (warning,) = result.warnings
     assert "was it in mm before it was taken for metres?" in warning
@@ -170,7 +170,7 @@ def test_kalibr_camchain(tmp_path):
 
 
 def test_cameras_on_the_wrong_sides_are_named(mounted, tmp_path):
-    """Whatever the format: the pair is legal, but every depth would come out negative."""
+    """In every format: the pair is valid, but every depth would be negative."""
     swapped = replace(mounted, R=mounted.R.T, T=-mounted.R.T @ mounted.T)
     camchain = KALIBR.replace("-0.085]", "0.085]")
     assert camchain != KALIBR
@@ -197,7 +197,7 @@ def test_an_image_size_of_other_pictures_is_named(mounted, tmp_path):
 
 
 def test_the_bounds_of_a_plausible_principal_point(mounted):
-    """A quarter of the width from the middle, (1280 - 1) / 2 px, and not a pixel more; 5 % for fx / fy."""
+    """At most a quarter of the width from the middle, (1280 - 1) / 2 px; 5 % for fx / fy."""
     for shift_px, doubts in ((319.0, 0), (321.0, 1), (-319.0, 0), (-321.0, 1)):
         matrix = np.array([[800.0, 0, 639.5 + shift_px], [0, 800.0, 359.5], [0, 0, 1]])
         assert len(pair_doubts(replace(mounted, M2=matrix))) == doubts, shift_px
@@ -305,7 +305,7 @@ def test_other_kalibr_models_are_refused(tmp_path, old, new):
         read_calibration([path])
 
 
-def test_rational_distortion_is_refused_unless_it_is_none(mounted, tmp_path):
+def test_rational_distortion_is_refused_unless_zero(mounted, tmp_path):
     files = exported(mounted, "opencv")
     five = ", ".join(map(repr, mounted.D1.tolist()))
     for tail, allowed in (("0.0, 0.0, 0.0", True), ("0.1, 0.0, 0.0", False)):
@@ -320,7 +320,7 @@ def test_rational_distortion_is_refused_unless_it_is_none(mounted, tmp_path):
 
 @pytest.mark.thorough
 def test_random_damage_ends_in_a_refusal_or_a_calibration(mounted, tmp_path):
-    """Six hundred seeded mutations of a good file: nothing but InputError comes out."""
+    """Six hundred seeded mutations of a good file: no other exception than InputError."""
     rng = np.random.default_rng(0)
     good = {form: exported(mounted, form) for form in ("opencv", "ros")} | {"kalibr": {"c.yaml": KALIBR.encode()}}
     refused = 0

@@ -1,7 +1,7 @@
-"""One pair in every kind of file that people have, written by the libraries of the formats: the same numbers come out.
+"""One pair in every kind of file, written by the libraries of the formats: the same numbers are read.
 
-`tests/data/foreign` holds files of the layouts that were met in public repositories, own numbers: T = -118.6, 0.4,
-1.9 mm, 640 x 480 px. Files of many digits come back to 1e-9, which is rounding of a few products.
+`tests/data/foreign` holds files in layouts of public repositories with invented numbers: T = -118.6, 0.4,
+1.9 mm, 640 x 480 px. Files of many digits are read to 1e-9, the rounding of a few products.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def test_foreign_files_are_read_as_they_are(names, source):
     np.testing.assert_allclose(result.stereo.M2[[0, 1, 0, 1], [0, 1, 2, 2]], [809.1, 808.8, 325.6, 239.4], atol=1e-9)
 
 
-def test_a_transposed_rotation_is_known_by_the_fundamental_matrix():
+def test_a_transposed_rotation_is_recognised_by_the_fundamental_matrix():
     path = FOREIGN / "transposed" / "c.json"
     with pytest.raises(InputError, match=r"R transposed, by what else the file says.*--key R=R\.T"):
         read_calibration([path])
@@ -106,13 +106,13 @@ def test_a_fold_is_named_with_its_radius():
         assert fold_radius(np.array([k1, 0, 0, 0, 0])) == pytest.approx(expected)
 
 
-def test_a_fisheye_is_fitted_or_refused_and_its_renaming_doubted(mounted):
+def test_a_fisheye_is_fitted_or_refused_and_its_renaming_is_reported(mounted):
     result = read_calibration([FOREIGN / "fisheye_advice" / "fisheye.yaml"])
     (note,) = (n for n in result.notes if "cam0.distortion_coeffs of fisheye.yaml" in n)
     assert "a fisheye lens, fitted to five coefficients within" in note
     followed = read_calibration([FOREIGN / "fisheye_advice" / "followed.yaml"])
     assert sum("fisheye (equidistant) model under another name" in w for w in followed.warnings) == 2
-    # OpenCV's own projections agree within what is stated, plus the grid's coarseness.
+    # OpenCV's own projections agree within the stated error, plus the grid's coarseness.
     stereo, coefficients = result.stereo, np.array([0.03, -0.02, 0.03, -0.01])
     rays = np.random.default_rng(1).uniform(-0.35, 0.35, (50, 2))
     points = np.column_stack([rays, np.ones(50)]).reshape(-1, 1, 3)
@@ -142,7 +142,7 @@ def plain(stereo: Stereo, names: str) -> dict[str, np.ndarray]:
         "K_l d_l K_r d_r stereo_R stereo_T",
     ),
 )
-def test_names_of_programs(mounted, tmp_path, names):
+def test_names_used_by_programs(mounted, tmp_path, names):
     lists = {name: value.tolist() for name, value in plain(mounted, names).items()}
     size = [mounted.image_width, mounted.image_height]
     (tmp_path / "a.json").write_text(json.dumps(lists | {"image_size": size}))
@@ -324,8 +324,8 @@ def test_matlab_structures(mounted, tmp_path):
     assert any("MATLAB counts pixels from 1" in note for note in result.notes)
 
 
-def test_one_file_each_and_one_between_them(mounted, tmp_path):
-    """In any order: names of files tell the cameras, R and T stand in the third or in the right one's."""
+def test_one_file_per_camera_and_a_common_one(mounted, tmp_path):
+    """In any order: file names give the cameras; R and T are in the third file or in the right camera's."""
     size = {"image_width": mounted.image_width, "image_height": mounted.image_height}
     between = {"R": mounted.R.tolist(), "T": mounted.T.tolist()}
     cameras = (("left", mounted.M1, mounted.D1), ("right", mounted.M2, mounted.D2))
@@ -341,7 +341,7 @@ def test_one_file_each_and_one_between_them(mounted, tmp_path):
 
 
 def test_a_rectified_pair_alone(mounted, tmp_path):
-    """P of both without anything else: the rectified pair triangulates to what the raw one does."""
+    """P of both cameras alone: the rectified pair triangulates to the points of the raw one."""
     size = mounted.image_width, mounted.image_height
     r1, _, p1, p2, *_ = cv2.stereoRectify(
         mounted.M1, mounted.D1, mounted.M2, mounted.D2, size, mounted.R, mounted.T[:, None], alpha=0
@@ -367,7 +367,7 @@ def test_a_rectified_pair_alone(mounted, tmp_path):
 
 
 def test_rational_models(mounted, tmp_path):
-    """A zero tail is plumb bob; a small one is fitted and said; a large one is refused by its error."""
+    """A zero tail is plumb bob; a small one is fitted and reported; a large one is refused by its error."""
     document = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()}
     document |= {"image_size": [1280, 720], "distortion_model": "rational_polynomial"}
     for tail, word in (
@@ -389,8 +389,8 @@ def test_rational_models(mounted, tmp_path):
             same(result.stereo, mounted)
 
 
-def test_poses_of_both_cameras_and_turns_the_other_way(mounted, tmp_path):
-    """R and T in the table of each camera are its pose; `.T` takes a matrix or Rodrigues' vector the other way."""
+def test_poses_of_both_cameras_and_inverse_rotations(mounted, tmp_path):
+    """R and T in the table of each camera are its pose; `.T` inverts a matrix or a Rodrigues vector."""
     world, at_mm = rotation_matrix(np.array([0.3, -0.2, 0.1])), np.array([10.0, 20, 1000])
     right = {"R": mounted.R @ world, "T": mounted.R @ at_mm + mounted.T, "K": mounted.M2, "D": mounted.D2}
     tables = {"left": {"R": world, "T": at_mm, "K": mounted.M1, "D": mounted.D1}, "right": right}
@@ -406,7 +406,7 @@ def test_poses_of_both_cameras_and_turns_the_other_way(mounted, tmp_path):
 
 
 def test_messages_of_both_cameras_in_one_paste(mounted, tmp_path):
-    """What repeats but for its header is one message; a line of dashes at the end is none."""
+    """Messages that differ in the header alone count once; a line of dashes at the end is none."""
     texts = [exported(mounted, "ros")[f"{side}.yaml"].decode() for side in ("left", "right")]
     path = tmp_path / "pasted.txt"
     path.write_text("".join(f"header: {{seq: {k}}}\n{text}---\n" for k, text in enumerate(2 * texts)))
@@ -440,7 +440,7 @@ def test_a_fisheye_of_orb_slam_and_a_rectified_pair_by_its_baseline(tmp_path):
 
 
 def test_two_picture_sizes_of_one_proportion(mounted, tmp_path):
-    """The right camera's matrix of pictures of 3/2 of the size comes out as that of the left one's size."""
+    """The right camera's matrix for pictures of 3/2 of the size is scaled to the left one's size."""
     larger = {name: value.tolist() for name, value in plain(mounted, "K1 D1 K2 D2 R T").items()}
     K2 = np.diag([1.5, 1.5, 1]) @ mounted.M2
     K2[:2, 2] += 0.25
@@ -457,8 +457,8 @@ def test_two_picture_sizes_of_one_proportion(mounted, tmp_path):
         read_calibration([path])
 
 
-def test_what_python_dumps_as_yaml(mounted, tmp_path):
-    """A list that two tables share is an alias, a tuple has a tag; arrays of NumPy are refused with the mend."""
+def test_yaml_dumps_of_python_are_read(mounted, tmp_path):
+    """A list shared by two tables is an alias, a tuple has a tag; arrays of NumPy are refused with a remedy."""
     size, good = [1280, 720], {name: value.tolist() for name, value in plain(mounted, "K D K2 D2 R T").items()}
     tables = {"left": {"K": good["K"], "D": good["D"], "size": size}}
     tables["right"] = {"K": good["K2"], "D": tuple(good["D2"]), "size": size}
@@ -472,14 +472,14 @@ def test_what_python_dumps_as_yaml(mounted, tmp_path):
 
 
 @pytest.mark.parametrize("key", ("ret", "retStereo", "mean_reprojection_error", "metadata.error"))
-def test_an_rms_is_used_under_the_names_that_it_has(mounted, tmp_path, key):
+def test_an_rms_is_read_under_its_common_names(mounted, tmp_path, key):
     good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()} | {"size": [1280, 720]}
     *table, name = key.split(".")
     (tmp_path / "a.json").write_text(json.dumps({**good, **({table[0]: {name: 0.77}} if table else {name: 0.77})}))
     assert "RMS 0.77 px (of the file)" in read_calibration([tmp_path / "a.json"]).stereo.assumed_from
 
 
-def test_what_no_name_tells_is_named_by_the_user(mounted, tmp_path):
+def test_missing_names_are_given_by_the_user(mounted, tmp_path):
     path = tmp_path / "odd.json"
     odd = plain(mounted, "alpha beta gamma delta epsilon zeta")
     path.write_text(json.dumps({"cal": {k: v.tolist() for k, v in odd.items()}, "image_size": [1280, 720]}))
@@ -493,7 +493,7 @@ def test_what_no_name_tells_is_named_by_the_user(mounted, tmp_path):
 
 
 def mistaken(mounted: Stereo) -> dict[str, tuple[dict[str, object], str]]:
-    """Mistakes in a plain JSON, and what names each."""
+    """Mistakes in a plain JSON, and the part of the message that names each."""
     good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()}
     good["image_size"] = [1280, 720]
     x, y, z = mounted.T
@@ -556,7 +556,7 @@ def mistaken(mounted: Stereo) -> dict[str, tuple[dict[str, object], str]]:
 
 
 @pytest.mark.parametrize("kind", mistaken(read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")))
-def test_mistakes_are_refused_with_the_mend(mounted, tmp_path, kind):
+def test_mistakes_are_refused_with_a_remedy(mounted, tmp_path, kind):
     document, word = mistaken(mounted)[kind]
     (tmp_path / "m.json").write_text(json.dumps(document))
     with pytest.raises(InputError) as caught:
@@ -564,8 +564,8 @@ def test_mistakes_are_refused_with_the_mend(mounted, tmp_path, kind):
     assert word in str(caught.value) and caught.value.remedy and "m.json" in str(caught.value)
 
 
-def test_absurd_pairs_are_named_by_file_and_key(mounted, tmp_path):
-    """A view near 180 deg, cameras that look elsewhere; one that is plausible has no doubt."""
+def test_implausible_pairs_are_named_by_file_and_key(mounted, tmp_path):
+    """A field of view near 180 deg, cameras with diverging axes; a plausible pair raises no doubt."""
     assert pair_doubts(mounted) == ()
     wide = replace(mounted, M1=np.array([[50.0, 0, 640], [0, 50, 360], [0, 0, 1]]), D1=np.zeros(5))
     assert any(
@@ -576,8 +576,8 @@ def test_absurd_pairs_are_named_by_file_and_key(mounted, tmp_path):
     assert any("R of stereo.json turns by 57 deg" in doubt for doubt in pair_doubts(turned))
 
 
-def test_what_would_pass_in_silence_is_said(mounted, tmp_path):
-    """Four coefficients that may be a fisheye's, poses in other axes or inverted."""
+def test_ambiguous_conventions_are_reported(mounted, tmp_path):
+    """Four coefficients that may be those of a fisheye, poses in other axes or inverted."""
     good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()}
     good["image_size"] = [1280, 720]
     x, y, z = mounted.T

@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 64, 48
 
 
 class FakeCapture:
-    """A camera of 30 frames/s with a buffer and a transfer delay; every picture holds the time of its exposure.
+    """A camera of 30 frames/s with a buffer and a transfer delay; every picture stores the time of its exposure.
 
     Pixel (0, 0) holds the exposure's start in ms, modulo 65536, in its first two channels.
     """
@@ -81,7 +81,7 @@ def test_no_frame_is_older_than_the_request(buffered, transfer_s, decode_s):
 
 
 def test_without_flushing_the_frames_would_be_old():
-    """The test above can fail: the plain next frame is older than its request."""
+    """Control of the test above: the next frame without flushing is older than its request."""
     clock = VirtualClock()
     capture = FakeCapture(clock)
     clock.sleep(1.0)
@@ -89,7 +89,7 @@ def test_without_flushing_the_frames_would_be_old():
     assert exposed_s(capture.retrieve()[1]) < 0.9
 
 
-def test_camera_that_never_waits_is_refused():
+def test_camera_that_returns_without_waiting_is_refused():
     clock = VirtualClock()
     camera = OpenCVCamera([FakeCapture(clock, period_s=1e-6)], WIDTH, HEIGHT, clock=clock)
     with pytest.raises(DeviceFault) as caught:
@@ -97,7 +97,7 @@ def test_camera_that_never_waits_is_refused():
     assert caught.value.code == "stale"
 
 
-def test_two_devices_are_flushed_both():
+def test_both_of_two_devices_are_flushed():
     clock = VirtualClock()
     pair = [FakeCapture(clock, 3, width=WIDTH), FakeCapture(clock, 40, 0.03, width=WIDTH)]
     camera = OpenCVCamera(pair, WIDTH, HEIGHT, clock=clock)
@@ -150,7 +150,7 @@ def test_automatic_exposure_is_off_on_every_backend(backend, manual):
     assert capture.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == manual
 
 
-def test_what_cannot_be_fixed_is_said():
+def test_settings_that_cannot_be_fixed_are_reported():
     clock = VirtualClock()
     camera = OpenCVCamera([FakeCapture(clock, obeys=False)], WIDTH, HEIGHT, clock=clock)
     assert "automatic exposure, white balance, focus" in camera.settings().warnings[0]
@@ -192,7 +192,7 @@ def test_cameras_of_a_rig_file():
 
 @pytest.mark.parametrize("wanted", (None, "7"))
 def test_opencv_is_silent_only_while_cameras_are_opened(monkeypatch, wanted):
-    """And not at all for anyone who asked for its messages; FFmpeg's variable is nobody else's afterwards."""
+    """Not where its messages are requested; FFmpeg's variable is restored afterwards."""
     logging, levels = cv2.utils.logging, []
     names = ("OPENCV_LOG_LEVEL", "OPENCV_FFMPEG_LOGLEVEL")
     for name in names:
@@ -213,7 +213,7 @@ def test_opencv_is_silent_only_while_cameras_are_opened(monkeypatch, wanted):
 
 
 @pytest.mark.parametrize("address", ["ftp://eye:secret@10.0.0.2/1", "http://eye:secret@127.0.0.1:9/x.mjpg"])
-def test_no_message_holds_a_password(address):
+def test_no_message_contains_a_password(address):
     with pytest.raises((InputError, DeviceFault), match="camera") as caught:
         open_capture(address)
     assert "secret" not in str(caught.value) and address.partition("@")[2] in str(caught.value)

@@ -1,4 +1,4 @@
-"""The paper's rectified pictures: the way back to raw pixels."""
+"""The paper's rectified pictures: conversion back to raw pixels."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from support.drawn_spots import small_pair
 from tvsbayes.cameras.contour import rectified_pair
 
 
-def test_contour_comes_back_to_raw_pixels():
-    """Against OpenCV's own way forward."""
+def test_contour_is_converted_to_raw_pixels():
+    """Against OpenCV's forward conversion."""
     stereo = small_pair()
     raw = np.random.default_rng(1).uniform([20, 20], [300, 220], (50, 2))
     for camera in rectified_pair(stereo):

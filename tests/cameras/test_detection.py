@@ -85,7 +85,7 @@ def found_speckled(speckled):
 
 
 def check_sds(folder: Folder, detection, tolerance: float) -> None:
-    """Root mean square of error over stated sd is 1 to the tolerance and what so few spots leave open."""
+    """The root mean square of error over stated sd is 1 within the tolerance and its sampling error."""
     errors, stated = folder.errors(detection)
     assert len(errors) >= LOOKS - 2
     ratio = np.sqrt(np.mean((errors / stated) ** 2))
@@ -132,7 +132,7 @@ def test_the_median_is_of_all_four_coordinates(plain, plain_detection):
     assert plain_detection.median_sd_px == np.median(plain.errors(plain_detection)[1])
 
 
-def test_what_is_learned_of_the_noise(plain_detection, found_speckled):
+def test_noise_is_estimated_from_the_spots(plain_detection, found_speckled):
     for side in ("left", "right"):
         assert plain_detection.noise[side].speckle_contrast < 0.08
         assert found_speckled.noise[side].speckle_contrast == pytest.approx(0.4, rel=0.25)
@@ -140,7 +140,7 @@ def test_what_is_learned_of_the_noise(plain_detection, found_speckled):
 
 @pytest.mark.parametrize("each", (True, False))
 def test_dark_pictures_are_subtracted(tmp_path, each):
-    """Bright things in the middle of both pictures, which pass for spots, with a picture of them or with one a look."""
+    """Bright objects in the middle of both pictures that resemble spots; one dark picture, or one a look."""
     folder, rng = Folder(tmp_path / "c", looks=6, peak_dn=150.0, seed=4), np.random.default_rng(4)
     (folder.path / "dark").mkdir()
     things = np.zeros((HEIGHT, WIDTH, 3))
@@ -172,7 +172,7 @@ def test_dark_pictures_are_subtracted(tmp_path, each):
 
 
 def test_deep_frames_are_detected_with_all_their_bits(tmp_path, monkeypatch):
-    """The same light in 12 bits of 16, finer than 8 bits: also where most looks are so dim that they would fit 10."""
+    """The same light in 12 bits of 16, finer than 8 bits; most looks are so dim that they would fit 10 bits."""
     folder = Folder(tmp_path / "c", looks=6)
     for name in sorted((folder.path / "frames").iterdir()):
         deep = cv2.imread(str(name)).astype(np.uint16) * 16 + 7
@@ -184,12 +184,12 @@ def test_deep_frames_are_detected_with_all_their_bits(tmp_path, monkeypatch):
     looks = detect(read_campaign(folder.path), progress=states.append)
     check_forward(states)
     assert doings(states) == [LEVELLING, LEARNING, DETECTING]
-    # A fifth of the light as it is, not scaled up by its own peak: its centre is worse.
+    # A fifth of the light, not scaled up by its own peak: its centre is less certain.
     assert looks.statuses == {"ok": 6} and looks.campaign.spots[0].su_left_px > 1.3 * looks.campaign.spots[1].su_left_px
     shallow = detect(read_campaign(Folder(tmp_path / "shallow", looks=6).path))
     for deep, eight in zip(looks.campaign.spots[1:-1], shallow.campaign.spots[1:-1], strict=True):
         assert abs(deep.u_left_px - eight.u_left_px) < 0.1 * eight.su_left_px
-        # 8 bits are 255 levels and these 4095 / 16: noise is what it was.
+        # 8 bits have 255 levels and these 4095 / 16: the noise is unchanged.
         assert deep.su_left_px == pytest.approx(eight.su_left_px, rel=0.1)
 
 
@@ -213,7 +213,7 @@ def test_a_beam_s_own_skew_is_no_noise(tmp_path):
     assert all(noise.speckle_contrast < 0.1 and max(np.abs(noise.skew)) > 0.01 for noise in detection.noise.values())
 
 
-def test_the_paper_s_contour_is_several_times_worse_and_says_so(speckled, found_speckled):
+def test_the_paper_s_contour_has_larger_errors_and_sds(speckled, found_speckled):
     contour = detect(read_campaign(speckled.path), "contour")
     errors, stated = speckled.errors(contour)
     assert len(errors) > LOOKS / 2
@@ -235,7 +235,7 @@ def test_a_pair_off_its_epipolar_lines_is_refused(plain, tmp_path):
     assert after == {0: "ok", 10: "epipolar", 20: "ok"}
 
 
-def test_an_uncertain_calibration_forgives_more(plain):
+def test_an_uncertain_calibration_widens_the_epipolar_tolerance(plain):
     loose = replace(plain.stereo, parameter_covariance=plain.stereo.parameter_covariance * 1e4)
     covariances = np.broadcast_to(np.diag(np.full(4, 0.05**2)), (LOOKS, 4, 4))
     assert not epipolar_refused(plain.true_px + np.array([0, 3.0, 0, 0]), covariances, loose).any()
@@ -245,7 +245,7 @@ def test_the_number_of_threads_changes_nothing(plain, plain_detection):
     assert detect(read_campaign(plain.path), workers=1).campaign.spots == plain_detection.campaign.spots
 
 
-def test_in_place_same_rows_other_columns_untouched(tmp_path, capsys):
+def test_detection_in_place_keeps_rows_and_other_columns(tmp_path, capsys):
     folder = Folder(tmp_path / "c", looks=5, contrast=0.4)
     before = read_campaign(folder.path)
     by_hand = replace(before.spots[0], status="sheet moved")
@@ -271,7 +271,7 @@ def test_in_place_same_rows_other_columns_untouched(tmp_path, capsys):
     drawn = cv2.imread(str(folder.path / "results" / "overlay" / "000030.png")).astype(int)
     assert ((drawn[..., 1] > 200) & (drawn[..., 0] < 80) & (drawn[..., 2] < 80)).sum() > 50, "green outline"
     assert ((drawn[..., 2] > 200) & (drawn[..., 0] < 80) & (drawn[..., 1] < 80)).sum() > 20, "red centre"
-    # Detecting again gives the same file, and a repaired frame its spot.
+    # A second detection gives the same file, and a repaired frame its spot.
     once = (folder.path / "spots.csv").read_bytes()
     assert run(["detect", str(folder.path)]) == 0
     assert (folder.path / "spots.csv").read_bytes() == once
@@ -333,7 +333,7 @@ def test_all_damaged_frames_are_named_at_once(tmp_path):
         assert caught.value.file == names[0] and names[6] not in str(caught.value)
 
 
-def test_a_refusal_that_is_no_pictures_stays_what_it_is(tmp_path):
+def test_a_refusal_of_another_path_is_passed_on(tmp_path):
     folder = Folder(tmp_path / "c", looks=2)
     (tmp_path / "taken").write_bytes(b"")
     with pytest.raises(InputError, match="taken"):

@@ -70,7 +70,7 @@ class Feature:
 
 
 class Kept(Feature):
-    """A feature that stays as it is."""
+    """A feature with a constant value."""
 
     value = property(lambda self: self._value, lambda self, new: None)
 
@@ -143,7 +143,7 @@ def opened(maker: Maker, **changes) -> GenicamCamera:
     return GenicamCamera(maker, replace(STATED, **changes), WIDTH, HEIGHT)
 
 
-def test_pictures_are_triggered_after_they_were_asked_for():
+def test_pictures_are_triggered_after_the_request():
     maker = Maker()
     camera = opened(maker, exposure_us=4000.0, gain=3.0)
     nodes = maker.acquirers[1].nodes
@@ -151,7 +151,7 @@ def test_pictures_are_triggered_after_they_were_asked_for():
     assert (nodes.TriggerSource.value, nodes.ExposureAuto.value, nodes.Gain.value) == ("Software", "Off", 3.0)
     assert camera.settings().values["right.exposure_us"] == 4000.0 and camera.settings().warnings == ()
     for acquirer in maker.acquirers:
-        # A picture that nobody fetched, as after a fault: it is older than the next request.
+        # A picture left in the buffer, as after a fault: it is older than the next request.
         acquirer.expose()
     image = camera.grab()
     assert image.left[0, 0].tolist() == image.right[0, 0].tolist() == [2, 2, 2]
@@ -168,7 +168,7 @@ def test_twelve_bits_are_kept():
     assert camera.settings().values["left.bits"] == 12.0
 
 
-def test_colour_is_turned_to_the_order_of_opencv():
+def test_colour_has_the_channel_order_of_opencv():
     picture = opened(Maker(), pixel_format="RGB8").grab().left
     assert picture[0, 0].tolist() == [3, 2, 1]
 
@@ -202,7 +202,7 @@ def test_a_line_is_pulsed_by_the_positioner(mounted_rig):
         ({}, HEIGHT + 1, "image-size", "12 x 11 px"),
     ],
 )
-def test_cameras_that_do_not_obey_are_named(changes, height, code, word):
+def test_cameras_that_ignore_settings_are_named(changes, height, code, word):
     maker = Maker(height)
     with pytest.raises(DeviceFault, match=word) as caught:
         opened(maker, **changes).grab()

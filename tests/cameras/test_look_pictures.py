@@ -1,4 +1,4 @@
-"""To which look a pair of pictures belongs, and how it comes into `frames/`."""
+"""Assignment of pairs of pictures to looks, and their copies in `frames/`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tvsbayes.files.images import png_bytes, read_image
 
 
 def test_the_number_in_the_name_is_the_move(tmp_path):
-    """Of several numbers the one that tells most looks apart; the rest of the name is the sheet."""
+    """Of several numbers the one that distinguishes most looks; the rest of the name is the sheet."""
     drawn(tmp_path, *pairs("_d1_000", "_d1_007", "_d2_007", "_d1_012"))
     matched = pair_looks(views_of(tmp_path).views, range(20))
     assert matched.matching == "number"
@@ -29,7 +29,7 @@ def test_the_number_in_the_name_is_the_move(tmp_path):
 
 
 def test_names_without_a_fitting_number_count_in_order(tmp_path):
-    """1, 2 ... 10 for moves 0 to 9: the names sort as people count."""
+    """1, 2 ... 10 for moves 0 to 9: names sort by number."""
     drawn(tmp_path, *pairs(*map(str, range(1, 11))))
     views = views_of(tmp_path).views
     matched = pair_looks(views, range(10))
@@ -42,7 +42,7 @@ def test_names_without_a_fitting_number_count_in_order(tmp_path):
             pair_looks(views, range(moves), matching=matching)
 
 
-def test_without_moves_every_number_is_one(tmp_path):
+def test_without_moves_every_number_is_a_move(tmp_path):
     drawn(tmp_path, *pairs("_5", "_7_a", "_7_b", "_12"))
     matched = pair_looks(views_of(tmp_path).views, None)
     assert [s.move for s in matched.spots] == [5, 7, 7, 12] and matched.renumbered is None
@@ -50,13 +50,13 @@ def test_without_moves_every_number_is_one(tmp_path):
     assert matched.without == tuple(move for move in range(12) if move not in (5, 7))
 
 
-def test_numbers_too_sparse_for_moves_are_counted_anew_and_told(tmp_path):
+def test_numbers_too_sparse_for_moves_are_renumbered_and_reported(tmp_path):
     drawn(tmp_path, *pairs("_0930", "_0931", "_1015"))
     matched = pair_looks(views_of(tmp_path).views, None)
     assert [s.move for s in matched.spots] == [0, 1, 2] and matched.renumbered == (930, 1015)
 
 
-def test_rows_that_wait_take_their_own_pictures(tmp_path):
+def test_rows_without_pictures_take_their_own(tmp_path):
     drawn(tmp_path, *pairs("3", "5"))
     numbers = (0.1,) * 4
     rows = [
@@ -72,7 +72,7 @@ def test_rows_that_wait_take_their_own_pictures(tmp_path):
         pair_looks(views_of(tmp_path).views, range(2), rows[1:2])
 
 
-def test_what_is_no_pair_is_said(tmp_path):
+def test_files_that_are_no_pair_are_reported(tmp_path):
     drawn(tmp_path, *pairs("1", "2"), "left3.png")
     drawn(tmp_path, *pairs("4"), size=(3, 4))
     (tmp_path / "left5.tif").write_bytes(b"")
@@ -122,7 +122,7 @@ def test_a_png_is_copied_as_it_is_and_a_jpeg_decoded(tmp_path):
     np.testing.assert_array_equal(read_image(frames / "000000_right.png"), right)
 
 
-def test_a_narrow_picture_among_wide_ones_is_said(tmp_path):
+def test_a_narrow_picture_among_wide_ones_is_reported(tmp_path):
     drawn(tmp_path / "wide", "look_0.png", "look_1.png", size=(6, 16))
     drawn(tmp_path / "wide", "room.png")
     assert views_of(tmp_path / "wide").unnamed == ("room.png",)

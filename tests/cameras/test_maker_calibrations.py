@@ -1,6 +1,6 @@
-"""Files of cameras' makers and of BoofCV: the same pair as every file of `tests/data/foreign`, and their mistakes.
+"""Files of camera makers and of BoofCV: the same pair as every file of `tests/data/foreign`, and mistakes.
 
-Numbers of twelve digits and more come back to 1e-9: rounding of a few products of three matrices.
+Numbers of twelve digits and more are read to 1e-9: rounding of a few products of three matrices.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_broken_files_of_makers_are_refused_with_the_mend(tmp_path, kind):
+def test_broken_files_of_makers_are_refused_with_a_remedy(tmp_path, kind):
     text, size, word = BROKEN[kind]
     (tmp_path / "m.txt").write_text(text())
     with pytest.raises(InputError) as caught:
@@ -115,9 +115,9 @@ def test_broken_files_of_makers_are_refused_with_the_mend(tmp_path, kind):
 
 
 def test_a_lens_described_from_pixels_to_rays_is_fitted():
-    """Inverse Brown-Conrady is no name for plumb bob: taken as that, a corner is off by many times what the fit states.
+    """Inverse Brown-Conrady is not plumb bob: read as that, a corner is off by many times the stated error of the fit.
 
-    The rays are those of the formula in librealsense's rsutil.h, written out here.
+    The rays follow the formula in librealsense's rsutil.h.
     """
     text = edited("realsense/intrinsics.json", "distortion.brown_conrady", "Inverse Brown Conrady")
     coefficients, pixel = np.array([-0.21, 0.08, 0.001, -0.0005, 0.0]), np.array([20.0, 30.0])
@@ -131,7 +131,7 @@ def test_a_lens_described_from_pixels_to_rays_is_fitted():
     still = np.zeros(3)
     ours = cv2.projectPoints(ray[None], still, still, matrix, lens.distortion)[0].ravel()
     renamed = cv2.projectPoints(ray[None], still, still, matrix, coefficients)[0].ravel()
-    # The fit's largest error is over a grid; a pixel between its points is off by hardly more.
+    # The fit's largest error is over a grid; between its points the error is slightly larger.
     assert np.abs(ours - pixel).max() < 1.1 * lens.error_px < 0.1
     assert np.abs(renamed - pixel).max() > 5
     assert json.loads(text)["left"]["model"] == "Inverse Brown Conrady"

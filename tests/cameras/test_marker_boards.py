@@ -1,4 +1,4 @@
-"""ChArUco boards in drawn pictures, parts of them outside: corners where they are, boards of other markers named."""
+"""ChArUco boards in rendered pictures, partly outside: positions of corners, boards of other markers named."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def few(folder, tmp_path_factory) -> Path:
-    """Two of the pairs: refusals search all of some pictures, for every dictionary."""
+    """Two of the pairs: before a refusal some pictures are searched for every dictionary."""
     place = tmp_path_factory.mktemp("few")
     for name in ("left_0", "right_0", "left_4", "right_4"):
         shutil.copy(folder / f"{name}.png", place)
@@ -46,7 +46,7 @@ def part_views(folder):
     return find_views(folder, NAMED)
 
 
-def test_corners_of_parts_are_found_where_they_are(part_views):
+def test_corners_of_parts_are_found_at_their_true_places(part_views):
     """The size of the markers and the older first square (an even number of rows) come from the pictures."""
     assert [view.name for view in part_views.views] == [f"_{k}" for k in range(6)]
     counts = []
@@ -59,7 +59,7 @@ def test_corners_of_parts_are_found_where_they_are(part_views):
 
 @pytest.mark.thorough
 def test_a_pair_is_calibrated_from_parts(part_views):
-    """Within four of its own sds, the largest of 24; the sds are those of tenths of a pixel."""
+    """Within four of its own sds, the largest of 24; the sds correspond to tenths of a pixel."""
     result = calibrate_stereo(part_views.views, NAMED, SIZE, fix_k3=True, pictures=part_views)
     sds = np.sqrt(np.diag(result.stereo.parameter_covariance))
     free = sds > 0

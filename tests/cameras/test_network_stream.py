@@ -1,4 +1,4 @@
-"""Streams of the network: read while nobody asks, opened again where they end."""
+"""Network streams: read continuously, opened again when they end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WAIT_S = 20.0
 
 
 class Stream:
-    """Frames 0, 1, 2, ... as fast as they are taken; ends by itself after `length`, and while `gate` is shut waits."""
+    """Frames 0, 1, 2, ... without delay; it ends after `length` and waits while `gate` is closed."""
 
     def __init__(self, length: int = 10**9):
         self.length, self.frames, self.released = length, 0, False
@@ -48,7 +48,7 @@ class Stream:
         self.released = True
 
 
-def test_frames_are_taken_while_nobody_asks_and_the_newest_is_handed_on():
+def test_frames_are_read_continuously_and_the_newest_is_returned():
     inner = Stream()
     stream = NetworkStream(lambda: inner)
     assert inner.many.wait(WAIT_S), "a hundred frames are read although nobody wants one"
@@ -64,7 +64,7 @@ def test_frames_are_taken_while_nobody_asks_and_the_newest_is_handed_on():
     assert inner.released
 
 
-def test_a_stream_that_ends_is_opened_again_once_for_every_time_that_it_ran():
+def test_a_stream_that_ends_is_reopened_once_per_run():
     streams = [Stream(5), Stream(3), Stream()]
     opened = iter(streams)
     stream = NetworkStream(lambda: next(opened))
@@ -78,7 +78,7 @@ def _gone():
 
 
 @pytest.mark.parametrize("again", [lambda: Stream(0), _gone], ids=["no frame", "not opened"])
-def test_a_stream_that_does_not_come_back_delivers_no_frame(again):
+def test_a_stream_that_cannot_be_reopened_gives_no_frame(again):
     first = Stream(3)
     attempts = iter([lambda: first, again])
     stream = NetworkStream(lambda: next(attempts)())
@@ -92,8 +92,8 @@ def test_a_stream_that_does_not_come_back_delivers_no_frame(again):
 
 
 @pytest.mark.thorough
-def test_a_server_that_drops_idle_viewers_keeps_us(monkeypatch):
-    """As during a homing: nobody grabs until the server has sent more than all buffers between hold."""
+def test_a_server_that_drops_idle_viewers_is_read_continuously(monkeypatch):
+    """As during a homing: no grab until the server has sent more than all buffers hold."""
     monkeypatch.setattr(streamed_camera, "VIEWER_TIMEOUT_S", 0.3)
     rng = np.random.default_rng(0)
     # Noise does not compress: 120 kB a frame, of which sockets hold a hundred at most.

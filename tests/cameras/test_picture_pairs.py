@@ -1,4 +1,4 @@
-"""Which file is of which camera, whatever people call them."""
+"""Assignment of files to cameras by their names."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def named(folder, *names: str) -> list[tuple[str, tuple[str, ...]]]:
         ("cam_left/01_left.png", "cam_right/01_right.png"),
     ],
 )
-def test_the_camera_stands_in_the_name(tmp_path, names):
+def test_the_camera_is_in_the_name(tmp_path, names):
     assert named(tmp_path, *names) == [("01", ("left",)), ("01", ("right",))]
 
 
@@ -55,7 +55,7 @@ def test_two_pictures_of_one_view_and_too_many_are_refused(tmp_path):
         paired_pictures(tmp_path / "absent", most=1)
 
 
-def test_natural_order_counts():
+def test_natural_order_is_numeric():
     assert sorted(["a10", "a9", "b1", "a2b"], key=natural_order) == ["a2b", "a9", "a10", "b1"]
 
 
@@ -93,7 +93,7 @@ def test_names_pair_up(tmp_path, way, swap):
     by_view: dict[str, dict[str, str]] = {}
     for picture in pictures:
         by_view.setdefault(picture.view, {})[picture.sides[0]] = picture.path.relative_to(tmp_path).as_posix()
-    # What names say of left and right stands; a number or a folder does not say it.
+    # Left and right in names decide; a number or a folder does not.
     sides = SIDES[::-1] if swap and way in UNSURE else SIDES
     assert sorted(tuple(pair[side] for side in sides) for pair in by_view.values()) == sorted(NAMES[way])
 
@@ -104,7 +104,7 @@ def test_documented_names_come_first(tmp_path):
 
 
 @pytest.mark.parametrize("names", (("image0.png", "image1.png"), ("wall.png", "floor.png", "sky.png"), ("a_1.png",)))
-def test_frames_of_both_cameras_are_no_pairs(tmp_path, names):
+def test_frames_of_both_cameras_are_refused_as_pairs(tmp_path, names):
     write(tmp_path, names)
     assert {picture.sides for picture in paired_pictures(tmp_path, most=100)} == {SIDES}
 
@@ -117,7 +117,7 @@ def test_links_and_hidden_folders_are_not_followed(tmp_path):
     assert [picture.path.name for picture in paired_pictures(tmp_path / "set", most=100)] == ["left1.png"]
 
 
-def test_other_formats_are_named_with_a_way_out(tmp_path):
+def test_other_formats_are_refused_with_a_remedy(tmp_path):
     write(tmp_path, ["left1.pgm", "right1.pgm"])
     with pytest.raises(InputError, match=r"2 pictures such as left1.pgm; allowed: PNG or JPEG; convert .*\*.pgm"):
         paired_pictures(tmp_path, most=100)
@@ -144,7 +144,7 @@ CLOCKS = ("A/t9.png", "A/t10.png", "B/t11.png", "B/t8.png")
     ],
 )
 def test_pairs_as_stated_go_by_their_order(tmp_path, options, first, second):
-    """Times of 9 and 10 s belong to 8 and 11 s; numbers are counted, and no name pairs up."""
+    """Times of 9 and 10 s belong to 8 and 11 s; files pair by order because no names match."""
     write(tmp_path, CLOCKS)
     pictures = paired_pictures(tmp_path, 4, Pairing(**options))
     by_view: dict[str, dict[str, str]] = {}
@@ -166,8 +166,8 @@ def test_pairs_as_stated_go_by_their_order(tmp_path, options, first, second):
         ({"in_order": True}, "3 at most"),
     ],
 )
-def test_pairs_as_stated_that_are_none_are_refused(tmp_path, options, message):
-    """A pattern that leaves the folder names nothing."""
+def test_impossible_stated_pairs_are_refused(tmp_path, options, message):
+    """A pattern outside of the folder matches nothing."""
     write(tmp_path, CLOCKS)
     with pytest.raises(InputError, match=message):
         paired_pictures(tmp_path, 3, Pairing(**options))

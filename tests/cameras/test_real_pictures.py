@@ -1,4 +1,4 @@
-"""Pictures that others took: stereo pairs and laser beams, whose truth nobody knows but whose laws hold."""
+"""Public pictures of stereo pairs and laser beams without known truth: agreement with OpenCV and among parts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_pairs_are_calibrated_as_opencv_does(views, calibration):
     assert calibration.stereo.rms_px == pytest.approx(theirs.rms_px, rel=1e-4)
     baseline = np.linalg.norm(calibration.stereo.T)
     assert abs(baseline - theirs.baseline_mm) < 0.01 * calibration.baseline_sd_mm
-    # Another program's, with two coefficients fewer: 1.8 standard uncertainties; three would be a find.
+    # Another program's result, with two coefficients fewer: 1.8 standard uncertainties; three would be significant.
     assert abs(baseline - SHIPPED_BASELINE_MM) < 3 * calibration.baseline_sd_mm
 
 
@@ -50,7 +50,7 @@ def test_columns_and_rows_may_be_exchanged(calibration):
     """6 x 4 for 4 x 6: corners in another order in all pictures, the same cameras."""
     pictures = find_views(PAIRS, Board(6, 4, 30.0))
     other = calibrate_stereo(pictures.views, Board(6, 4, 30.0), SIZE)
-    # The classic finder starts at other corners and ends a hundredth of a pixel beside.
+    # The classic finder starts at other corners and ends a hundredth of a pixel away.
     assert abs(other.stereo.rms_px - calibration.stereo.rms_px) < 0.002
     z = (other.stereo.vector - calibration.stereo.vector) / np.sqrt(np.diag(calibration.stereo.parameter_covariance))
     assert np.abs(z).max() < 0.2
@@ -58,7 +58,7 @@ def test_columns_and_rows_may_be_exchanged(calibration):
 
 @pytest.mark.parametrize("names", ("cam{camera}/{view:04d}.jpg", "take_{view}_{letter}.jpg"))
 def test_pairs_of_two_moments_are_refused_by_the_command(tmp_path, capsys, names):
-    """Left k with right k + 1, under other names than ours."""
+    """Left k with right k + 1, under other names."""
     for k in range(11):
         for camera, letter, number in ((0, "L", k + 1), (1, "R", (k + 1) % 11 + 1)):
             place = tmp_path / names.format(camera=camera, letter=letter, view=k)
@@ -85,19 +85,19 @@ def test_pictures_without_the_board_are_named_and_left_out(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", ("t-348mm", "t-770mm", "TEM00_140mm"))
-def test_parts_of_a_beam_agree_as_they_say(name):
+def test_parts_of_a_beam_agree_within_their_sds(name):
     """8 and 16 bits; 30 degrees of freedom: 1 / sqrt(60) of the root, of which three are 0.4."""
     beam = beam_of(BEAMS / f"{name}.png")
     assert beam.statuses == {"ok": 16} and beam.whole.status == "ok"
     assert 0.6 < beam.rms < 1.4
 
 
-def test_deep_pictures_stay_deep():
+def test_deep_pictures_keep_their_bits():
     """1977 different values, far more than 8 bits hold."""
     picture = read_image(BEAMS / "TEM00_140mm.png")
     assert picture.dtype == np.uint16 and len(np.unique(picture)) == 1977
 
 
 @pytest.mark.parametrize("name, reason", (("FBWR_151", "clipped"), ("sb_259mm_10", "two-spots")))
-def test_beams_that_tell_no_centre_are_refused(name, reason):
+def test_beams_without_a_centre_are_refused(name, reason):
     assert beam_of(BEAMS / f"{name}.png").whole.status == reason

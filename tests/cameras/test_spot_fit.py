@@ -1,4 +1,4 @@
-"""The centre of one spot: its covariance, refusals by name, what clipping and neighbours do to it."""
+"""The centre of one spot: its covariance, refusals by name, effects of clipping and neighbours."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ THERE = np.array([210.3, 120.8])
 
 @pytest.mark.parametrize("contrast", [0.0, 0.4])
 def test_propagation_of_known_noise(contrast):
-    """200 pictures whose noise is known: what remains is how the fit passes it on."""
+    """200 pictures with known noise: the test is of its propagation by the fit."""
     rng, scene, chi2 = np.random.default_rng(8), Scene(speckle_contrast=contrast), []
     for number in range(200):
         centre = np.array([40.0, 32.0]) + rng.uniform(-1, 1, 2)
@@ -73,7 +73,7 @@ def test_all_reasons_are_tested():
     assert set(REASONS) - set(REFUSED) == {"epipolar", "unfitted"}
 
 
-def test_a_window_in_the_corner_moves_no_spot():
+def test_a_window_in_the_corner_does_not_shift_a_spot():
     """The centre is that of the dark picture to a quarter of its sd: the background is estimated from other pixels."""
     frame = picture(Footprint(HERE, SMALL, 180.0))
     dark, lit = (find_spot(image, SpotNoise(0.04, 0)) for image in (frame, window(frame)))
@@ -81,7 +81,7 @@ def test_a_window_in_the_corner_moves_no_spot():
     assert np.abs(lit.centre_px - dark.centre_px).max() < 0.25 * np.sqrt(dark.covariance_px2.max())
 
 
-def test_a_weak_second_reflection_and_a_gradient_do_no_harm():
+def test_a_weak_second_reflection_and_a_gradient_are_harmless():
     steep = Scene(speckle_contrast=0.0, ambient_dn=60.0, ambient_gradient_dn=100.0)
     spot = find_spot(
         picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 25.0), scene=steep), SpotNoise(0.04, 0)
@@ -114,7 +114,7 @@ def test_neighbours_of_clipped_pixels_are_not_used():
 
 
 def test_correlation_follows_a_turned_spot():
-    """A long spot at 45 degrees is known worse along itself: u and v errors go together."""
+    """A long spot at 45 degrees is less certain along its axis: errors in u and v are correlated."""
     turned = np.array([[20.0, 14.0], [14.0, 20.0]])
     for sign in (1, -1):
         cov = find_spot(
@@ -136,8 +136,8 @@ def beam(rng: np.random.Generator, white: int, gain_dn: float = 0.03) -> np.ndar
 
 
 @pytest.mark.parametrize("white", (255, 4095, 65535))
-def test_pixels_of_a_wide_beam_tell_its_uncertainty(white):
-    """No truth: sixteen pictures of every fourth row and column must agree as they say, whatever the bits."""
+def test_pixels_of_a_wide_beam_give_its_uncertainty(white):
+    """Without truth: sixteen pictures of every fourth row and column agree within their sds, at any bit depth."""
     picture_of = beam(np.random.default_rng(white), white)
     centres, variances = [], []
     for row in range(4):
@@ -150,13 +150,13 @@ def test_pixels_of_a_wide_beam_tell_its_uncertainty(white):
     # 30 degrees of freedom: 1 / sqrt(60) of the root; four of them would be 0.52.
     assert 0.6 < np.sqrt(np.sum(z**2) / 30) < 1.4
     whole = find_spot(picture_of)
-    # Four times the pixels each way; the whole has no other centre than its parts.
+    # Four times the pixels each way; the whole has the centre of its parts.
     assert np.sqrt(np.mean(variances) / np.trace(whole.covariance_px2) * 2) == pytest.approx(4, rel=0.3)
     assert np.abs(whole.centre_px - np.mean(centres, axis=0)).max() < 0.05
 
 
 def test_a_beam_far_from_its_shape_is_refused():
-    """Half of it cut off by an edge: no shape of a beam."""
+    """Half of it cut off by an edge is no shape of a beam."""
     cut = beam(np.random.default_rng(1), 255)
     cut[:, 240:] = np.minimum(cut[:, 240:], 3)
     assert find_spot(cut).status != "ok"

@@ -1,4 +1,4 @@
-"""The noise of pixels: what demosaicing makes of it, and what is learned of it."""
+"""The noise of pixels: effect of demosaicing, and estimation from spots."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ def test_noise_through_demosaicing_has_the_correlation_that_is_assumed():
 
 
 SHAPE = np.array([50.0, -20.0, 0.0, 100.0])
-"""A beam's own skews, which every look shows: no noise."""
+"""A beam's own skews, common to all looks, are no noise."""
 
 
-def test_noise_is_learned_from_skews_drawn_from_it():
+def test_noise_is_estimated_from_skews_drawn_from_it():
     rng = np.random.default_rng(3)
     parts = np.column_stack((rng.uniform(1, 2, 400), rng.uniform(50, 200, 400), rng.uniform(5e3, 2e4, 400)))
     for gain, contrast in ((0.04, 0.0), (0.05, 0.4)):
         variance = parts @ [1.0, gain, contrast**2]
         skews = np.tile(SHAPE, 100) + rng.normal(0, np.sqrt(variance))
         learned = learn_noise(np.column_stack((skews, parts)).reshape(100, 4, 4))
-        # 400 squares tell a variance to sqrt(2 / 400) = 7 %; what of it is gain and what contrast^2 they tell less.
+        # 400 squares determine a variance to sqrt(2 / 400) = 7 %; its parts by gain and contrast^2 less.
         prediction = parts @ [1.0, learned.gain_dn, learned.speckle_contrast**2]
         assert prediction.mean() == pytest.approx(variance.mean(), rel=4 * np.sqrt(2 / 400))
         # A median of 100 values is known to 1.25 sds / 10; four of them.

@@ -81,7 +81,7 @@ def sds(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.diag(covariance))
 
 
-def test_thinned_study_finds_the_covariance_true():
+def test_thinned_study_confirms_the_covariance():
     """Four rigs, 96 degrees of freedom, bounds at 1e-4 from their number; sds 0.7 times as large would fail."""
     rows = [calibrate(("white", seed), VIEWS) for seed in range(4)]
     total = sum(row["chi2"] for row in rows)
@@ -95,7 +95,7 @@ def test_thinned_study_finds_the_covariance_true():
 
 @pytest.mark.parametrize("off_mm", (0.0, 0.2))
 def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
-    """Corners off in all pictures alike: the residuals tell by how much, and the parameters miss by what is stated."""
+    """Corners displaced alike in all pictures: the residuals give the size, and parameters err by the stated sds."""
     total, alone = 0.0, 0.0
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -107,7 +107,7 @@ def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
             moved = np.einsum("qca,ca->cq", _corner_slopes(view, BOARD, scene.stereo), away)
             views.append(replace(view, left=view.left + moved[:, :2], right=view.right + moved[:, 2:]))
         result = calibrate_stereo(views, BOARD, SIZE)
-        # 155 displacements tell their sd to 6 %; three of them, and what noise of the corners leaves open.
+        # 155 displacements determine their sd to 6 %; three of them, and the noise of the corners.
         assert abs(result.board_error_mm - off_mm) < 0.02 + 3 * 0.06 * off_mm
         missed = result.stereo.vector - drawn[0].stereo.vector
         total += chi2(missed, result.stereo.parameter_covariance)
@@ -127,7 +127,7 @@ def test_errors_that_corners_share_are_in_the_covariance():
 
 
 def test_pitch_is_a_separable_type_b_term():
-    """T is off by the pitch's error, and the stated uncertainty holds it."""
+    """T errs by the pitch's error, which the stated uncertainty covers."""
     row = calibrate(("pitch", 0), VIEWS)
     low, high = stats.chi2(24).ppf([5e-5, 1 - 5e-5])
     assert low < row["chi2"] < high
@@ -176,8 +176,8 @@ def test_single_camera_agrees_with_opencv(pairs, side):
 
 
 @pytest.mark.slow
-def test_halves_of_the_real_pairs_agree_as_they_say(pairs):
-    """No truth needed: two independent halves differ by what both state; independent corners would state too little."""
+def test_halves_of_the_real_pairs_agree_within_their_sds(pairs):
+    """Without truth: two independent halves differ within both sds; independent corners would understate them."""
     rng = np.random.default_rng(0)
     stored, independent = [], []
     for _ in range(2):
@@ -250,7 +250,7 @@ def test_lengths_follow_the_pitch_and_nothing_else_does(views, calibration):
     np.testing.assert_allclose(doubled.stereo.parameter_covariance, stored, rtol=1e-9, atol=1e-30)
 
 
-def test_exact_corners_give_the_truth(drawn, exact):
+def test_exact_corners_give_the_true_parameters(drawn, exact):
     # Rounding of 1e3 px and condition numbers of 1e3 leave ten digits of the largest entries.
     np.testing.assert_allclose(exact.stereo.vector, drawn[0].stereo.vector, rtol=1e-6, atol=1e-7)
     assert exact.stereo.rms_px < 1e-8
@@ -284,7 +284,7 @@ def test_pictures_all_of_two_moments_are_refused(views):
 
 @pytest.mark.parametrize("moved_px, doubt", ((0.0, "none"), (0.5, "warned"), (3.0, "refused")))
 def test_a_board_that_moved_between_the_two_pictures(views, moved_px, doubt):
-    """Each camera by itself sees nothing of it: the pair does."""
+    """Each camera alone does not show it; the pair does."""
     rng = np.random.default_rng(4)
     moved = [replace(view, right=view.right + rng.normal(0, moved_px, 2)) for view in views]
     if doubt == "refused":
@@ -297,7 +297,7 @@ def test_a_board_that_moved_between_the_two_pictures(views, moved_px, doubt):
 
 
 @pytest.mark.parametrize("which", (slice(5, 6), slice(0, None), slice(0, None, 2)))
-def test_corners_in_another_order_are_put_right_and_named(views, calibration, which):
+def test_corners_in_another_order_are_reordered_and_named(views, calibration, which):
     """One view, every view (a camera upside down), every second one: of two half turns the fewer, or the named."""
     turn = corner_orders(BOARD)[1]
     names = {view.name for view in views[which]}
@@ -308,7 +308,7 @@ def test_corners_in_another_order_are_put_right_and_named(views, calibration, wh
 
 
 def test_doubtful_view_is_named_and_left_out_on_request(views, without_the_sixth):
-    """One picture with corners off by 1 px: named, kept; with `robust` as if it were not there."""
+    """One picture with corners off by 1 px: named and kept; left out with `robust`."""
     rng = np.random.default_rng(9)
     doubtful = replace(views[5], left=views[5].left + rng.normal(0, 1.0, (54, 2)))
     wrong = [*views[:5], doubtful, *views[6:]]
@@ -319,7 +319,7 @@ def test_doubtful_view_is_named_and_left_out_on_request(views, without_the_sixth
     np.testing.assert_allclose(robust.stereo.vector, without_the_sixth.stereo.vector, rtol=1e-6, atol=1e-9)
 
 
-def test_views_of_one_camera_inform_that_camera(views, calibration):
+def test_views_of_one_camera_are_used_for_that_camera(views, calibration):
     half = [view if k % 2 else replace(view, right=None) for k, view in enumerate(views)]
     result = calibrate_stereo(half, BOARD, SIZE)
     only = calibrate_stereo([view for view in half if view.right is not None], BOARD, SIZE)
@@ -343,7 +343,7 @@ def test_fixed_k3_has_no_variance(drawn, views):
     parse_stereo(stereo_bytes(result.stereo), "stereo.json")
 
 
-def test_too_little_is_refused_in_words(views):
+def test_too_few_views_are_refused_in_words(views):
     with pytest.raises(NothingToEstimate, match="2 pictures of the left camera"):
         calibrate_stereo(views[:2], BOARD, SIZE)
     apart = [replace(v, **{("left", "right")[k % 2]: None}) for k, v in enumerate(views)]
@@ -404,7 +404,7 @@ def ask(capsys, tmp_path):
         yield run_json
 
 
-def test_command_writes_what_it_says(ask, tmp_path):
+def test_command_writes_its_files(ask, tmp_path):
     """Six perfect pictures of a known pair: baseline within its interval, files readable, exit 0."""
     for k, pose in enumerate(POSES):
         write_pair(tmp_path, str(k), pictures(pose))
@@ -467,8 +467,8 @@ def test_command_names_the_missing_option(ask, tmp_path, options, missing):
 
 
 @pytest.mark.parametrize("there", ("stereo.json", "intrinsics.yml"))
-def test_command_replaces_no_file(ask, tmp_path, there):
-    """Not even before the work: the folder holds no pictures, which would be refused otherwise."""
+def test_command_does_not_replace_files(ask, tmp_path, there):
+    """It is refused before the work: the folder has no pictures, which would be refused later."""
     (tmp_path / there).write_text("kept")
     pictures_or_file = (tmp_path, "--board", "7x6", "--pitch-mm", "25"), ("--import", MOUNTED / "stereo.json")
     for source in pictures_or_file:
@@ -489,8 +489,8 @@ def test_command_warns_of_an_implausible_import(ask, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("falls", [0, 1, RESTARTS_MAX, RESTARTS_MAX + 1])
-def test_the_end_that_counts_was_repeated(monkeypatch, falls):
-    """Every descent ends lower than the one before, so many times: the last end is compared with another one's."""
+def test_the_accepted_end_was_repeated(monkeypatch, falls):
+    """Every descent ends lower than the one before: the last end is compared with another one."""
     ends = [_End(np.full(24, float(k)), np.full(8, 0.5 ** min(k, falls)), np.zeros((8, 24))) for k in range(9)]
     following = iter(ends[1:])
     monkeypatch.setattr("tvsbayes.cameras.bundle_adjustment._descended", lambda z, arrays: next(following))

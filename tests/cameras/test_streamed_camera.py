@@ -16,7 +16,7 @@ from tvsbayes.errors import DeviceFault
 WIDTH, HEIGHT = 64, 48
 
 
-def test_viewer_that_says_nothing_does_not_hold_the_streamed_camera(monkeypatch):
+def test_a_silent_viewer_does_not_block_the_streamed_camera(monkeypatch):
     monkeypatch.setattr("support.streamed_camera.VIEWER_TIMEOUT_S", 0.2)
     with StreamedCamera(lambda: None) as virtual:
         host, port = virtual.address.split("/")[2].split(":")
@@ -41,9 +41,9 @@ def test_streamed_camera_without_a_port_leaves_the_environment_alone(monkeypatch
 
 
 def test_stream_over_http_from_rendering_to_pictures(monkeypatch):
-    """Every frame carries its number as grey level on both sides; a grab never returns one rendered before it.
+    """Every frame has its number as grey level on both sides; a grab never returns one rendered before it.
 
-    Whatever proxy the environment names: FFmpeg would ask it for this computer's own address.
+    FFmpeg does not use a proxy of the environment for the loopback address.
     """
     monkeypatch.setenv("http_proxy", "http://proxy.invalid:3128")
     monkeypatch.delenv("no_proxy", raising=False)
