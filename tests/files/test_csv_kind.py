@@ -1,4 +1,4 @@
-"""Kinds of CSV files: one declaration reads, writes and explains."""
+"""Kinds of CSV files: one declaration for reader, writer and documentation."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def refused(rows: str) -> InputError:
     return caught.value
 
 
-def test_a_file_is_read_as_it_was_written():
-    """Optional columns stand there by groups, only where one is not at its default."""
+def test_a_csv_file_round_trips():
+    """Groups of optional columns are written only where one is not at its default."""
     plain = [Weight(row=0, segment=0, side="left", mass_g=0.1), Weight(row=1, segment=0, status="lost")]
     assert WEIGHTS.content(plain).decode() == f"{HEADER}\n0,0,left,0.1,ok\n1,0,,,lost\n"
     limited = [plain[0], Weight(row=1, segment=1, side="right", mass_g=3.0, high_g=2.5)]
@@ -56,7 +56,7 @@ def test_a_file_is_read_as_it_was_written():
     assert WEIGHTS.parse(emptied, "weights.csv") == tuple(limited), "an empty cell is the default"
 
 
-def test_what_is_wrong_is_refused_at_its_cell():
+def test_errors_are_refused_at_their_cell():
     for rows, line, column, code in (
         ("", 1, None, "empty"),
         ("1,0,left,1,ok", 2, "row", "order"),

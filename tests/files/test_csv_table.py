@@ -47,7 +47,7 @@ def test_other_numbers_are_refused(cell, empty_elsewhere):
         assert len(caught.value.message) < 400
 
 
-def test_decimal_comma_is_taught():
+def test_decimal_comma_is_refused_with_a_remedy():
     with pytest.raises(InputError, match="decimal point, not a comma"):
         parse_table(b'x\n"9,4"\n', "t.csv", ("x",)).numbers("x", float, 0.0, 10.0)
     with pytest.raises(InputError, match="a decimal comma splits a number in two"):
@@ -125,18 +125,18 @@ def test_csv_round_trip_keeps_every_digit():
     assert table.texts("t") == ['a "quoted", cell'] * 4
 
 
-def test_lines_are_added_under_one_head(tmp_path):
+def test_lines_are_appended_under_one_header(tmp_path):
     path = tmp_path / "t.csv"
     append_line(path, ("a", "b"), (1, "x, y"))
     append_line(path, ("a", "b"), (2, None))
     assert path.read_bytes() == b'a,b\n1,"x, y"\n2,\n'
-    # Somebody's editor took the last newline.
+    # An editor removed the last newline.
     path.write_bytes(b"a,b\r\n1,2")
     append_line(path, ("a", "b"), (3, 4))
     assert path.read_bytes() == b"a,b\r\n1,2\n3,4\n"
 
 
-def test_another_table_is_kept_as_it_is(tmp_path):
+def test_another_table_is_unchanged(tmp_path):
     path = tmp_path / "t.csv"
     path.write_bytes(b"other\n1\n")
     with pytest.raises(InputError) as refused:
@@ -145,7 +145,7 @@ def test_another_table_is_kept_as_it_is(tmp_path):
     assert path.read_bytes() == b"other\n1\n"
 
 
-def test_a_full_disk_leaves_no_part_of_a_line(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_no_partial_line(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     append_line(path, ("a",), ("kept",))
     write = os.write

@@ -1,4 +1,4 @@
-"""Bytes read under a cap, files written whole or not at all."""
+"""Reading with a size limit, writing of complete files or none."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_interrupted_write_leaves_the_old_file_whole(tmp_path, monkeypatch, brok
 @pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
 @pytest.mark.parametrize(("number", "fails"), [(errno.EINVAL, False), (errno.ENOTSUP, False), (errno.EIO, True)])
 def test_a_folder_that_cannot_be_flushed(tmp_path, monkeypatch, number, fails):
-    """Some network shares flush files only; a disk that fails is another matter."""
+    """Some network shares flush files only; a failing disk is an error."""
     flush = os.fsync
 
     def files_only(descriptor):
@@ -111,8 +111,8 @@ def test_shipped_data_lies_beside_a_checkout_or_inside_a_wheel():
     assert data.name == "data" and data.parent.name in ("tvsbayes", package.parent.name)
 
 
-def test_a_place_for_results_is_tried_before_the_work(tmp_path):
-    """Nothing is made, nothing left; a file in its way is named as what it is."""
+def test_a_place_for_results_is_checked_before_the_work(tmp_path):
+    """Nothing is created; a file in place of the folder is named."""
     require_writable(tmp_path / "a" / "results")
     require_writable(tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -46,8 +46,8 @@ def test_hostile_toml(name):
         assert caught.value.line == line
 
 
-def test_a_table_that_stands_twice_is_named_with_both_lines():
-    """A template has [rig.prior]; a second one below it is what people add."""
+def test_a_duplicate_table_is_named_with_both_lines():
+    """A template has [rig.prior]; users add a second one below it."""
     text = b"[rig]\nname = 'a'\n[rig.prior]\nx = 1\n[motion]\n[rig.prior]\ny = 1\n"
     with pytest.raises(
         InputError, match=r"line 6: found the table \[rig\.prior\] a second time, first in line 3"
@@ -142,7 +142,7 @@ def test_toml_messages_name_the_line_of_the_key_itself(name):
     assert keys.refuse(path[-1], "code", "allowed", "remedy").line == line
 
 
-def test_lines_are_looked_for_in_the_beginning_of_a_file_alone():
+def test_lines_are_searched_at_the_beginning_of_a_file_alone():
     text = '{"a": {"c": 1},\n"b": "' + " " * LINES_CHARS_MAX + '",\n"c": {"a": 1}}'
     values = parse_json(text.encode(), "t.json")
     assert [values.refuse(key, "code", "allowed", "remedy").line for key in ("a", "b", "c")] == [1, 2, None]

@@ -1,4 +1,4 @@
-"""Tables of other programs: encodings, separators, decimal commas, XLSX; what is no table is refused."""
+"""Tables of other programs: encodings, separators, decimal commas, XLSX, refusals."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def test_every_notation_gives_the_same_table(tmp_path, encoding, separator, poin
     assert ("decimal commas" in table.kind) == (point == ",")
 
 
-def test_marks_between_thousands_go_and_mixed_points_stay(tmp_path):
+def test_thousands_separators_are_removed_and_mixed_points_kept(tmp_path):
     assert written(tmp_path / "a.csv", b"x;y\n1.024,50;a\n2,25;b\n").columns["x"] == ("1024.50", "2.25")
     assert written(tmp_path / "b.csv", b"x;y\n1,024.50;a\n").columns["x"] == ("1024.50",)
     assert written(tmp_path / "c.csv", b"x;y\n1,5;a\n1.5;b\n").columns["x"] == ("1,5", "1.5")
 
 
 def test_remarks_empty_lines_and_missing_names(tmp_path):
-    """Lines are those of the file; a table without names gets numbers; a stated separator counts."""
+    """Lines are those of the file; columns without names get numbers; a stated separator is used."""
     table = written(tmp_path / "a.csv", b"sep=;\n# bench 3\n\n1;2,5\n3;4,5\n;\n")
     assert table.columns == {"column 1": ("1", "3"), "column 2": ("2.5", "4.5")}
     assert table.lines == (4, 5) and table.first_line == 4
@@ -62,7 +62,7 @@ def test_remarks_empty_lines_and_missing_names(tmp_path):
     ],
 )
 def test_rows_with_more_cells_than_names_are_refused(tmp_path, lines, line, counts, cause):
-    """Every cell after a divided one would stand under a wrong name."""
+    """Every cell after a split one would be under a wrong name."""
     with pytest.raises(InputError) as refused:
         written(tmp_path / "t.csv", lines.encode())
     assert refused.value.line == line and counts in refused.value.message and cause in refused.value.remedy
@@ -70,7 +70,7 @@ def test_rows_with_more_cells_than_names_are_refused(tmp_path, lines, line, coun
 
 @pytest.mark.parametrize("above", ["bench 3\n", "Serial;117\n\nOperator: A. B.\n", "a\n" * 30])
 def test_lines_above_the_names_are_left_out(tmp_path, above):
-    """And said; a short table below them is one too."""
+    """They are reported; a short table below them is read."""
     for rows in (20, 4):
         table = written(tmp_path / "t.csv", (above + "n;v;w\n" + "1;2,5;3\n" * (rows + above.count("\n"))).encode())
         assert list(table.columns) == ["n", "v", "w"] and set(table.columns["v"]) == {"2.5"}
@@ -105,7 +105,7 @@ def test_remarks_in_few_rows_hide_no_names_below_other_lines(tmp_path):
     ],
 )
 def test_lines_of_a_serial_monitor(tmp_path, text, columns):
-    """A name that comes again begins a row; a clock becomes seconds, also past midnight."""
+    """A repeated name begins a row; a clock becomes seconds, also past midnight."""
     table = written(tmp_path / "t.txt", text.encode())
     assert table.columns == (columns or {"Target": ("0", "5", "9"), "Read (deg)": ("1.5", "", "2")})
     assert ("1 other line left out" in table.kind) == text.startswith("boot")
@@ -135,7 +135,7 @@ def test_sheets_of_a_workbook(tmp_path):
 
 
 def test_numbers_of_a_workbook_beside_texts_with_decimal_commas(tmp_path):
-    """Cells that are numbers have no notation: texts beside them are read by their own."""
+    """Numeric cells have no notation; texts beside them are read by theirs."""
     book = openpyxl.Workbook()
     for row in (("t", "XL", "n"), (61.5, "885,203", 7), (62.25, "1.024,5", "8")):
         book.active.append(row)
@@ -149,7 +149,7 @@ def test_numbers_of_a_workbook_beside_texts_with_decimal_commas(tmp_path):
 
 
 def bomb() -> bytes:
-    """A workbook that says it unpacks to a megabyte."""
+    """A workbook with a stated unpacked size of a megabyte."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("xl/workbook.xml", bytes(1_000_000))
@@ -168,7 +168,7 @@ def workbook(sheet: str) -> bytes:
     return output.getvalue()
 
 
-def test_a_stated_size_of_a_sheet_is_not_believed(tmp_path):
+def test_a_stated_size_of_a_sheet_is_not_trusted(tmp_path):
     cell = '<sheetData><row r="1"><c r="A1"><v>1</v></c></row></sheetData>'
     table = written(tmp_path / "t.xlsx", workbook(f'<dimension ref="A1:XFD1048576"/>{cell}'))
     assert table.columns == {"column 1": ("1",)}
@@ -196,7 +196,7 @@ LAST = '<sheetData><row r="1048576"><c r="A1048576"><v>1</v></c></row></sheetDat
     ],
     ids=["empty", "xls", "zip", "bomb", "last row", "entity", "png", "quote", "break", "sep", "wide", "long"],
 )
-def test_what_is_no_table_is_refused(tmp_path, monkeypatch, data, match):
+def test_files_that_are_no_table_are_refused(tmp_path, monkeypatch, data, match):
     monkeypatch.setattr(foreign_table, "UNPACKED_BYTES_MAX", 999_999)
     with pytest.raises(InputError, match=match):
         written(tmp_path / "t.csv", data)

@@ -1,4 +1,4 @@
-"""PNG and JPEG: sizes before anything is decoded, damage refused."""
+"""PNG and JPEG: size limits before decoding, refusal of damaged files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def refused(data: bytes) -> InputError:
     return caught.value
 
 
-def test_a_png_comes_back_to_the_bit(tmp_path):
+def test_a_png_round_trips_to_the_bit(tmp_path):
     pixels = picture()
     (tmp_path / "a.png").write_bytes(png_bytes(pixels))
     np.testing.assert_array_equal(read_image(tmp_path / "a.png", tmp_path), pixels)
@@ -78,7 +78,7 @@ def test_a_picture_bomb_is_refused_by_its_header():
 
 
 @pytest.mark.parametrize("data", [b"", b"GIF89a" + bytes(60), b"BM" + bytes(60), b"II*\0" + bytes(60), b"\xff\xd8\xff"])
-def test_other_formats_are_refused_whatever_they_are_called(data):
+def test_other_formats_are_refused_under_any_name(data):
     assert refused(data).code == "image"
 
 
@@ -96,7 +96,7 @@ def test_jpegs_of_unusual_kinds_are_refused():
         refused(data[:length])
 
 
-def test_deep_pngs_keep_every_bit_and_are_half_as_large():
+def test_deep_pngs_keep_every_bit_at_half_the_size():
     deep = picture().astype(np.uint16) * 16 + 5
     np.testing.assert_array_equal(decode_image(png_bytes(deep), "a.png"), deep)
     np.testing.assert_array_equal(decode_image(png_bytes(deep[..., 0]), "a.png"), np.repeat(deep[..., :1], 3, axis=2))
@@ -109,7 +109,7 @@ def test_deep_pngs_keep_every_bit_and_are_half_as_large():
 
 
 def test_grey_levels_of_deep_pictures():
-    """Full scale is 255 whatever the converter's bits; eight bits stay what they are."""
+    """Full scale is 255 at any bit depth; eight bits are unchanged."""
     shallow = picture()
     assert in_grey_levels(shallow) is shallow
     assert [white_level(value) for value in (0, 255, 256, 1023, 4000, 4095, 4096, 65535)] == [
@@ -129,7 +129,7 @@ def test_links_out_of_the_folder_are_refused(tmp_path):
     assert caught.value.code == "path"
 
 
-def test_pictures_are_small_and_the_window_stands_on_the_spot():
+def test_pictures_are_small_and_the_window_is_on_the_spot():
     image = np.zeros((720, 1280, 3), np.uint8)
     image[300:303, 700:703] = 250
     whole = decode_image(small_picture(image), "whole")

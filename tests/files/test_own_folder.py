@@ -1,4 +1,4 @@
-"""Sealed files: what is not exactly what this user wrote is not there."""
+"""Sealed files: only unchanged files of this user are read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def folder(tmp_path) -> OwnFolder:
     return OwnFolder(tmp_path / "own")
 
 
-def test_what_was_written_is_read(folder):
+def test_a_sealed_file_round_trips(folder):
     assert folder.read("a") is None and folder.fault() == "it does not exist"
     assert folder.write("a", b"content") and folder.write("empty", b"")
     assert folder.read("a") == b"content" and folder.read("empty") == b"" and folder.read("b") is None
@@ -27,7 +27,7 @@ def test_what_was_written_is_read(folder):
 
 
 @pytest.mark.parametrize("place", [0, len(MAGIC) - 1, len(MAGIC), len(MAGIC) + 31, len(MAGIC) + 32, -1])
-def test_one_wrong_byte_is_seen(folder, place):
+def test_one_wrong_byte_is_detected(folder, place):
     folder.write("a", b"content")
     data = bytearray((folder.path / "a").read_bytes())
     data[place] ^= 1
@@ -36,7 +36,7 @@ def test_one_wrong_byte_is_seen(folder, place):
 
 
 @pytest.mark.parametrize("length", [0, 5, len(MAGIC) + 10, len(MAGIC) + 32, -1])
-def test_a_truncated_file_is_seen(folder, length):
+def test_a_truncated_file_is_detected(folder, length):
     folder.write("a", b"content")
     whole = (folder.path / "a").read_bytes()
     (folder.path / "a").write_bytes(whole[:length])
@@ -54,7 +54,7 @@ def test_only_the_user_may_write(folder):
 
 @posix
 @pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
-def test_a_folder_into_which_others_write_is_not_trusted(folder, mode):
+def test_a_folder_writable_by_others_is_not_trusted(folder, mode):
     folder.write("a", b"content")
     folder.path.chmod(mode)
     assert folder.read("a") is None and not folder.write("b", b"more")
@@ -65,7 +65,7 @@ def test_a_folder_into_which_others_write_is_not_trusted(folder, mode):
 
 @posix
 @pytest.mark.parametrize("mode", [0o620, 0o602])
-def test_a_file_into_which_others_write_is_not_trusted(folder, mode):
+def test_a_file_writable_by_others_is_not_trusted(folder, mode):
     folder.write("a", b"content")
     (folder.path / "a").chmod(mode)
     assert folder.read("a") is None
@@ -73,8 +73,8 @@ def test_a_file_into_which_others_write_is_not_trusted(folder, mode):
 
 @posix
 @pytest.mark.parametrize("which", ["folder", "file"])
-def test_what_belongs_to_somebody_else_is_not_trusted(folder, which, monkeypatch):
-    """A test cannot give files away unless it is root: the system's answer is changed instead."""
+def test_files_of_another_user_are_not_trusted(folder, which, monkeypatch):
+    """Only root can change the owner of a file: the system's answer is replaced instead."""
     folder.write("a", b"content")
     real = {"folder": os.lstat, "file": os.fstat}[which]
 
@@ -107,7 +107,7 @@ def test_sizes_are_capped(tmp_path):
     assert small.read("a") is None and OwnFolder(small.path).read("a") == b"x" * 100
 
 
-def test_what_was_used_longest_ago_goes_first(tmp_path):
+def test_the_least_recently_used_file_is_removed_first(tmp_path):
     size = 1000
     # Three of them with their seals; a fourth is too many.
     folder = OwnFolder(tmp_path / "own", bytes_max=3 * (size + 100))
@@ -126,7 +126,7 @@ def test_a_place_that_cannot_be_written_is_no_error(tmp_path):
     assert folder.fault()
 
 
-def test_a_full_disk_leaves_nothing_behind(folder, monkeypatch):
+def test_a_full_disk_leaves_no_file(folder, monkeypatch):
     folder.write("a", b"content")
 
     def full(*_):
