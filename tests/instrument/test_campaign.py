@@ -61,8 +61,8 @@ def test_numpy_scalars_are_written_as_numbers(tmp_path):
     assert_same(numpy_like, read_campaign(tmp_path / "c"))
 
 
-def test_a_look_that_found_nothing_may_be_taken_again(tmp_path):
-    """The same point of the experiment, and its correlations empty like its pixels; `classic` takes the one seen."""
+def test_a_look_without_a_spot_may_be_repeated(tmp_path):
+    """The same point of the experiment; correlations and pixels are empty; `classic` uses the look with a spot."""
     campaign = small_campaign()
     lost = dataclasses.replace(campaign.spots[6], experiment=3, point=1)
     write_campaign(dataclasses.replace(campaign, spots=(*campaign.spots[:6], lost)), tmp_path / "c")
@@ -86,7 +86,7 @@ def test_write_refuses_a_folder_with_files(tmp_path):
         write_campaign(small_campaign(), tmp_path / "notes.txt")
 
 
-def test_write_refuses_what_read_would(tmp_path):
+def test_write_refuses_campaigns_that_read_refuses(tmp_path):
     campaign = small_campaign()
     wrong = {
         "nan": {"spots": (dataclasses.replace(campaign.spots[0], u_left_px=float("nan")),)},
@@ -101,7 +101,7 @@ def test_write_refuses_what_read_would(tmp_path):
         assert not (tmp_path / name).exists()
 
 
-def test_truth_frames_results_and_strangers_are_not_read(tmp_path):
+def test_truth_frames_results_and_other_files_are_not_read(tmp_path):
     write_campaign(small_campaign(), tmp_path / "c")
     (tmp_path / "c" / "truth.json").write_bytes(b"\xff no JSON at all")
     (tmp_path / "c" / "frames").mkdir()
@@ -131,8 +131,8 @@ def test_a_campaign_may_have_no_spots_yet(tmp_path):
     assert read_campaign(tmp_path / "c").spots == ()
 
 
-def test_a_campaign_has_the_title_that_somebody_chose():
-    """Else that of its folder; what earlier templates wrote was chosen by nobody, and a folder's name is untrusted."""
+def test_a_campaign_has_its_stated_title():
+    """Otherwise that of its folder; titles of earlier templates are ignored, and a folder's name is untrusted."""
     campaign = dataclasses.replace(small_campaign(), path=Path("/data/rig 7"))
     for name, title in (
         ("bench B", "bench B"),
@@ -146,7 +146,7 @@ def test_a_campaign_has_the_title_that_somebody_chose():
     assert dataclasses.replace(campaign, header={}, path=Path("/data/a\nb")).title.isprintable()
 
 
-def test_hashes_cover_the_data_and_not_the_names(tmp_path):
+def test_hashes_cover_data_and_no_names(tmp_path):
     campaign = small_campaign()
     reference = input_hashes(campaign)
     assert set(reference) == {"moves", "spots", "stereo", "rig"}
@@ -225,7 +225,7 @@ def test_a_refused_spot_keeps_its_pixels(tmp_path):
 
 
 def test_records_are_hashable_and_small():
-    # Frozen, slotted records: 40 000 spots stay cheap and cannot be changed behind an estimator's back.
+    # Frozen, slotted records: 40 000 spots are small and cannot be changed during an estimate.
     assert not hasattr(small_campaign().spots[0], "__dict__")
     with pytest.raises(dataclasses.FrozenInstanceError):
         small_campaign().spots[0].u_left_px = 1.0  # type: ignore[misc]

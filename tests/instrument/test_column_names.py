@@ -1,4 +1,4 @@
-"""Which column of somebody's table is which of our fields."""
+"""Assignment of the columns of a foreign table to fields."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ COUNTER_NAMES = [
 
 @pytest.mark.parametrize("names", COUNTER_NAMES, ids=[" ".join(names) for names in COUNTER_NAMES])
 def test_counters_in_four_languages(names):
-    """A word that is known of one axis is known of the other one too."""
+    """A word known for one axis is known for the other one too."""
     assert map_columns(names).columns == dict(zip(COUNTERS, names, strict=True))
 
 
@@ -73,7 +73,7 @@ def test_other_fields_in_four_languages():
         assert map_columns(names).columns == dict(zip(fields, names, strict=True))
 
 
-def test_our_own_names_and_other_words():
+def test_native_names_and_other_words():
     assert map_columns(SPOTS.columns).columns == {name: name for name in SPOTS.columns}
     mapping = map_columns(["steps pan", "TiltCount", "t (ms)", "Blatt", "B (rad)", "pan_approach", "remark"])
     assert mapping.columns == {
@@ -108,7 +108,7 @@ def test_units_in_names():
     assert [unit_of_name(name, READING_UNITS) for name in readings] == ["um", "um", "um", "nm", "counts", "urad", None]
 
 
-def test_what_two_columns_claim_is_asked_for():
+def test_a_field_of_two_columns_is_ambiguous():
     mapping = map_columns(["pan_pos", "pan_goal", "tilt"])
     assert mapping.ambiguous == {"pan_steps": ("pan_pos", "pan_goal")}
     assert "pan_steps" not in mapping.columns
@@ -120,7 +120,7 @@ def test_what_two_columns_claim_is_asked_for():
             map_columns(["pan_pos", "tilt"], stated)
 
 
-def test_what_a_table_must_have():
+def test_required_columns_of_a_table():
     assert missing(["u_left_px"], moves_known=True) == list(PIXELS[1:])
     assert missing(["u_left_px"], moves_known=False) == [*PIXELS[1:], *COUNTERS]
     assert missing(["pan_steps"], moves_known=False) == ["tilt_steps"]

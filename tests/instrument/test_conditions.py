@@ -1,4 +1,4 @@
-"""How long the machine was on and how warm, at every move; what the moves then tell of shifts of the zeros."""
+"""Minutes since power-on and temperature at every move; the shifts of the zeros that moves determine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CREATED = "created = 2026-01-15T10:00:00Z\n"
 
 
 def moves_at(times_s: list[float], degC: list[float | None] | None = None) -> list[Move]:
-    """Moves of nothing at these times."""
+    """Moves of zero steps at these times."""
     rows = [Move(move=k, segment=0, time_s=t, pan_steps=0, tilt_steps=0) for k, t in enumerate(times_s)]
     return rows if degC is None else [replace(m, temperature_degC=t) for m, t in zip(rows, degC, strict=True)]
 
@@ -39,8 +39,8 @@ def test_minutes_since_the_first_move_or_since_switching_on():
 
 
 @pytest.mark.parametrize("times_s", [[5.0, 5.0, 5.0], [0.0, 1.0, 2.0]])
-def test_moves_without_times_do_not_warm_up(times_s):
-    """All alike, or counted as an import does; then nothing tells of a creep."""
+def test_moves_without_times_have_no_warm_up(times_s):
+    """Equal times, or those counted by an import; then a creep is not determined."""
     moves = moves_at(times_s)
     assert not warm_minutes(moves).any()
     assert set(unseen_shifts(moves, RIG_PRIORS)) == set(ZERO_SHIFT_NAMES)
@@ -56,7 +56,7 @@ def test_moves_without_times_do_not_warm_up(times_s):
     ],
     ids=["no clock", "later", "no zone", "a day"],
 )
-def test_a_time_of_switching_on_that_fits_no_clock_is_refused(text):
+def test_an_impossible_time_of_switching_on_is_refused(text):
     with pytest.raises(InputError, match=r"powered_on.*`created`"):
         header(text)
 
@@ -69,14 +69,14 @@ def test_temperatures_are_interpolated_in_time_and_counted():
     assert not kelvin(moves_at([0.0, 9.0], [20.0, None])).any()
 
 
-def test_the_column_is_read_and_written_where_there_is_one():
+def test_the_temperature_column_round_trips_where_present():
     moves = moves_at([0.0, 7.0], [21.5, None])
     moves[0] = replace(moves[0], pan_approach="left", tilt_approach="up")
     assert list(parse_moves(MOVES.content(moves))) == moves
     assert b"temperature" not in MOVES.content([replace(m, temperature_degC=None) for m in moves])
 
 
-def test_what_the_moves_tell_of():
+def test_shifts_determined_by_the_moves():
     warm, both = moves_at([0.0, 7.0]), moves_at([0.0, 7.0], [20.0, 21.0])
     still = {**RIG_PRIORS, **dict.fromkeys(names_of("creep_deg"), Prior(0.0, 0.0))}
     assert unseen_shifts(warm, RIG_PRIORS) == names_of("thermal_deg_per_K")

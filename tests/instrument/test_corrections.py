@@ -1,4 +1,4 @@
-"""Corrections of whole tables: signs, rows, cameras, pixels, steps; what is not asked for stays as it was."""
+"""Corrections of whole tables: signs, rows, cameras, pixels, steps; the rest is unchanged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_flip_changes_one_counter_and_leaves_the_approach(twin):
     assert "approaches stay" in result.changes[0]
 
 
-def test_steps_of_moves_are_summed_up_again(twin):
+def test_relative_steps_are_summed_again(twin):
     steps = relative(twin, None)
     assert corrected(steps.moves, steps.spots, Correction(relative=True)).moves == twin.moves
     second = replace(twin.moves[1], segment=1, pan_steps=7)
@@ -37,7 +37,7 @@ def test_steps_of_moves_are_summed_up_again(twin):
 def test_looks_are_shifted_from_a_spot_on_and_none_is_lost(twin):
     result = corrected(twin.moves, twin.spots, Correction(shifts=(Shift(1, twin.spots[62].spot),)))
     assert [b.move - a.move for a, b in zip(twin.spots, result.spots, strict=True)] == [0] * 62 + [1] * 81 + [0]
-    # Nobody listed a move after the last one.
+    # There is no move after the last one.
     last = result.spots[-1]
     assert last.status == f"refused: move {len(twin.moves)} is not listed" and last.u_left_px is not None
     assert "1 left out" in result.changes[0]
@@ -45,7 +45,7 @@ def test_looks_are_shifted_from_a_spot_on_and_none_is_lost(twin):
     assert alone.moves is None and [s.move for s in alone.spots] == [s.move - 1 for s in twin.spots]
 
 
-def test_cameras_are_exchanged_with_all_that_is_stated_of_them(twin):
+def test_cameras_are_exchanged_with_their_sds_and_correlations(twin):
     spot = replace(twin.spots[0], su_left_px=0.3, ruv_right=0.5)
     once = corrected(None, (spot,), Correction(swapped=True)).spots
     assert (once[0].u_left_px, once[0].v_right_px) == (spot.u_right_px, spot.v_left_px)
@@ -74,7 +74,7 @@ def test_shifts_are_read(twin):
         corrected(twin.moves, twin.spots, Correction(shifts=(Shift(1, 10_000),)))
 
 
-def test_a_table_that_lacks_what_is_to_be_changed_is_refused(twin):
+def test_a_table_without_the_columns_to_change_is_refused(twin):
     for correction in (Correction(flipped=("pan",)), Correction(relative=True)):
         with pytest.raises(InputError, match="no counters"):
             corrected(None, twin.spots, correction)

@@ -1,4 +1,4 @@
-"""Limits of the counters: what a rig states, and what stands for the rest."""
+"""Limits of the counters: stated ones and defaults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Notations of numbers in cells of somebody's table."""
+"""Notations of numbers in cells of a foreign table."""
 
 from __future__ import annotations
 
@@ -28,5 +28,5 @@ def test_notations_of_numbers(cells, plain, unit):
 
 
 @pytest.mark.parametrize("cells", [("1.5 mm", "2 deg"), ("12:61:00", "1:2:3"), ("slipped", "1"), ("1/0", "1/2")])
-def test_cells_of_no_one_notation_stay(cells):
+def test_cells_of_mixed_notation_are_unchanged(cells):
     assert plain_column("x", cells).cells == cells

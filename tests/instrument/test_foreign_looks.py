@@ -1,4 +1,4 @@
-"""Moves and looks of somebody's table."""
+"""Moves and looks of a foreign table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOOKS = ("0 0 641 361 501 360 near", "0 0 651 361 561 360 far", "200 0 701 361 5
 
 
 def looks(*rows: str, header: str = HEADER, notation: Notation | None = None, listed=None):
-    """What a table of these cells gives; - is an empty one."""
+    """Moves and looks of a table with these cells; - is an empty one."""
     names = header.split()
     cells = list(
         zip(*([cell.replace("-", "") if cell == "-" else cell for cell in row.split()] for row in rows), strict=True)
@@ -117,8 +117,8 @@ def test_dates_become_seconds_and_stated_spreads_stay():
 
 @pytest.mark.parametrize("zone", ["UTC", "Europe/Berlin", "America/Mexico_City"])
 @pytest.mark.skipif(not hasattr(time, "tzset"), reason="only POSIX changes its time zone in a process")
-def test_dates_without_a_zone_do_not_hang_on_that_of_this_machine(monkeypatch, zone):
-    """In the night to 29 March 2026 clocks in Berlin went from 02:00 to 03:00, and in Mexico nobody's did."""
+def test_dates_without_a_zone_do_not_depend_on_the_local_zone(monkeypatch, zone):
+    """On 29 March 2026 clocks in Berlin went from 02:00 to 03:00, and not in Mexico."""
     monkeypatch.setenv("TZ", zone)
     time.tzset()
     try:
@@ -130,7 +130,7 @@ def test_dates_without_a_zone_do_not_hang_on_that_of_this_machine(monkeypatch, z
     assert [move.time_s for move in result.moves] == [0.0, 3600.0, 5400.0]
 
 
-def test_texts_are_such_as_our_own_reader_takes():
+def test_texts_are_accepted_by_the_campaign_reader():
     cells = {
         **{name: ("0", "1", "2", "3") for name in ("pan_steps", "tilt_steps")},
         **{name: ("5", "5", "5", "") for name in PIXELS},
@@ -145,7 +145,7 @@ def test_texts_are_such_as_our_own_reader_takes():
     assert parse_spots(spots_bytes(result.spots), "spots.csv", 4, stereo) == result.spots
 
 
-def test_numbers_that_cannot_be_kept_are_told():
+def test_numbers_that_cannot_be_kept_are_reported():
     header = "Pan Tilt XL YL XR YR Spot Exp Point"
     result = looks("0 0 1 1 1 1 7 3 1", "0 0 1 1 1 1 7 3 -", "0 0 1 1 1 1 8 - 2", header=header)
     assert [(s.spot, s.experiment, s.point) for s in result.spots] == [(0, 3, 1), (1, None, None), (2, None, None)]
@@ -154,21 +154,21 @@ def test_numbers_that_cannot_be_kept_are_told():
         "spot: numbers are missing or repeated, so looks are numbered by their rows",
         "experiment, point: 2 rows with only one of them, which is left out",
     ]
-    # A move without a look has no number to lose.
+    # A move without a look has no number of a spot.
     whole = looks("0 0 1 1 1 1 7 3 1", "50 0 - - - - - - -", "0 0 1 1 1 1 9 3 2", header=header)
     assert [s.spot for s in whole.spots] == [7, 9]
     assert not [text for text in whole.assumed if text.startswith(("spot", "experiment"))]
 
 
 def test_points_without_experiments_count_looks():
-    """No four-point experiment: numbers above 4 are nobody's mistake."""
+    """Without four-point experiments numbers above 4 are valid."""
     rows = [f"{10 * k} 0 1 1 1 1 {k}" for k in range(1, 9)]
     result = looks(*rows, header="Pan Tilt XL YL XR YR Point")
     assert {(s.experiment, s.point) for s in result.spots} == {(None, None)} and len(result.spots) == 8
     assert any("column Point is left out" in text for text in result.assumed)
 
 
-def test_looks_alone_go_to_moves_that_are_listed():
+def test_looks_alone_are_assigned_to_listed_moves():
     moves = looks(*(row.rsplit(" ", 5)[0] for row in LOOKS), header="Pan Tilt").moves
     assert len(moves) == 3
     header = "XL YL XR YR move"
@@ -187,8 +187,8 @@ def test_looks_alone_go_to_moves_that_are_listed():
         ("0 a - 3", None),
     ],
 )
-def test_a_log_of_moves_that_counts_otherwise_than_we_do_is_told(numbers, remark):
-    """Pictures named by that log would else be paired with other moves, and nothing would say so."""
+def test_a_log_that_numbers_moves_differently_is_reported(numbers, remark):
+    """Pictures named by that log would otherwise be paired with other moves without a message."""
     rows = [f"{number} {100 * k} 0" for k, number in enumerate(numbers.split())]
     remarks = [text for text in looks(*rows, header="Nr Pan Tilt").assumed if text.startswith("move: ")]
     assert len(remarks) == (remark is not None)

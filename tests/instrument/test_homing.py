@@ -1,4 +1,4 @@
-"""Ways of coming home that nobody recorded, as variants of a campaign."""
+"""Unrecorded homing directions as variants of a campaign."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def test_an_axis_is_unrecorded_only_if_every_homing_is():
 
 @pytest.mark.parametrize("axis", ["pan", "tilt"])
 def test_chances_of_an_axis_sum_to_one(axis):
-    # Three numbers of two digits: exact but for a rounding.
+    # Three numbers of two digits: exact except for rounding.
     assert sum(ways(axis).values()) == pytest.approx(1.0, abs=1e-15)
     assert ways(axis)[ANYWHERE] == pytest.approx(0.1, abs=1e-15)
 
@@ -38,7 +38,7 @@ def test_every_combination_once():
     assert sum(map(prior_chance, choices)) == pytest.approx(1.0, abs=1e-14)
 
 
-def test_only_unknown_approaches_are_told():
+def test_only_unknown_approaches_are_replaced():
     campaign = replace(small_campaign(), moves=moves(("unknown", "up"), ("left", "unknown")))
     rows = homed(campaign, {"pan": "right", "tilt": ANYWHERE}).moves
     assert [m.pan_approach for m in rows] == ["right", "", "left", ""]

@@ -1,4 +1,4 @@
-"""The list of mechanisms: a copy is the entry itself, here and in another process."""
+"""The list of mechanisms: a copy is the entry itself, also in another process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tvsbayes.instrument.mechanisms import MECHANISMS
 
 
 @pytest.mark.parametrize("key", sorted(MECHANISMS))
-def test_a_copy_is_the_entry_of_the_list(key):
+def test_a_copy_is_the_same_object(key):
     """Readers and writers of files compare by identity; studies send rigs to other processes."""
     mechanism = MECHANISMS[key]
     assert copy.deepcopy(mechanism) is mechanism

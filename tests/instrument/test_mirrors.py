@@ -1,4 +1,4 @@
-"""Vectors, turns and mirrors: the laws they obey, in Python floats, NumPy and JAX; the chain against the twin's."""
+"""Vectors, rotations and mirrors: their laws in Python floats, NumPy and JAX; the chain against the twin's."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PAN_RAD, TILT_RAD = np.radians([10.0, -25.0, 3.0]), np.radians([5.0, -12.0, 20.0
 
 
 def optics() -> Optics:
-    """Of the printed test vector; the registry names what each field is made of."""
+    """Optics of the printed test vector; the registry names the parameters of each field."""
 
     def block(name: str) -> float | list[float]:
         values = [math.radians(VECTOR[n]) if name.endswith("_deg") else VECTOR[n] for n in BLOCKS[name]]
@@ -62,7 +62,7 @@ def test_a_turn_is_the_rotation_about_z(functions):
     np.testing.assert_allclose(turn.back(turned), many, atol=4 * ROUNDING)
 
 
-def test_vectors_know_their_products():
+def test_products_of_vectors():
     first, second = np.random.default_rng(3).standard_normal((2, 3, 5, 7))
     one, other = Vectors.of(first), Vectors.of(second)
     np.testing.assert_allclose(one.dot(other), np.sum(first * second, axis=0), atol=10 * ROUNDING)
@@ -72,14 +72,14 @@ def test_vectors_know_their_products():
 @pytest.mark.parametrize("factor", [2.0, 2, np.float64(2.0), np.full(50, 2.0), jnp.full(50, 2.0)])
 @pytest.mark.usefixtures("x64")
 def test_a_factor_stands_on_either_side(factor):
-    """A tuple would be repeated, and an array would take it for an array of three rows."""
+    """A tuple would be repeated, and an array would treat it as an array of three rows."""
     many = vectors(4)
     for product in (many * factor, factor * many):
         assert isinstance(product, Vectors)
         np.testing.assert_array_equal(product, 2.0 * np.array(many))
 
 
-def test_one_vector_goes_with_many():
+def test_one_vector_broadcasts_against_many():
     many = vectors(5, 4)
     both = (many + Vectors(0.0, 2.0, 0.0) - many) * 0.5
     np.testing.assert_allclose(both.stacked(), np.repeat([[0.0], [1.0], [0.0]], 4, axis=1), atol=4 * ROUNDING)
@@ -92,7 +92,7 @@ def test_vectors_are_stacked_by_the_functions_of_their_kind():
     np.testing.assert_array_equal(traced, vectors(6).stacked())
 
 
-def test_reflection_keeps_what_lies_in_the_mirror_and_turns_the_rest():
+def test_reflection_keeps_tangential_and_negates_normal_components():
     direction, normal = unit_vectors(7), unit_vectors(8)
     out = reflect(direction, normal)
     incoming, outgoing = direction.dot(normal), out.dot(normal)
@@ -101,7 +101,7 @@ def test_reflection_keeps_what_lies_in_the_mirror_and_turns_the_rest():
     np.testing.assert_allclose(reflect(out, normal), direction, atol=4 * ROUNDING)
 
 
-def test_intersection_lies_on_line_and_plane():
+def test_intersection_is_on_line_and_plane():
     origin, direction, point, normal = vectors(9), unit_vectors(10), vectors(11), unit_vectors(12)
     hit = intersect_plane(origin, direction, point, normal)
     size = np.maximum(1.0, np.sqrt(hit.dot(hit)))
@@ -110,7 +110,7 @@ def test_intersection_lies_on_line_and_plane():
     assert np.max(np.sqrt(across.dot(across)) / size) < 10 * ROUNDING
 
 
-def test_any_number_of_mirrors_follow_each_other():
+def test_any_number_of_mirrors_in_sequence():
     """Three at right angles send every ray back along its direction, and each ray starts in its mirror's plane."""
     axes = np.eye(3)
     corner = [Mirror(Vectors(0.0, 0.0, 0.0), Vectors(*axis)) for axis in axes]
@@ -134,7 +134,7 @@ def test_the_chain_is_the_twins():
 
 
 @pytest.mark.usefixtures("x64")
-def test_floats_numpy_and_jax_take_the_same_way():
+def test_floats_numpy_and_jax_agree():
     """Derivatives too: NumPy's by a complex step (Squire and Trapp, SIAM Review 40 (1998) 110), JAX's own."""
 
     def ends(pan, functions):
@@ -150,8 +150,8 @@ def test_floats_numpy_and_jax_take_the_same_way():
         np.testing.assert_allclose(np.transpose(singles), expected[k], atol=CHAIN_ROUNDING)
 
 
-def test_a_compiler_may_be_told_to_compute_each_part_once():
-    """The turns of the stages and the ray that leaves each mirror pass through it, and what it returns is used."""
+def test_each_part_may_be_materialised_once():
+    """The rotations of the stages and the ray of each mirror pass through the function, and its results are used."""
     trees = []
 
     def materialise(tree):

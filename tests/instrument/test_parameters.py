@@ -19,14 +19,14 @@ from tvsbayes.instrument.parameters import (
 )
 
 
-def test_names_are_the_contracts():
+def test_names_are_those_of_the_documents():
     assert NAMES == (*RIG_PRIORS, *STEREO_PARAMETER_NAMES) and RIG_NAMES == tuple(RIG_PRIORS)
     assert len(set(NAMES)) == len(NAMES) == 86
     assert all(NAMES[index] == name for name, index in INDEX.items())
 
 
 def test_the_order_of_stored_draws():
-    """The order of `draws.npz` and of every covariance of results: as results written earlier have it."""
+    """The order of `draws.npz` and of every covariance of results is that of earlier results."""
     blocks = (
         *("degrees_per_step", "ratio_contrast_deg_per_step", "backlash_deg", "tilt_zero_deg", "mirror_offset_mm"),
         *("mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm", "tilt_axis_skew_deg"),

@@ -1,4 +1,4 @@
-"""Counters at which repeating errors are told apart: their number, the shares of looks, and the line through them."""
+"""Places of repeating errors: their number, the shares of looks, and the line through them."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def test_interpolation_is_exact_for_cubics(count):
     assert np.all(np.count_nonzero(share, axis=1) <= 4)
     cubic = np.polynomial.Polynomial(rng.standard_normal(4), domain=[-310.0, 420.0])
     np.testing.assert_allclose(share @ cubic(nodes), cubic(counters), atol=ROUNDING)
-    # A node has itself, whole.
+    # A node has weight 1 at itself.
     np.testing.assert_allclose(interpolation(nodes, nodes), np.eye(count), atol=ROUNDING)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_nodes_take_what_polynomials_there_are(count):
+def test_few_nodes_use_polynomials_of_lower_degree(count):
     nodes = np.linspace(-10.0, 30.0, count)
     polynomial = np.polynomial.Polynomial(np.arange(1.0, 1 + count))
     counters = np.array([-10.0, 3.0, 30.0])
@@ -73,8 +73,8 @@ def test_many_counters_have_regular_places(degrees, count):
     np.testing.assert_allclose(np.diff(places), np.ptp(counters) / (count - 1), rtol=1e-12)
 
 
-def test_regular_places_meet_an_error_that_changes_over_eight_degrees():
-    """Within 4 % of its sd, by the process' own covariance: what the four nearest say beside what is."""
+def test_regular_places_resolve_an_error_of_length_eight_degrees():
+    """Within 4 % of its sd, by the process' own covariance: interpolation from the four nearest against the error."""
     nodes = np.arange(0.0, 40.0, SPACING_DEG)
     inside = np.linspace(nodes[3], nodes[-4], 200)
     share = interpolation(inside, nodes)
@@ -88,7 +88,7 @@ def test_regular_places_meet_an_error_that_changes_over_eight_degrees():
 
 
 def moves() -> list[Move]:
-    """Both axes; the first side of pan is known, of tilt not."""
+    """Moves of both axes; the first side of pan is known, that of tilt is not."""
     counters = [(0, 0), (60, 0), (60, 40), (20, 40), (20, -40), (60, -40)]
     first, *others = [move_row(k, 0, 10.0 * k, *steps) for k, steps in enumerate(counters)]
     return [replace(first, pan_approach="right", tilt_approach="unknown"), *others]
@@ -100,7 +100,7 @@ def test_looks_have_the_error_of_their_counter_and_half_the_play_of_their_side()
     np.testing.assert_array_equal(places.steps, [0, 20, 60, -40, 0, 40])
     np.testing.assert_array_equal(places.on_tilt, [False] * 3 + [True] * 3)
     where = np.array([(0, 4), (2, 4), (2, 5), (1, 5), (1, 3), (1, 3), (2, 3)])
-    # Pan: homed from the right, left, held, right, held, left; tilt: nobody knows, held, up, held, down, held.
+    # Pan: homed from the right, left, held, right, held, left; tilt: unknown, held, up, held, down, held.
     side = np.array([(-1, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (-1, -1), (1, -1)])
     error, play = np.zeros((7, 6)), np.zeros((7, 6))
     for row in range(7):

@@ -1,4 +1,4 @@
-"""Plans: written, read and refused with their place; what following one does."""
+"""Plans: round trip, refusals with their place, effect of their actions."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_plan_without_steps_and_look_before_place(tmp_path):
         write_plan([PlanStep(0, "home"), PlanStep(1, "look")], tmp_path / "plan.csv")
 
 
-def test_a_plan_does_what_its_actions_mean(mounted_rig):
+def test_actions_of_a_plan_have_their_effect(mounted_rig):
     """Empty counters are 0 after homing and keep the axis elsewhere; without `home` a plan begins as homed at 0, 0."""
     steps = (PlanStep(0, "place", target="d1"), PlanStep(1, "look"), PlanStep(2, "move", 50, None))
     steps = (*steps, PlanStep(3, "look"), PlanStep(4, "home", None, 7), PlanStep(5, "place", target="d2"))
@@ -80,7 +80,7 @@ def test_a_plan_does_what_its_actions_mean(mounted_rig):
         run_plan((PlanStep(0, "look"),), mounted_rig)
 
 
-def test_a_plan_that_is_built_orders_no_move_twice():
+def test_a_built_plan_has_no_repeated_move():
     plan = PlanBuilder()
     plan.home()
     plan.move(pan=10)
@@ -92,10 +92,10 @@ def test_a_plan_that_is_built_orders_no_move_twice():
     assert plan.at == (10, -5)
 
 
-def test_a_plan_goes_on_without_the_sheet_that_is_in_place():
+def test_a_plan_does_not_place_the_present_sheet_again():
     looks = PlanStep(1, "move", 10, 0), PlanStep(2, "look")
     steps = (PlanStep(0, "place", target="d1"), *looks)
     assert continued(steps, 7, "d1") == (PlanStep(7, "move", 10, 0), PlanStep(8, "look"))
     assert [(step.step, step.action) for step in continued(steps, 7, "d2")] == [(7, "place"), (8, "move"), (9, "look")]
-    # A head places nothing: its first step is a move.
+    # A head places no sheet: its first step is a move.
     assert continued(looks, 1, "") == looks and continued((), 1, "") == ()

@@ -1,4 +1,4 @@
-"""The standard plans: how starts are reached, and what is seen from which side."""
+"""The standard plans: approaches of starts, and sides of looks."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_four_point_plans(name: str):
 
 
 def test_approaches_of_the_protocols():
-    """Reversed where asked; right and up cleared in the twin's; both kinds in the mixed."""
+    """Reversed as requested; right and up cleared in the twin's plan; both kinds in the mixed one."""
     plan = four_point_protocol(repeats=3, approaches={name: ("reversed",) for name in DIRECTION_SIGNS})
     assert _approach_signs(plan) == {name: {False} for name in DIRECTION_SIGNS}
     twin = _approach_signs(PROTOCOLS["paper_twin"]())
@@ -106,7 +106,7 @@ def test_protocols_are_valid_plans_within_their_range(name, tmp_path):
 
 
 @pytest.mark.parametrize("how", ["reversed", "cleared"])
-def test_starts_are_reached_as_ordered(how):
+def test_starts_have_the_ordered_approach(how):
     """The last move of the axis before point 1 runs against (reversed) or along (cleared) the experiment."""
     plan = four_point_protocol(3, approaches=dict.fromkeys(DIRECTION_SIGNS, (how,)))
     directions = [name for name in DIRECTION_SIGNS for _ in range(3)]
@@ -125,7 +125,7 @@ def test_starts_are_reached_as_ordered(how):
     assert count == 12
 
 
-def test_step_counts_are_taken_in_turn(mounted_rig):
+def test_step_counts_alternate(mounted_rig):
     campaign = simulate(mounted_rig, four_point_protocol(2, steps=(100, 200)), seed=1).campaign
     ends = {s.experiment: campaign.moves[s.move] for s in campaign.spots if s.point == 3}
     starts = {s.experiment: campaign.moves[s.move] for s in campaign.spots if s.point == 2}

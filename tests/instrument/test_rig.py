@@ -37,14 +37,14 @@ def test_rig_table_defaults_and_both_spellings():
 
 
 def test_any_parameter_may_stand_in_the_priors():
-    """Also one whose own place is [rig]."""
+    """Also one that belongs in [rig]."""
     one = rig_table("[rig]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
     other = rig_table("[rig.prior]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
     assert one == other and other.priors["baseline_mm"] == Prior(199.0, 0.2)
 
 
 def test_one_camera_of_both_pictures_may_be_a_number(tmp_path):
-    """As the template says."""
+    """As in the template."""
     text = re.sub(r"(?m)^(source|left|right) = .*\n", "", RIG_FILE).replace("[cameras]", "[cameras]\nsource = 3")
     assert read_rig(write_rig(tmp_path, text)).cameras["source"] == 3
 
@@ -70,7 +70,7 @@ def test_rig_table_round_trip():
 
 
 def test_the_scatter_of_looks_is_written_where_it_is_stated():
-    """At its default a table reads as it did before looks scattered, and so do the hashes of campaigns."""
+    """At its default the text of the table, and so the hash of campaigns, is that of earlier versions."""
     assert "look_scatter" not in rig_table_toml(RigTable(dict(RIG_PRIORS)))
     for u in (0.0, 0.02):
         table = RigTable({**RIG_PRIORS, "look_scatter_deg.tilt": Prior(0.0, u, "half-normal")})
@@ -79,7 +79,7 @@ def test_the_scatter_of_looks_is_written_where_it_is_stated():
 
 
 def test_shifts_of_the_zeros_are_written_where_they_are_stated():
-    """At their defaults a table reads as it did before; medians and signs come back."""
+    """At their defaults the text is that of earlier versions; medians and signs round trip."""
     assert not {"creep", "thermal"} & set(re.findall("creep|thermal", rig_table_toml(RigTable(dict(RIG_PRIORS)))))
     stated = {"creep_deg.pan": Prior(-0.02, 0.01), "creep_minutes": Prior(45.0, 0.3, "log-normal")}
     stated["thermal_deg_per_K.tilt"] = Prior(0.0, 0.0)
@@ -275,7 +275,7 @@ RIG_REFUSED = {
 
 
 @pytest.mark.parametrize("name", RIG_REFUSED)
-def test_rig_table_refusals_teach(name):
+def test_rig_table_refusals_state_a_remedy(name):
     text, line, teaches = RIG_REFUSED[name]
     with pytest.raises(InputError, match=teaches) as caught:
         rig_table(text)

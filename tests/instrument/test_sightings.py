@@ -1,4 +1,4 @@
-"""Campaigns of a head that says where it was found to point: files, refusals, what `check` says of them."""
+"""Campaigns of a head with measured directions: files, refusals, findings of `check`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PLACES = [(-900, 200), (-400, 900), (100, 500), (600, 1200), (1100, 300), (-1300
 
 
 def head_rig() -> Rig:
-    """A head with gears of 0.05 deg a step and axes some degrees from where it is believed to point."""
+    """A head with gears of 0.05 deg a step and axes some degrees from their nominal direction."""
     table = RigTable(mechanism=SIGHTING_HEAD)
     return Rig(table, None, dict(table.priors), {}, {}, {}, {"move_s": 1.0, "look_s": 1.0})
 
@@ -37,7 +37,7 @@ def simulated():
     return simulate(head_rig(), plan.steps, 7)
 
 
-def test_folder_there_and_back(simulated, tmp_path):
+def test_folder_of_sightings_round_trips(simulated, tmp_path):
     simulated.write(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "campaign.toml",
@@ -59,7 +59,7 @@ def test_folder_there_and_back(simulated, tmp_path):
 @pytest.mark.parametrize(
     "of_spots", [plots.points_3d, plots.setup, plots.coverage, lambda campaign: campaign.stereo_pair]
 )
-def test_what_needs_spots_refuses_sightings(simulated, of_spots):
+def test_functions_of_spots_refuse_sightings(simulated, of_spots):
     with pytest.raises(InputError, match=r"found sightings of a head.*; allowed: spots that a stereo pair sees; give"):
         of_spots(simulated.campaign)
 
@@ -83,14 +83,14 @@ def test_sightings_of_a_scanner_are_refused(simulated, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["mirror_offset_mm", "extrinsics.translation_mm.x", "focal_scale", "baseline_mm"])
-def test_terms_of_others_are_refused(name):
+def test_terms_of_other_mechanisms_are_refused(name):
     text = f'[rig]\nmechanism = "pan-tilt"\n[rig.prior]\n"{name}" = {{ value = 1.0, u = 1.0 }}\n'
     with pytest.raises(InputError, match="means nothing to this mechanism"):
         parse_rig_table(parse_toml(text.encode(), "campaign.toml").table("rig"), sightings=True)
 
 
 @pytest.mark.parametrize("key", MECHANISMS)
-def test_tables_there_and_back(key):
+def test_tables_of_sightings_round_trip(key):
     table = RigTable(mechanism=MECHANISMS[key])
     text = rig_table_toml(table)
     assert parse_rig_table(parse_toml(text.encode(), "campaign.toml").table("rig"), table.mechanism.sightings) == table
@@ -129,7 +129,7 @@ def test_wrong_tables_are_named(simulated, mended, code):
     assert next(f.code for f in findings if f.certain) == code
 
 
-def test_tangent_frames_are_right_angled_at_the_pole_too():
+def test_tangent_frames_are_orthonormal_at_the_pole():
     frames = tangent_frames(np.array([[0.0, 0.0], [400.0, 89.9999], [-30.0, 90.0], [10.0, -90.0]]))
     assert np.allclose(frames @ np.swapaxes(frames, 1, 2), np.eye(3), atol=1e-15)
     assert np.allclose(frames[0], [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])

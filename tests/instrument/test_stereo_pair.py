@@ -34,14 +34,14 @@ def test_rotation_vector_inverts_rotation_matrix(length):
         vector = length * axis / np.linalg.norm(axis)
         matrix = rotation_matrix(vector)
         assert np.abs(rotation_matrix(rotation_vector(matrix)) - matrix).max() < ROUNDING
-        # Next to pi the rounding of the matrix may turn the axis over: there only the matrix is compared.
+        # Near pi rounding of the matrix may negate the axis: there only the matrix is compared.
         if length < 3.1:
             assert np.abs(rotation_vector(matrix) - vector).max() < ROUNDING
 
 
 def test_rotation_vector_takes_the_nearest_rotation():
     matrix = rotation_matrix(np.array([0.1, 0.2, -0.3]))
-    # A symmetric stretch does not turn: the polar factor is the rotation itself.
+    # A symmetric stretch has no rotation: the polar factor is the rotation itself.
     assert rotation_vector(matrix @ np.diag([1 + 1e-7, 1 - 1e-7, 1.0])) == pytest.approx([0.1, 0.2, -0.3], abs=ROUNDING)
 
 
@@ -136,7 +136,7 @@ def test_stereo_refusals_name_line_and_key(tmp_path, name):
     assert error.line == 2 + list(document).index(key)
 
 
-def test_covariance_must_be_one(tmp_path):
+def test_covariance_must_be_symmetric_and_positive(tmp_path):
     good = small_stereo().parameter_covariance
 
     def refused(covariance: np.ndarray) -> str:

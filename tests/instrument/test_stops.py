@@ -1,4 +1,4 @@
-"""Where moves come to rest, and what a sequence of moves can tell before any fit."""
+"""Stops of moves, and the quantities that a sequence of moves determines."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def test_stops_have_the_sense_of_the_last_move_of_their_axis():
     assert observed_stops(moves, {0, 1, 2, 4}, "tilt") == (Stop(0, 0, 1),)
 
 
-def test_two_looks_at_one_rest_are_one_stop():
-    """Moves that order the same counters again, or move the other axis, end no rest."""
+def test_two_looks_at_rest_are_one_stop():
+    """Moves to the same counters, or of the other axis, do not end a rest."""
     moves = (*pan_moves(0, 200, 200), move_row(3, 0, 3.0, 200, 50), move_row(4, 0, 4.0, 0, 50))
     assert observed_stops(moves, {1, 2, 3, 4}, "pan") == (Stop(0, 200, 1), Stop(0, 0, -1))
     assert observed_stops(moves, {1, 2, 3, 4}, "tilt") == (Stop(0, 0, 1), Stop(0, 50, 1))
@@ -57,14 +57,14 @@ def test_a_homing_begins_a_new_stop_at_the_same_counter():
     assert observed_stops(moves, range(4), "tilt") == (Stop(0, 0, 1), Stop(1, 0, 0))
 
 
-def test_going_and_returning_by_one_step_count_is_named_with_its_cure():
+def test_return_moves_of_one_step_count_are_named_with_a_remedy():
     text = pan_separation(*[0, 200] * 12)
     assert "only one |N| = 200" in text
     assert "add N = 100 or a cleared approach" in text
 
 
 def test_one_odd_leg_among_many_is_not_enough():
-    """The first start, reached by the homing, tells a little; one leg of another length hardly more."""
+    """The first start, reached by the homing, adds little information; one leg of another length little more."""
     assert "nearly every leg has |N| = 200" in pan_separation(*[0, 200] * 24, 100)
 
 
@@ -81,7 +81,7 @@ def test_cleared_starts_separate():
 
 
 def test_homing_is_no_leg():
-    """A second segment homed at counter 40 says no more of a leg's length than the first did."""
+    """A second segment homed at counter 40 adds no leg of another length."""
     one = pan_moves(*[0, 200] * 12)
     homed = move_row(len(one), 1, 100.0, 40, 0, "left", "up")
     both = (*one, homed)
@@ -108,8 +108,8 @@ def test_every_segment_has_its_own_zero():
     assert separation([replace(stop, segment=0) for stop in stops], "tilt") is None
 
 
-def test_a_rest_knows_how_it_was_reached():
-    """Distance of the last move, the way since the last reversal, and the homing that the counter counts from."""
+def test_a_rest_has_its_approach():
+    """Distance of the last move, distance since the last reversal, and the homing of the counter."""
     moves = (*pan_moves(0, 200, 260, 260, 100), move_row(5, 1, 5.0, 30, 0, "right", "up"))
     rests = [(rest.move, rest.sign, rest.distance, rest.leg, rest.homing) for rest in rests_of(moves, "pan")]
     assert rests[:3] == [(0, 1, 0, math.inf, 0), (1, 1, 200, math.inf, 0), (2, 1, 60, math.inf, 0)]
@@ -117,9 +117,9 @@ def test_a_rest_knows_how_it_was_reached():
     assert legs_of(moves) == {"left": [200, 60], "right": [160]}
 
 
-def test_a_stop_error_is_new_once_its_own_counter_has_changed_or_was_set():
+def test_a_stop_error_is_redrawn_when_its_counter_changes_or_is_set():
     moves = (*pan_moves(0, 200, 0), move_row(3, 0, 3.0, 0, 50), move_row(4, 1, 4.0, 0, 50, "unknown", "down"))
-    # The pan axis went away and came back between the second look and the third.
+    # The pan axis moved away and back between the second and the third look.
     new = redraws(moves, (0, 0, 2, 3, 4))
     assert new.redraw.tolist() == [[True, True], [False, False], [True, False], [False, True], [True, True]]
     assert new.redraw_mix[[0, 2, 4], 0].tolist() == [[0, 1], [1, 0], [0.5, 0.5]]
