@@ -31,7 +31,7 @@ def fit_with(correlation: float, shift: str, *, free: bool = True) -> SimpleName
 @pytest.mark.parametrize(
     ("shift", "word"), [("creep_deg.pan", "alternate the directions"), ("thermal_deg_per_K.pan", "another temperature")]
 )
-def test_a_contrast_that_goes_with_a_shift_is_named_with_its_cure(shift, word):
+def test_a_contrast_that_goes_with_a_shift_is_named_with_its_remedy(shift, word):
     (weak,) = _shift_directions(fit_with(0.8, shift), "pan")
     assert weak.text.startswith("the contrast of left and right and a ") and word in weak.text
     assert set(weak.loadings) == {"ratio_contrast_deg_per_step.pan", shift}

@@ -134,10 +134,10 @@ class CameraObserver:
                 for camera in CAMERAS
             }
         unsteady = max(rises_dn(lit, dark)) > CHANGE_DN
-        found = DetectedSpot(UNSTEADY) if unsteady else self.detector(lit, dark)
-        if found.status == "ok" and min(rises_dn(dark, lit)) <= CHANGE_DN:
-            self._require_new(found, dark)
-        return Observation(found, pictures)
+        detected = DetectedSpot(UNSTEADY) if unsteady else self.detector(lit, dark)
+        if detected.status == "ok" and min(rises_dn(dark, lit)) <= CHANGE_DN:
+            self._require_new(detected, dark)
+        return Observation(detected, pictures)
 
     def _grab(self) -> StereoImage:
         """Grab a pair with its full scale, from the driver or else from the brightest pixel so far.

@@ -111,17 +111,17 @@ def sum_directions(free: np.ndarray, physical: np.ndarray, weights: np.ndarray) 
     correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     own_share = 1 / np.diag(np.linalg.inv(correlation))
     shared = np.flatnonzero(own_share < WEAK_VARIANCE).tolist()
-    found = sorted({*shared, *(int(np.argmin(correlation[k])) for k in shared)})
-    if not found:
+    columns = sorted({*shared, *(int(np.argmin(correlation[k])) for k in shared)})
+    if not columns:
         return ()
-    labels, least = [QUANTITIES[scales[k]].label for k in found], correlation[np.ix_(found, found)].min()
+    labels, least = [QUANTITIES[scales[k]].label for k in columns], correlation[np.ix_(columns, columns)].min()
     listed = f"{', '.join(labels[:-1])} and {labels[-1]}"
-    plural, verb, them = ("", "is", "it") if len(found) == 2 else ("s", "are", "them")
+    plural, verb, them = ("", "is", "it") if len(columns) == 2 else ("s", "are", "them")
     text = f"only the sum{plural} of the variances of {listed} {verb} known (correlation {least:+.2f}): "
     text += f"the priors divide {them}"
-    if any(scales[k].startswith("stop_sd_deg") for k in found):
+    if any(scales[k].startswith("stop_sd_deg") for k in columns):
         text += "; look twice at some stops"
-    return (WeakDirection(text, {scales[k]: float(correlation[found[0], k]) for k in found}),)
+    return (WeakDirection(text, {scales[k]: float(correlation[columns[0], k]) for k in columns}),)
 
 
 SHIFTS = {
@@ -145,7 +145,7 @@ def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
         f"the {axis} backlash": (backlash, f"backlash_deg.{axis}"),
     }
     directions = []
-    for block, (words, cure) in SHIFTS.items():
+    for block, (words, remedy) in SHIFTS.items():
         shift = f"{block}.{axis}"
         if not fit.free[INDEX[shift]]:
             continue
@@ -154,7 +154,7 @@ def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
             if np.ptp(values) > 1e-12 * np.max(np.abs(values)):
                 correlation = float(np.corrcoef(values, draws)[0, 1])
                 if inseparable(correlation):
-                    text = f"{what} and {words} are poorly separated (correlation {correlation:+.2f}): {cure}"
+                    text = f"{what} and {words} are poorly separated (correlation {correlation:+.2f}): {remedy}"
                     directions.append(WeakDirection(text, {name: 1.0, shift: correlation}))
     return directions
 

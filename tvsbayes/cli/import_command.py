@@ -123,7 +123,7 @@ def import_(
     stated = dict(map(_field_and_column, column or ()))
     flipped = tuple(dict.fromkeys(map(flipped_axis, flip or ())))
     correction = Correction(flipped, tuple(map(shift_of, shift_moves or ())), swap)
-    found: Import | None
+    task: Import | None
     kind_of_file = _kind_of_file(file, to, options)
     _refuse_others(kind_of_file, options)
     if kind_of_file in (SIGHTINGS, LOOKS):
@@ -131,13 +131,13 @@ def import_(
 
         refuse_log(file)
     if kind_of_file == COPY:
-        found = _corrected_campaign(file, to, replace(correction, pixels_from=pixels_from, relative=relative), options)
+        task = _corrected_campaign(file, to, replace(correction, pixels_from=pixels_from, relative=relative), options)
     elif kind_of_file == URDF:
         from tvsbayes.cli.head_commands import import_urdf
 
-        found = import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn)
+        task = import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn)
     elif kind_of_file == POINTING:
-        found = _pointing_table(file, to)
+        task = _pointing_table(file, to)
     elif kind_of_file == AXIS:
         from tvsbayes.cli.axis_import import KINDS, FileOptions, import_readings
         from tvsbayes.single_axis.guide_log import ASSUMPTIONS
@@ -145,17 +145,17 @@ def import_(
         assumed = _assumptions(assume, ASSUMPTIONS, "declination_deg=45.9")
         check_word("--format", kind, ("auto", *KINDS), closest(kind, KINDS, "leave it out: it is in the file"))
         wish = FileOptions(kind, run, deviations, counts_per_turn, assumed)
-        found = import_readings(file, to, stated, sheet, wish, yes=yes, as_json=as_json)
+        task = import_readings(file, to, stated, sheet, wish, yes=yes, as_json=as_json)
     elif kind_of_file == SIGHTINGS:
         from tvsbayes.cli.head_commands import import_sightings
 
         u_deg = _assumptions(assume, {"u_deg": "standard uncertainty"}, "u_deg=0.005").get("u_deg")
-        found = import_sightings(file, to, stated, sheet, notation, correction, u_deg)
+        task = import_sightings(file, to, stated, sheet, notation, correction, u_deg)
     else:
         interactive = not (yes or as_json) and is_interactive()
-        found = _looks(file, to, stated, sheet, notation, correction, interactive)
-    if found is not None:
-        found.carry_out(to, yes, as_json)
+        task = _looks(file, to, stated, sheet, notation, correction, interactive)
+    if task is not None:
+        task.carry_out(to, yes, as_json)
 
 
 def _kind_of_file(file: Path, to: Path, options: Mapping[str, Any]) -> str:

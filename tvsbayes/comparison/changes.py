@@ -65,7 +65,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         changes.append(Change(name, unit_of(name), a, b, b - a, u, ratio, significant))
     moved = [c for c in changes if c.significant]
     listed = ", ".join(
-        f"{c.told} by {c.difference:+.3g} {c.unit} "
+        f"{c.label} by {c.difference:+.3g} {c.unit} "
         + ("(held fixed)" if c.normalised is None else f"({c.normalised:+.1f} u)")
         for c in moved
     )

@@ -141,7 +141,7 @@ class _Idealised:
     ideal: np.ndarray
 
 
-def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Idealised:
+def _idealised(joint: JointFit, selection: Selection, chosen: _Chosen) -> _Idealised:
     from tvsbayes.posterior.draws import derived_of
     from tvsbayes.posterior.predictive import by_way, looks, turned_by
 
@@ -149,14 +149,14 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
     # Without play there is no variation of play either.
     straight_rad = np.where(np.arange(errors_rad.shape[1]) < errors_rad.shape[1] // 2, errors_rad, 0.0)
 
-    spaces = [found.space]
+    spaces = [joint.space]
     for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
         spaces.append(_ideal(spaces[-1], names))
     full, ideal = (
-        np.asarray(derived_of(replace(found, space=space), z[None], errors_rad[None]).effective_deg_per_step)[0]
+        np.asarray(derived_of(replace(joint, space=space), z[None], errors_rad[None]).effective_deg_per_step)[0]
         for space in (spaces[0], spaces[-1])
     )
-    rows = experiment_rows(found.campaign, selection)
+    rows = experiment_rows(joint.campaign, selection)
     ratios = []
     for space in spaces:
         repeating_rad = errors_rad if space is spaces[0] else straight_rad
@@ -165,7 +165,7 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
             return looks(replace(fit, space=space), z[values], turned_by(fit.arrays, repeating_rad[values]))[:, rows]
 
         pixels = by_way(chosen.ways, of_way)
-        ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo_pair))
+        ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, joint.campaign.stereo_pair))
     return _Idealised(tuple(ratios), full, ideal)
 
 

@@ -187,8 +187,8 @@ def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
     def through(number, so_far):
         start = jnp.asarray(number) * size
         part = arrays.of_spots(start, size)
-        found = angles_at(gears, zero, arrays.moves, part.spots.move_index, so_far.stretch)
-        given = filter_input(model, part, found.angles)
+        at_looks = angles_at(gears, zero, arrays.moves, part.spots.move_index, so_far.stretch)
+        given = filter_input(model, part, at_looks.angles)
         # The first group is filtered with the residuals: its columns need no loop of their own.
         both = [given.rows.residual[..., None], place_columns(given.slope, part.gears.some(0, together))]
         rows = eqx.tree_at(lambda r: r.residual, given.rows, jnp.concatenate(both, axis=2))
@@ -215,7 +215,7 @@ def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
             gram = jax.lax.fori_loop(0, pairs_of(groups), of_pair, gram)
         squares = jnp.sum(after.log_variance) + jnp.sum(standardised**2)
         log_density = so_far.sums.log_density + jnp.sum(given.log_scale) - 0.5 * squares
-        return FilteredBlocks(after.belief, means, block, Sums(log_density, along, gram), found.stretch)
+        return FilteredBlocks(after.belief, means, block, Sums(log_density, along, gram), at_looks.stretch)
 
     sums = Sums(jnp.zeros(()), jnp.zeros((most, columns)), jnp.zeros((pairs_of(most), columns, columns)))
     begin = FilteredBlocks(

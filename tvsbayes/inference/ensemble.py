@@ -64,7 +64,7 @@ class Run[D: Density]:
         advance: Advance,
         began: float,
     ):
-        self.start, self.keep, self.told, self.began = start, keep, advance, began
+        self.start, self.keep, self.advance, self.began = start, keep, advance, began
         density = start.density
         positions = start.starts(density.walkers)
         walkers, dimension = positions.shape
@@ -138,7 +138,7 @@ class Run[D: Density]:
                         return sample
                 elif time.monotonic() - self.saved_at > CHECKPOINT_SECONDS:
                     self.save()
-                self.told(max(towards.share(done, self.goal), elapsed / seconds))
+                self.advance(max(towards.share(done, self.goal), elapsed / seconds))
         except KeyboardInterrupt:
             self.save()
             raise

@@ -169,7 +169,7 @@ class _Cure:
     after: Judgement
 
 
-def _cure(
+def _remedy(
     steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates, axis: Axis, before: Judgement
 ) -> _Cure | None:
     """Find the fewest looks after which the axis has no fault, on the present sheet; None if there are none."""
@@ -206,13 +206,13 @@ def _fault(
     before = plan.u(axis)
     if possible is None:
         return PlanFault(axis, text)
-    cure = _cure(steps, knowledge, possible, axis, plan)
-    if cure is None:
+    remedy = _remedy(steps, knowledge, possible, axis, plan)
+    if remedy is None:
         return PlanFault(axis, f"{text}; up to {CURE_LOOKS} more looks do not change that on this rig")
-    looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
-    looks_text = f"{looks} more look{'s' * (looks != 1)}, {describe_looks(knowledge.rig, cure.addition, steps)}"
+    looks, after = sum(s.action == "look" for s in remedy.addition), remedy.after.u(axis)
+    looks_text = f"{looks} more look{'s' * (looks != 1)}, {describe_looks(knowledge.rig, remedy.addition, steps)}"
     text += f"; smallest addition: {looks_text}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
-    return PlanFault(axis, text, actions_of(cure.addition), after)
+    return PlanFault(axis, text, actions_of(remedy.addition), after)
 
 
 def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:

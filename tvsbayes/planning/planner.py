@@ -233,10 +233,10 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
     sides = {d: looks.side[:, AXES.index(axis)] == sign for d, (axis, sign) in DIRECTION_SIGNS.items()}
     for direction, stops in too_few({d: int(np.sum(reached)) for d, reached in sides.items()}).items():
         reached = f"only {stops} stop{'s' * (stops != 1)} {direction}"
-        cure = "plan u(worst), which asks for every direction"
+        remedy = "plan u(worst), which asks for every direction"
         if target.quantity == "worst":
-            cure = f"look more often: {FEW_STOPS} stops determine their scatter"
-        notes.append(f"{reached}: this plan is for its target only; for reliable intervals of {direction} {cure}")
+            remedy = f"look more often: {FEW_STOPS} stops determine their scatter"
+        notes.append(f"{reached}: this plan is for its target only; for reliable intervals of {direction} {remedy}")
     return notes
 
 

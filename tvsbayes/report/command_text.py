@@ -397,7 +397,7 @@ def changes_text(comparison: Comparison) -> str:
     """Changes between two calibrations of one instrument as text."""
     rows = []
     for c in comparison.changes:
-        cells = [c.told, f"{c.first:.6f}", f"{c.second:.6f}", concise(c.difference, c.u), c.unit]
+        cells = [c.label, f"{c.first:.6f}", f"{c.second:.6f}", concise(c.difference, c.u), c.unit]
         normalised = "fixed" if c.normalised is None else f"{c.normalised:+.2f}"
         rows.append([*cells, normalised, "yes" if c.significant else "no"])
     pan, tilt = comparison.reference_pose_deg

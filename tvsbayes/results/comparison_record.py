@@ -245,7 +245,7 @@ class Change(Record, frozen=True):
     significant: bool
 
     @property
-    def told(self) -> str:
+    def label(self) -> str:
         """The documented name of the quantity."""
         return self.quantity.replace("effective_deg_per_step", "local_deg_per_step")
 
@@ -273,7 +273,7 @@ class Comparison(Shown, Record, frozen=True, tag_field="kind", tag="two calibrat
         """Show the changes."""
         columns = ("quantity", "unit", "A", "B", "B - A", "u", "normalised", "significant")
         rows = [
-            (c.told, c.unit, c.first, c.second, c.difference, c.u, c.normalised, c.significant) for c in self.changes
+            (c.label, c.unit, c.first, c.second, c.difference, c.u, c.normalised, c.significant) for c in self.changes
         ]
         return View(f"Comparison: {self.verdict}", columns, rows)
 

@@ -96,10 +96,10 @@ def provenance(inputs: Mapping[str, str], seed: int) -> Provenance:
     return Provenance(dict(inputs), versions, seed, shlex.join(["tvsbayes", *sys.argv[1:]]))
 
 
-def covariance_of_draws(names: Sequence[str], physical: np.ndarray, told: Mapping[str, object]) -> NamedCovariance:
-    """Covariance of the columns in `told`; `physical` has shape (draws, names), in the units of the names."""
-    told_of = [index for index, name in enumerate(names) if name in told]
-    return NamedCovariance(tuple(names[i] for i in told_of), np.cov(physical[:, told_of], rowvar=False))
+def covariance_of_draws(names: Sequence[str], physical: np.ndarray, columns: Mapping[str, object]) -> NamedCovariance:
+    """Covariance of the named columns; `physical` has shape (draws, names), in the units of the names."""
+    kept = [index for index, name in enumerate(names) if name in columns]
+    return NamedCovariance(tuple(names[i] for i in kept), np.cov(physical[:, kept], rowvar=False))
 
 
 @dataclass(frozen=True, repr=False)

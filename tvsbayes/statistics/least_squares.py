@@ -128,7 +128,7 @@ def _nearly_there(begin: _Surroundings) -> _Surroundings:
 class _Descended:
     """End of Newton steps: where, whether the next step is negligible, whether steps alternated at a kink."""
 
-    here: _Surroundings
+    end: _Surroundings
     settled: bool
     kinked: bool = False
 
@@ -185,7 +185,7 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
         eigenvalues, vectors = np.linalg.eigh(hessian)
         # Far from the mode the density may be flat or convex along a direction: the step has the expected scale then.
         descent = _descended(surroundings, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
-        surroundings = descent.here
+        surroundings = descent.end
         if (
             descent.settled
             and np.linalg.norm(np.linalg.solve(surroundings.ways[rows], (surroundings.z - begin)[rows])) < HESSIAN_KEPT

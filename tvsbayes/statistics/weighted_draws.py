@@ -209,8 +209,8 @@ def smoothed_weights(log_ratios: np.ndarray) -> SmoothedWeights:
     exceedances = ratios[tail] - cutoff
     if exceedances[int(count / 4 + 0.5) - 1] <= 0:
         return SmoothedWeights(ratios / ratios.sum(), 0.0)
-    found = pareto_tail(exceedances)
-    raised = cutoff + found.quantiles((np.arange(count) + 0.5) / count)
+    pareto = pareto_tail(exceedances)
+    raised = cutoff + pareto.quantiles((np.arange(count) + 0.5) / count)
     smooth = ratios.copy()
     smooth[tail] = np.minimum(raised, ratios[order[-1]])
-    return SmoothedWeights(smooth / smooth.sum(), found.k)
+    return SmoothedWeights(smooth / smooth.sum(), pareto.k)
