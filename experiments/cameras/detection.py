@@ -194,7 +194,7 @@ def table(rows: list[dict]) -> str:
 
 
 def summary(rows: list[dict]) -> str:
-    """What the grid says in a few lines."""
+    """The grid in a few lines."""
     lines = []
     chance = 1 / np.sqrt(4 * PICTURES)
     for method in METHODS:

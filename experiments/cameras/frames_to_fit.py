@@ -4,7 +4,7 @@
     python -m experiments.cameras.frames_to_fit table > experiments/cameras/frames_to_fit.md
     python -m experiments.cameras.frames_to_fit paper FOLDER mounted table1 >> experiments/cameras/frames_to_fit.md
 
-`run` draws rig i from `data/rigs/mounted` with seed i, every prior quantity anew as `tvsbayes simulate` does, and
+`run` draws rig i from `data/rigs/mounted` with seed i, every prior quantity as `tvsbayes simulate` does, and
 measures four-point experiments of |N| = 100 and 200 (64 looks), twice with the same stops and sheets: `centroids` are
 drawn by the twin, `frames` are rendered, written, read and detected by the method `fit`. Both are fitted (joint,
 Laplace); what differs between the two is what detection adds. Drawn centroids have the stated noise times the drawn

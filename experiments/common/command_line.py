@@ -26,9 +26,9 @@ def study_parser(
 
     Args:
         doc: the script's docstring.
-        rows: the file of rows where no other is asked for.
+        rows: the default file of rows.
         n: default of `--n`; without it there is no such option.
-        actions: what can be asked for, see `act`.
+        actions: the actions, see `act`.
     """
     cli = parser(doc)
     cli.add_argument("action", choices=actions)
@@ -40,6 +40,6 @@ def study_parser(
 
 
 def act(cli: argparse.ArgumentParser, **actions: Action) -> None:
-    """Do what the command line asks for."""
+    """Carry out the action of the command line."""
     arguments = cli.parse_args()
     actions[arguments.action](arguments)

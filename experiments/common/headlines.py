@@ -1,4 +1,4 @@
-"""Headlines of a fit against the truth: PIT, z and contraction, and what a table says of them.
+"""Headlines of a fit against the truth: PIT, z and contraction, and their cells in a table.
 
 PIT: share of the draws below the truth. Contraction: 1 - posterior variance / prior variance. Bounds are two-sided at
 `tvsbayes.statistics.chances.BOUND`.
@@ -121,7 +121,7 @@ class Verdict:
 
 
 def verdict(entries: Sequence[Mapping[str, float]], shrunk: bool = False) -> Verdict:
-    """What `judged` says of one quantity, rig by rig; `shrunk` judges the draws shrunk by `SHRINK`."""
+    """The judgement of one quantity, rig by rig; `shrunk` judges the draws shrunk by `SHRINK`."""
     pit = np.array([e["pit_shrunk" if shrunk else "pit"] for e in entries])
     z = np.array([e["z"] for e in entries]) / (SHRINK if shrunk else 1.0)
     low, high = rms_bounds(len(pit))

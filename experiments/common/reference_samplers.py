@@ -28,7 +28,7 @@ STRETCH_STEPS = 400
 STEP = 0.5
 """Posterior sds (of what the coordinates before leave open) over which second differences are taken."""
 STIFF_SD = 0.05
-"""Prior sds: a coordinate that the data tell better than this, given those before it, is sheared."""
+"""Prior sds: a coordinate that the data determine better than this, given those before it, is sheared."""
 BATCH = 64
 
 

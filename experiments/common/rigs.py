@@ -71,7 +71,7 @@ def small_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
 
 
 def dense_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
-    """30 spots per sheet, both axes driven between any two: every spot tells a stop of each axis; 60 spots for two."""
+    """30 spots per sheet, both axes driven between any two: every spot has new stops of both axes; 60 spots for two."""
     orders: list[tuple] = [("home", 0, 0)]
     for sheet in sheets:
         orders.append(("place", None, None, sheet))

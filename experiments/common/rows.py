@@ -76,7 +76,7 @@ def run_rows(one: Callable, tasks: Sequence[tuple], rows: Path, keys: Sequence[s
 
 
 def git(*words: str) -> str:
-    """What git says in the checkout, empty where it fails."""
+    """Output of git in the checkout, empty where it fails."""
     return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
 
 

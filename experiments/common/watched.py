@@ -13,7 +13,7 @@ from pathlib import Path
 from experiments.common.rows import ROOT
 
 MEMORY_MAX, CPU_S_MAX = 1e9, 30.0
-"""Bytes and seconds of processor that a command on somebody's folder may take."""
+"""Bytes and seconds of processor that a command on a folder may take."""
 WALL_S_MAX = 600
 EXIT_CODES = {0, 2, 3, 4, 5}
 OWN = ("spots.csv", "results")
@@ -31,7 +31,7 @@ def listing(*places: Path) -> dict[str, str]:
                 if stat.S_ISLNK(mode):
                     state[str(path)] = f"link to {path.readlink()}"
                 elif stat.S_ISREG(mode):
-                    # Sparse giants of the folder itself are told by their size.
+                    # Sparse giants of the folder itself are identified by their size.
                     large = path.stat().st_size > 5e7
                     state[str(path)] = str(path.stat().st_size if large else hashlib.sha256(path.read_bytes()).digest())
                 else:
@@ -45,7 +45,7 @@ def watched(arguments: list[str], place: Path, scratch: Path) -> dict[str, objec
     Args:
         arguments: of `tvsbayes`.
         place: watched: holds the campaign's folder `c`, a HOME `home` and a TMPDIR `tmp`.
-        scratch: not watched: compiled functions and what the command says.
+        scratch: not watched: compiled functions and the output of the command.
     """
     home = place / "home"
     environment = {**os.environ, "HOME": str(home), "TMPDIR": str(place / "tmp"), "PYTHONPATH": str(ROOT)}

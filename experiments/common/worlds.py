@@ -1,4 +1,4 @@
-"""Worlds that no prior holds: true rigs whose gears err otherwise than the model says, and campaigns on them.
+"""Worlds that no prior holds: true rigs whose gears err otherwise than the model assumes, and campaigns on them.
 
 Errors of both axes, in degrees of the output: `pinion`, a wave of the pinion's turn; `tooth`, one of its teeth;
 `step`, a jump at one place, as of a damaged tooth or of a wheel joined of two halves; `warm-up`, a zero that creeps

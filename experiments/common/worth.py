@@ -47,7 +47,7 @@ def full_turn_plan(looks: int, turn_steps: int = TURN_STEPS) -> tuple[PlanStep, 
 
 @dataclass(frozen=True)
 class Worth:
-    """What a plan tells of left, right, up, down.
+    """The worth of a plan for left, right, up, down.
 
     Attributes:
         spots: looks seen.
@@ -83,7 +83,7 @@ def worth_of_plan(
     """The same of a plan, taken `times` times over."""
     information = information_of(steps, knowledge)
     visible = information.expectation.seen
-    # A turn later is the same beam: the mean of the counters would be a pose half a turn away that nobody looked at.
+    # A turn later is the same beam: the mean of the counters would be a pose half a turn away, without looks.
     angles = information.expectation.mirror_angles_rad[visible]
     pose = np.array([np.mean((angles[:, 0] + np.pi) % (2 * np.pi) - np.pi), angles[:, 1].mean()])
     return worth_of(knowledge, times * information.fisher, pose, round(times * visible.sum()), quantity)

@@ -5,7 +5,7 @@
 
 Rig s is the mounted rig drawn with seed s, measured by 16 four-point experiments of 100 and 200 steps; the calibration
 is that of the mode with its Laplace approximation. The scanner is homed again and aimed at six directions from all four
-pairs of sides, each seen on two sheets: 12 looks, anew in each world. Another machine is the rig of another seed.
+pairs of sides, each seen on two sheets: 12 looks, new in each world. Another machine is the rig of another seed.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def plan_of(
 
 
 def sent(calibration: Calibration, rig: Rig, pan: int, tilt: int, sides: tuple[str, str], factors) -> tuple[int, int]:
-    """Counters that the motors get for those asked, where the common part and the play act so many times.
+    """Counters that the motors get for the commanded ones, where the common part and the play act so many times.
 
-    By the calibration's own aiming: the same direction from the other sides tells the play, nominal ratios the rest.
+    By the calibration's own aiming: the same direction from the other sides gives the play, nominal ratios the rest.
     """
     direction = calibration.ray(pan, tilt, sides).direction
     azimuth, elevation = np.degrees(np.arctan2(direction[1], direction[0])), np.degrees(np.arcsin(direction[2]))
@@ -81,7 +81,7 @@ def sent(calibration: Calibration, rig: Rig, pan: int, tilt: int, sides: tuple[s
 def aimed(
     rig: Rig, truth: Truth, calibration: Calibration, factors=(1.0, 1.0), *, seed: int = 5, aims=AIMS, **options
 ) -> Campaign:
-    """Looks of a rig whose moves say what was asked for."""
+    """Looks of a rig whose moves list the commanded counters."""
     counters, sides = [aim[:2] for aim in aims], [aim[2] for aim in aims]
     run = simulate(rig, plan_of([sent(calibration, rig, *aim, factors) for aim in aims], sides, **options), seed, truth)
     named = simulate(rig, plan_of(counters, sides, **options), seed, truth).campaign.moves

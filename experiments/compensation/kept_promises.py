@@ -7,9 +7,9 @@ Axis s is drawn with seed s from the default priors of `[axis]` (play, error by 
 stops, drift), its ratio within 0.2 % of nominal, its homings scattering by 0.02 % of the travel (a limit switch). Nine
 positions from -20 to 20 mm are read up and down after each of three homings. Of its fit three formats are made; the
 axis is homed again and driven with what the format adds. `PROMISED` stops a side at random commands are held against
-the promise. `verify` gets 12 readings, drawn anew, in each world: as promised, not applied, applied twice, wrong sign,
+the promise. `verify` gets 12 new readings in each world: as promised, not applied, applied twice, wrong sign,
 and another axis (drawn with another seed, and so perhaps like one of the others). Where the correction is smaller than
-what a homing and a stop leave open, no number of readings tells: an axis counts as one that can be told where the
+what a homing and a stop leave open, no number of readings reduces: an axis counts as decidable where the
 worlds applied and not applied are `TELLING` standard deviations apart for its 12 readings, by the model.
 """
 
@@ -149,7 +149,7 @@ def table(arguments: argparse.Namespace) -> None:
 
 
 def worlds_table(tests: list[dict]) -> None:
-    """What `verify` said in each world, on axes whose table is large enough to be seen, and on the others."""
+    """Verdicts of `verify` in each world, on axes whose table is large enough to be seen, and on the others."""
     print("| world | where it can be told | named | KEPT | BROKEN | CANNOT TELL |\n|---|---|---|---|---|---|")
     for where, far in (("yes", True), ("no", False)):
         rows = [v for v in tests if (v["distance"] >= TELLING) == far]

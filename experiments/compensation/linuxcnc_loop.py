@@ -1,4 +1,4 @@
-"""The loop closed with a real controller: a table that LinuxCNC applies to a drawn axis, and what `verify` says of it.
+"""The loop closed with a real controller: a table that LinuxCNC applies to a drawn axis, and the verdict of `verify`.
 
     apt-get install --no-install-recommends linuxcnc-uspace          # Debian; no hardware, no display
     python -m experiments.compensation.linuxcnc_loop > experiments/compensation/linuxcnc_loop.md

@@ -5,7 +5,7 @@
 
 Drives are drawn from their priors, half of them with a wave, whose period is not known beforehand. Where the fit is
 accepted and knows a wave, its table is applied to the true wave and creep at 40 times of one span of the promise, drawn
-somewhere in the record, with a walk of the zero, seeing and noise drawn anew; errors are off the true line of the
+somewhere in the record, with a walk of the zero, new seeing and noise; errors are off the true line of the
 drive, but for their mean.
 """
 

@@ -6,7 +6,7 @@ AXES holds tables of ISO 230-2 runs as `experiments.real.axis_files` takes them;
 of a geared axis with an encoder (`place_deg`, `side`, `repeat`, `time_s`, `encoder_counts`); a visit is a repeat. Of
 every reading left out the error is counted: as it is, from the nominal line through the others (offset alone); after
 taking off one constant play; the mean of the others at its command and side; what the table of `compensate` expects
-there, which is for a machine that was homed anew; the same with the zero of the others, as the constant play has it,
+there, which is for a machine that was homed again; the same with the zero of the others, as the constant play has it,
 since nothing was homed here; and what the fit expects at its own time, the walk of the zero followed. `home_sd` is 0; a
 zero that warms up is no matter of a table. The places of the rotary axis were read one after the other, so that place,
 time and travel are one to the data. Its last row states what is known of a train of gears in a steady room: teeth keep
@@ -108,7 +108,7 @@ def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> LeftO
 
 
 def _followed(fit: AxisFit, campaign: AxisCampaign, moves: np.ndarray) -> np.ndarray:
-    """Readings of moves of the campaign, expected by a fit that does not know them, at their own times."""
+    """Readings of moves of the campaign, predicted by a fit without them, at their own times."""
     model = AxisModel.of(
         replace(rows_of(campaign), line=fit.rows.line), fit.model.priors, None, fit.model.coordinates.waves
     )

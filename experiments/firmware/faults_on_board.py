@@ -6,7 +6,7 @@
 The unchanged sketch runs on QEMU's Cortex-M7, the driver reaches it over a pseudo-terminal, the engine runs a plan of
 twelve looks with two homings between them. A fault comes at the fifth look, with the laser on, or in the motion after
 it. The laser pin is read from outside the processor; a look is counted wrongly when it counts though the motors stood
-elsewhere than the counters said.
+elsewhere than at the counters.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def of_trial(scratch: Scratch, defects: Sequence[Defect]) -> str:
 
 
 def of_wrong_inputs(scratch: Scratch) -> str:
-    """The mistakes of new users in one good campaign, made anew."""
+    """The mistakes of new users in one good campaign, made again."""
     spoilt = module_of_tests("support.wrong_inputs").SPOILT
     with open(HERE / "before_wrong_inputs.csv", encoding="utf-8") as stream:
         before = {row["mistake"]: row["before"] for row in csv.DictReader(stream)}

@@ -129,7 +129,7 @@ def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
 
 
 def accepted(rows: list[dict], name: str) -> list[dict]:
-    """What a model says of the rigs that it was fitted to and accepted by."""
+    """Results of a model for the rigs that it was fitted to and accepted by."""
     return [row[name] for row in rows if name in row and row[name]["converged"] and row[name]["accepted"]]
 
 
@@ -175,7 +175,7 @@ def _effort(entries_of: dict[str, list[dict]]) -> None:
 
 
 def cases(rows: list[dict]) -> dict[str, dict[str, list[dict]]]:
-    """What each model says in every world and protocol that has rigs, by title."""
+    """Results of each model in every world and protocol that has rigs, by title."""
     by_case = {}
     for world, size_deg in (("priors", 0.0), *WORLDS):
         for protocol in PROTOCOLS:

@@ -5,7 +5,7 @@
 Writes data/tutorial/rig.svg. Every ray, mirror and frame is computed by the digital twin's own optics
 (`tvsbayes.twin.physics`) and by the transformations of the conventions, so the picture cannot turn an axis the other
 way than the code does; `tests/promises/test_tutorial.py` holds it to that. Lengths are those of a tidy drawing, mm.
-Colours are of the Okabe-Ito palette; no colour says what a label does not say too.
+Colours are of the Okabe-Ito palette; no information is in colour alone.
 """
 
 from __future__ import annotations

@@ -186,7 +186,7 @@ class Kind:
 
     Attributes:
         title: of its section.
-        text: what is said of it.
+        text: its description.
         commands: in their order.
         files: by name: where it is copied from, or what writes its content.
         lines: how many of the first file are shown.

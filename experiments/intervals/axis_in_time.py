@@ -3,9 +3,9 @@
     python -m experiments.intervals.axis_in_time run --n 200 --cores 0 1
     python -m experiments.intervals.axis_in_time table > experiments/intervals/axis_in_time.md
 
-Axes are drawn from the priors, half of the waves that are asked for are there (`twin/simulated_axis`, whose
+Axes are drawn from the priors, half of the requested waves are there (`twin/simulated_axis`, whose
 formulas are its own), and fitted by weighted draws. A wave that is not there and is given a probability above 0.95 is a
-false one. Amplitude, period and phase are asked of the waves that are there, given that there is one.
+false one. Amplitude, period and phase are tested on the waves that are there, given that there is one.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _stops(places: np.ndarray, seed: int) -> tuple[AxisMove, ...]:
 
 
 def template(protocol: str, seed: int) -> AxisCampaign:
-    """What is moved, stated and asked for."""
+    """Moves, statements and requested periods."""
     rng = np.random.default_rng([seed, 99])
     if protocol == "drive":
         times = np.sort(rng.uniform(0.0, 1600.0, 400))
@@ -164,7 +164,7 @@ def table(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Carry out the action of the command line."""
     act(study_parser(__doc__, ROWS, 200), run=run, table=table)
 
 

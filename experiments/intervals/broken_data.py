@@ -3,9 +3,9 @@
     python -m experiments.intervals.broken_data run --n 60 --cores 0 1     # 7 s a rig and core, resumable
     python -m experiments.intervals.broken_data table > experiments/intervals/broken_data.md
 
-`run` fits campaigns of 96 spots (`rigs.small_plan`), rig i drawn with seed i, every prior quantity anew, with the
+`run` fits campaigns of 96 spots (`rigs.small_plan`), rig i drawn with seed i, every prior quantity, with the
 Laplace approximation, plain and robust, after breaking the model: a share of the spots off by 10 stated sds in one
-camera, Student-t(4) pixel noise of the same variance, and a pinion error of 0.1 deg that the fit does not know.
+camera, Student-t(4) pixel noise of the same variance, and a pinion error of 0.1 deg that the fit does not model.
 `table` prints RMS z and the coverage of central intervals; **!** marks a figure outside its two-sided bounds at 1e-4
 for that number of rigs. Nothing is left out for looking bad; rigs that did not converge are counted and listed.
 """

@@ -3,7 +3,7 @@
     python -m experiments.intervals.heads run --n 30 --cores 0        # of each kind, 10 to 40 CPU s a head, resumable
     python -m experiments.intervals.heads table > experiments/intervals/heads.md
 
-Head i is drawn with seed i, every prior quantity anew: gears with errors by position, play, drift and scatter, all
+Head i is drawn with seed i, every prior quantity: gears with errors by position, play, drift and scatter, all
 terms of the geometry. One with sightings turns to 24 directions twice, in an order of its own; one that carries the
 laser runs the shipped grid before a stereo pair. Each is simulated by the twin's own optics, fitted and sampled by
 importance.
@@ -32,7 +32,7 @@ PAN_STEPS, TILT_STEPS = (-1500, -800, -200, 400, 900, 1500), (100, 400, 800, 120
 
 
 def head_of(kind: str) -> Rig:
-    """What is believed of a head, and drawn from: sightings of 0.005 deg, or the stereo pair of the mounted rig."""
+    """The prior of a head, from which it is drawn: sightings of 0.005 deg, or the stereo pair of the mounted rig."""
     if kind == "sightings":
         ratios = dict.fromkeys(names_of("degrees_per_step"), Prior(0.05, 0.002))
         table = RigTable(ratios, mechanism=SIGHTING_HEAD)

@@ -1,4 +1,4 @@
-"""Do the intervals hold the truth? Simulated rigs, every prior quantity drawn anew, refitted by both estimators.
+"""Do the intervals hold the truth? Simulated rigs, every prior quantity drawn, refitted by both estimators.
 
     python -m experiments.intervals.laplace_coverage run --n 300 --cores 0 1     # 2 to 3 s per rig and core, resumable
     python -m experiments.intervals.laplace_coverage table > experiments/intervals/laplace_coverage.md

@@ -118,7 +118,7 @@ def _spread(values: Sequence[float], form: str) -> str:
 
 
 def workings(of: dict[str, list[dict]]) -> None:
-    """What the tier said of itself and what it cost, by protocol."""
+    """Diagnostics and cost of the tier, by protocol."""
     columns = ("protocol", "rigs", "fit converged", "accepted", "Pareto k", "worst k of a headline", "draws")
     columns += (
         "effective share",

@@ -276,7 +276,7 @@ def table_tier(title: str, rows: list[dict], pictured: bool) -> None:
 
 
 def workings(rows: list[dict]) -> str:
-    """Medians of what importance sampling says of itself, and the cost."""
+    """Medians of the diagnostics of importance sampling, and the cost."""
     done = [r for r in rows if "draws" in r]
     k, worst, draws, share, ess, cpu = (
         np.median([r[name] for r in done])
@@ -289,7 +289,7 @@ def workings(rows: list[dict]) -> str:
 
 
 def clean_part(design: Design, p: dict[str, float], pictured: bool) -> None:
-    """Every quantity of the clean simulations, the two densities first, then by p; with the picture if asked for."""
+    """Every quantity of the clean simulations, the two densities first, then by p; with the picture if requested."""
     first = ["log-likelihood", "log-posterior"]
     order = first + sorted((n for n in p if n not in first), key=p.get)
     if pictured:

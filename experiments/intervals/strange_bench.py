@@ -3,7 +3,7 @@
 A bench is a folder with `looks.csv` (counters, sheet, centroids; empty where a camera does not see the spot),
 `rig_stereo.yml` (OpenCV's FileStorage, no covariance) and `truth.json`. Nothing here is the package's: see
 `strange_optics`. True values are drawn evenly from ranges inside the package's default priors, but for the offset of
-the mirrors: looks leave half of its prior's variance, and intervals hold what is spread as the prior says. World and
+the mirrors: looks leave half of its prior's variance, and intervals hold what is distributed as the prior. World and
 units of `strange_optics`.
 """
 
@@ -245,7 +245,7 @@ def _view(left: Camera, right: Camera, rotation: np.ndarray, place: np.ndarray, 
 
 
 def _aimed(rig: Rig, ratios: np.ndarray) -> np.ndarray:
-    """Counters at which the beam meets the middle of the first and last sheet's points, as somebody drives it there."""
+    """Counters at which the beam meets the middle of the first and last sheet's points, as a user drives it there."""
     target = (rig.sheets[0][0] + rig.sheets[-1][0]) / 2
     local = rig.rotation.T @ (target - rig.shift_mm)
     counters = np.zeros(2)

@@ -164,7 +164,7 @@ class Gear:
         error_deg: transmission error at a place of the wheel.
         zero_deg: how far the zero has crept after so many hours.
         stop_sd_deg: scatter of where it comes to rest.
-        look_sd_deg: scatter anew at every look.
+        look_sd_deg: independent scatter of every look.
         homed_deg: sd of the zero after every homing but the first.
     """
 

@@ -170,7 +170,7 @@ def _looks_seen(table: Path) -> int:
 
 
 def answer_of(document: dict) -> Row:
-    """What a fit says of itself: its answer, and how importance sampling went."""
+    """A fit's answer, and the diagnostics of importance sampling."""
     sampling = document.get("sampling") or {}
     error = document.get("error") or {}
     importance = sampling.get("importance") or {}

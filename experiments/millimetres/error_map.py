@@ -3,7 +3,7 @@
     python -m experiments.millimetres.error_map > experiments/millimetres/error_map.md     # a minute, also the figure
 
 The paper twin is fitted (Laplace). Its posterior draws stand for the rigs that the data allow; on each the beam is
-followed to a range, the aperture reads it, and every calibration is asked for the point. Nominal and classic get the
+followed to a range, the aperture reads it, and every calibration locates the point. Nominal and classic get the
 shortened baseline and the moved origin that formulation 5 calls fair. The error is the distance from the true point,
 root mean square over 500 rigs; it holds stop errors and aperture noise of the look, which no calibration removes.
 """

@@ -6,7 +6,7 @@
 The shipped twins, whose truth is known, and drawn rigs (`data/rigs/mounted`, seed i), each under the mixed steps with
 aperture readings and under the paper's protocol without. After the campaign the machine is homed and sent to 5 x 5
 counters within the campaign's, from random sides; the true beam with a stop error of its own meets a target at each
-range along it, the aperture reads it, and every calibration is asked for the point. Nominal and classic are the fair
+range along it, the aperture reads it, and every calibration locates the point. Nominal and classic are the fair
 comparators of formulation 5 (`tvsbayes.coordinates.simple_calibration`). Error: distance from the true point;
 stated: the root of the trace of the joint's covariance (Laplace, law of propagation), and its 95 % intervals for x, y,
 z and ellipsoid. Expected errors over all rigs that a campaign allows stand in error_map.md, coverage over 1000 rigs in

@@ -1,4 +1,4 @@
-"""Two rigs, one Table 1: equal gears with lost motion seen at an azimuth, and four literal ratios; who tells?
+"""Two rigs, one Table 1: equal gears with lost motion seen at an azimuth, and four literal ratios: are they separable?
 
     python -m experiments.paper.two_rigs run --n 8 --cores 0        # 10 minutes, resumable
     python -m experiments.paper.two_rigs table > experiments/paper/two_rigs.md     # writes the figure too
@@ -11,10 +11,10 @@ drawing, each solved so that the classic estimator reads Table 1's means without
   is. Such gears drift away (no toothed gear can be so over long travel): homed before every experiment.
 
 Both run the same plans, with the stop errors of the paper twin (which give the Table's sds) and 0.05 px. The nominal
-rig is declared, which knows nothing of the mounting, with N(0, 0.005 deg/step) for the contrasts: the default 2e-4
+rig is declared, without knowledge of the mounting, with N(0, 0.005 deg/step) for the contrasts: the default 2e-4
 excludes literal ratios beforehand. Three models are fitted: gears with play and one ratio per axis; ratios per
 direction without play; both. log10 of the Bayes factor = difference of the Laplace evidences of the first two. It is
-called told apart beyond 100 to 1, called the other rig with more than 20 to 1 against the truth. Effective ratios are
+called separated beyond 100 to 1, called the other rig with more than 20 to 1 against the truth. Effective ratios are
 those of the model with both, by Laplace with all ways of homing weighed. Campaigns:
 
 * paper, as published: |N| = 200, 24 in each direction, every experiment from a homing at its start counters, ended on
@@ -86,7 +86,7 @@ def wide(rig: Rig) -> Rig:
 
 
 def forget_sides(campaign: Campaign) -> Campaign:
-    """The campaign as somebody records it who does not note from where a start was reached."""
+    """The campaign without a record of where a start was reached from."""
     first = {"pan_approach": "unknown", "tilt_approach": "unknown"}
     return replace(campaign, moves=tuple(replace(m, **first) if m.pan_approach else m for m in campaign.moves))
 
@@ -165,7 +165,7 @@ def drift_deg() -> tuple[float, float]:
     for axis, plus, minus in (("pan_steps", "left", "right"), ("tilt_steps", "up", "down")):
         steps = np.diff([getattr(m, axis) for m in moves])
         turned = np.sum(np.where(steps > 0, table[plus], table[minus]) * steps)
-        # Against the mean ratio, which would bring the counter back to where it says.
+        # Against the mean ratio, which would bring the counter back to its value.
         result.append(float(turned - (table[plus] + table[minus]) / 2 * np.sum(steps)))
     return result[0], result[1]
 

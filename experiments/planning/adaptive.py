@@ -59,7 +59,7 @@ ADAPTIVE, FIXED = "adapt", ("planned", "grid")
 
 @dataclass
 class Last:
-    """The newest fit of a run and what the sampled posterior says beside it, if it was asked."""
+    """The newest fit of a run and the sampled posterior's confirmation, if there was one."""
 
     fit: JointFit | None = None
     sampled: Confirmation | None = None
@@ -70,7 +70,7 @@ class Beside(Replanning):
 
     Args:
         given: as of `Replanning`.
-        last: is told every fit.
+        last: receives every fit.
     """
 
     def __init__(self, *arguments: Any, last: Last, **more: Any):
@@ -246,7 +246,7 @@ def coverage(rows: list[dict]) -> list[str]:
 
 
 def confirmed_part(rows: list[dict]) -> None:
-    """How often the posterior was asked, what it said, how far it was from Laplace."""
+    """How often the posterior was sampled, its verdicts, its ratio to Laplace."""
     tests = [event for row in rows for event in row["confirmed"]]
     if not tests:
         return

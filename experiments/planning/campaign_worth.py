@@ -12,7 +12,7 @@ same looks are taken a hundred times: repeats lower some of the priors' part, si
 
 `run` draws rigs, simulates and refits three of the points (`tvsbayes.studies`), and compares the error of the estimate
 with the sd predicted at that truth; prediction.md does the same for 384 spots of the paper and the grid. The
-rigs of the full turn have pan ratios of 0.06 +- 1e-4 deg/step, which an earlier session told; the fit is not told.
+rigs of the full turn have pan ratios of 0.06 +- 1e-4 deg/step, known from an earlier session; the fit does not use it.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ TURN = {"pan_min_steps": -100, "pan_max_steps": 7000, "tilt_min_steps": -130, "t
 
 @dataclass(frozen=True)
 class Session:
-    """What a plan tells: its information, the worst ratio's slopes at its pose, and u of that ratio, deg/step."""
+    """A plan's information, the worst ratio's slopes at its pose, and u of that ratio, deg/step."""
 
     knowledge: Knowledge
     information: PlanInformation
@@ -68,7 +68,7 @@ class Session:
 
 
 def session(knowledge: Knowledge, steps: Sequence[PlanStep]) -> Session:
-    """What a plan tells before anything is measured."""
+    """Information of a plan before anything is measured."""
     information = information_of(steps, knowledge)
     at = sensitivity(TARGET, knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad)
     return Session(knowledge, information, at, at.value(covariance_of(knowledge.precision + information.fisher)))

@@ -1,4 +1,4 @@
-"""Does a fit come out as the planner said? Predicted sd against RMS error, and predicted assurance against a count.
+"""Does a fit come out as the plan predicts? Predicted sd against RMS error, and predicted assurance against a count.
 
     python -m experiments.planning.prediction designs              # searches the planned designs, two minutes
     python -m experiments.planning.prediction run --n 1000 --cores 0 1     # 7 s per campaign and core, resumable
@@ -6,7 +6,7 @@
 
 Four designs on the mounted rig: the paper's 96 experiments, the grid, and what `tvsbayes plan` recommends for its
 default target with an assurance of 80 % (`n80`) and of 95 % (`n95`). Campaign i of a design is drawn with a seed of its
-own, every prior quantity anew, simulated by the twin, fitted and sampled (as `tvsbayes study` does). Compared are: the
+own, every prior quantity, simulated by the twin, fitted and sampled (as `tvsbayes study` does). Compared are: the
 error of the estimate with the sd that the planner predicts AT that truth before any data (RMS of z, chi-square bounds
 at 1e-4); with the sd that the fit reports; and the share of fits that report the target as met with the assurance that
 the planner stated from its own draws (binomial bounds around the stated value, which has a Monte Carlo error itself).

@@ -178,7 +178,7 @@ def figure(_: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Carry out the action of the command line."""
     cli = parser(__doc__)
     cli.add_argument("action", choices=("run", "simulate", "table", "figure"))
     cli.add_argument("folder", type=Path, nargs="?", help="of tables, for run")

@@ -75,7 +75,7 @@ def deviations(spots: Sequence[Centre]) -> np.ndarray:
 
 
 def beam_of(path: Path) -> Beam:
-    """A picture with all that is said of it."""
+    """A picture with its results."""
     picture = read_image(path)
     sixteen = parts_of(picture, PARTS, PARTS)
     # Two centres: their difference over the root of both variances is twice the first's deviation over root two.

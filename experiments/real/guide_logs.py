@@ -3,7 +3,7 @@
     python -m experiments.real.guide_logs run FOLDER          # PHD2 logs, by the importer of `import --axis`
     python -m experiments.real.guide_logs table > experiments/real/guide_logs.md
 
-Every run of at least `FRAMES_MIN` frames is read and asked for what `import --axis` writes: one range of periods,
+Every run of at least `FRAMES_MIN` frames is read, with the periods that `import --axis` writes: one range of periods,
 from a minute to a third of the run; fits by weighted draws.
 """
 
@@ -130,7 +130,7 @@ def table(_: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Carry out the action of the command line."""
     cli = parser(__doc__)
     cli.add_argument("action", choices=("run", "table"))
     cli.add_argument("folder", type=Path, nargs="?", help="of logs, for run")

@@ -2,7 +2,7 @@
 
     python -m experiments.real.pan_tilts FOLDER > experiments/real/pan_tilts.md
 
-FOLDER holds camera.csv, servo_pan.csv, servo_tilt.csv. A picture of a known point says where the optical axis points,
+FOLDER holds camera.csv, servo_pan.csv, servo_tilt.csv. A picture of a known point gives where the optical axis points,
 if the camera's place is known: a row becomes a sighting, counters are the commanded degrees with the other sign. The
 height of the camera over the floor is the one at which least squares leave least.
 """
@@ -69,7 +69,7 @@ def head_of(rows: np.ndarray, angles_deg: np.ndarray) -> Campaign:
 
 
 def camera(rows: np.ndarray) -> None:
-    """Terms by least squares, and what one pose says by one point and by another."""
+    """Terms by least squares, and one pose by one point and by another."""
     models = {height: pointing_model(head_of(rows, sighted(rows, height))) for height in HEIGHTS.tolist()}
     height, model = min(models.items(), key=lambda item: item[1].rms_deg)
     print(f"## Camera, {len(rows)} pictures\n\nCamera {height:g} above the floor: {model.rms_deg:.2f} deg RMS.\n")

@@ -83,7 +83,7 @@ def predicted(campaign: Campaign) -> dict[str, object]:
 
 
 def night(file: Path) -> dict[str, object]:
-    """All that is said of one table."""
+    """All results of one table."""
     began, stars = time.process_time(), read_stars(file).stars
     terms, errors, left = small_angles(stars)
     campaign = campaign_of(stars, file.stem)

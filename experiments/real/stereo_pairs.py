@@ -84,7 +84,7 @@ def split(views: Sequence[View], first: Sequence[int], board: Board, size: tuple
 
 
 def spoiled(views: Sequence[View], board: Board) -> dict[str, list[View]]:
-    """The pairs in ways in which they must not be believed, or must be put right."""
+    """The pairs with mistakes that must be refused or corrected."""
     after = [*views[1:], views[0]]
     shifted = [replace(view, right=later.right) for view, later in zip(views, after, strict=True)]
     turned = [replace(view, right=view.right[corner_orders(board)[1]]) for view in views if view.right is not None]

@@ -1,4 +1,4 @@
-"""Pictures read in two fields: are even and odd lines of a spot in one place, and is it said where they are not?
+"""Pictures read in two fields: are even and odd lines of a spot in one place, and is it reported where they are not?
 
     python -m experiments.real.two_fields > experiments/real/two_fields.md
 

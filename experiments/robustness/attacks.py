@@ -56,7 +56,7 @@ def numbers(folder: Path) -> set[int]:
 
 
 class Run:
-    """`acquire --simulate` in a process of its own; what it says goes to a file beside its folder."""
+    """`acquire --simulate` in a process of its own; its output goes to a file beside its folder."""
 
     def __init__(self, rows: int, out: Path, *options: str):
         self.out, self.log, steps = out, out.with_suffix(".txt"), out.with_suffix(".csv")

@@ -3,8 +3,8 @@
     python -m experiments.robustness.evidence device     # slow tests of protocol, journal and engine, about 25 minutes
     python -m experiments.robustness.evidence table      # rewrites evidence.md
 
-`table` computes a figure anew from the rows that its study left in `experiments/output/` (git ignores them: run the
-command of a line to have its rows) and says of when and which commit they are. A line whose rows are not there stays
+`table` computes a figure again from the rows that its study left in `experiments/output/` (git ignores them: run the
+command of a line to have its rows) and states their date and commit. A line whose rows are not there stays
 as it stands in the page, with its own date and commit.
 """
 
@@ -95,7 +95,7 @@ def joint_coverage(rows: list[dict]) -> tuple[str, bool]:
 
 
 def protocol_coverage(protocol: str, rigs: int, accepted: list[dict]) -> tuple[str, bool]:
-    """Of the 95 % intervals of the headlines that the accepted of so many rigs learned something about."""
+    """Of the 95 % intervals of the headlines of the accepted rigs that gained information on them."""
     if not accepted:
         return f"{protocol}, none of {rigs} rigs accepted: nothing to judge", False
     low, high = binomial_bounds(len(accepted), LEVEL)

@@ -249,7 +249,7 @@ def _random_four_points(rng: np.random.Generator) -> tuple[PlanStep, ...]:
 
 
 def sound_campaign(number: int, rigs: Mapping[str, Rig]) -> tuple[str, Campaign]:
-    """A campaign without a mistake, drawn anew for every number, with the name of its rig, which take turns."""
+    """A campaign without a mistake, a new one for every number, with the name of its rig, which take turns."""
     rng = np.random.default_rng([7, number])
     name = list(rigs)[number % len(rigs)]
     planned = sorted((Path(__file__).parent / "plans").glob("*.csv"))
@@ -271,7 +271,7 @@ def cut(campaign: Campaign, looks: int) -> Campaign:
 
 
 def cuts_of(campaign: Campaign, rng: np.random.Generator) -> list[int]:
-    """Numbers of looks after which a campaign is asked, the last: all."""
+    """Numbers of looks after which a campaign is checked, the last: all."""
     count = len(campaign.spots)
     later = rng.integers(FIRST_LOOKS, max(count, FIRST_LOOKS + 1), CUTS).tolist()
     return sorted({k for k in (*range(SPOTS_MIN, FIRST_LOOKS), *later, count) if k <= count})
@@ -307,7 +307,7 @@ def sound_table(count: int) -> list[str]:
 
 
 def others_table(folders: Sequence[Path]) -> list[str]:
-    """What is said of campaigns of others, and of mistakes made in them."""
+    """Findings in campaigns of others, and in mistakes made in them."""
     lines = ["| campaign | sound | pan sign | tilt sign | spots one move early |", "|---|---|---|---|---|"]
     for folder in folders:
         campaign, cells = read_campaign(folder), []

@@ -3,7 +3,7 @@
     python -m experiments.robustness.model_error run --clean 200 --n 20 --cores 0     # 1 s a campaign, resumable
     python -m experiments.robustness.model_error table > experiments/robustness/model_error.md
 
-`run` draws rig i of `data/rigs/mounted` with seed i, every prior quantity anew, and simulates the grid protocol (144
+`run` draws rig i of `data/rigs/mounted` with seed i, every prior quantity, and simulates the grid protocol (144
 spots, no aperture readings) clean and with each defect at three sizes: gears whose transmission error is a wave, a
 camera pair that was knocked or that drifts, gears whose ratio drifts, lost steps, a bent sheet. Clean and broken
 campaigns of a seed share rig, stop errors and pixel noise. Each is fitted by the Laplace approximation
@@ -66,7 +66,7 @@ def broken_campaign(defect: str, size: float, seed: int):
     """A simulated campaign with one defect, and its truth; the twin's own formulas with other angles or points."""
     rig, plan = mounted_rig(), shipped_plan("grid")
     if defect == "pinion" or defect == "tooth":
-        # The line through the looks, which is asked for, is that of gears with this error.
+        # The line through the looks, the quantity wanted, is that of gears with this error.
         simulated = campaign_of(rig, plan, defect, size, seed)
         return simulated.campaign, simulated.truth
     simulated = simulate(rig, plan, seed)

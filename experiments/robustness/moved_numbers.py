@@ -3,8 +3,8 @@
     python -m experiments.robustness.moved_numbers run [FOLDER ...]     # campaigns and axis folders of your own beside
     python -m experiments.robustness.moved_numbers table > experiments/robustness/moved_numbers.md
 
-`run` asks both releases the same of the same files, those of 0.2.0, and keeps their documents in
-`experiments/output/robustness/moved_numbers/`; what is there is not asked again. 0.3.0 is asked three times: as it is
+`run` runs both releases on the same files, those of 0.2.0, and keeps their documents in
+`experiments/output/robustness/moved_numbers/`; what is there is not run again. 0.3.0 is run three times: as it is
 (`default`), with the statements that take creep and scatter of looks out of its model (`alike`), and in the folders
 that 0.2.0 left, with its `results/`, exports and tables (`reads`). `table` compares the numbers at the same place of
 both documents; entries of a list belong together by their names, rows of a report's tables by their labels.
@@ -78,7 +78,7 @@ LEFT = {
 }
 """Files that are part of what a command answers."""
 NAMES = ("name", "parameter", "quantity", "what", "cause", "axis", "position", "direction")
-"""Keys that tell entries of a list apart."""
+"""Keys that identify entries of a list."""
 SAID = ("verdict", "answer", "passed", "cause", "converged", "estimator", "tier", "met", "code")
 FREE = r"weak_directions|prior_conflicts|report\.html"
 """Parts whose keys follow from the data."""
@@ -146,7 +146,7 @@ def _answer(line: str, folder: Path, tree: Path) -> dict[str, Any]:
 
 
 def _files(base: Path, before: Path, own: list[Path]) -> None:
-    """What both releases are asked of: shipped files of 0.2.0, what it simulates and leaves half done, and your own."""
+    """The inputs of both releases: shipped files of 0.2.0, what it simulates and leaves half done, and your own."""
     for name, at in (("paper", "twins/paper_twin"), ("grid", "twins/grid_twin"), ("rig", "rigs/mounted")):
         shutil.copytree(before / "data" / at, base / name)
     for number, folder in enumerate(own, start=1):

@@ -9,7 +9,7 @@ others are named. `run` unpacks HEAD into a temporary folder, writes mutmut's se
 
 mutmut runs pytest several times in one process, which jaxtyping's import hook refuses: the project's options of pytest
 are left out, and shapes are not checked. It forks for every mutant: a module that JAX compiles is traced and
-compiled anew each time, and a fork that hangs counts as seen by mutmut's time limit (5 of the first 37 mutants of
+compiled again each time, and a fork that hangs counts as seen by mutmut's time limit (5 of the first 37 mutants of
 `model/laser_path.py` on a busy machine). It reads the syntax of Python 3.13.
 """
 

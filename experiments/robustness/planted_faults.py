@@ -114,7 +114,7 @@ def valid_rows(path: Path, root: Path = ROOT) -> dict[str, dict]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Append a row for every fault that has none; the number of survivors among those asked for."""
+    """Append a row for every fault that has none; the number of survivors among those selected."""
     if problems := misfits():
         raise SystemExit("\n".join(["the list does not fit the tree:", *problems]))
     # One commit from beginning to end, whatever is committed meanwhile.

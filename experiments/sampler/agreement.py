@@ -48,7 +48,7 @@ SHEETS = {DENSE: ("d1", "d3"), FEW: ("d1", "d2")}
 MEAN_WANTED, SD_WANTED = 0.1, 6.0
 """In posterior sds, and in per cent."""
 CHANCE = 4.0
-"""Monte Carlo errors up to which a gap decides nothing, as in `fit`: a thousand effective draws know an sd to 2 %."""
+"""Monte Carlo errors up to which a gap decides nothing, as in `fit`: a thousand effective draws fix an sd to 2 %."""
 MAX_MINUTES = 15.0
 NUTS = "NUTS"
 SETTINGS = {
@@ -101,7 +101,7 @@ def one_case(task: tuple[str, str]) -> dict[str, object]:
 
 
 def by_nuts(joint: JointFit, setting: Setting) -> dict[str, object]:
-    """NUTS of a posterior: what it says of itself and of every quantity."""
+    """NUTS of a posterior: its diagnostics and every quantity."""
     with jax.enable_x64(True):
         nuts = hamiltonian(joint, setting)
     run, rhat = nuts.run, max(row["rhat"] for row in nuts.rows.values())

@@ -3,7 +3,7 @@
     python -m experiments.sampler.explicit > experiments/sampler/explicit.md     # 10 minutes; needs the extra `bench`
 
 A dozen spots of the mounted rig, six stops at two sheets, both axes with cleared and reversed moves. Optics, cameras
-and extrinsics are held, so that a dozen spots tell what is left: mean ratios, contrasts, backlashes, tilt zero, stop
+and extrinsics are held, so that a dozen spots determine the rest: mean ratios, contrasts, backlashes, tilt zero, stop
 sds, pixel scale. NumPyro's NUTS samples these, every stop error and every range; a range is flat in image
 displacement, so the density carries |d(pixels)/d(range)|. NUTS moves in coordinates whitened at the mode
 of the marginal density; with a mass matrix of its own finding it spent 1000 gradients on every draw. It shares

@@ -81,7 +81,7 @@ def summary(values: np.ndarray) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Found:
-    """A run, and what `summary` says of every quantity."""
+    """A run, and the `summary` of every quantity."""
 
     run: Run
     rows: dict[str, dict[str, float]]

@@ -122,7 +122,7 @@ def day(
 
 
 def one_task(task: tuple[int]) -> dict[str, object]:
-    """As `run_rows` asks for it."""
+    """The row for `run_rows`."""
     return one_rig(*task)
 
 

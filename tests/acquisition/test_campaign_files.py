@@ -1,4 +1,4 @@
-"""Campaign files beside a journal: written after every look, kept where somebody edited them."""
+"""Campaign files beside a journal: written after every look, kept where the user edited them."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def interrupted_at_the_third(instrument) -> Failing:
 
 @pytest.mark.parametrize("kept", ["half", "created"])
 def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp_path, capsys, kept):
-    """Rows that only the tables have are lost looks: nobody edited anything, and nothing of them is thrown away."""
+    """Rows that only the tables have are lost looks, not edits; they are kept."""
     folder, plan = tmp_path / "c", small_plan(2)
     Run(mounted_rig, folder, plan).engine.run()
     before = {name: (folder / name).read_bytes() for name in ("moves.csv", "spots.csv")}
@@ -131,7 +131,7 @@ def test_a_deleted_journal_has_a_remedy_that_leads_somewhere(mounted_rig, tmp_pa
 
 
 def test_a_repair_counts_what_follows_a_lost_event(mounted_rig, tmp_path, capsys):
-    """A motion of the first look is lost: until the next homing nobody knows where the mirrors stood."""
+    """A motion of the first look is lost: until the next homing the mirror angles are unknown."""
     folder = tmp_path / "c"
     Run(mounted_rig, folder, small_plan(2)).engine.run()
     lines = (folder / LOG).read_bytes().splitlines(keepends=True)

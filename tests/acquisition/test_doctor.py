@@ -56,7 +56,7 @@ def bench(**camera):
 
 
 def checks_of(device, camera, tmp_path, *, laser=False, homed=True):
-    """The checks by name, after a homing where wanted."""
+    """The checks by name, after a homing if `homed`."""
     links = lambda: ModelLink(device)  # noqa: E731
     if homed:
         first = SerialPositioner(links, {"hp": -60, "ht": -40}, device.clock)
@@ -87,7 +87,7 @@ def test_healthy_instrument(tmp_path):
 
 
 def test_a_grbl_board_is_examined_by_its_own_rules(tmp_path):
-    """No version of our firmware is asked of it, and that nothing watches its laser is said."""
+    """Its firmware version is not compared; the missing watchdog of the laser is reported."""
     board = GrblBoard()
     device, camera = bench()
     checks = examine(
@@ -190,7 +190,7 @@ def test_rig_without_hardware_says_what_is_missing(tmp_path):
 
 @pytest.mark.thorough
 def test_missing_hardware_is_told_once_and_by_us_alone(tmp_path):
-    """In a process of its own: OpenCV and FFmpeg write past Python, FFmpeg as loud as its first caller says."""
+    """In a process of its own: OpenCV and FFmpeg write past Python, FFmpeg at the log level of its first caller."""
     folder = shipped_data() / "rigs" / "mounted"
     tables = '[positioner]\nport = "/nowhere/port"\n[cameras]\n'
     environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV_")}
@@ -212,7 +212,7 @@ def test_missing_hardware_is_told_once_and_by_us_alone(tmp_path):
 
 
 def test_contract_of_drivers_that_keep_it_and_of_one_that_does_not(small_rig):
-    """On the simulated bench; then with a positioner that tells other counters, and limits that nobody stated."""
+    """On the simulated bench; then with a positioner that reports other counters, and without limits."""
     simulated = {"driver": "simulated"}
     limits = {"pan_min_steps": -50, "pan_max_steps": 150, "tilt_min_steps": -30, "tilt_max_steps": 40}
     rig = replace(small_rig, positioner=simulated | limits, cameras={**simulated, "spot_sd_px": 0.08})

@@ -1,4 +1,4 @@
-"""The promises of drivers: ours keep them, and one that breaks a promise is told so."""
+"""The promises of drivers: ours keep them, and a broken promise is reported."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def test_a_board_without_a_port_is_told_to_name_one(rig):
 
 
 def test_the_doctor_examines_a_simulated_bench(small_rig, tmp_path):
-    """No port is asked for, and both drivers show the same twin: the cameras see its laser."""
+    """No port is needed, and both drivers show the same twin: the cameras see its laser."""
     simulated = {"driver": "simulated", "options.seed": 3}
     rig = replace(small_rig, positioner=dict(simulated), cameras={**simulated, "spot_sd_px": 0.08})
     checks = {check.name: check for check in examine(rig, tmp_path)}

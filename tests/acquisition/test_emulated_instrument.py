@@ -22,7 +22,7 @@ def test_without_an_emulator_nothing_is_begun(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(bool(NO_EMULATOR), reason=NO_EMULATOR)
 def test_emulated_firmware_measures_what_its_model_measures(tmp_path):
-    """Same rig, same stops, same noise; only the drift of the zeros knows that real time has passed."""
+    """Same rig, same stops, same noise; only the drift of the zeros depends on real time."""
     rig, measured = read_rig(RIG_FILE), {}
     for emulate in (False, True):
         outcome = acquire(rig, small_plan(1), tmp_path / str(emulate), simulate=True, emulate=emulate, seed=3)

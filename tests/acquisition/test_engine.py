@@ -262,7 +262,7 @@ def test_resuming_what_is_done_asks_for_nothing(mounted_rig, tmp_path):
 
 
 def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(mounted_rig, tmp_path):
-    """The device stayed on: its counters tell the resumed run's homing what happened before."""
+    """The device stayed on: its counters pass the history to the resumed run's homing."""
     folder, plan = tmp_path / "c", small_plan()
     first = Run(
         mounted_rig, folder, plan, observer=lambda i: Failing(i, 4, lambda i: signal.raise_signal(signal.SIGINT))

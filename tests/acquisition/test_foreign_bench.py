@@ -1,4 +1,4 @@
-"""A whole run on somebody else's board: GRBL behind the engine, from the first homing to a resumed end."""
+"""A whole run on a foreign board: GRBL behind the engine, from the first homing to a resumed end."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CREATED = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 
 
 class Hand:
-    """Puts every sheet where it is asked for."""
+    """Puts every sheet at its target."""
 
     target = ""
 
@@ -74,7 +74,7 @@ def engine(rig, folder, board, resume=False, plan=None, **happening):
 
 
 def test_a_run_on_a_grbl_board_that_is_reset_and_resumed(mounted_rig, tmp_path):
-    """What GRBL cannot tell is written down as unknown: whether steps were lost."""
+    """What GRBL does not report is recorded as unknown: whether steps were lost."""
     rig, board = replace(mounted_rig, positioner={"driver": "grbl", "port": "/dev/ttyUSB0"}), GrblBoard()
     with pytest.raises(DeviceFault) as caught:
         engine(rig, tmp_path / "c", board, at=4, action=lambda board: board.power_on()).run()
@@ -90,7 +90,7 @@ def test_a_run_on_a_grbl_board_that_is_reset_and_resumed(mounted_rig, tmp_path):
 
 
 def test_a_stop_where_a_board_was_homed_has_no_known_side(mounted_rig, tmp_path):
-    """$23 says in which sense GRBL pulls off its switches, and nobody has asked it."""
+    """$23 sets the sense in which GRBL pulls off its switches; it was not read."""
     rig, board = replace(mounted_rig, positioner={"driver": "grbl", "port": "/dev/ttyUSB0"}), GrblBoard()
     engine(rig, tmp_path / "c", board, plan=[PlanStep(0, "home", -80, -70)]).run()
     move = recorded(read_journal(tmp_path / "c").records).moves[0]

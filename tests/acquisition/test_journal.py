@@ -312,7 +312,7 @@ class PowerLossDisk(Disk):
 
     Data are durable once their file was flushed, names once their folder was. Until then a cut may leave any
     selection of the pending name changes, and of a file's new bytes none, half, all, or zeros of that length.
-    `forget` leaves out calls of one kind, as a careless writer would.
+    `forget` leaves out calls of one kind.
     """
 
     forget: str = ""

@@ -31,7 +31,7 @@ def states(live: LiveRun) -> list[tuple[str, str]]:
 
 
 def run_with(rig, folder, live, at, *whats, **options) -> Run:
-    """A run in whose look number `at` something is asked for, with the laser on."""
+    """A run in whose look number `at` something is requested, with the laser on."""
 
     def ask(instrument):
         for what in whats:
@@ -81,7 +81,7 @@ def test_laser_off_breaks_off_the_look_which_is_taken_again(mounted_rig, tmp_pat
     run.positioner.laser = watched
     outcome = run.engine.run()
     assert (outcome.reason, outcome.looks, outcome.ok, outcome.retries) == ("done", 8, 8, 0)
-    # The first order after the request is the one that it asks for.
+    # The first order after the request is the requested one.
     assert [on for on, waiting in lit if "laser off" in waiting] == [False]
     assert requests(tmp_path / "c") == [("laser off", False), ("resume", False)]
     assert run.dark()

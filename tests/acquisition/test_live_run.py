@@ -70,7 +70,7 @@ def test_faults_and_repeated_looks_are_told_in_words(mounted_rig, tmp_path):
 
 
 def test_darkness_is_not_promised_after_a_fault():
-    """A device that does not answer has not said that its laser is off."""
+    """A device that does not answer has not confirmed that its laser is off."""
     answers = []
     for error in (None, DeviceFault("unplugged", "gone", remedy="plug it in")):
         live = LiveRun()

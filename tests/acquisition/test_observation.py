@@ -76,7 +76,7 @@ def test_pictures_without_a_visible_spot_wait_for_detection(mounted_rig):
 
 
 class AlwaysLit:
-    """Cameras of a twin whose laser never goes off, whatever the device says."""
+    """Cameras of a twin whose laser never goes off, whatever the device reports."""
 
     def __init__(self, instrument, rig, seed):
         self.instrument, self.render, self.frame = instrument, twin_renderer(rig, seed), 0

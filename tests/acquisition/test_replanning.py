@@ -80,7 +80,7 @@ def test_weights_that_cannot_be_used_end_no_run(mounted_rig, tmp_path):
 
 
 def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
-    """At the most that is asked for, with counters and u as long as they get."""
+    """The largest request, with the longest counters and u."""
     from tvsbayes.acquisition.journal import Journal
     from tvsbayes.acquisition.replanning import Proposal, adapted_entries, looks_next
     from tvsbayes.instrument.plan import PlanStep

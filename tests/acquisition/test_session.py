@@ -57,7 +57,7 @@ def test_resume_with_another_plan_rig_or_seed_is_refused(mounted_rig, tmp_path):
 
 
 def test_a_run_begun_before_looks_scattered_goes_on(mounted_rig):
-    """Its journal says nothing of them; a scatter stated since then is another rig."""
+    """Its journal does not hold them; a scatter stated since then is another rig."""
     plan, header = small_plan(), {"synthetic": True, "seed": 5}
     before = {**identity(mounted_rig, plan, True), **header}
     before["rig"] = {key: value for key, value in before["rig"].items() if "look_scatter" not in key}
@@ -87,7 +87,7 @@ SETUPS = {
 
 @pytest.mark.parametrize("what", SETUPS)
 def test_a_rig_that_is_reached_or_driven_otherwise_goes_on(mounted_rig, tmp_path, what):
-    """Whatever says nothing about what was measured; the change is written down."""
+    """What has no effect on the measurement may change; the change is recorded."""
     plan, (table, change) = small_plan(1), SETUPS[what]
     stopped_run(mounted_rig, tmp_path / "c", plan)
     changed = replace(mounted_rig, **{table: {**getattr(mounted_rig, table), **change}})
@@ -261,7 +261,7 @@ def test_twenty_killed_acquisitions(tmp_path, seed):
 
 
 def test_passwords_of_cameras_stay_out_of_the_journal(mounted_rig):
-    """A campaign folder is handed on; the address tells which camera it was."""
+    """A campaign folder is handed on; the address identifies the camera."""
     sources = {"left": "rtsp://eye:secret@10.0.0.2/1", "right": "http://eye:secret@10.0.0.3/a?x=1@2"}
     entries = setup_entries(replace(mounted_rig, cameras={**sources, "exposure": -6.0}), synthetic=False)
     assert entries["cameras.left"] == "rtsp://10.0.0.2/1" and entries["cameras.right"] == "http://10.0.0.3/a?x=1@2"

@@ -112,7 +112,7 @@ def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
 
 
 def test_camera_that_looks_on_does_not_change_the_motion(mounted_rig):
-    """The way from the home switch follows the mean ratio, whatever a camera's thread asks meanwhile."""
+    """The way from the home switch follows the mean ratio, whatever a camera's thread requests meanwhile."""
     ends = []
     for watched in (False, True):
         instrument = Instrument(mounted_rig, 5)

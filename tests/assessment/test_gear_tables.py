@@ -1,4 +1,4 @@
-"""Errors of gears where nobody looked: against dense Gaussian processes, written out once more."""
+"""Errors of gears away from the looks: against dense Gaussian processes, written out once more."""
 
 from __future__ import annotations
 
@@ -118,13 +118,13 @@ def test_tables_hold_what_draws_hold_at_places_and_forget_it_beyond(own_scales):
             assert np.std(drawn[:, column]) == pytest.approx(sd, rel=0.08), (name, column)
         assert abs(np.corrcoef(drawn[:, part.stop - 1], drawn[:, part.stop - 2])[0, 1]) < 5 / np.sqrt(DRAWS)
         np.testing.assert_allclose(drawn[:, part.stop - 1].mean(), 0, atol=1e-12)
-    # At the scales of the mode the means follow the places as `by_places` says.
+    # At the scales of the mode the means follow the places by `by_places`.
     normal = np.linalg.solve(root, errors.T).T
     np.testing.assert_allclose(gears.expected, normal @ gears.by_places.T, atol=1e-6)
 
 
 def test_every_draw_has_scales_of_its_own():
-    """Draws of twice the sd are twice as open where nobody looked, and their lengths are theirs."""
+    """Draws of twice the sd scatter twice as much away from the looks, each with its length."""
     fit, mode, root = fitted(STEPS, SCALES)
     rng = np.random.default_rng(6)
     physical = np.tile(mode, (DRAWS, 1))
@@ -162,7 +162,7 @@ def twin_gears(number: int) -> list[AxisErrors]:
 
 
 def calibrated(gears: list[AxisErrors], seed: int) -> Calibration:
-    """A calibration that knows the true rig but for errors of its gears away from the places."""
+    """A calibration of the true rig, except for errors of its gears away from the places."""
     fit, mode, _ = fitted(STEPS, SCALES, RATIOS)
     for name, value in {**TRUE, **dict.fromkeys(NOISE_NAMES, 1e-9)}.items():
         mode[INDEX[name]] = value
@@ -190,7 +190,7 @@ def true_point(gears: list[AxisErrors], steps: tuple[float, float], reading_deg:
 
 
 def test_located_points_of_twins_whose_gears_err():
-    """Points where the twin's beam truly is, as near as the calibration says; wider where nobody looked, and told so.
+    """Points where the twin's beam truly is, within the stated u; wider away from the looks, and marked so.
 
     The twin draws errors by waves and has mirrors and a meeting of beam and reading of its own.
     """

@@ -14,7 +14,7 @@ LEFT, LOOK, NOISE = "stop_sd_deg.left", "look_scatter_deg.pan", "pixel_scale"
 
 
 def independent() -> np.ndarray:
-    """Draws of all parameters that know nothing of each other, shape (DRAWS, p)."""
+    """Independent draws of all parameters, shape (DRAWS, p)."""
     return np.random.default_rng(5).lognormal(0.0, 0.3, (DRAWS, len(NAMES)))
 
 

@@ -47,7 +47,7 @@ def test_a_normal_prior_of_another_width_gives_the_conjugate_posterior(factor):
 
 @pytest.mark.parametrize("factor", FACTORS)
 def test_a_half_normal_prior_is_weighed_by_its_quantity(factor):
-    """B = halfnorm(u) with a coordinate that the data know: the mean of z under twice or half the u, by quadrature."""
+    """B = halfnorm(u) with a coordinate that data fix: the mean of z under twice or half the u, by quadrature."""
     z = np.linspace(-9.0, 9.0, 200_001)
     b = stats.halfnorm.isf(stats.norm.sf(z))
     density = stats.norm.pdf(z, DATA[0], SPREAD) * stats.norm.pdf(z)

@@ -79,7 +79,7 @@ def test_what_the_fit_can_follow_is_not_seen(clean):
     first, second = ({t.name: t for t in tests} for tests in (before, after))
     assert len(first) >= 8
     for name, test in first.items():
-        # Directions that the spots tell less than 1e-4 prior sds are not followed: 0.3 sd of 50 of them.
+        # Directions in which the spots gain less than 1e-4 prior sds are not followed: 0.3 sd of 50 of them.
         assert second[name].chi2 == pytest.approx(test.chi2, abs=0.3), name
 
 

@@ -1,4 +1,4 @@
-"""A shift of a zero that cannot be told from what the gears do is a weak direction in words."""
+"""A shift of a zero that cannot be separated from gear errors is a weak direction in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit says of itself: headlines, contraction, weak directions, leverage, the classic predicted."""
+"""The summary of a fit: headlines, contraction, weak directions, leverage, the classic predicted."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tvsbayes.twin.simulated_campaign import simulate
 def paper(mounted_rig) -> Campaign:
     """The paper's go-and-return protocol: one |N|, the first start is the homing itself.
 
-    Two moves at the end that nobody looks at make it as long as the shipped twin, for which the model is compiled.
+    Two moves without a look at the end make it as long as the shipped twin, for which the model is compiled.
     """
     steps = paper_protocol()
     unseen = (PlanStep(len(steps) + k, "move", 100 * k, 0) for k in range(2))
@@ -110,7 +110,7 @@ def test_contraction_tells_data_from_prior(summary):
 
 @pytest.mark.parametrize("problem", [None, "it stopped", "nothing was learned"])
 def test_only_a_converged_fit_that_learned_something_is_worth_sampling(fitted, problem):
-    """By the same rule as what is said of the whole summary, which takes much longer to make."""
+    """By the same rule as for the whole summary, which takes much longer to make."""
     fit = fitted
     if problem == "it stopped":
         fit = replace(fit, converged=False, problems=(problem,))
@@ -136,7 +136,7 @@ def test_two_step_counts_and_cleared_approaches_are_not(mounted_rig):
 
 @pytest.fixture(scope="module")
 def pan_only(mounted_rig) -> Campaign:
-    """Left and right alone: after the homing every leg reverses, so move 0 alone tells ratio from backlash."""
+    """Left and right alone: after the homing every leg reverses, so move 0 alone separates ratio and backlash."""
     campaign = simulate(mounted_rig, paper_protocol(repeats=12), seed=8).campaign
     last = next(m.move for m in campaign.moves if m.tilt_steps != 0)
     return replace(
@@ -203,7 +203,7 @@ def test_a_draw_that_went_astray_drops_no_experiment(paper, fitted, monkeypatch)
     mine = selection.direction == direction
     mine[1] = False
     predicted = _classic_predicted(SimpleNamespace(fit=fitted, posterior=object()))[direction]
-    # The draw itself tells nothing of the mean of all; the experiment is in it.
+    # The draw itself does not determine the mean of all; the experiment is in it.
     assert predicted.sd == pytest.approx(ratios[1:, mine].mean(axis=1).std(), rel=1e-9)
     assert predicted.value == pytest.approx(np.nanmean(ratios[:, mine], axis=0).mean(), rel=1e-12)
 
@@ -254,7 +254,7 @@ def test_aperture_readings_bring_their_parameters(mounted_rig):
 
 @pytest.mark.thorough
 def test_gears_without_play_are_not_called_weak_for_it(short):
-    """Of one |N| the ratio cannot be told from play; of gears said to have none it can."""
+    """With one |N| the ratio is inseparable from play; with gears stated to have none it is not."""
     summary = summarise(fit(short, model=ModelChoice(no_backlash=True)))
     assert not any("backlash" in weak.text for weak in summary.weak_directions)
     assert not any("backlash" in entry.quantity for entry in summary.leverage)

@@ -44,7 +44,7 @@ INVERSE_LIMITS = {"pan": (-300.0, 420.0), "tilt": (-200.0, 150.0)}
 
 
 def python_answer(one, kind: int, target: tuple[float, float, float], sides: tuple[int, int]) -> list[int]:
-    """Counters, by way of which, sides and extrapolation, as the header tells them."""
+    """Counters, by way of which, sides and extrapolation, as the header returns them."""
     names = [
         {1: positive, -1: negative}.get(side) for side, (negative, positive) in zip(sides, SIDES.values(), strict=True)
     ]

@@ -84,7 +84,7 @@ def geared_complete() -> Calibration:
 
 
 def test_files_of_the_first_format_are_of_gears_without_errors(tmp_path):
-    """Neither draws.npz nor JSON of it know a table: they are read as they were written."""
+    """Neither its draws.npz nor its JSON has a table: they are read as they were written."""
     one, path = complete(), tmp_path / "draws.npz"
     arrays = arrays_of(one)
     tables = json.loads(str(arrays["tables"]))

@@ -80,7 +80,7 @@ def rays_of_draws(placed, frame):
 def test_covariance_is_that_of_the_draws(placed, frame):
     """Of the point 500 mm along the ray, in which origin and direction meet: sds within 3 %, correlations 0.03.
 
-    40 000 draws of 4 000 rigs know an sd to 1.1 %, a correlation to 0.016.
+    40 000 draws of 4 000 rigs determine an sd to 1.1 %, a correlation to 0.016.
     """
     ray = placed.ray(*STEPS, APPROACH, frame=frame, covariance=True)
     along = np.c_[np.eye(3), 500.0 * np.eye(3)]

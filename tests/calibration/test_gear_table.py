@@ -71,7 +71,7 @@ def test_covariance_of_a_look_is_that_of_the_interpolated_draws():
 
 @pytest.mark.parametrize("approach", [("left", "up"), ("right", "down"), ("left", "unknown")])
 def test_a_constant_error_is_a_zero_and_a_constant_change_is_play(approach):
-    """Everything a robot asks is what it is for a rig whose zero and play are that much larger."""
+    """Every answer is that for a rig whose zero and play are that much larger."""
     shifts = {"transmission_error_at_deg_tilt": 0.3, "play_variation_at_deg_pan": 0.2}
     one = constant(calibration(), **shifts)
     moved = dict(BENT)

@@ -51,7 +51,7 @@ def test_ranges_are_those_of_jax_from_anywhere(azimuth):
     assert 400 < meets.sum() < 1600
     ranges = range_components(tuple(origin), tuple(direction), 200.0, angle_deg, azimuth)
     with np.errstate(invalid="ignore"):
-        # Points behind the baseline are refused by anyone who asks for the range.
+        # Points behind the baseline are refused by the callers that need the range.
         np.testing.assert_array_equal((ranges > 0) & (origin[0] + ranges * direction[0] > 0), meets)
     np.testing.assert_allclose(ranges[meets], np.asarray(expected.range_mm)[meets], rtol=1e3 * ROUNDING)
     for k in range(100):

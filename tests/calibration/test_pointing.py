@@ -175,7 +175,7 @@ def test_a_beam_along_the_line_of_sight_is_refused():
 
 
 def test_points_that_too_many_draws_lose_are_refused_as_by_the_draws(bent):
-    """More than 0.1 % of draws diverge. The law of propagation asks range and u, the other counts draws."""
+    """More than 0.1 % of draws diverge. The law of propagation needs range and u, the other counts draws."""
     rng = np.random.default_rng(4)
     count = 4000
     inputs = np.array([NOMINAL[name] for name in INPUT_NAMES]) + np.zeros((count, 1))

@@ -29,7 +29,7 @@ def test_a_calibration_has_not_changed_from_itself(mixed_fit):
     np.testing.assert_allclose([c.first for c in same.changes[:4]], local, rtol=1e-12)
     assert [c.quantity for c in same.changes[:2]] == ["effective_deg_per_step.left", "effective_deg_per_step.right"]
     assert "local_deg_per_step.left" in changes_text(same) and "effective" not in changes_text(same)
-    # What is least known may hide most: here the second ratio, made ten times less sure.
+    # The largest u may hide most: here that of the second ratio, ten times as large.
     worst = structs.replace(same.changes[1], u=10 * same.changes[1].u)
     less = structs.replace(same, changes=(same.changes[0], worst, *same.changes[2:]))
     assert f"may have changed by up to {100 * same.limit * worst.u / worst.first:.2g} % undetected" in changes_text(

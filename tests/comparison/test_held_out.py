@@ -64,7 +64,7 @@ def test_joint_predicts_a_step_count_it_never_saw(mixed_fit):
 
 
 def test_left_out_spots_teach_nothing(mixed_fit):
-    """Spoiling experiments that a fit was told to leave out changes no bit of it."""
+    """Spoiling experiments that a fit leaves out changes no bit of it."""
     campaign = mixed_fit.campaign
     selection = select_experiments(campaign)
     out = frozenset(campaign.spots[r].spot for r in selection.spot_rows[np.abs(selection.steps) == 100].ravel())

@@ -88,7 +88,7 @@ def test_another_machine_is_none_of_the_worlds(mounted_rig, mixed_fit, truth, ca
 
 
 def test_a_plan_reaches_its_stops_from_their_sides_and_tells(mounted_rig, mixed_fit, truth, calibration):
-    """Its looks are a plan that runs; under the calibration in force they are as many as tell."""
+    """Its looks are a plan that runs; under the calibration in force they suffice."""
     planned = plan_looks(mixed_fit.campaign, calibration)
     assert planned.enough and len(planned.stops) >= 6 and planned.distance >= 5
     (low, high), (down, up) = calibration.range_steps
@@ -107,7 +107,7 @@ def test_a_plan_reaches_its_stops_from_their_sides_and_tells(mounted_rig, mixed_
 
 
 def nominal_of(calibration, rig):
-    """A calibration that says what the nominal rig does."""
+    """A calibration of the nominal rig."""
     ratios = {
         f"degrees_per_step.{axis}": rig.table.priors[f"degrees_per_step.{axis}"].value for axis in ("pan", "tilt")
     }

@@ -104,7 +104,7 @@ def test_a_planted_change_is_named(mounted_rig, mixed_fit, truth, changed, what,
 
 
 def test_nothing_has_moved(mounted_rig, mixed_fit, truth, monkeypatch):
-    """The same looks are OK where their power is enough, and tell which change they cannot see where it is not."""
+    """The same looks are OK where their power is enough, and name the change they cannot detect where it is not."""
     looks = next_day(mounted_rig, truth)
     test = watch(mixed_fit, looks)
     assert test.verdict == CANNOT_TELL and test.p > FALSE_ALARM_RATE and not test.moved and test.same_cameras

@@ -51,7 +51,7 @@ def test_points_are_those_of_the_law_and_of_the_published_equations():
     np.testing.assert_array_equal(block.lines, np.arange(2, 52)[met])
     assert [each.line for each in block.refused] == [2 + k for k in range(6, 50, 7)]
     assert {each.error.code for each in block.refused} == {"diverging"}
-    # What a simple calibration says lies on its beam, and the aperture, 170 mm from the beam's origin, reads the angle.
+    # A simple calibration's point lies on its beam, and the aperture, 170 mm from the beam's origin, reads the angle.
     ray = simple_rays(SIMPLE["nominal"], rows.settings.steps[met])
     along = block.simple_xyz_mm["nominal"].T - ray.origin_mm
     np.testing.assert_allclose(np.cross(along, ray.direction, axis=0), 0.0, atol=ROUNDING_MM)

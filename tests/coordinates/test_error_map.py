@@ -67,7 +67,7 @@ def mapped(one: Calibration, simple: SimpleCalibration, pan=PAN, tilt=TILT, rang
 
 @pytest.mark.parametrize("azimuth", [False, True])
 def test_a_perfect_rig_has_no_error_straight_ahead(azimuth):
-    """At pan 0 the beam leaves where published equations think it does; turned, it runs L beside the pan axis."""
+    """At pan 0 the beam leaves where published equations assume it; turned, it runs L beside the pan axis."""
     one = calibration(NOMINAL, {}, NO_NOISE_DEG, azimuth=azimuth)
     errors = mapped(one, simple_calibration(), pan=np.array([0.0, 100.0]))
     assert errors.valid.all()
@@ -114,7 +114,7 @@ def test_joint_beats_nominal_on_a_biased_rig():
     errors = mapped(one, simple_calibration(), ranges=np.array([150.0, 200.0, 300.0, 400.0]))
     assert errors.valid.all()
     assert np.all(errors.rms_mm["joint"] < errors.rms_mm["nominal"])
-    # The joint error is what `locate` says of a look: the trace of its covariance.
+    # The joint error is that of `locate` for a look: the trace of its covariance.
     ray = one.ray(PAN[0], TILT[1])
     point = ray.origin_mm + 300.0 * ray.direction
     reading = aperture_angle_deg(point, one.estimates["baseline_mm"], "in-plane")

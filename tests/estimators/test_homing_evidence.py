@@ -39,7 +39,7 @@ def test_no_way_is_fitted_that_cannot_matter_and_few_where_one_axis_was_recorded
         return independent(sides)
 
     ways = weighed(AXES, evidence)
-    # "up" is e^10 less probable than "down": it is asked for alone, never with a side of the other axis.
+    # "up" is e^10 less probable than "down": it is fitted alone, never with a side of the other axis.
     together = [dict(key) for key in fits if ANYWHERE not in dict(key).values()]
     assert together and all("up" not in sides.values() for sides in together)
     assert len(fits) < most_fits(AXES) and most_fits(AXES[:1]) == 3 and most_fits(()) == 0

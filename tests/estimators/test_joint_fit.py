@@ -1,4 +1,4 @@
-"""The joint estimator: finds the truth, says how sure it is, blames the right spot, compiles once (formulation 4.2)."""
+"""The joint estimator: finds the truth with its uncertainty, names the right spot, compiles once (formulation 4.2)."""
 
 from __future__ import annotations
 
@@ -71,13 +71,13 @@ def test_truth_is_found_within_its_uncertainty(simulated, fitted):
 def test_the_data_shrink_the_ratios_a_hundredfold(fitted):
     prior = fitted.prior_draws.effective_deg_per_step.std(axis=0)
     posterior = fitted.draws.effective_deg_per_step.std(axis=0)
-    # The prior says 0.01 deg/step, stereo and focal scale leave 0.3 to 0.5 % of 0.06.
+    # The prior is 0.01 deg/step, stereo and focal scale leave 0.3 to 0.5 % of 0.06.
     assert np.all(posterior < prior / 30)
 
 
 @pytest.mark.thorough
 def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
-    # The nominal rig knows its mounting to 0.5 rad and 100 mm; the true one stands 0.32 rad and 100 mm away.
+    # The nominal rig states its mounting to 0.5 rad and 100 mm; the true one stands 0.32 rad and 100 mm away.
     wide = {f"extrinsics.rotation_rad.{a}": Prior(0.0, 0.5) for a in "xyz"}
     wide |= {f"extrinsics.translation_mm.{a}": Prior(0.0, 100.0) for a in "xyz"}
     campaign = simulated.campaign

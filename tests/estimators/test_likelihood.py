@@ -105,7 +105,7 @@ def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evalua
 def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
     """Stop errors, homings and play of the dozen last from one block of four to the next.
 
-    Twenty do not divide the padded number: four do. Another padded number is compiled anew.
+    Twenty do not divide the padded number: four do. Another padded number is compiled again.
     """
     whole = evaluate(dozen.z, dozen.space, dozen.arrays).log_likelihood
     monkeypatch.setattr(density, "BLOCK", 20)
@@ -115,7 +115,7 @@ def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
 
 
 def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
-    """The mistake formulation 3.1 names: both axes drawn anew at every move."""
+    """The mistake formulation 3.1 names: new draws of both axes at every move."""
     mistaken = drawn_at_every_move(dozen.campaign, dozen.arrays)
     right, wrong = (evaluate(dozen.z, dozen.space, arrays) for arrays in (dozen.arrays, mistaken))
     dense = dense_log_density(dozen.campaign, right, persistent=False)

@@ -137,7 +137,7 @@ def test_leave_one_out_is_the_prediction_by_all_others():
 
 
 def test_leave_one_out_of_weighted_spots_is_that_of_full_weight():
-    """Robust weights scale a spot's noise; its distance is told as if it alone had its full weight again."""
+    """Robust weights scale a spot's noise; its distance is that at its full weight again."""
     spots = campaign()
     weight = np.random.default_rng(11).uniform(0.2, 1.0, len(spots.residual))
     root = np.sqrt(weight)[:, None]
@@ -185,7 +185,7 @@ def test_sd_is_infinite_where_nothing_else_informs():
 def test_outlier_of_a_stop_is_blamed_on_its_spot(seed, blamed):
     """Two looks at one stop, one of them wrong by 12 sds: the wrong one has the largest distance.
 
-    One-step innovations would blame the second look where the first is wrong: the stop error follows the first.
+    One-step innovations would name the second look where the first is wrong: the stop error follows the first.
     """
     spots = campaign(seed)
     rng = np.random.default_rng(100 + seed)
@@ -216,7 +216,7 @@ def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen)
     Home offsets, unknown play, stop errors that outlive moves of the other axis, two looks at one stop.
     """
     rng = np.random.default_rng(5)
-    # As many as a fit asks for at once: that is compiled.
+    # As many as a fit evaluates at once: that is compiled.
     z = jnp.asarray(dozen.z + 0.1 * rng.standard_normal((BATCH, dozen.z.size)))
     # Errors at places are given: what others say of them would be lost with a move.
     none = jnp.zeros_like(dozen.arrays.gears.places.valid)

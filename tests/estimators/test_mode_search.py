@@ -9,7 +9,7 @@ from tvsbayes.estimators.mode_search import Problem
 
 CENTRE = np.array([0.4, -1.2, 0.03])
 CURVATURE = np.array([1.0, 40.0, 4000.0])
-"""Of negative log densities along noise scales, prior sds^-2: from what the prior leaves to what many looks tell."""
+"""Of negative log densities along noise scales, prior sds^-2: from the prior's alone to those of many looks."""
 SETTLED_SDS = 0.02
 """Twice the slope at which the search ends, in sds."""
 CALLS_MAX = 6

@@ -1,4 +1,4 @@
-"""What a campaign tells before any fit: readable numbers that no rig can have measured are named."""
+"""Plausibility of a campaign before any fit: readable numbers that no rig can have measured are named."""
 
 from __future__ import annotations
 

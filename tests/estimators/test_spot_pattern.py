@@ -77,7 +77,7 @@ def test_few_spots_show_no_pattern(twins):
 
 
 def test_centres_scatter_as_left_and_right_say(twins):
-    """The twin's noise is pixel_scale times 0.1 px; the median of 144 tells a spread to 10 %, here three."""
+    """The twin's noise is pixel_scale times 0.1 px; the median of 144 estimates a spread to 10 %, here three."""
     campaign = twins["grid_twin"]
     rng = np.random.default_rng(6)
     pixels = pixels_of(campaign.spots) + 0.7 * rng.standard_normal((len(campaign.spots), 4))

@@ -84,7 +84,7 @@ def test_groups_of_other_means_are_told_by_r_hat(judged):
     z[..., 1] += 0.25 * np.repeat([1.0, -1.0] * (GROUPS // 2), WALKERS // GROUPS)
     missing = "; ".join(judged(chain_of(z)).convergence.missing)
     value = float(re.search(r"R-hat of \S+ is ([\d.]+), wanted 1.01", missing)[1])
-    # The 500 draws of half a group tell its mean to 0.045: 0.25 +- 0.045 is 1.035 +- 0.012.
+    # The 500 draws of half a group determine its mean to 0.045: 0.25 +- 0.045 is 1.035 +- 0.012.
     assert value == pytest.approx(1.035, abs=0.02)
 
 
@@ -151,7 +151,7 @@ def test_a_chain_that_says_the_same_as_importance_sampling_agrees(judged):
 
 @pytest.mark.parametrize(("shift", "answer"), [(-0.15, "rough"), (-1.0, "laplace")])
 def test_a_chain_that_says_something_else_is_known_no_better_than_both_agree(judged, shift, answer):
-    """The chain's 5000 draws know a mean to 0.014 sd, the weighted 8000, worth 3600, to 0.017: 0.15 is seven errors."""
+    """The chain's 5000 draws have a mean to 0.014 sd, the weighted 8000, worth 3600, to 0.017: 0.15 is seven errors."""
     sample = judged(chain_of(independent()), weighted(shift))
     agreement = sample.convergence.agreement
     assert sample.convergence.answer == answer and not agreement.agrees
@@ -164,7 +164,7 @@ def test_a_chain_that_says_something_else_is_known_no_better_than_both_agree(jud
 
 
 def test_where_every_headline_is_fixed_the_others_must_agree(judged, monkeypatch):
-    """A rig whose geometry is stated as known: the campaign teaches its noise."""
+    """A rig whose geometry is stated as known: the campaign determines its noise."""
     monkeypatch.setattr(TwoNormals, "headlines", ("effective_mirror_offset_mm",))
     assert judged(chain_of(independent()), weighted()).convergence.converged
     sample = judged(chain_of(independent()), weighted(-0.15))

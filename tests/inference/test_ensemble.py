@@ -1,4 +1,4 @@
-"""A chain is extended as long as its own diagnosis asks."""
+"""A chain is extended until its diagnosis passes."""
 
 from __future__ import annotations
 

@@ -173,7 +173,7 @@ def test_between_cuts_a_density_goes_on_as_it_does_at_them():
     gumbel = -NODES / width - np.exp(-NODES / width)
     cuts = np.isin(NODES, CUT_NODES)
     values = between_cuts(np.array([parabola, gumbel])[:, cuts])
-    # Rounding of the largest value, some operations long; cuts up to 3 stand 1 apart, and a slope asks two beside.
+    # Rounding of the largest value, some operations long; cuts up to 3 stand 1 apart, and a slope needs two beside.
     rounding = 64 * np.spacing(np.abs(parabola).max())
     near = np.abs(NODES) <= 1
     np.testing.assert_allclose(values[0, near], parabola[near], atol=rounding)

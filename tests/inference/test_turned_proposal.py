@@ -1,4 +1,4 @@
-"""A proposal whose coordinates lean on each other: its density is that of its draws, and it learns how they lean."""
+"""A proposal of coupled coordinates: its density is that of its draws, and the coupling is fitted."""
 
 from __future__ import annotations
 

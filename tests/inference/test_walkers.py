@@ -118,7 +118,7 @@ def test_walkers_are_half_the_dimensions_or_more_in_whole_batches():
 
 
 def test_groups_never_use_one_another():
-    """Other walkers in one group move nobody in the others: same random numbers, same steps, bit for bit."""
+    """Other walkers in one group move none in the others: same random numbers, same steps, bit for bit."""
     generator = np.random.default_rng(9)
     start = generator.standard_normal((WALKERS, 3))
     other = start.copy()

@@ -232,7 +232,7 @@ def test_text_stays_text(payload):
     # Five texts of the campaign, its certificate twice, three of the call, two of the fit in both lists of software.
     assert sum((e.text or "").count(shown) for e in root.iter()) == 14
     assert b"<script" not in data and b"<svg" not in data and b"<!" not in data
-    # The value of a release stays what the Schematron wants, whatever the version says.
+    # The value of a release stays what the Schematron requires, whatever the version is.
     assert set(texts(root, ".//dcc:release")) == {"v0.1.0"}
 
 

@@ -115,7 +115,7 @@ def test_each_cause_of_a_budget_is_its_own_propagation(caused):
 
 
 def test_budgets_of_gears_that_vary_have_their_rows():
-    """Causes and parameters add up at counters seen and beyond; u of the gears is the larger where nobody looked."""
+    """Causes and parameters add up at counters seen and beyond; u of the gears is the larger away from the looks."""
     one = geared(calibration(noise_spread=0.0))
     count, variances = len(INPUT_NAMES), np.linalg.eigh(one.covariance)
     root = variances.eigenvectors * np.sqrt(np.clip(variances.eigenvalues, 0.0, None))

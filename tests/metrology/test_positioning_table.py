@@ -118,7 +118,7 @@ def test_too_few_stops_give_a_reason_and_no_table():
 
 
 def test_an_axis_that_turns_far_is_asked_for_more_targets():
-    """More than 180 deg of travel want eight targets, in the words as in the tests."""
+    """More than 180 deg of travel need eight targets, in the words as in the tests."""
     fit = stops_of(np.zeros(STOPS))
     calibration = known_calibration()
     far = replace(calibration, range_steps=np.array([[0, 4000], calibration.range_steps[1]]))

@@ -1,4 +1,4 @@
-"""The folder of compiled functions: the user's own or none, and what the doctor is told of it."""
+"""The folder of compiled functions: the user's own or none, and what the doctor reports of it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_without_a_name_it_is_the_users_cache_folder(tmp_path, monkeypatch):
 
 @posix
 def test_a_folder_into_which_others_write_is_not_used(folder, capsys):
-    """Neither JAX's own entries, which are code too; anyone who runs a command is told."""
+    """Nor JAX's own entries, which are code too; every command reports it."""
     folder.mkdir()
     folder.chmod(0o777)
     before = jax.config.jax_compilation_cache_dir

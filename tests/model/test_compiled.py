@@ -1,4 +1,4 @@
-"""Traces kept between processes: used where they are whole, the user's own and of this code; else made anew."""
+"""Traces kept between processes: used where they are whole, the user's own and of this code; else made again."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def pair(count: int = 3) -> Pair:
 
 @pytest.fixture
 def traces(tmp_path, monkeypatch) -> Traces:
-    """A folder of traces for this test; the clock says that no source was written since."""
+    """A folder of traces for this test; by the clock no source is newer."""
     counted = Traces(tmp_path / "traced")
     monkeypatch.setattr(Traces, "used", counted)
     monkeypatch.setattr(subject, "LOADED_TIME_S", 1e12)
@@ -185,7 +185,7 @@ def test_other_code_has_other_traces(traces, tmp_path, monkeypatch):
 
 
 def test_code_is_what_a_module_imports(tmp_path):
-    """Whatever way it is written; what nobody imports from there is other code."""
+    """In every form; what is not imported from there is other code."""
     package = tmp_path / "tvsbayes"
     texts = {"a/one": "from tvsbayes.b.two import (\n    x,\n)\n", "b/two": "def f():\n    import tvsbayes.b.three\n"}
     texts |= {"b/three": "from tvsbayes.b import four\n", "b/four": "", "b/five": "from tvsbayes.a.one import y\n"}

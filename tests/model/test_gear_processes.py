@@ -162,7 +162,7 @@ def test_gears_without_errors_have_none_in_their_line(line):
 
 
 def test_turns_of_the_beam_are_unwrapped(line):
-    """Beyond half a turn the azimuth begins anew; its line does not."""
+    """Beyond half a turn the azimuth wraps; its line does not."""
     ratio = float(line.model.transmission.ratio_rad_per_step[0])
     beyond = np.array([0.0, 0.0, np.pi - ratio * 300 + 0.05, 0.0, *[0.0] * 4])
     slopes = np.asarray(line.slopes(beyond, SECANT)[0])

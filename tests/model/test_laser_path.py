@@ -197,7 +197,7 @@ def test_contrast_is_positive_minus_negative_ratio(gears, axis, sign):
 
 
 def test_first_row_of_a_segment_rehomes_with_the_mean_ratio(gears):
-    """Whatever happened before: q = k n, not the history's sum; play as its approach says."""
+    """Whatever happened before: q = k n, not the history's sum; play by its approach."""
     k, c, b = 1e-3, 2e-4, 8e-3
     values = np.array([k, k, c, c, b, b, 0.0])
     before = [[0, 0], [300, -300], [100, 50]]

@@ -300,7 +300,7 @@ def test_coordinates_are_the_inverse(physical):
 
 
 def test_the_spread_of_a_half_normal_is_that_of_its_draws():
-    """Against draws: 40000 know an sd to 0.4 %, three times that is asked; far from zero the slope is enough."""
+    """Against draws: 40000 determine an sd to 0.4 %, three times that is allowed; far from zero the slope is enough."""
     draws = np.random.default_rng(5).standard_normal(40_000)
     for mean, sd in ((-2.0, 1.0), (0.0, 0.5), (1.0, 0.1)):
         values = stats.halfnorm.isf(stats.norm.sf(mean + sd * draws))
@@ -309,7 +309,7 @@ def test_the_spread_of_a_half_normal_is_that_of_its_draws():
 
 
 def test_one_point_in_numpy_is_that_of_jax():
-    """Values and slopes of every kind of prior, in the bulk, in the tails and beyond what a half-normal can tell."""
+    """Values and slopes of every kind of prior, in the bulk, in the tails and beyond the range of a half-normal."""
     space = parameter_space(table(), small_stereo())
     rng = np.random.default_rng(6)
     for scale in (1.0, 4.0, 60.0):

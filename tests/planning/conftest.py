@@ -1,4 +1,4 @@
-"""Plans are judged on a rig of perfect gears, unless a test says otherwise: searches are told by its looks alone."""
+"""Plans are judged on a rig of perfect gears, unless a test has others: searches depend on its looks alone."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def believers(knowledge, *z) -> Instruments:
 def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge, pool, monkeypatch, together, kept):
     """One by one, move by move through the filter: at the true noise for the scales, at these for the covariance.
 
-    In parts of any size, and a design asked for later than others.
+    In parts of any size, and a design requested later than others.
     """
     monkeypatch.setattr(Assurance, "PAIRS", together)
     monkeypatch.setattr(Assurance, "CACHED", kept)
@@ -92,7 +92,7 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
 
 
 def test_other_noise_scales_need_no_new_look(knowledge, pool, seen):
-    """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
+    """Looks whitened again for other stop errors and pixels carry the information that looking again would give."""
     family = Family(knowledge, pool, np.arange(len(pool.looks)), False)
     truth = believers(knowledge, knowledge.z)
     assurance = Assurance(family, parse_target(DEFAULT_TARGET), truth, 0)
@@ -107,7 +107,7 @@ def test_other_noise_scales_need_no_new_look(knowledge, pool, seen):
 
 
 def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, seen):
-    """Thousands of stops tell the true sd; none leave the prior's root mean square; the scatter is 1 / sqrt(2 n)."""
+    """Thousands of stops give the true sd; none leave the prior's root mean square; the scatter is 1 / sqrt(2 n)."""
     true = knowledge.z.copy()
     columns = STOP_COLUMNS.ravel()
     true[columns] = 1.5
@@ -146,7 +146,7 @@ def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(kn
 
     exact = np.zeros((PARAMETERS, PARAMETERS))
     geometry = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
-    # Nothing is learned where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
+    # No information is gained where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
     precision = np.diag(knowledge.precision)
     unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
     left_over = 1 - np.sum(geometry & (precision > 0)) / (2 * seen.seen[chosen].sum())

@@ -1,4 +1,4 @@
-"""Information of a plan is what a fit of it knows, move by move."""
+"""Information of a plan is that of its fit, move by move."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
 
 
 def test_looks_that_scatter_tell_a_plan_less(knowledge):
-    """Every stop looked at once: what a plan tells follows the sum of both variances, and falls with it."""
+    """Every stop looked at once: information follows the sum of both variances, and falls with it."""
     plan = PlanBuilder()
     plan.home(0, 0)
     plan.place("d1")

@@ -152,8 +152,8 @@ def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
 def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_own_scales(real):
     """Assurance of designs equals the plan judged move by move, on gears whose errors are as large as drawn.
 
-    Neither the line over all candidates, nor over looks that the cameras miss, nor the scales believed beforehand would
-    do: all tell another u.
+    Neither the line over all candidates, nor over looks that the cameras miss, nor the prior scales would
+    do: all give another u.
     """
     known, pool = real
     family = Family(known, pool, np.random.default_rng(4).integers(0, len(pool.looks), 24), False)
@@ -249,7 +249,7 @@ def test_perfect_gears_have_no_places(knowledge, pool):
 
 @pytest.mark.parametrize(("ratio", "axis"), [("left", 0), ("up", 1)])
 def test_a_plan_for_real_gears_looks_from_more_counters(mounted_rig, monkeypatch, ratio, axis):
-    """Where mirrors are known and stops precise: a line along errors of 0.08 deg wants more counters than a gear's.
+    """Where mirrors are known and stops precise: a line along errors of 0.08 deg needs more counters than a gear's.
 
     At stop errors of 0.04 deg and unknown mirrors both plans look from all over: the mirrors ask for as much.
     """

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 
 @pytest.fixture(scope="module")
 def wide(mounted_rig):
-    """A rig that can look at everything again a full turn away, and knows its ratio well enough to find it."""
+    """A rig that can look at everything again a full turn away, and whose prior ratio is precise enough to find it."""
     limits = {"pan_min_steps": -200, "pan_max_steps": 6400, "tilt_min_steps": -130, "tilt_max_steps": 130}
     return with_priors(replace(mounted_rig, positioner=limits), degrees_per_step__pan=Prior(0.06, 1e-5))
 
@@ -59,9 +59,9 @@ def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
 
 
 def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
-    """Exact cameras of unknown focal scale, known mechanics, one depth: the scale limits, and its cure is enough.
+    """Exact cameras of unknown focal scale, known mechanics, one depth: the scale limits, and its remedy is enough.
 
-    4 degrees of pan, seen to a pixel, are too few to tell the scale from the ratio.
+    4 degrees of pan, seen to a pixel, are too few to separate scale and ratio.
     """
     free = ("degrees_per_step", "backlash", "stop_sd", "pixel_scale", "focal_scale")
     priors = mounted_rig.table.priors
@@ -110,7 +110,7 @@ def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, pool):
 
 
 def test_errors_of_the_gears_at_the_point_are_not_called_its_stop(knowledge):
-    """Stop 3 mm and reading 4 mm make 5 mm; with 12 mm of the gears, which looks nearer by would tell, 13 mm."""
+    """Stop 3 mm and reading 4 mm make 5 mm; with 12 mm of the gears, which nearer looks would reduce, 13 mm."""
     parts = {AT_POINT[0]: np.array([9.0]), AT_POINT[1]: np.array([16.0]), GEARS_AT_POINT: np.array([144.0])}
     point, none = Sensitivity(at({SCALE: 1e-3})[None], parts), np.zeros((PARAMETERS, PARAMETERS))
 
@@ -175,7 +175,7 @@ def target_of(limit: float) -> Target:
 
 
 def test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high(knowledge):
-    """A value that is one prior's alone goes with its u: a floor 4 / 1.02 times the target asks for u / 4 * 1.02."""
+    """A value that is one prior's alone goes with its u: a floor 4 / 1.02 times the target requires u / 4 * 1.02."""
     nothing, only = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({SCALE: 2.0})[None])
     limit = limit_of(knowledge, nothing, only, target_of(0.51))
     assert (limit.floor, limit.cause, limit.reachable) == (2.0, "focal scale", False)

@@ -135,7 +135,7 @@ def test_looks_and_instruments_keep_their_places_whatever_the_block(knowledge, m
     """
     looks = Looks(np.array(STEPS), np.array(SIDES), np.array([0, 1, 2, 0, 1, 0, 1]))
     drawn = draw_instruments(knowledge, count, seed=1)
-    # The truth lies in another space where something is held fixed; whether it is seen is asked in the common one.
+    # The truth lies in another space where something is held fixed; visibility is evaluated in the common one.
     z = drawn.z
     rows = [row for row in (0, 1, 128 // 7, 256 // 7, 1024 // 7, count - 1) if row < count]
     one_by_one = [LookArrays(looks, knowledge, False).at(z[row], knowledge.space) for row in rows]

@@ -1,4 +1,4 @@
-"""What a plan leaves together, its cure, and the one rule by which plan and fit judge."""
+"""What a plan leaves inseparable, its remedy, and the one rule by which plan and fit judge."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def partly_cleared(repeats: int, cleared: int) -> tuple[PlanStep, ...]:
 
 
 def test_plan_and_fit_judge_by_one_rule(mounted_rig):
-    """At the edge: what is said of a plan is what a fit of its expected correlation says, and moves alone say no more.
+    """At the edge: a plan is judged like a fit of its expected correlation; moves alone add nothing.
 
     With 2 of 12 starts cleared the ratio and the backlash of both axes correlate by 0.51 to 0.56, with 4 by 0.37 to
     0.44. A fit at the very instrument of the plan, whose covariance is the plan's, judges the same numbers.

@@ -126,7 +126,7 @@ def refine(knowledge, pool, seen):
 
 @pytest.fixture(scope="module")
 def poor(pool):
-    """Eight looks at one sheet, all at one place: they tell nothing of the ratio."""
+    """Eight looks at one sheet, all at one place: no information on the ratio."""
     return np.full(2 * LOOKS_PER_EXPERIMENT, np.flatnonzero(pool.looks.sheet == 1)[0])
 
 

@@ -1,4 +1,4 @@
-"""Looks planned for a watch: powers are those of the looks taken, the budget holds, what is out of reach is said."""
+"""Looks planned for a watch: powers are those of the looks taken, the budget holds, what is out of reach is named."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_plan_notices_what_it_states(planned, measured, watched_fit, designs
 def test_what_is_out_of_reach_is_said(planned):
     by_name = {change.what: change for change in planned.changes}
     assert list(by_name) == NAMES and not planned.met
-    # 0.3 % of a ratio over 200 steps is 0.036 deg, and the first day knows it to 0.4 %.
+    # 0.3 % of a ratio over 200 steps is 0.036 deg, and the first day determines it to 0.4 %.
     ratio = by_name["ratio: pan"]
     assert ratio.power < POWER_MIN and ratio.looks_needed is None and ratio.looks_to_add > 100
     cameras = by_name["cameras: shift"]

@@ -84,7 +84,7 @@ def test_refusals_and_alarms_are_named(action, code):
 
 
 def test_motion_that_somebody_stopped_is_no_arrival():
-    """Even at the very counters ordered: done is what the device says of this motion, not where it stands."""
+    """Even at the very counters ordered: the device's report on this motion counts, not its counters."""
     device = simulated()
     positioner = connected(device)
     positioner.home()

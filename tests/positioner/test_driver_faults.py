@@ -254,7 +254,7 @@ def session(kind: str, step: int, seed: int) -> Session:
     if kind not in ("lost steps", "blocked motor"):
         wrong += missed
     elif verified and missed:
-        # Lost in both senses to the same number: the counters are right again, and only the cameras can tell.
+        # Lost in both senses to the same number: the counters are right again, and only the cameras detect it.
         counters = device.model.state.pan_steps, device.model.state.tilt_steps
         expect(counters == tuple(device.mechanics.true_steps), missed[0])
         outcome = "losses that cancelled"

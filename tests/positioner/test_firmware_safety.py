@@ -226,7 +226,7 @@ def test_bounce_of_the_home_switch_makes_no_wrong_zero(agreed, after, readings):
     state = bench.state(4)
     assert (state.status, state.pan_steps, state.tilt_steps) == ("idle", -60, -40)
     assert bench.board.true_steps == [-60, -40]
-    # What the core took for home is not on record; another homing tells.
+    # What the core took for home is not on record; another homing determines it.
     bench.ask(5, "HOME")
     bench.pass_time(15)
     state = bench.state(6)
@@ -315,7 +315,7 @@ def test_direction_stands_before_the_step():
 
 
 def test_a_switch_that_bounces_while_it_is_left_is_left_by_the_whole_way(agreed):
-    """Twenty steps without a contact, counted anew after one."""
+    """Twenty steps without a contact, counted again after one."""
     bench = Twin().homed()
     bench.ask(5, "HOME")
     bench.pass_time(0.05)

@@ -1,4 +1,4 @@
-"""Headers of fits on the processor of the board: what a microcontroller sends is what Python says."""
+"""Headers of fits on the processor of the board: a microcontroller sends what Python computes."""
 
 from __future__ import annotations
 

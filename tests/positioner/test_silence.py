@@ -21,7 +21,7 @@ UNREADABLE = bytes(random.Random(3).choice((0x00, 0x80, 0xF8, 0xFE, 0x1C, 0x66))
 
 
 class Board:
-    """Something at the other end: what it says at first and to every line, on a virtual clock."""
+    """Something at the other end: its greeting and its answer to every line, on a virtual clock."""
 
     def __init__(self, clock: VirtualClock, greeting: bytes, says):
         self.clock, self.pending, self.says, self.written = clock, bytearray(greeting), says, bytearray()

@@ -54,7 +54,7 @@ def test_the_line_through_the_looks_is_found_and_the_local_slope_knows_less(gear
 
 @pytest.mark.slow
 def test_both_samplers_say_the_same(gear_fit):
-    """The chain's limits are met; where importance sampling wants more draws for its own, it still says the same."""
+    """The chain's limits are met; where importance sampling needs more draws for its own, it still agrees."""
     fitted = gear_fit[1]
     chain, run = sample(fitted, "emcee", seed=5, max_minutes=20.0), importance_run(fitted, 5)
     weighted = run.density.posterior(run.sample, run.seed)

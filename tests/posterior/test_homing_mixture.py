@@ -42,7 +42,7 @@ def first(run):
 
 
 def shared(first: WayDraws, rounds: int = 1) -> WayDraws:
-    """Draws of another way weighed anew; here the other way has the same density."""
+    """Draws reweighted for another way, which has the same density here."""
     target = Target(first.target.fit, first.target.path)
     way = WayDraws(target, Pool.empty(first.pool.next_proposal), SEED, shared=True)
     return way.extended(rounds, first.pool)
@@ -56,7 +56,7 @@ def second(run, first):
 
 
 def test_the_same_density_weighed_anew_has_the_same_weights(first):
-    """Only the errors at places are drawn anew; the density of w has them integrated out."""
+    """Only the errors at places are drawn again; the density of w has them integrated out."""
     again = shared(first, first.rounds)
     np.testing.assert_allclose(again.weighed.log_weights, first.weighed.log_weights, atol=1e-9)
     assert again.log_evidence == pytest.approx(first.log_evidence, abs=1e-9)

@@ -215,7 +215,7 @@ def too_narrow(sampled, monkeypatch):
 
 @pytest.mark.thorough
 def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monkeypatch):
-    """Its draws teach the next one; they take no part in the answer, which is that of the right proposal."""
+    """Its draws adapt the next one; they take no part in the answer, which is that of the right proposal."""
     begun = []
 
     def empty(proposal, invalid=0):
@@ -227,7 +227,7 @@ def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monke
     posterior = run.density.posterior(run.sample, SEED)
     judged, other = posterior.convergence, sampled[2].convergence
     assert judged.answer == "accepted" and judged.missing == ()
-    # After the narrowed one come proposals fitted anew.
+    # After the narrowed one come refitted proposals.
     assert len(begun) > 1 and run.pool.proposals == (begun[-1],)
     assert run.pool.counts == (judged.importance.draws,), "draws of the narrow proposal are in the answer"
     # Fitted to draws of a bad proposal it is worth less than a good one, but no tenth of it.
@@ -264,7 +264,7 @@ def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
     assert judged.pareto_k > importance.K_MAX
     missing = "; ".join(posterior.convergence.missing)
     assert f"Pareto k {judged.pareto_k:.2f}, wanted below 0.70" in missing
-    # What is said of it is Laplace's, and that it is, with what is missing; commands end with 0.
+    # The result is stated to be Laplace's, with what is missing; commands end with 0.
     summary = summarise(too_narrow, posterior)
     assert (summary.estimator, summary.answer, summary.converged) == ("laplace", "laplace", False)
     assert summary.explained and unusable(summary) is None
@@ -352,18 +352,18 @@ def test_the_paper_twin_against_nuts(monkeypatch):
     # Errors of a nanodegree are none, and need no functions of other shapes than gears that err.
     table = perfect_gears(campaign.rig)
     nearly = dict.fromkeys(BLOCKS["transmission_error_deg"], Prior(1e-9, 0.0, "half-normal"))
-    # The reference knows no scatter of looks, and the twin has none.
+    # The reference has no scatter of looks, and the twin has none.
     nearly |= dict.fromkeys(BLOCKS["look_scatter_deg"], Prior(0.0, 0.0, "half-normal"))
     perfect = fit(replace(campaign, rig=replace(table, priors={**table.priors, **nearly})))
     reference = json.loads((shipped_data() / "reference" / "posterior_paper.json").read_text())["quantities"]
-    # What is accepted knows an sd to 4 %; the reference knows it better.
+    # Accepted draws determine an sd to 4 %; the reference is more precise.
     monkeypatch.setattr(importance, "ROUNDS_LEAST", 6)
     posterior = sample(perfect, "importance")
     assert posterior.converged
     columns = posterior.by_name
     summary = posterior.summarised(np.stack([columns[name] for name in reference], axis=-1)[None])
     there = {key: np.array([row[key] for row in reference.values()]) for key in ("mean", "sd", "sd_mcse")}
-    # Both know a mean to some 0.02 sd, an sd to 2 %; of 61 quantities one may lie three of these out.
+    # Both determine a mean to some 0.02 sd, an sd to 2 %; of 61 quantities one may lie three of these out.
     np.testing.assert_array_less(np.abs(summary.mean - there["mean"]), 0.1 * there["sd"])
     np.testing.assert_array_less(np.abs(summary.sd / there["sd"] - 1), 0.06)
     # All together they scatter as their errors say.

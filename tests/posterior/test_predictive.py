@@ -127,7 +127,7 @@ def test_looks_taken_again_scatter_about_their_stops(dozen, monkeypatch):
 
 @dataclass(frozen=True)
 class FitOfOneWay:
-    """What the predictions read of a fit; its arrays are a number that tells it from the other."""
+    """What the predictions read of a fit; its arrays are a number that identifies it."""
 
     campaign: Campaign
     arrays: SimpleNamespace

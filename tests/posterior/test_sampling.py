@@ -105,7 +105,7 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
     resumed = sample(fitted, seed=SEED, checkpoint=broken, resume=True)
     np.testing.assert_array_equal(resumed.z, unbroken.z)
     np.testing.assert_array_equal(resumed.log_density, unbroken.log_density)
-    # What importance sampling found is restored, not drawn again, and compared with anew.
+    # What importance sampling found is restored, not drawn again, and compared with again.
     assert resumed.convergence.importance == unbroken.convergence.importance
     assert resumed.convergence.agreement == unbroken.convergence.agreement
     whole, parts, longer = stored(tmp_path / "unbroken.npz"), stored(broken), stored(long[1])

@@ -35,7 +35,7 @@ from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width, centred_count, curvatures
 
 PRECISION = 1e-5
-"""Relative, of what the map says at other scales."""
+"""Relative, of the map at other scales."""
 FLOOR = 1e-9
 """Of a centred map, in y: Gauss and Newton take differences of residuals of 1e4 units of noise."""
 

@@ -42,7 +42,7 @@ def test_every_readable_version_has_a_schema_and_kept_documents():
 def test_old_documents_stay_valid_and_readable(path):
     document = json.loads(path.read_text())
     assert problems(document, schema_of(document)) == []
-    # Keys that came within the version, as they are where nothing is said; those of a diagnosis stay away.
+    # Keys that came within the version, at their defaults; those of a diagnosis stay away.
     later = {"local_deg_per_step": {}, "range_steps": {}, "homing_side": {}, "answer": None, "monte_carlo_error": {}}
     later["periods"] = []
     assert read_fit(path).as_json() == {"validation": None, "few_stops": {}, "tier": None, **later, **document}
@@ -194,7 +194,7 @@ def test_the_schema_refuses(tmp_path, path, value):
 
 @pytest.mark.parametrize("version", FIT_FORMATS)
 def test_a_schema_has_only_rules_that_are_checked(version):
-    """A keyword that JSON Schema does not know would be passed over in silence."""
+    """A keyword that JSON Schema does not define would be ignored silently."""
     schema = schema_of({"format": version})
     Draft202012Validator.check_schema(schema)
     known = {*Draft202012Validator.VALIDATORS, "$schema", "$id", "$defs", "title", "description", "default"}
@@ -242,7 +242,7 @@ def test_numbers_that_are_none_are_refused(tmp_path):
 
 
 def test_a_failure_without_its_test_and_foreign_figures_are_refused(tmp_path):
-    """What pages and certificates look up must be there; the schema does not know it."""
+    """What pages and certificates look up must be there; the schema does not require it."""
     failed = {"passed": False, "level": 0.01, "cause": "drift", "inflation": 2.0, "tests": []}
     axis = {"axis": "pan", "deg_per_step": 0.06, "target_steps": [0, 100], "runs": 5, "estimator": "laplace"}
     axis |= {"plug_in_steps": [], "plug_in_runs": [], "reading_u_deg": None, "missing": None, "notes": []}

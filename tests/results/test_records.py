@@ -82,7 +82,7 @@ class Kept(Record, frozen=True, rename={"short": "a_long_key"}):
 
     Attributes:
         short: a length, mm;
-            None where nobody knows.
+            None where unknown.
         known, hidden: two more.
     """
 

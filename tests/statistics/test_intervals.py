@@ -117,7 +117,7 @@ def error(statistic: Callable, draws: np.ndarray, rate: float = 0.5) -> np.ndarr
     return np.std([statistic(block) for block in np.split(draws, PARTS)], axis=0, ddof=1) * PARTS**-rate
 
 
-# Published values are rounded, hence the unit; four standard errors because ten blocks know one to a quarter only.
+# Published values are rounded, hence the unit; four standard errors because ten blocks determine one to a quarter only.
 def agrees(statistic: Callable, draws: np.ndarray, published, unit: float, rate: float = 0.5) -> None:
     allowed = unit + 4 * error(statistic, draws, rate)
     assert np.all(np.abs(statistic(draws) - np.asarray(published)) <= allowed), (statistic(draws), published, allowed)
@@ -185,7 +185,7 @@ def test_law_is_validated_for_a_sum_of_normals():
 
 
 def test_law_is_validated_for_a_sum_of_rectangles_but_narrowly():
-    """JCGM 101 9.2.3: 3.92 - 3.88 against 0.05; a million draws know an end to 0.005, so this stays undecided."""
+    """JCGM 101 9.2.3: 3.92 - 3.88 against 0.05; a million draws determine an end to 0.005, so this stays undecided."""
     result = summed("9.2.3")
     verdict = result.validate()
     exact = 2 * HALF_WIDTH * (stats.irwinhall.ppf(0.975, 4) - 2)

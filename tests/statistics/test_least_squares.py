@@ -12,7 +12,7 @@ from tvsbayes.cameras.bundle_adjustment import STATIONARY_SD
 from tvsbayes.statistics.least_squares import KINK_FALL, least_squares_covariance, newton_mode
 
 PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0
-"""Digits wanted of every parameter and of every standard error."""
+"""Digits required of every parameter and of every standard error."""
 HIGHER = {"MGH09", "Thurber", "BoxBOD", "Rat42", "MGH10", "Eckerle4", "Rat43", "Bennett5"}
 """NIST's level of difficulty: where solvers fail. Every case takes a compilation."""
 CASES = [
@@ -36,7 +36,7 @@ def test_strd(name, start):
 
 @pytest.mark.usefixtures("x64")
 def test_unfinished_run_is_not_converged():
-    """Three steps do not reach the minimum: the step that is left says so."""
+    """Three steps do not reach the minimum: the remaining step shows it."""
     b, x = np.array([2.0, 0.5]), np.linspace(0.0, 4.0, 20)
     y = b[0] * np.exp(-b[1] * x) + 0.01 * np.random.default_rng(1).standard_normal(20)
 

@@ -105,7 +105,7 @@ def test_errors_are_the_scatter_of_runs_repeated():
         values = np.array([getattr(run, name) for run in runs])
         errors = np.array([getattr(run, f"mcse_{name}") for run in runs])
         scatter = values.std(axis=0)
-        # 300 runs know a scatter to 4 %, 5 sds of which are 20 %; an end's error is itself known to some 10 %.
+        # 300 runs determine a scatter to 4 %, 5 sds of which are 20 %; an end's error is itself known to some 10 %.
         np.testing.assert_allclose(errors.mean(axis=0), scatter, rtol=0.25, err_msg=name)
         np.testing.assert_array_less(np.abs(values.mean(axis=0) - truth), SIGMAS * scatter / np.sqrt(300), name)
         if name != "interval95":
@@ -158,7 +158,7 @@ def test_a_constant_factor_of_the_weights_changes_nothing():
 
 
 def test_the_tail_index_is_that_of_the_tail():
-    """Pareto's own: of 1/u^k it is k; 20 000 draws have 424 in the tail, which know it to (1 + k) / sqrt(424)."""
+    """Pareto's own: of 1/u^k it is k; 20 000 draws have 424 in the tail, which determine it to (1 + k) / sqrt(424)."""
     u = np.random.default_rng(6).uniform(size=20_000)
     for k in (0.2, 0.5, 0.9):
         assert pareto_k(u**-k) == pytest.approx(k, abs=SIGMAS * (1 + k) / np.sqrt(424))

@@ -1,4 +1,4 @@
-"""Engines: unknown ones refused, dead workers told with what to do."""
+"""Engines: unknown ones refused, dead workers reported with a remedy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class CommClosedError(OSError):
 
 
 class Pool:
-    """Makes row 5 and loses every other; remembers what it was asked for."""
+    """Makes row 5 and loses every other; records its requests."""
 
     def __init__(self, lost: BaseException):
         self.lost, self.threads, self.ended = lost, "", False

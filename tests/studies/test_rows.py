@@ -87,7 +87,7 @@ def test_rows_that_cannot_be_written_are_refused_before_the_first_fit(tmp_path):
 
 
 def test_a_file_that_takes_no_row_is_refused_before_the_first_fit(tmp_path, monkeypatch):
-    """By trying: anyone who is root may write what `access` knows, and not a file that is immutable."""
+    """By trying: root may write whatever `access` states, but not a file that is immutable."""
     path = tmp_path / "rows.jsonl"
     path.touch()
     taken = type(path).open

@@ -1,4 +1,4 @@
-"""A small campaign with a kept fit that is said to be its own, and its certificate."""
+"""A small campaign with a kept fit that is stated to be its own, and its certificate."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Certified:
 
 
 def certified(**header: object) -> Certified:
-    """The small campaign and a kept fit whose inputs are said to be its own; None leaves a key of the header out."""
+    """The small campaign and a kept fit whose inputs are stated to be its own; None leaves a key of the header out."""
     campaign = small_campaign()
     merged = {key: value for key, value in {**campaign.header, **header}.items() if value is not None}
     campaign = replace(campaign, header=merged)

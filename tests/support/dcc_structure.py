@@ -1,4 +1,4 @@
-"""What the DCC schema asks of a certificate, as far as one is written here: order, number and content of elements."""
+"""Rules of the DCC schema for a certificate, as far as one is written here: order, number and content of elements."""
 
 from __future__ import annotations
 

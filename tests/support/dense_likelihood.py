@@ -62,7 +62,7 @@ def stop_labels(moves: Sequence[Move], axis: str) -> list[tuple[int, tuple[str, 
 
 
 def drawn_at_every_move(campaign: Campaign, arrays: CampaignArrays) -> CampaignArrays:
-    """A campaign whose stop errors both axes draw anew at every move, from where each of them came last."""
+    """A campaign with new stop errors of both axes at every move, from where each of them came last."""
     spots = ordered_spots(campaign)
     redraw, mix = np.array(arrays.spots.redraw), np.array(arrays.spots.redraw_mix)
     for axis, (name, (positive, negative)) in enumerate(SENSES.items()):
@@ -127,7 +127,7 @@ class RepeatedCovariances:
 
 
 def side(directions: tuple[str, ...]) -> int:
-    """+1 where a stop was reached left or up, -1 right or down, 0 where nobody knows."""
+    """+1 where a stop was reached left or up, -1 right or down, 0 where unknown."""
     return 0 if len(directions) > 1 else 1 if directions[0] in ("left", "up") else -1
 
 

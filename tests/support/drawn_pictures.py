@@ -1,4 +1,4 @@
-"""Small random pictures of two cameras, for whatever only asks what their files are called."""
+"""Small random pictures of two cameras, for tests that need only their file names."""
 
 from __future__ import annotations
 

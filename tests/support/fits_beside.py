@@ -29,7 +29,7 @@ def endless(folder: Path, looks: int) -> Estimate:
 
 
 def waiting(folder: Path, looks: int) -> Estimate:
-    """Ends once somebody opens the other end of a pipe, without a result."""
+    """Ends once the other end of a pipe is opened, without a result."""
     (folder.parent / "go").read_text()
     raise ArithmeticError("not converged")
 

@@ -13,7 +13,7 @@ from tvsbayes.calibration.pointing import Calibration
 STEPS = (tuple(np.linspace(-800.0, 800.0, 33).tolist()), tuple(np.linspace(-700.0, 700.0, 21).tolist()))
 """Table counters of (pan, tilt), 400 beyond what looks reached."""
 SD_DEG = dict(zip(GEAR_INPUTS, (0.08, 0.05, 0.03, 0.02), strict=True))
-"""Of each error where nobody looked."""
+"""Of each error away from the looks."""
 KNOWN = 0.2
 """Of that, where looks reached."""
 

@@ -261,7 +261,7 @@ def both(*edits: Edit) -> Edit:
 
 
 def npy(descr: str, shape: tuple[int, ...], body: bytes = b"") -> bytes:
-    """An .npy whose header says what it likes."""
+    """An .npy with an arbitrary header."""
     header = repr({"descr": descr, "fortran_order": False, "shape": shape}).encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + body

@@ -2,7 +2,7 @@
 
 Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
 at (0, -a/2, 0). mm and rad; degrees where a name says `_deg`. The emission angle C and the aperture angle B are
-interior angles of the triangle whose third corner is the spot. The law of propagation knows no frame, takes any unit.
+interior angles of the triangle whose third corner is the spot. The law of propagation has no frame and takes any unit.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def half_baseline(baseline_mm: Scalar) -> Vectors:
 
 
 def model_from(inputs: Float[Array, " columns"], period_deg: Float[Array, "2"]) -> Model:
-    """A model that knows what coordinates depend on; its cameras are empty."""
+    """A model with what coordinates depend on; its cameras are empty."""
     return model_of(jnp.zeros(len(NAMES)).at[INPUT_COLUMNS].set(inputs), jnp.tile(period_deg[:, None], 3))
 
 

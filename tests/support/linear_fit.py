@@ -23,7 +23,7 @@ from tvsbayes.model.parameter_space import parameter_space
 SPOTS = 40
 ROWS, STATES = 4 * SPOTS, 12
 REDRAWN = (0, 7, 14, 21, 28, 35), (0, 4, 11, 18, 25, 32)
-"""Spots at which the stop error of pan, of tilt is drawn anew."""
+"""Spots with a new stop error of pan, of tilt."""
 
 
 def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -33,7 +33,7 @@ def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """
     rng = np.random.default_rng(17)
     jacobian = rng.normal(size=(ROWS, len(NAMES))) * np.exp(rng.normal(size=len(NAMES)))
-    # What the cameras do looks like what the rig does: no data tell one from the other.
+    # What the cameras do looks like what the rig does: no data separate them.
     mix = rng.normal(size=(len(RIG_NAMES), len(NAMES) - len(RIG_NAMES)))
     jacobian[:, len(RIG_NAMES) :] = 0.02 * stereo * jacobian[:, : len(RIG_NAMES)] @ mix
     # Fixed in the rig, which has no transmission error; scales of errors move no spot.
@@ -119,7 +119,7 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
 
 
 def without_places(parameters: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `StopInformation` says of errors at places where there are none."""
+    """`StopInformation` of errors at places where there are none."""
     return np.zeros(0), np.zeros((0, parameters)), np.zeros((0, 0))
 
 

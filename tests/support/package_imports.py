@@ -1,4 +1,4 @@
-"""Who imports whom in the package: its modules by name, and what the code of each asks for."""
+"""Who imports whom in the package: its modules by name, and what the code of each imports."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ ANYTHING = "..."
 
 @dataclass(frozen=True)
 class Shown:
-    """A command of the page and what the page says it prints."""
+    """A command of the page and the output that the page states."""
 
     arguments: tuple[str, ...]
     printed: str

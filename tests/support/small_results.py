@@ -48,7 +48,7 @@ NAMES = ("backlash_deg.pan", "not estimated", "pixel_scale")
 
 
 def whole_summary() -> FitSummary:
-    """With every parameter that the schema wants."""
+    """With every parameter that the schema requires."""
     summary = small_summary()
     names = ("degrees_per_step.pan", "degrees_per_step.tilt")
     return structs.replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})

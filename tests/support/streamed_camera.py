@@ -74,8 +74,8 @@ class StreamedCamera:
         self._stop.clear()
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = False
-        # Behind the bind, which may fail: then nobody would put it back.
-        # FFmpeg, which OpenCV opens the address with, asks the proxy of the environment even for this computer.
+        # Behind the bind, which may fail: then it would stay changed.
+        # FFmpeg, which OpenCV opens the address with, uses the proxy of the environment even for this computer.
         self._no_proxy = os.environ.get("no_proxy")
         os.environ["no_proxy"] = ",".join(filter(None, (self._no_proxy, "127.0.0.1")))
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)

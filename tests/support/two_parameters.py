@@ -51,7 +51,7 @@ class Scaled(Transport):
 def route() -> Transport:
     """The map z_1 = w_1, z_2 = w_2 exp(0.3 w_1) at two of the parameters.
 
-    The first scales the noise of the one datum that knows the second, which has no prior.
+    The first scales the noise of the one datum of the second, which has no prior.
     """
     return Scaled(
         mode=np.zeros(len(NAMES)),

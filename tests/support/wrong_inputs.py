@@ -1,4 +1,4 @@
-"""Campaign folders as somebody new spoils them, each with the command and the words that must help.
+"""Campaign folders spoiled as by new users, each with the command and the words that must help.
 
 Changes are made to the text of files, with nothing of the package: an older version can be given the same folders.
 """

@@ -63,7 +63,7 @@ def geared(rig: Rig, period_deg: dict[str, tuple[float, ...]] | None = None, **s
 def test_errors_are_draws_of_a_matern_process():
     """4000 rigs: sd, and correlation at half a length, at one and a half, at two; each error is Gaussian about 0.
 
-    Enough to tell it from one of smoothness 3/2, whose correlation at half a length is less by 0.044.
+    Enough to separate it from one of smoothness 3/2, whose correlation at half a length is less by 0.044.
     """
     count, places = 4000, np.array([3.0, 7.0, 19.0])
     rng = np.random.default_rng(5)

@@ -1,4 +1,4 @@
-"""Worlds of the robustness experiments: each errs as it says, and in nothing else."""
+"""Worlds of the robustness experiments: each errs as declared, and in nothing else."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from tvsbayes.view.access import BROWSERS_MAX, KEY_HEADER, SECURITY_HEADERS, SIL
 
 
 class Clock:
-    """Seconds that pass when the test says so."""
+    """A clock that the test advances, s."""
 
     def __init__(self):
         self.now_s = 100.0

@@ -60,7 +60,7 @@ class Gated(TwinObserver):
 
 
 class Gate:
-    """Where a run waits for the test, with the laser on, before look `at`; then it does what the test says."""
+    """Where a run waits for the test, with the laser on, before look `at`; then it does what the test requests."""
 
     def __init__(self):
         self.at = 3

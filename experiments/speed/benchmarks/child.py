@@ -17,7 +17,7 @@ def main() -> None:
     child = os.posix_spawn(command[0], command, os.environ)
     late = False
     while True:
-        # Polled: wait4 alone knows this child's memory, but has no time limit.
+        # Polled: wait4 alone reports this child's memory, but has no time limit.
         pid, status, usage = os.wait4(child, os.WNOHANG)
         wall_s = time.perf_counter() - start
         if pid:

@@ -63,7 +63,7 @@ def measure(bench: Bench, kinds: Sequence[str] = (STAGE, EXACT)) -> None:
 
 
 def compiled(kind: str) -> str:
-    """The contender whose compilation is told."""
+    """The contender whose compilation is reported."""
     return f"{OURS}, {kind.lower()}"
 
 

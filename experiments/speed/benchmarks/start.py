@@ -31,7 +31,7 @@ PROGRAM = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()"]
 
 
 def kept(out: Path) -> list[str]:
-    """Where a fit goes, and that it says so in JSON."""
+    """Folder of a fit's results, with output in JSON."""
     return ["--json", "--out", str(out / "results")]
 
 

@@ -69,7 +69,7 @@ def ours(seed: int) -> dict[str, object]:
 
 def opencv(together: bool) -> Work:
     """OpenCV's cameras one by one, then the pair, or then all parameters together."""
-    # As many steps as it wants: the default of 30 steps or 1e-6 stops in a hurry.
+    # As many steps as it needs: the default of 30 steps or 1e-6 stops in a hurry.
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-9)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS if together else cv2.CALIB_FIX_INTRINSIC
 
