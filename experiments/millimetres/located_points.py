@@ -4,7 +4,7 @@
     python -m experiments.millimetres.located_points table > experiments/millimetres/located_points.md
 
 Rig i is drawn from the priors of `data/rigs/mounted` with seed i: gears, mirrors, extrinsics, cameras, baseline, C0,
-aperture zero, everything. It runs the mixed protocol with aperture readings and is fitted (Laplace). Then the
+and aperture zero. It runs the mixed protocol with aperture readings and is fitted (Laplace). Then the
 machine is homed and sent to random counters, from random sides, once within the counters of the campaign and once up to
 half their span outside; the beam, with a stop error of its own, meets a target at 0.25 to 1.2 m, and the aperture reads
 it. `locate` is given counters, sides and reading. Counted are the 95 % intervals of x, y and z and the ellipsoid

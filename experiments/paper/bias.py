@@ -4,8 +4,8 @@
     python -m experiments.paper.bias table > experiments/paper/bias.md       # also writes bias.png
 
 `run` draws rig i of `data/rigs/mounted` with seed i, every prior quantity, sets one factor to a level, simulates
-four-point experiments (4 per direction, |N| 100 and 200 in turn, 64 spots) and has both estimators estimate the effective
-ratios at the campaign's mean pose. The classic estimator sees every seed, the joint one (Laplace, by
+four-point experiments (4 per direction, |N| 100 and 200 in turn, 64 spots) and estimates the effective
+ratios at the campaign's mean pose by both estimators. The classic estimator sees every seed, the joint one (Laplace, by
 `fits.fit_from_truth`) the first `--fits`. Rigs, stop errors and noise of a seed are the same at every level. `table`
 prints the mean error over the true ratio with its standard error, the RMS error, and how often 95 % intervals held
 the truth, left and right together, up and down together.
