@@ -34,7 +34,7 @@ def test_campaign_is_readable_after_every_look(mounted_rig, tmp_path):
 
 
 @pytest.mark.parametrize("refusals", [3, 10_000])
-def test_a_table_that_somebody_has_open_does_not_end_the_run(mounted_rig, tmp_path, monkeypatch, refusals):
+def test_a_table_open_in_another_program_does_not_end_the_run(mounted_rig, tmp_path, monkeypatch, refusals):
     """On Windows `os.replace` refuses while a spreadsheet holds spots.csv; the journal has the look already."""
     replace_, left = os.replace, [refusals]
 
@@ -53,7 +53,7 @@ def test_a_table_that_somebody_has_open_does_not_end_the_run(mounted_rig, tmp_pa
         assert len(read_campaign(tmp_path / "c").spots) == 8
 
 
-def test_what_somebody_changed_since_is_kept_beside(mounted_rig, tmp_path):
+def test_what_was_edited_since_is_kept_beside(mounted_rig, tmp_path):
     """A refused spot, and a prior stated in campaign.toml: resuming writes these files again."""
     Run(
         mounted_rig,
@@ -171,7 +171,7 @@ def test_an_empty_journal_has_one_remedy(mounted_rig, tmp_path, capsys):
         assert caught.value.remedy == EMPTY_REMEDY
 
 
-def test_folder_without_a_homing_is_told_so(mounted_rig, tmp_path, capsys):
+def test_a_missing_homing_is_reported(mounted_rig, tmp_path, capsys):
     begin(tmp_path / "c", mounted_rig, small_plan(), False, HEADER).close()
     assert run(["check", str(tmp_path / "c"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -140,7 +140,7 @@ def test_bad_pictures_are_named_with_a_remedy(tmp_path, camera, name, word):
     assert check.status in ("warning", "fault") and word in check.remedy
 
 
-def test_laser_stays_off_unless_asked_for(tmp_path):
+def test_laser_stays_off_unless_requested(tmp_path):
     device, camera = bench()
     lasers = []
     grab = camera.grab
@@ -189,7 +189,7 @@ def test_rig_without_hardware_says_what_is_missing(tmp_path):
 
 
 @pytest.mark.thorough
-def test_missing_hardware_is_told_once_and_by_us_alone(tmp_path):
+def test_missing_hardware_is_reported_once_and_by_us_alone(tmp_path):
     """In a process of its own: OpenCV and FFmpeg write past Python, FFmpeg at the log level of its first caller."""
     folder = shipped_data() / "rigs" / "mounted"
     tables = '[positioner]\nport = "/nowhere/port"\n[cameras]\n'

@@ -83,7 +83,7 @@ def test_a_driver_that_cannot_be_loaded_is_named(rig, monkeypatch):
         positioner_of(replace(rig, positioner={"driver": "gone"}))
 
 
-def test_a_board_without_a_port_is_told_to_name_one(rig):
+def test_a_board_without_a_port_has_the_remedy_to_name_one(rig):
     for driver in ("serial", "grbl"):
         with pytest.raises(InputError, match="names no serial port"):
             positioner_of(replace(rig, positioner={"driver": driver}))

@@ -126,7 +126,7 @@ def test_a_pause_without_a_page_ends_with_ctrl_c_only(mounted_rig, tmp_path):
     assert events[events.index("asked") :] == ["asked", "stop"], "nothing moves"
 
 
-def test_what_cannot_be_carried_out_is_said_to_have_failed(mounted_rig, tmp_path):
+def test_requests_that_cannot_be_carried_out_are_reported_as_failed(mounted_rig, tmp_path):
     live = LiveRun()
 
     def gone(instrument):

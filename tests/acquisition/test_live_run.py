@@ -48,7 +48,7 @@ def test_a_run_tells_where_it_stands(mounted_rig, tmp_path):
     assert json.loads(json.dumps(last, allow_nan=False)) == json.loads(json.dumps(last))
 
 
-def test_faults_and_repeated_looks_are_told_in_words(mounted_rig, tmp_path):
+def test_faults_and_repeated_looks_are_reported_in_words(mounted_rig, tmp_path):
     live = LiveRun()
 
     class Blind(TwinObserver):
@@ -80,7 +80,7 @@ def test_darkness_is_not_promised_after_a_fault():
     assert "cut the laser's supply" in answers[1] and "supply" not in answers[0] and "is off" not in " ".join(answers)
 
 
-def test_an_error_of_the_program_is_told_too(mounted_rig, tmp_path):
+def test_an_error_of_the_program_is_reported_too(mounted_rig, tmp_path):
     live = LiveRun()
     bug = Run(
         mounted_rig,
@@ -93,7 +93,7 @@ def test_an_error_of_the_program_is_told_too(mounted_rig, tmp_path):
     assert (live.latest.reason, live.latest.fault.code) == ("crashed", "ZeroDivisionError") and bug.dark()
 
 
-def test_what_nobody_reads_costs_no_memory():
+def test_unread_data_cost_no_memory():
     """A long run keeps the last look, and bounded tails of the rest."""
     live = LiveRun()
     estimate = {"left": 0.06}

@@ -39,7 +39,7 @@ def test_questions_go_to_stderr(monkeypatch, capsys):
     assert out == "" and "Type yes [now]: " in err
 
 
-def test_without_standard_input_nobody_can_be_asked(monkeypatch, capsys):
+def test_without_standard_input_there_is_no_question(monkeypatch, capsys):
     """Python has None for a stream that was closed, as by `tvsbayes acquire ... <&-`."""
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(InputError, match="the laser hazard cannot be asked"):

@@ -113,7 +113,7 @@ def test_stop_ends_the_program_too(mounted_rig, tmp_path, monkeypatch):
     assert [one["exit_code"] for one in events(tmp_path / "c", "place_command")] == [None]
 
 
-def test_much_that_is_said_is_kept_short():
+def test_long_output_is_kept_short():
     done = program("print('x' * 10**6 + 'end')").run("d1", 175.0, 0, lambda: True)
     assert len(done.words) == WORDS_MAX and done.words.strip().endswith("end")
 
@@ -125,7 +125,7 @@ def test_no_program_is_refused_before_the_run(line):
     assert refused.value.column == "--place-command"
 
 
-def test_nobody_is_asked_for_the_sheet():
+def test_the_sheet_needs_no_question():
     def ask(question: str) -> str:
         raise AssertionError(question)
 

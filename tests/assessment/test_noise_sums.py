@@ -49,7 +49,7 @@ def test_noise_and_looks_without_stops_ask_for_no_second_look():
     assert "look scatter pan and noise / stated is known" in weak.text and "look twice" not in weak.text
 
 
-def test_what_is_told_apart_or_fixed_is_not_named():
+def test_what_is_separated_or_fixed_is_not_named():
     assert sum_directions(FREE, independent(), EVEN) == ()
     assert sum_directions(~FREE, independent(), EVEN) == ()
     shared, fixed = known_sum_of(LEFT, LOOK), FREE.copy()

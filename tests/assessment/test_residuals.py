@@ -121,7 +121,7 @@ PLANTED = {
 
 
 @pytest.mark.parametrize("name", PLANTED)
-def test_a_planted_cause_is_found_and_no_other_blamed_alone(name):
+def test_a_planted_cause_is_found_and_no_other_named_alone(name):
     causes = residual_causes([PLANTED[name](r) for r in stops(np.random.default_rng(6), 120)])
     assert {c.name for c in causes if c.suspicious} >= {name}
     # Counters alternate with directions here: a phase of two steps is a direction as well.

@@ -38,7 +38,7 @@ def test_a_contrast_that_goes_with_a_shift_is_named_with_its_remedy(shift, word)
     assert weak.loadings[shift] == pytest.approx(0.8, abs=4 / np.sqrt(DRAWS))
 
 
-def test_what_is_told_apart_or_not_estimated_is_not_named():
+def test_what_is_separated_or_not_estimated_is_not_named():
     assert _shift_directions(fit_with(0.3, "creep_deg.pan"), "pan") == []
     assert _shift_directions(fit_with(0.8, "creep_deg.pan"), "tilt") == []
     assert _shift_directions(fit_with(0.8, "creep_deg.pan", free=False), "pan") == []

@@ -23,7 +23,7 @@ from tvsbayes.twin.simulated_campaign import simulate
 pytestmark = pytest.mark.thorough
 
 
-def test_a_refit_that_failed_judges_nobody(mixed_fit, monkeypatch):
+def test_a_refit_that_failed_is_not_judged(mixed_fit, monkeypatch):
     lost = replace(mixed_fit, converged=False, problems=("it went astray",))
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: lost)
     held = hold_out(mixed_fit)
@@ -95,7 +95,7 @@ def test_regions_of_a_campaign_that_moved_one_axis(mounted_rig):
     assert np.all(np.sum(list(folds.values()), axis=0) == 1)
 
 
-def test_experiments_beyond_the_lens_model_neither_teach_nor_are_asked():
+def test_experiments_beyond_the_lens_model_are_neither_fitted_nor_predicted():
     rows, nothing = np.zeros((4, 4), dtype=int), np.zeros((4, 4, 4))
     selection = Selection(np.arange(4), rows, nothing, np.full(4, 200), np.full(4, "pan"), ())
     angle = np.array([12.0, 12.1, 11.9, np.nan])

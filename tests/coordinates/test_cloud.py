@@ -149,7 +149,7 @@ def test_what_fails_half_way_leaves_the_old_cloud(tmp_path):
 
 
 @pytest.mark.parametrize("part", ["points", "cloud"])
-def test_a_full_disk_leaves_the_old_cloud_and_is_said(tmp_path, monkeypatch, part):
+def test_a_full_disk_leaves_the_old_cloud_and_is_reported(tmp_path, monkeypatch, part):
     def full(*_) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

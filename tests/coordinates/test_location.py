@@ -179,7 +179,7 @@ def test_more_than_a_thousandth_of_diverging_draws_refuses(count, refused):
         assert point.xyz_mm[0, 0] == pytest.approx(170.0 * math.tan(math.radians(60.0)), abs=0.05)
 
 
-def test_what_cannot_be_asked_is_refused():
+def test_impossible_arguments_are_refused():
     one = calibration()
     with pytest.raises(ValueError, match="at least 500"):
         locate(one, 0.0, 0.0, 60.0, draws=499)

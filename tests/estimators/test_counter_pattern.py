@@ -31,7 +31,7 @@ def with_prior(campaign: Campaign, **changed: Prior) -> Campaign:
     return replace(campaign, rig=replace(campaign.rig, priors=priors))
 
 
-def test_nothing_is_said_of_sound_campaigns_whole_or_cut():
+def test_sound_campaigns_have_no_finding_whole_or_cut():
     """One of each rig, from every protocol and plan; 500 in experiments/robustness/mistakes.md."""
     drawn = rigs()
     for number in range(len(drawn)):

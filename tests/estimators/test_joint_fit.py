@@ -116,7 +116,7 @@ def test_the_order_of_rows_does_not_matter(simulated, fitted):
 
 
 @pytest.mark.thorough
-def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated, fitted):
+def test_an_outlier_is_assigned_to_the_right_spot_of_its_stop(simulated, fitted):
     spots = ordered_spots(simulated.campaign)
     # The first of two spots taken at one stop, away from the ends of the campaign.
     first = next(a for a, b in pairwise(spots[20:]) if a.move == b.move)

@@ -182,7 +182,7 @@ def test_sd_is_infinite_where_nothing_else_informs():
 
 @pytest.mark.parametrize("blamed", [0, 1])
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
-def test_outlier_of_a_stop_is_blamed_on_its_spot(seed, blamed):
+def test_outlier_of_a_stop_is_assigned_to_its_spot(seed, blamed):
     """Two looks at one stop, one of them wrong by 12 sds: the wrong one has the largest distance.
 
     One-step innovations would name the second look where the first is wrong: the stop error follows the first.

@@ -221,7 +221,7 @@ def test_what_explains_a_failed_fit(paper_twin, su_px, scale, code):
     assert misfit_causes(turned_round)[0].code == "counter-sign"
 
 
-def test_a_campaign_without_usable_spots_is_told_once(paper_twin):
+def test_a_campaign_without_usable_spots_is_reported_once(paper_twin):
     spots = tuple(replace(s, status="too dim", experiment=None, point=None) for s in paper_twin.spots)
     check = check_campaign(replace(paper_twin, spots=spots))
     assert check.ok_spots == 0

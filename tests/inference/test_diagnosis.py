@@ -88,7 +88,7 @@ def test_groups_of_other_means_are_told_by_r_hat(judged):
     assert value == pytest.approx(1.035, abs=0.02)
 
 
-def test_too_few_effective_draws_are_told(judged):
+def test_too_few_effective_draws_are_reported(judged):
     """54 of 60 steps of 64 walkers with memory 0.9, nineteen steps to an independent draw: 180, of the tails more."""
     missing = "; ".join(judged(chain_of(autoregressive(60, WALKERS, 0.9))).convergence.missing)
     for kind in ("bulk", "tail"):
@@ -96,7 +96,7 @@ def test_too_few_effective_draws_are_told(judged):
         assert 100 < value < 400
 
 
-def test_a_chain_of_few_autocorrelation_times_is_told(judged):
+def test_a_chain_of_few_autocorrelation_times_is_reported(judged):
     """Memory 0.9: 19 steps to an independent draw, 16 of them in the chain, known badly from so few."""
     missing = "; ".join(judged(chain_of(autoregressive(STEPS, WALKERS, 0.9))).convergence.missing)
     value = int(re.search(r"steps are (\d+) autocorrelation times, wanted 50", missing)[1])

@@ -85,7 +85,7 @@ def test_an_axis_draws_are_those_of_its_fit(axis):
 
 
 @pytest.mark.parametrize("answer", ["rough", "laplace"])
-def test_an_answer_that_is_not_accepted_is_refused_unless_asked_for(tmp_path, answer):
+def test_an_answer_that_is_not_accepted_is_refused_unless_requested(tmp_path, answer):
     scanner(tmp_path, answer)
     with pytest.raises(NotConverged, match="not accepted") as refused:
         load_posterior(tmp_path)

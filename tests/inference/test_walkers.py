@@ -83,7 +83,7 @@ def test_differential_evolution_keeps_the_target(dimension):
     assert bias(run(move, dimension, EVOLUTION_STEPS[dimension], max(64, 2 * dimension))) == ""
 
 
-def test_the_moves_are_the_three_that_are_tried_here():
+def test_the_moves_are_the_three_of_this_test():
     mixture = moves(off_target(3))
     assert [type(move) for move, _ in mixture] == [emcee.moves.MHMove, emcee.moves.MHMove, GroupEvolution]
     assert sum(share for _, share in mixture) == pytest.approx(1.0, abs=len(mixture) * ROUNDING)

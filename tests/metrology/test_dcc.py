@@ -135,7 +135,7 @@ def declared(root: ET.Element) -> dict[str, tuple[str, str | None]]:
     }
 
 
-def test_nothing_is_claimed_that_nobody_vouches_for():
+def test_nothing_is_claimed_without_a_declaration():
     statements = declared(certified().root())
     assert statements["accreditation"][0] == NOT_ACCREDITED
     # small_campaign names certificate B-17 of its board.

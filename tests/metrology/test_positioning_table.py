@@ -117,7 +117,7 @@ def test_too_few_stops_give_a_reason_and_no_table():
     assert table.predicted is not None
 
 
-def test_an_axis_that_turns_far_is_asked_for_more_targets():
+def test_an_axis_of_long_travel_needs_more_targets():
     """More than 180 deg of travel need eight targets, in the words as in the tests."""
     fit = stops_of(np.zeros(STOPS))
     calibration = known_calibration()

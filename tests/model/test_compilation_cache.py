@@ -95,7 +95,7 @@ def test_what_one_process_leaves_the_next_one_takes(folder, monkeypatch, tmp_pat
         (FileNotFoundError("python"), "could not be tried"),
     ],
 )
-def test_what_does_not_work_is_said_in_words(folder, monkeypatch, outcome, words):
+def test_what_does_not_work_is_reported_in_words(folder, monkeypatch, outcome, words):
     def run(command, **_):
         assert command[0] == sys.executable
         if isinstance(outcome, Exception):

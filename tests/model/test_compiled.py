@@ -130,7 +130,7 @@ def test_inside_other_functions_it_is_the_plain_one(traces):
 
 
 @pytest.mark.parametrize("harm", ["a byte", "cut", "foreign", "others write the file", "others write the folder"])
-def test_a_trace_that_may_be_wrong_is_made_anew(traces, harm):
+def test_a_trace_that_may_be_wrong_is_made_again(traces, harm):
     Compiled(sums, Sums)(pair(), 1.0)
     (path,) = stored(traces)
     data = path.read_bytes()

@@ -33,7 +33,7 @@ def wide(mounted_rig):
     return with_priors(replace(mounted_rig, positioner=limits), degrees_per_step__pan=Prior(0.06, 1e-5))
 
 
-def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
+def test_next_looks_are_worth_what_they_state_near_and_a_full_turn_away(wide):
     """As many looks a turn away as here: 6000 steps of 0.06 deg. Gains are those of the plan judged move by move."""
     known = prior_knowledge(wide)
     pool = candidates(known)
@@ -192,7 +192,7 @@ def test_what_is_needed_is_never_rounded_up(knowledge):
         assert needed == "it suffices to know u(focal_scale) = 0.00051 instead of 0.002"
 
 
-def test_two_inputs_are_asked_for_where_one_is_not_enough(knowledge):
+def test_two_inputs_are_required_where_one_is_not_enough(knowledge):
     """4^2 + 3^2 with a target of 2: the larger to a tenth of its u, the smaller to sqrt(4 - 0.4^2) / 3 = 0.653."""
     nothing, both = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({STEREO: 4.0, SCALE: 3.0})[None])
     limit = limit_of(knowledge, nothing, both, target_of(2.0))

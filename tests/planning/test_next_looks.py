@@ -97,7 +97,7 @@ def test_a_sheet_that_stands_there_costs_nothing(proposal, mounted_rig):
     assert seconds == pytest.approx(cost_s - 60.0 * (placements[0] == "d1"))
 
 
-def test_the_posterior_confirms_where_it_is_asked_to(begun_fit, mounted_rig, proposal, monkeypatch):
+def test_the_posterior_confirms_on_request(begun_fit, mounted_rig, proposal, monkeypatch):
     """In place of draws of the posterior those of Laplace, spread by half as much again."""
     tiers = []
 

@@ -55,7 +55,7 @@ def test_what_the_rig_holds_fixed_has_no_contraction(mounted_rig, fixed):
     assert document["expected"][f"{name}.pan"] == 0 and not check.faults
 
 
-def test_the_papers_protocol_leaves_ratio_and_backlash_together_and_is_cured(mounted_rig, monkeypatch):
+def test_the_papers_protocol_leaves_ratio_and_backlash_inseparable_with_a_remedy(mounted_rig, monkeypatch):
     # Of three levels of tilt only the middle one leaves room for a run-up.
     monkeypatch.setattr("tvsbayes.planning.candidates.TILT_LEVELS", 5)
     steps = paper_protocol(12)
@@ -70,7 +70,7 @@ def test_the_papers_protocol_leaves_ratio_and_backlash_together_and_is_cured(mou
     json.dumps(check.as_json(), allow_nan=False)
 
 
-def test_a_grid_is_not_blamed(mounted_rig):
+def test_a_grid_has_no_finding(mounted_rig):
     check = check_plan(mounted_rig, grid_protocol(pan_steps=(0, 120, 240), tilt_steps=(-90, -30, 30, 90)))
     assert check.faults == () and check.warnings == ()
 

@@ -50,7 +50,7 @@ def test_greedy_takes_the_best_look_and_exchange_never_worsens():
 
 @pytest.mark.parametrize("criterion", CRITERIA)
 @pytest.mark.parametrize("share", [1.0, 0.4])
-def test_greedy_choices_are_those_of_covariances_inverted_anew(criterion, share):
+def test_greedy_choices_are_those_of_inverted_covariances(criterion, share):
     """Every candidate beside everything chosen before it, by a whole inverse each; prior sds from 1 to 1000."""
     generator = np.random.default_rng(11)
     rows, gradient = generator.normal(size=(30, 4, 7)), generator.normal(size=(3, 7))

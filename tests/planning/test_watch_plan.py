@@ -60,7 +60,7 @@ def test_the_plan_notices_what_it_states(planned, measured, watched_fit, designs
     np.testing.assert_allclose(shares, [change.power for change in planned.changes], atol=0.03)
 
 
-def test_what_is_out_of_reach_is_said(planned):
+def test_what_is_out_of_reach_is_reported(planned):
     by_name = {change.what: change for change in planned.changes}
     assert list(by_name) == NAMES and not planned.met
     # 0.3 % of a ratio over 200 steps is 0.036 deg, and the first day determines it to 0.4 %.

@@ -83,7 +83,7 @@ def test_refusals_and_alarms_are_named(action, code):
     assert not device.mechanics.laser_on
 
 
-def test_motion_that_somebody_stopped_is_no_arrival():
+def test_motion_stopped_from_outside_is_no_arrival():
     """Even at the very counters ordered: the device's report on this motion counts, not its counters."""
     device = simulated()
     positioner = connected(device)
@@ -253,7 +253,7 @@ def test_unplugged_and_plugged_in_again(reset):
     assert not device.mechanics.laser_on, "the watchdog of the device saw to it meanwhile"
 
 
-def test_unplugged_for_good_is_said_in_time():
+def test_unplugged_for_good_is_reported_in_time():
     device = simulated()
     plug = Plug(device)
     positioner = SerialPositioner(plug.open, SETTINGS, device.clock)

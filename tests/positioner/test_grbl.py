@@ -75,7 +75,7 @@ def test_a_laser_left_on_is_off_in_motion(laser):
     assert positioner.laser(True).laser_on and board.laser_on
 
 
-def test_light_behind_a_motion_is_cut_as_it_is_told():
+def test_light_behind_a_motion_is_cut_as_reported():
     """Somebody else's order, in mid-motion."""
     board = GrblBoard()
     positioner = connected(board)
@@ -278,7 +278,7 @@ def test_an_unplugged_board_is_named():
 
 @pytest.mark.parametrize(("lost", "code"), [("gone", "unplugged"), ("silent", "no-answer")])
 @pytest.mark.parametrize("lit", [True, False])
-def test_whoever_loses_a_lit_board_is_told_to_cut_its_light_first(lost, code, lit):
+def test_loss_of_a_lit_board_has_the_remedy_to_cut_its_light_first(lost, code, lit):
     """Nothing of ours reaches it any more, and no watchdog of its own ends the light."""
     board = GrblBoard()
     positioner = connected(board)

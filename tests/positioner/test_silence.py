@@ -107,7 +107,7 @@ def test_a_port_that_another_program_holds_is_named():
             os.close(descriptor)
 
 
-def test_a_message_for_somebody_else_is_no_wrong_speed():
+def test_a_message_for_another_program_is_no_wrong_speed():
     """And what begins like text but is noise is one."""
     body = b"<7 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none"
     assert explained(body + b"*%04X\n" % crc16(body)).cause == "nak"

@@ -55,7 +55,7 @@ def second(run, first):
     return WayDraws(target, Pool.empty(run.pool.proposals[-1]), SEED + 1).extended(2, run.pool)
 
 
-def test_the_same_density_weighed_anew_has_the_same_weights(first):
+def test_the_same_density_reweighted_has_the_same_weights(first):
     """Only the errors at places are drawn again; the density of w has them integrated out."""
     again = shared(first, first.rounds)
     np.testing.assert_allclose(again.weighed.log_weights, first.weighed.log_weights, atol=1e-9)

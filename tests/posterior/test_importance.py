@@ -214,7 +214,7 @@ def too_narrow(sampled, monkeypatch):
 
 
 @pytest.mark.thorough
-def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monkeypatch):
+def test_a_proposal_that_is_too_narrow_is_fitted_again(too_narrow, sampled, monkeypatch):
     """Its draws adapt the next one; they take no part in the answer, which is that of the right proposal."""
     begun = []
 
@@ -294,7 +294,7 @@ def errors(mean: float = 0.05, low: float = 0.1, high: float = 0.1) -> dict[str,
     return {"backlash_deg.tilt": MonteCarloError(mean, (low, high)), "other": MonteCarloError(0.01, (0.01, 0.01))}
 
 
-def test_every_limit_is_said():
+def test_every_limit_is_reported():
     """Each is crossed alone, from just inside."""
     inside = {"pareto_k": 0.69, "heaviest": 0.05, "draws": 4096, "errors": errors(0.1, 0.2, 0.2)}
     assert Acceptance(**inside).missing == ()

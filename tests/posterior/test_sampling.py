@@ -171,7 +171,7 @@ def test_only_a_converged_fit_is_sampled(fitted):
 
 
 @pytest.mark.thorough
-def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
+def test_what_is_missing_when_the_time_is_over_is_reported(fitted, monkeypatch):
     monkeypatch.setattr("tvsbayes.inference.ensemble.BLOCK", BLOCK)
     quickly(monkeypatch)
     # What weighted draws say is then no answer either: it would be given instead.

@@ -82,7 +82,7 @@ def test_unknown_engines_are_refused(job):
         ("dask", CommClosedError("row 3"), "scheduler is gone"),
     ],
 )
-def test_dead_workers_are_told_with_what_to_do(job, monkeypatch, engine, lost, what):
+def test_dead_workers_are_reported_with_a_remedy(job, monkeypatch, engine, lost, what):
     """Rows before are given out, workers have one thread, and what was started is ended."""
     pool = pool_of(engine, lost, monkeypatch)
     before = {name: os.environ.get(name) for name in SINGLE_THREADED}

@@ -39,7 +39,7 @@ def test_a_study_goes_on_where_it_was_killed(job, quick, tmp_path):
     assert study(job, 9, StudyRows(path)) == whole and quick == []
 
 
-def test_who_is_told_may_end_a_study_and_loses_no_row(job, quick, tmp_path):
+def test_the_progress_callback_may_end_a_study_and_loses_no_row(job, quick, tmp_path):
     def stop(state):
         if "3 of 9" in state.doing:
             raise LookupError("enough")

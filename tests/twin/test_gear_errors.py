@@ -250,7 +250,7 @@ def test_the_headline_is_the_line_through_the_looks(mounted_rig):
     assert effective_deg_per_step(p, PERFECT, replace(many, spots=())) is None
 
 
-def test_homing_sides_that_nobody_recorded(mounted_rig):
+def test_unrecorded_homing_sides(mounted_rig):
     """The mirrors stand where the true side puts them, and the campaign does not say which."""
     truth = quiet(draw_truth(mounted_rig, np.random.default_rng(13)).with_gears(), **{"backlash_deg.pan": 1.0})
     plan = tuple(PlanStep(number, "home", 0, 0) for number in range(30))

@@ -333,7 +333,7 @@ def test_aperture_reads_the_spot_with_its_zero(convention: str):
     assert np.std(error, ddof=1) == pytest.approx(0.02, rel=4 * 0.12)
 
 
-def test_every_placement_stands_anew():
+def test_every_placement_is_a_new_one():
     """The same target placed twice is not at the same depth."""
     rig = make_rig(truth_u=0.0)
     orders = [("home",), ("place", "d1"), ("look",), ("look",), ("place", "d1"), ("look",)]

@@ -96,7 +96,7 @@ def test_own_page_may_ask(access, host):
         {"Sec-Fetch-Site": "same-site"},
     ],
 )
-def test_strangers_are_told_so(access, wrong):
+def test_strangers_are_refused_in_words(access, wrong):
     assert access.stranger({"Host": "127.0.0.1:4711"} | wrong)
 
 

@@ -151,7 +151,7 @@ def wait_for(browsed: Browsed, name: str, part: str) -> None:
     browsed.until(f"document.getElementById('{name}').textContent.includes({part!r})")
 
 
-def test_page_shows_the_run_and_asks_nobody_else(going, browsed):
+def test_page_shows_the_run_and_requests_no_other_host(going, browsed):
     assert browsed.opened(going.link) == "running"
     assert text(browsed, "name") == "test" and "simulated" in text(browsed, "notes")
     assert "3 of 8" in text(browsed, "facts") and "laser ON" in text(browsed, "facts")

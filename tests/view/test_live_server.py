@@ -99,7 +99,7 @@ def test_control_passes_on_and_is_written_down(asker, live, monkeypatch):
     assert asker.answer("/ask", "POST", {"what": "stop"}, **second)[0] == 202
 
 
-def test_nobody_without_a_key_sees_or_asks_anything(asker, live):
+def test_without_a_key_nothing_is_shown_or_requested(asker, live):
     for key in ({}, {KEY_HEADER: "x"}, {KEY_HEADER: asker.token}, {KEY_HEADER: ""}):
         for path in ("/live", "/live/3/left/whole"):
             assert asker.answer(path, **key)[0] == 403
@@ -126,7 +126,7 @@ def test_another_page_with_the_key_asks_for_nothing(asker, live, headers):
         b'{"what": "control passed on"}',
     ],
 )
-def test_what_cannot_be_asked_for_is_refused(asker, live, body):
+def test_impossible_requests_are_refused(asker, live, body):
     assert asker.answer("/ask", "POST", body, **asker.key())[0] == 400
     assert live.requests.recent() == ()
 

@@ -69,7 +69,7 @@ def page(both, browsed) -> Iterator[Browsed]:
     assert browsed.requested_hosts() == set()
 
 
-def test_page_shows_everything_and_asks_nobody(page):
+def test_page_shows_everything_and_requests_no_host(page):
     assert page.one("name").text == "paper twin beside paper twin"
     for plot in PLOTS:
         assert page.js("return document.querySelectorAll(`#${arguments[0]} svg.chart *`).length", plot) > 10

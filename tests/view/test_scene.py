@@ -67,7 +67,7 @@ def test_look_without_a_spot_is_there_without_numbers(shown):
         assert np.isfinite(np.delete(column, row, axis=0)).all()
 
 
-def test_pictures_are_told_by_camera(shown):
+def test_pictures_are_sorted_by_camera(shown):
     kept = np.argwhere(shown.looks.pictures).tolist()
     assert kept == [[shown.looks.spot.tolist().index(PICTURED), 0]]
 
