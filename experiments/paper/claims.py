@@ -135,8 +135,8 @@ def third(chosen, stereo) -> None:
     points = np.column_stack((depth, -100.0 + depth * slope, np.zeros(4)))
     example = []
     for cameras in (plain, stereo):
-        seen = project(points, cameras)[None]
-        moved = shift(seen, np.array([200]), np.array(["pan"]), np.array(["left"]), cameras)
+        image = project(points, cameras)[None]
+        moved = shift(image, np.array([200]), np.array(["pan"]), np.array(["left"]), cameras)
         example.append(f"{moved['left']:+.2f} %")
     size = [abs(v) for v in shifts.values()]
     holds = "holds" if min(size) >= 0.25 and max(size) <= 0.55 else "common to all repeats: holds; larger than stated"

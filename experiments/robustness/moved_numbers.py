@@ -145,15 +145,15 @@ def _answer(line: str, folder: Path, tree: Path) -> dict[str, Any]:
     return answer | {path.name: _content(path) for path in left if path.exists()}
 
 
-def _files(base: Path, before: Path, own: list[Path]) -> None:
+def _files(base: Path, before: Path, folders: list[Path]) -> None:
     """The inputs of both releases: shipped files of 0.2.0, what it simulates and leaves half done, and your own."""
     for name, at in (("paper", "twins/paper_twin"), ("grid", "twins/grid_twin"), ("rig", "rigs/mounted")):
         shutil.copytree(before / "data" / at, base / name)
-    for number, folder in enumerate(own, start=1):
+    for number, folder in enumerate(folders, start=1):
         kind = "axis" if "tvsbayes-axis" in (folder / "campaign.toml").read_text(encoding="utf-8") else "campaign"
         shutil.copytree(folder, base / f"{kind}{number}", ignore=shutil.ignore_patterns("results"))
-    for made in ("mixed.csv trial --aperture", "grid.csv night --aperture"):
-        _answer(f"simulate rig/rig.toml rig/{made} --seed 7", base, before)
+    for words in ("mixed.csv trial --aperture", "grid.csv night --aperture"):
+        _answer(f"simulate rig/rig.toml rig/{words} --seed 7", base, before)
     _answer("acquire rig/rig.toml rig/planned.csv run --simulate --centroids --seed 3", base, before)
     journal = (base / "run" / "log.jsonl").read_bytes().splitlines(keepends=True)
     (base / "run" / "log.jsonl").write_bytes(b"".join(journal[: len(journal) // 2]))
@@ -175,8 +175,8 @@ def run(arguments: argparse.Namespace) -> None:
         if not (base := PLACE / "files").exists():
             _files(base, before, arguments.own)
         fitted = ["paper", "grid", *sorted(path.name for path in base.glob("[ac]*[0-9]"))]
-        asked = {line.format(name): FRESH for name in fitted for line in FITS} | COMMANDS
-        asked |= {f"report {name}": EVERY for name in fitted if name.startswith("axis")}
+        commands = {line.format(name): FRESH for name in fitted for line in FITS} | COMMANDS
+        commands |= {f"report {name}": EVERY for name in fitted if name.startswith("axis")}
         for name in (NAME_BEFORE, *ASKED):
             folder, answers = PLACE / f"in {name}", PLACE / name
             if not folder.exists():
@@ -184,7 +184,7 @@ def run(arguments: argparse.Namespace) -> None:
                 for path in (*folder.glob("*/campaign.toml"), folder / "rig/rig.toml") if name == "alike" else ():
                     _state(path)
             answers.mkdir(exist_ok=True)
-            for number, (line, of) in enumerate(asked.items()):
+            for number, (line, of) in enumerate(commands.items()):
                 if name in (NAME_BEFORE, *of) and not (path := answers / f"{number:02d}.json").exists():
                     answer = _answer(line, folder, before if name == NAME_BEFORE else ROOT)
                     path.write_text(json.dumps({"asked": line, "commit": commit(), **answer}))
@@ -244,9 +244,9 @@ def _cells(before: dict, after: dict) -> list[str]:
     gaps = {path: abs(b["value"] - a["value"]) for path, (a, b) in pairs.items()}
     errors = {path: math.sqrt(_monte_carlo(a) + _monte_carlo(b)) for path, (a, b) in pairs.items()}
     widths = [b["sd"] / a["sd"] for path, (a, b) in pairs.items() if re.search(HEADLINE, path)]
-    said = [path for path in both if path.rpartition(".")[2] in SAID and one[path] != two[path]]
+    changed = [path for path in both if path.rpartition(".")[2] in SAID and one[path] != two[path]]
     keys = [{re.sub(r"\[.*?\]", "[]", path) for path in of if not re.search(FREE, path)} for of in (one, two)]
-    others = [f"{p.rpartition('.')[2]}: {one[p]}, now {two[p]}" for p in said]
+    others = [f"{p.rpartition('.')[2]}: {one[p]}, now {two[p]}" for p in changed]
     others += [f"no {key}" for key in sorted(keys[0] - keys[1])]
     page = "report.html"
     return [
@@ -268,8 +268,8 @@ def table(_: argparse.Namespace) -> None:
     print(HEADER.format(before=NAME_BEFORE, commits=", ".join(sorted({of["commit"] for of in answers.values()}))))
     for name, heading in ASKED.items():
         print(f"\n## {heading}\n\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
-        for (asked, file), after in sorted(answers.items()):
-            if asked == name:
+        for (command, file), after in sorted(answers.items()):
+            if command == name:
                 cells = _cells(answers[NAME_BEFORE, file], after)
                 moved = cells[1] or re.search(r"\b(?!(\d+) of \1 )\d+ of \d+ rows", cells[-1])
                 why = next(why for how, what, why in CAUSES if how == name and re.search(what, after["asked"]))

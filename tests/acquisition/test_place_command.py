@@ -36,11 +36,11 @@ def test_every_placement_is_made_by_the_program_in_the_dark(mounted_rig, tmp_pat
     ordinary, light = PlaceCommand.run, []
     run_ = Run(mounted_rig, tmp_path / "c", place_command=program(SAYS))
 
-    def seen(self, *arguments):
+    def recorded(self, *arguments):
         light.append(run_.instrument.mechanics.laser_on)
         return ordinary(self, *arguments)
 
-    monkeypatch.setattr(PlaceCommand, "run", seen)
+    monkeypatch.setattr(PlaceCommand, "run", recorded)
     outcome = run_.engine.run()
     assert (outcome.reason, outcome.ok) == ("done", 8) and run_.dark()
     done, placed = events(tmp_path / "c", "place_command"), events(tmp_path / "c", "placed")
@@ -67,13 +67,13 @@ def test_the_stage_of_the_page_stands_at_every_target(mounted_rig, tmp_path, mon
     ordinary = PlaceCommand.run
     with EmulatedBoard(on_step) as board:
 
-        def seen(self, *arguments):
+        def recorded(self, *arguments):
             done = ordinary(self, *arguments)
             board.drain()
             stood.append((arguments[1], at[0]))
             return done
 
-        monkeypatch.setattr(PlaceCommand, "run", seen)
+        monkeypatch.setattr(PlaceCommand, "run", recorded)
         command = PlaceCommand((sys.executable, str(tmp_path / "stage.py"), board.port))
         assert Run(mounted_rig, tmp_path / "c", place_command=command).engine.run().reason == "done"
     assert len(stood) > 1 and stood == [(x_mm, round(10 * (x_mm - 225))) for x_mm, _ in stood]

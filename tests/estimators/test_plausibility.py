@@ -199,13 +199,13 @@ def test_pixels_that_count_from_one_show_at_the_edge(paper_twin):
     def moved(count: int, by_px: float):
         return replace(paper_twin, spots=(*(replace(s, u_left_px=edge + by_px) for s in spots[:count]), *spots[count:]))
 
-    def said(campaign):
+    def certain(campaign):
         return [f.certain for f in implausible(campaign) if f.code == "pixels-from-one"]
 
-    assert said(moved(2, 0.4)) == [True] and said(moved(1, 0.4)) == [False]
-    assert said(moved(2, -0.1)) == [] and said(moved(2, 1.1)) == []
+    assert certain(moved(2, 0.4)) == [True] and certain(moved(1, 0.4)) == [False]
+    assert certain(moved(2, -0.1)) == [] and certain(moved(2, 1.1)) == []
     near_zero = moved(2, 0.4)
-    assert said(replace(near_zero, spots=(*near_zero.spots[:-1], replace(spots[-1], v_right_px=0.2)))) == []
+    assert certain(replace(near_zero, spots=(*near_zero.spots[:-1], replace(spots[-1], v_right_px=0.2)))) == []
 
 
 @pytest.mark.parametrize(

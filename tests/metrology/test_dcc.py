@@ -216,15 +216,15 @@ def test_text_stays_text(payload):
     plain = dict.fromkeys(("name", "operator", "instrument", "serial", "method", "notes"), "plain")
     board = {"board_certificate": "plain", "stereo_calibrated": datetime.date(2026, 1, 3)}
 
-    def made(text):
+    def certificate(text):
         header = {**dict.fromkeys(plain, text), "traceability": {**board, "board_certificate": text}}
         fit = certified(**header)
         fit = fit.with_provenance(command=text, versions={**fit.fit.provenance.versions, "jax": text})
         data = fit.certificate(identifier=text, parties=Parties(text, text))
         return data, ET.fromstring(data)
 
-    data, root = made(payload)
-    _, benign = made("plain")
+    data, root = certificate(payload)
+    _, benign = certificate("plain")
     assert structure_problems(root) == []
     assert [e.tag for e in root.iter()] == [e.tag for e in benign.iter()]
     assert [sorted(e.attrib.items()) for e in root.iter()] == [sorted(e.attrib.items()) for e in benign.iter()]

@@ -194,12 +194,12 @@ def test_code_is_what_a_module_imports(tmp_path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
 
-    def found(module: str) -> set[str]:
+    def sources(module: str) -> set[str]:
         paths = subject.sources_of(module, package)
         return {path.relative_to(package).with_suffix("").as_posix() for path in paths}
 
-    assert found("tvsbayes.a.one") == {"a/one", "b/two", "b/three", "b/four"}
-    assert found("tvsbayes.b.four") == {"b/four"} and found("elsewhere") == set(texts)
+    assert sources("tvsbayes.a.one") == {"a/one", "b/two", "b/three", "b/four"}
+    assert sources("tvsbayes.b.four") == {"b/four"} and sources("elsewhere") == set(texts)
 
 
 def test_source_written_since_the_start_is_not_what_runs(traces, tmp_path, monkeypatch):

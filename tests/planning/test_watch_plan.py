@@ -107,8 +107,8 @@ def test_looks_keep_to_the_sheets_of_the_rig(watched_fit):
 def test_a_short_budget_is_kept_or_refused(watched_fit, monkeypatch):
     tried, kept = plans._trials, []
     monkeypatch.setattr(plans, "_trials", lambda designs: kept or kept.extend(tried(designs)) or kept)
-    found = watch_plan(watched_fit, read_rig(RIG), minutes=2.0)
-    assert found.minutes <= 2 and found.looks >= 4
+    short = watch_plan(watched_fit, read_rig(RIG), minutes=2.0)
+    assert short.minutes <= 2 and short.looks >= 4
     with pytest.raises(InputError, match="4 looks take"):
         watch_plan(watched_fit, read_rig(RIG), minutes=0.5)  # a placement alone takes one
 

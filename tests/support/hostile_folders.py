@@ -710,7 +710,7 @@ TARGETS: dict[str, Target] = {
     "spots.csv": Target("spots.csv", lambda path: parse_spots(path.read_bytes(), path.name, 5, STEREO)),
     "plan.csv": Target("plan.csv", lambda path: parse_plan(path.read_bytes(), path.name)),
     "log.jsonl": Target("journal/log.jsonl", _read_log),
-    "log.jsonl, sealed": Target("journal/log.jsonl", _read_log, lambda *given: sealed(mutate(*given))),
+    "log.jsonl, sealed": Target("journal/log.jsonl", _read_log, lambda *args: sealed(mutate(*args))),
     "fit.json": Target("results/fit.json", read_fit),
     "draws.npz": Target("results/draws.npz", read_draws),
     "draws.npz, repacked": Target("results/draws.npz", read_draws, repacked),
