@@ -2,7 +2,7 @@
 
     python -m experiments.first_users.before_after > experiments/first_users/before_after.md
 
-Chromium is asked for the phone's width; a few minutes, most of them fits and compilation.
+Chromium takes the phone's width; a few minutes, most of them fits and compilation.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
     python -m experiments.intervals.posterior_coverage table > experiments/intervals/posterior_coverage.md
 
 `run` draws rig i of the paper's, the mixed and the grid protocol from `data/rigs/mounted` with seed i, every prior
-quantity anew, simulates the protocol, fits it and samples its posterior by one tier. `table` prints RMS z and the
+quantity, simulates the protocol, fits it and samples its posterior by one tier. `table` prints RMS z and the
 coverage of central intervals for every headline; **!** marks a figure outside its two-sided bounds at 1e-4 for that
 number of rigs. Judged are the rigs whose tier was accepted, as a user would get them; the last column has all rigs. A
 quantity whose median contraction is below 0.1 is printed as "prior" and not judged. The same table of draws shrunk

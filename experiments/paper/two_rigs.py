@@ -74,7 +74,7 @@ NOTES = """\
 True contrasts of the literal rigs: about -2.6 (pan) and +1.1 (tilt) in 1e-3 deg/step, of the others 0. True backlashes
 of the rigs with lost motion: about 0.53 and 0.20 deg, of the others 0. Tilt over pan ratio: 1.000, and about 1.135.
 
-Where the sides are not recorded every way of homing is fitted (each side, or anywhere in the band anew at every start)
+Where the sides are not recorded every way of homing is fitted (each side, or anywhere in the band at every start)
 and weighed by its evidence. What tells the two apart is where the beam stands after moves both ways, against homings
 that are good to 0.05 deg (the model's fixed value)."""
 

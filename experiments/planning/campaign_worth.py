@@ -7,7 +7,7 @@ On the paper's rig (`data/rigs/mounted`), expected information at the most proba
 mixed steps with 1 to 96 repeats, the grid taken 1 to 8 times, the planner's looks, and a full turn: the same eight
 poses from both sides, on two sheets, once near and once 6000 counters later (the ratio is known by then, or the spot
 would not be found). Minutes and the planner's comparison stand in planned_looks.md. Two parts of the variance are
-told apart: its cause (looks; cameras = stereo and focal scale; priors of gears and optics), and what remains when the
+separated: its cause (looks; cameras = stereo and focal scale; priors of gears and optics), and what remains when the
 same looks are taken a hundred times: repeats lower some of the priors' part, since spots calibrate the instrument.
 
 `run` draws rigs, simulates and refits three of the points (`tvsbayes.studies`), and compares the error of the estimate

@@ -55,7 +55,7 @@ def gain_of_odd_rows(picture: np.ndarray, at: np.ndarray) -> float:
 def with_moved_rows(picture: np.ndarray, by_px: float, seed: int = 23) -> np.ndarray:
     """The picture whose odd rows see the beam so much lower.
 
-    Between rows light goes in a straight line, which moves a centre by what is asked; whole grey levels are met by
+    Light is interpolated linearly between rows, which moves a centre by `by_px`; whole grey levels are met by
     chance, unbiased: rounded as they fall, levels of 8 bits would hide a small move.
     """
     rows = np.arange(len(picture))

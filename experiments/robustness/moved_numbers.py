@@ -169,7 +169,7 @@ def _state(path: Path) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Ask both releases."""
+    """Run both releases."""
     PLACE.mkdir(parents=True, exist_ok=True)
     with tree_before(PLACE / "before") as before:
         if not (base := PLACE / "files").exists():

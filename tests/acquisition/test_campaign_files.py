@@ -115,7 +115,7 @@ def test_tables_that_lack_a_look_of_the_journal_say_which(mounted_rig, tmp_path,
     assert run(["classic", str(folder)]) == 0
     assert "warning: spots.csv lacks look 7, which log.jsonl holds" in " ".join(capsys.readouterr().err.split())
     (folder / LOG).write_bytes(b"damaged\n")
-    assert behind_journal(folder, read_campaign(folder)) == "", "what is wrong with a journal is said by check"
+    assert behind_journal(folder, read_campaign(folder)) == "", "what is wrong with a journal is reported by check"
 
 
 def test_a_deleted_journal_has_a_remedy_that_leads_somewhere(mounted_rig, tmp_path):

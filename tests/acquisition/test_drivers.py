@@ -61,7 +61,7 @@ def test_a_driver_of_another_package_drives(rig):
     positioner.home()
     assert positioner.move_to(20, -5).pan_steps == 20
     positioner.close()
-    assert known(POSITIONERS)["serial"] == OWN[POSITIONERS]["serial"], "nobody replaces one of ours"
+    assert known(POSITIONERS)["serial"] == OWN[POSITIONERS]["serial"], "a shipped driver is not replaced"
     with pytest.raises(DeviceFault, match="turntable failed: RuntimeError: no table") as caught:
         positioner_of(replace(rig, positioner={"driver": "turntable"}))
     assert caught.value.code == "driver" and caught.value.exit_code == 5

@@ -99,7 +99,7 @@ def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evalua
         logs.append(evaluate(z, dozen.space, once).log_likelihood)
     assert logs[1:] == pytest.approx(logs[:1] * 2, abs=FINE_UNIT, rel=1e-12)
     shared = evaluate(z, dozen.space, dozen.arrays).log_likelihood
-    assert abs(shared - logs[0]) > LOG_UNIT, "of stops looked at twice the shares are told"
+    assert abs(shared - logs[0]) > LOG_UNIT, "with stops looked at twice the shares are known"
 
 
 def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):

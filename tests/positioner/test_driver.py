@@ -50,7 +50,7 @@ def test_a_laser_left_on_is_off_in_motion():
     device.mechanics.moved = lambda axis, steps: lit.append(device.mechanics.laser_on)
     positioner.laser(True)
     assert not positioner.move_to(200, -15).laser_on and lit == [False, False]
-    assert positioner.laser(True).laser_on, "and comes on again when it is asked for"
+    assert positioner.laser(True).laser_on, "and comes on again on request"
 
 
 def test_a_second_program_goes_on_in_the_same_sequence():

@@ -98,6 +98,6 @@ def test_a_declaration_is_the_document_and_its_schema():
     schema = schema_of(Kept, closed=True, format={"const": "kept/1"}, inner=Inner)
     assert set(schema["properties"]) == {"a_long_key", "known", "format", "inner"}
     assert set(schema["required"]) == {"a_long_key", "known", "format", "inner"}
-    assert schema["properties"]["a_long_key"]["description"] == "a length, mm; null where nobody knows."
+    assert schema["properties"]["a_long_key"]["description"] == "a length, mm; null where unknown."
     assert not schema["additionalProperties"] and not schema["$defs"]["Inner"]["additionalProperties"]
     assert schema["$defs"]["Inner"]["description"] == "A number, whole or not, and a switch."
