@@ -51,7 +51,7 @@ SIZES = ((1280, 960), (1280, 720), (1920, 1080), (1440, 1080))
 MADE = ("all stated", "way unknown", "nothing stated")
 SPLITS = 40
 RMS_MAX_PX = 1.0
-"""Nobody keeps a calibration that ended in a local minimum."""
+"""Calibrations that ended in a local minimum are left out."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ COORDINATES = ("u left", "v left", "u right", "v right")
 
 @dataclass(frozen=True)
 class Observed:
-    """A simulated campaign as a stranger would fit it, and its truth.
+    """A simulated campaign without its truth, and the truth.
 
     Attributes:
         truth: of the rig.

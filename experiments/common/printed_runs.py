@@ -1,6 +1,6 @@
 """Tables of ISO 230-2 runs that others printed, as axis campaigns.
 
-A table has the columns cycle, direction, command_mm, reading_mm in order of time. Nobody recorded times: a reading a
+A table has the columns cycle, direction, command_mm, reading_mm in order of time. Times were not recorded: a reading a
 minute. Between runs of opposite direction ISO 230-2 goes beyond the end and comes back, which takes up the play: that
 move is written down, a twentieth of the range beyond, without a reading.
 """

@@ -102,7 +102,7 @@ class Calibration:
         corners: found, of both cameras, each (views, corners, 2), px.
         fix_k3: whether k3 was held at 0.
         matrices: M1 D1 M2 D2 R T.
-        rms_px: as `cv2.stereoCalibrate` says.
+        rms_px: as `cv2.stereoCalibrate` returns it.
     """
 
     board: tuple[int, int, float]

@@ -111,7 +111,7 @@ def test_changed_background_is_refused(mounted_rig):
 
 @pytest.mark.parametrize("known", [None, 4095])
 def test_noise_of_twelve_bits_is_no_light(mounted_rig, known):
-    """Dark pictures below 256 counts say nothing of the bits: the driver does, or the first light does."""
+    """Dark pictures below 256 counts do not show the bit depth: the driver or the first light does."""
     instrument = Instrument(mounted_rig, 1)
     positioner = instrument.positioner()
     positioner.home()
@@ -135,7 +135,7 @@ def test_noise_of_twelve_bits_is_no_light(mounted_rig, known):
 
 @pytest.mark.parametrize("depth", range(0, 12))
 def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
-    """A camera without any flushing, with a buffer `depth` frames deep: light alone keeps the spots true."""
+    """A camera without any flushing, with a buffer `depth` frames deep: light alone identifies new frames."""
     instrument = Instrument(mounted_rig, 1)
     positioner = instrument.positioner()
     positioner.home()

@@ -58,7 +58,7 @@ def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
 
 
 def test_the_sampled_posterior_has_the_last_word(mounted_rig, tmp_path):
-    """Half as much again as Laplace: 27 looks (4.4e-4) are not enough, 33 (3.6e-4) not worth asking, 40 are."""
+    """Half as much again as Laplace: 27 looks (4.4e-4) are not enough, 33 (3.6e-4) not worth sampling, 40 are."""
     with Replanning(tmp_path / "c", ahead(ratio=1.5), 4.6e-4, 60.0, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(20), estimate=estimate).engine.run()
     assert (outcome.reason, outcome.looks) == ("target met", 40)

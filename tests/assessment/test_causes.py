@@ -72,7 +72,7 @@ def test_headline_causes_are_what_refitting_shows(linear_fit):
     np.testing.assert_allclose(sd_by["stereo calibration"], np.linalg.norm(cameras, axis=1), rtol=1e-6)
     for name in ("mirror_offset_mm", "laser_tilt_deg.y", "focal_scale", "backlash_deg.pan"):
         np.testing.assert_allclose(sd_by[name], gradient @ by_prior[:, INDEX[name]], atol=1e-6 * scale, rtol=1e-6)
-    # They add up to the variance: nothing is forgotten, nothing counted twice.
+    # They add up to the variance: each is counted once.
     total = np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient)
     np.testing.assert_allclose((causes.contribution**2).sum(axis=1), total, rtol=1e-6)
 

@@ -73,7 +73,7 @@ def test_residuals_of_a_clean_campaign_scatter_as_stated(paper_fit):
 
 
 def test_a_zero_that_creeps_is_no_deviation_of_the_stops(mixed_fit):
-    """Of 100 campaigns whose zeros walk farther than stops scatter no more than 1 % are accused, at 1e-4."""
+    """Of 100 campaigns whose zeros walk farther than stops scatter at most 1 % raise an alarm, at 1e-4."""
     plain = mixed_fit.linearised
     creeping = eqx.tree_at(
         lambda lin: (lin.stop_variance, lin.drift_variance),

@@ -143,7 +143,7 @@ def test_draws_file_brings_everything_back(tmp_path, vary):
 
 
 def test_results_without_a_calibration_are_no_damage(tmp_path):
-    """A fit that did not converge, or an older version, leaves draws alone: such results are as good as none."""
+    """A fit that did not converge, or an older version, leaves draws alone: such results count as none."""
     campaign = replace(small_campaign(), path=tmp_path)
     (tmp_path / "results").mkdir()
     np.savez_compressed(tmp_path / "results" / "draws.npz", names=np.array(INPUT_NAMES), physical=np.zeros((3, 65)))

@@ -85,7 +85,7 @@ def test_folds_leave_every_experiment_out_once(mixed_fit):
 
 
 def test_regions_of_a_campaign_that_moved_one_axis(mounted_rig):
-    """Experiments of pan alone, as a maker's first try: the other axis has no regions."""
+    """Experiments of pan alone: the other axis has no regions."""
     steps = [s for s in four_point_protocol(repeats=2, steps=(100, 200)) if s.experiment is None or s.experiment < 4]
     campaign = simulate(mounted_rig, steps, seed=3).campaign
     selection = select_experiments(campaign)

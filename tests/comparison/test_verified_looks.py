@@ -55,7 +55,7 @@ def calibration(mixed_fit):
     ],
 )
 def test_every_world_is_named(mounted_rig, mixed_fit, truth, calibration, factors, world):
-    """Also where it befell the play alone."""
+    """Also where it acts on the play alone."""
     check = verify_looks(mixed_fit, calibration, aimed(mounted_rig, truth, calibration, factors))
     assert check.world == world and check.worlds[world] > 0.95, check.worlds
     assert check.verdict == (KEPT if world == APPLIED else BROKEN)

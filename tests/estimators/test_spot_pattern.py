@@ -1,4 +1,4 @@
-"""Mistakes in tables that the spots themselves give away, each named; good campaigns are not accused."""
+"""Mistakes in tables that the spots reveal, each named; good campaigns have no finding."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def twins():
 @pytest.mark.parametrize("twin", TWINS)
 @pytest.mark.parametrize("mistake", SEEN)
 def test_a_mistake_is_called_by_its_name(twins, twin, mistake):
-    """And nothing else is accused of it."""
+    """Nothing else has this finding."""
     change, words = MISTAKES[mistake]
     sentences = [finding.sentence for finding in implausible(change(twins[twin], np.random.default_rng(2)))]
     assert sentences and all(any(word in text for word in words.split("|")) for text in sentences), sentences

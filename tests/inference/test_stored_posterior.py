@@ -1,4 +1,4 @@
-"""Draws of `results/`, read back for anyone who has no model: of a scanner, of an axis, or refused."""
+"""Draws of `results/`, read back without a model: of a scanner, of an axis, or refused."""
 
 from __future__ import annotations
 

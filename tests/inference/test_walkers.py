@@ -1,4 +1,4 @@
-"""The ensemble leaves its target alone.
+"""The ensemble leaves its target invariant.
 
 emcee 3.1.6 ships moves that narrow the posterior by up to a quarter without any sign of it, so every move that is
 used is tried on a target whose moments are known, from exact draws of it: whatever moves away then is a bias.

@@ -106,7 +106,7 @@ def test_slopes_against_differences(physical):
 
 
 def test_a_stray_coordinate_of_a_half_normal_is_still_a_number(physical):
-    """A fit that goes astray may try what no prior holds; Phi(-40) underflows, and infinities reach the gradient."""
+    """A diverging fit may try values outside every prior; Phi(-40) underflows, and infinities reach the gradient."""
     z = np.zeros((3, len(NAMES)))
     z[:, INDEX["backlash_deg.pan"]] = [35.0, 40.0, 1e3]
     values = physical(z, parameter_space(table(), small_stereo()))[0][:, INDEX["backlash_deg.pan"]]

@@ -1,4 +1,4 @@
-"""The next looks of a run that goes on: what they promise is what a fit of them reports, and they stay in reach."""
+"""The next looks of a running campaign: predicted is what a fit of them reports, and they stay in reach."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def laplace_sds(proposal) -> list[float]:
 
 
 def test_what_is_promised_is_the_information_of_the_whole_run(proposal, mounted_rig, begun_fit):
-    """The plan so far and the proposal through the filter, move by move, at the point that the fit believes in."""
+    """The plan so far and the proposal through the filter, move by move, at the point of the fit."""
     assert proposal.now == pytest.approx(max(laplace_sds(proposal)), rel=0.1)
     assert proposal.expected == proposal.after_each[-1] < 0.7 * proposal.now
     assert np.all(np.diff([proposal.now, *proposal.after_each]) < 1e-12)

@@ -143,7 +143,7 @@ def test_a_device_that_never_answers_is_darkened_all_the_same():
     before.home()
     before.laser(True)
     device.model._write = lambda line: None
-    # A watchdog that leaves the light to anyone who connects.
+    # A watchdog that leaves the light on for any client.
     device.model._settings["wd"] = 10**6
     with pytest.raises(DeviceFault):
         connected(device)

@@ -185,7 +185,7 @@ def test_firmware_core_and_model_do_the_same_in_300_sessions(native, seed):
 
 
 def test_random_sessions_reach_every_branch():
-    """The differential test is worth what its sessions exercise."""
+    """The differential test covers what its sessions exercise."""
     lines = "\n".join(line for seed in range(12) for line in Bench().run(random_orders(seed)))
     text = "\n".join(bytes.fromhex(line.split()[2]).decode() for line in lines.splitlines() if line.startswith("w"))
     wanted = [f"err {word} " for word in ("command", "argument", "seq", "unhomed", "alarm", "busy", "limit")]

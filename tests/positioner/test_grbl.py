@@ -76,7 +76,7 @@ def test_a_laser_left_on_is_off_in_motion(laser):
 
 
 def test_light_behind_a_motion_is_cut_as_reported():
-    """Somebody else's order, in mid-motion."""
+    """An order of another program, in mid-motion."""
     board = GrblBoard()
     positioner = connected(board)
     positioner.home()
@@ -279,7 +279,7 @@ def test_an_unplugged_board_is_named():
 @pytest.mark.parametrize(("lost", "code"), [("gone", "unplugged"), ("silent", "no-answer")])
 @pytest.mark.parametrize("lit", [True, False])
 def test_loss_of_a_lit_board_has_the_remedy_to_cut_its_light_first(lost, code, lit):
-    """Nothing of ours reaches it any more, and no watchdog of its own ends the light."""
+    """No order reaches it any more, and it has no watchdog that ends the light."""
     board = GrblBoard()
     positioner = connected(board)
     positioner.home()

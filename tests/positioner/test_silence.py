@@ -108,7 +108,7 @@ def test_a_port_that_another_program_holds_is_named():
 
 
 def test_a_message_for_another_program_is_no_wrong_speed():
-    """And what begins like text but is noise is one."""
+    """Noise that begins like text is one."""
     body = b"<7 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none"
     assert explained(body + b"*%04X\n" % crc16(body)).cause == "nak"
     assert explained(b"ab" + UNREADABLE).cause == "unreadable"

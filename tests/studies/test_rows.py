@@ -48,7 +48,7 @@ def test_a_foreign_file_is_refused_with_its_line(job, quick, tmp_path, line):
 
 
 def test_a_foreign_line_without_an_end_is_no_torn_row(tmp_path, job):
-    """Nobody's only line is cut off; the torn beginning of a first row is."""
+    """A foreign only line is kept; the torn beginning of a first row is cut off."""
     path = tmp_path / "truth.json"
     for text in (b'{"my": "only copy"}', b"\x00\x00", b"x"):
         path.write_bytes(text)

@@ -1,4 +1,4 @@
-"""Axes made by hand or drawn, small enough to be fitted in a blink."""
+"""Axes made by hand or drawn, small enough for quick fits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A drawn axis with its fit and a table, and fresh readings of it under whatever became of the table."""
+"""A drawn axis with its fit and a table, and fresh readings of it in every world of the table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points of beams and readings in JAX, from the model's own beams: what the calibration's NumPy is held against.
+"""Points of beams and readings in JAX, from the model's own beams: the reference for the calibration's NumPy.
 
 Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
 at (0, -a/2, 0). mm and rad; degrees where a name says `_deg`. The emission angle C and the aperture angle B are

@@ -33,7 +33,7 @@ def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """
     rng = np.random.default_rng(17)
     jacobian = rng.normal(size=(ROWS, len(NAMES))) * np.exp(rng.normal(size=len(NAMES)))
-    # What the cameras do looks like what the rig does: no data separate them.
+    # Effects of cameras and rig are alike: no data separate them.
     mix = rng.normal(size=(len(RIG_NAMES), len(NAMES) - len(RIG_NAMES)))
     jacobian[:, len(RIG_NAMES) :] = 0.02 * stereo * jacobian[:, : len(RIG_NAMES)] @ mix
     # Fixed in the rig, which has no transmission error; scales of errors move no spot.

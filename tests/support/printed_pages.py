@@ -1,4 +1,4 @@
-"""Pages that show commands with what they print: commands found, run, and held against the page."""
+"""Pages that show commands with what they print: commands found, run, and compared with the page."""
 
 from __future__ import annotations
 

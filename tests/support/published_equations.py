@@ -1,4 +1,4 @@
-"""The coordinates of the paper as printed: the outside truth of the package's own route (Metrology 2025, 5(4), 58)."""
+"""The coordinates of the paper as printed: an independent reference for the package (Metrology 2025, 5(4), 58)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rigs whose gears repeat errors by position, or do not, whatever the defaults say."""
+"""Rigs whose gears repeat errors by position, or do not, whatever the defaults."""
 
 from __future__ import annotations
 

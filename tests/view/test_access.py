@@ -1,4 +1,4 @@
-"""Who may ask: browsers with the link, from this page alone; one of them controls."""
+"""Access: browsers with the link, from this page alone; one of them controls."""
 
 from __future__ import annotations
 

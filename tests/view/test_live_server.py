@@ -90,7 +90,7 @@ def test_first_browser_controls_and_others_make_it_safer(asker, live):
 def test_control_passes_on_and_is_written_down(asker, live, monkeypatch):
     first, second = asker.key(), asker.key()
     assert asker.now(first)["controls"] and live.requests.recent() == ()
-    # From now on everybody who does not ask this very moment is silent.
+    # From now on every client without a request at this moment counts as silent.
     monkeypatch.setattr(access, "SILENT_S", -1.0)
     assert asker.now(second)["controls"] is True
     monkeypatch.undo()

@@ -1,6 +1,6 @@
 """The planted faults: what a user would suffer in a sentence, where, what changes, and a test that must fail.
 
-A place is a qualified name and a test the name of a function: whatever moves or renames files leaves the entries.
+A place is a qualified name and a test the name of a function: moving or renaming files leaves the entries.
 """
 
 from __future__ import annotations
