@@ -1,4 +1,4 @@
-"""Scales of noise of which the data know only sums of variances are named, others are not."""
+"""Scales of noise of which the data determine only sums of variances are named, others are not."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
 
     def interrupt(state):
         stages.append(state.doing)
-        # Told of once when the chain begins, then after every block.
+        # Reported once when the chain begins, then after every block.
         if stages.count(walking(CHAIN)) == 2:
             raise KeyboardInterrupt
 
