@@ -19,12 +19,20 @@ from support.dozen_spots import coordinates
 from support.drawn_residuals import drawn_residual
 from support.small_results import small_summary
 
-from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _defects_in_place, _holm, _SeenAxis, _Tested, validate
+from tvsbayes.assessment.score_tests import (
+    KNOWN_DIRECTION,
+    VALIDATION_LEVEL,
+    _defects_in_place,
+    _holm,
+    _SeenAxis,
+    _Tested,
+    validate,
+)
 from tvsbayes.estimators.joint_fit import JointFit, fit_at
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, NOISE_NAMES
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.fit_text import fit_text, validation_lines
@@ -36,6 +44,7 @@ from tvsbayes.statistics.least_squares import Mode
 from tvsbayes.twin.simulated_campaign import simulate
 
 PAN = (0, 70, 141, 200, 142, 71)
+CREEPS = np.isin(NAMES, CREEP_NAMES)
 TILT = (-60, -36, -12, 13, 36, 61, 37, 12, -12, -36)
 
 
@@ -74,8 +83,8 @@ def drawn(fit: JointFit, seed: int) -> np.ndarray:
 def test_what_the_fit_can_follow_is_not_seen(clean):
     """Adding J a changes no test: the true rig may lie anywhere, and no refit is needed to see a defect."""
     residual = drawn(clean, 1)
-    offset = own_columns(clean) @ (0.3 * np.random.default_rng(2).standard_normal(len(NAMES)))
-    before, after = (validate(with_residual(clean, r)).tests for r in (residual, residual + offset))
+    size = np.where(CREEPS, 0.0, 0.3 * np.random.default_rng(2).standard_normal(len(NAMES)))
+    before, after = (validate(with_residual(clean, r)).tests for r in (residual, residual + own_columns(clean) @ size))
     first, second = ({t.name: t for t in tests} for tests in (before, after))
     assert len(first) >= 8
     for name, test in first.items():
@@ -83,9 +92,19 @@ def test_what_the_fit_can_follow_is_not_seen(clean):
         assert second[name].chi2 == pytest.approx(test.chi2, abs=0.3), name
 
 
+def test_a_creep_is_known_by_its_prior_wherever_the_fit_is_linearised(clean):
+    """From z to z + a with the residual that follows: a mode between zero and the true creep decides no test."""
+    residual, size = drawn(clean, 1), np.where(CREEPS, np.random.default_rng(3).standard_normal(len(NAMES)), 0.0)
+    moved = replace(with_residual(clean, residual - own_columns(clean) @ size), z=clean.z + size)
+    first, second = ({t.name: t.chi2 for t in validate(fit).tests} for fit in (with_residual(clean, residual), moved))
+    assert second == pytest.approx(first, rel=KNOWN_DIRECTION)
+
+
 def test_p_values_are_uniform_and_false_alarms_rare(clean):
-    """Twenty-five clean campaigns: one-place tests by Kolmogorov-Smirnov, all by the number of alarms, both at 1e-4."""
-    validations = [validate(with_residual(clean, drawn(clean, seed))) for seed in range(25)]
+    """Twenty-five clean campaigns with creeps by their prior: Kolmogorov-Smirnov and numbers of alarms, at 1e-4."""
+    rng = np.random.default_rng(4)
+    creeps = [own_columns(clean) @ np.where(CREEPS, rng.standard_normal(len(NAMES)), 0.0) for _ in range(25)]
+    validations = [validate(with_residual(clean, drawn(clean, k) + creep)) for k, creep in enumerate(creeps)]
     alarms = sum(not v.passed for v in validations)
     assert alarms <= stats.binom.isf(1e-4, len(validations), VALIDATION_LEVEL)
     by_name: dict[str, list[ValidationTest]] = {}

@@ -17,7 +17,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.chances import log_chance
@@ -32,6 +32,8 @@ ABSORBED = 1e-3
 """Share of a defect's effect below which the fit has absorbed it: the remainder is its curvature only."""
 KNOWN_DIRECTION = 1e-4
 """Information (in prior sds) above which the fit can move along a direction."""
+BY_PRIOR = np.isin(NAMES, CREEP_NAMES)
+"""Coordinates known by their priors, as errors of stops are: creeps of any size would absorb what changes in time."""
 _POSE = names_of("extrinsics.rotation_rad", "extrinsics.translation_mm")
 
 
@@ -237,8 +239,8 @@ def _common(fit: JointFit, defects: Sequence[_Defect]) -> _Common:
     information = stop_information(linear_spots(fit.linearised, fit.arrays, columns_of_all))
     score = information.score(columns_of_all)
     p = columns_of_fit.shape[2]
-    fisher, cross = information.fisher[:p, :p], information.fisher[:p, p:]
-    values, vectors = np.linalg.eigh(fisher)
+    cross, own_score = information.fisher[:p, p:], score[:p] - BY_PRIOR * fit.z
+    values, vectors = np.linalg.eigh(information.fisher[:p, :p] + np.diag(BY_PRIOR))
     kept = values > KNOWN_DIRECTION
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     followed = inverse @ cross
@@ -247,11 +249,11 @@ def _common(fit: JointFit, defects: Sequence[_Defect]) -> _Common:
     _, gradient = headline_gradients(fit, moved_directions(fit))
     sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient))
     scores = _Scores(
-        score=(score[p:] - followed.T @ score[:p]) * scale,
+        score=(score[p:] - followed.T @ own_score) * scale,
         variance=(information.fisher[p:, p:] - cross.T @ followed) * np.outer(scale, scale),
         moved_by=gradient @ fit.covariance @ cross * scale / sd[:, None],
     )
-    return _Common(information.groups, score[:p], inverse, scores)
+    return _Common(information.groups, own_score, inverse, scores)
 
 
 def validate(fit: JointFit) -> Validation:
@@ -259,9 +261,10 @@ def validate(fit: JointFit) -> Validation:
 
     For columns D = d(prediction)/d(size of a defect) the score is g = D'^T C^-1 r, C the covariance of pixel noise,
     stop errors and home offsets, D' = D less the part that the fit can absorb. If the model holds, g ~ N(0, D'^T C^-1
-    D') and g^T (D'^T C^-1 D')^-1 g is chi-square for any true rig (Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50).
-    Nothing is refitted. The places of one defect share its level (Bonferroni), all tests share `VALIDATION_LEVEL`
-    (Holm, Scand. J. Statist. 6 (1979) 65). Noise scales are the fitted ones, which include the effect of a defect.
+    D') and g^T (D'^T C^-1 D')^-1 g is chi-square for any true rig (Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50). A
+    creep is in C by its prior, as an error of a stop is. Nothing is refitted. The places of one defect share its level
+    (Bonferroni), all tests share `VALIDATION_LEVEL` (Holm, Scand. J. Statist. 6 (1979) 65). Noise scales are the fitted
+    ones, which include the effect of a defect.
 
     A defect of size s = (D'^T C^-1 D')^-1 g, left out of the model, shifts the mode by S J^T C^-1 D s. That is an
     uncorrected systematic effect: its square is added to the squared u (GUM F.2.4.5). `inflation` is sqrt(1 + (largest
