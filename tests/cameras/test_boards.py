@@ -119,10 +119,10 @@ def test_turned_corner_orders_are_corrected(tmp_path, monkeypatch, columns, rows
 
     monkeypatch.setattr(boards, "find_corners", turned)
     monkeypatch.setattr(boards.os, "cpu_count", lambda: 1)
-    mended = find_views(tmp_path, board)
-    assert mended.reordered == ("1",)
+    ordered = find_views(tmp_path, board)
+    assert ordered.reordered == ("1",)
     for side in ("left", "right"):
-        np.testing.assert_array_equal(getattr(mended.views[0], side), getattr(straight.views[0], side))
+        np.testing.assert_array_equal(getattr(ordered.views[0], side), getattr(straight.views[0], side))
 
 
 def test_mirrored_corner_orders_are_corrected(monkeypatch):

@@ -90,10 +90,10 @@ def test_a_counter_with_the_wrong_sign_is_refused_and_corrected_by_the_remedy(as
     words = shlex.split(finding["remedy"].split("`")[1])
     code, document = ask(*words[1:])
     assert code == 0 and document["files"] and "approaches stay" in document["assumed"][0]
-    mended, sound = read_campaign(tmp_path / "wrong-mended"), grid_campaign
-    assert (mended.moves, mended.spots) == (sound.moves, sound.spots)
-    assert (mended.path / "campaign.toml").read_bytes() == (tmp_path / "wrong" / "campaign.toml").read_bytes()
-    assert ask("check", mended.path)[1]["findings"] == []
+    repaired, sound = read_campaign(tmp_path / "wrong-mended"), grid_campaign
+    assert (repaired.moves, repaired.spots) == (sound.moves, sound.spots)
+    assert (repaired.path / "campaign.toml").read_bytes() == (tmp_path / "wrong" / "campaign.toml").read_bytes()
+    assert ask("check", repaired.path)[1]["findings"] == []
     assert ask(*words[1:])[0] == 2, "nothing is overwritten"
 
 

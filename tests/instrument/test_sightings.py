@@ -98,7 +98,7 @@ def test_tables_of_sightings_round_trip(key):
 
 
 @pytest.mark.parametrize(
-    ("mended", "code"),
+    ("change", "code"),
     [
         (
             lambda s: Sighting(
@@ -122,8 +122,8 @@ def test_tables_of_sightings_round_trip(key):
         ),
     ],
 )
-def test_wrong_tables_are_named(simulated, mended, code):
-    wrong = tuple(map(mended, simulated.campaign.spots))
+def test_wrong_tables_are_named(simulated, change, code):
+    wrong = tuple(map(change, simulated.campaign.spots))
     campaign = type(simulated.campaign)(simulated.campaign.moves, wrong, None, simulated.campaign.rig)
     findings = check_campaign(campaign).findings
     assert next(f.code for f in findings if f.certain) == code

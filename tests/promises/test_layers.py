@@ -31,7 +31,7 @@ HARDWARE_USERS = {
     "report": {"cameras"},
     "cli": set(HARDWARE),
 }
-"""Who may import the hardware side; nobody else."""
+"""The only packages that may import the hardware side."""
 MODEL = {"model", "estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"}
 BESIDE_THE_TWIN = {"calibration", "metrology", "results", "inference", *MODEL}
 """What the digital twin shares no formula with, nor with the mirrors of the instrument."""

@@ -13,7 +13,7 @@ FOLDER = ROOT / "data" / "docs" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 BYTES_MAX = 150_000
 MACHINE = re.compile(r"/(?:home|root|tmp|work|Users|mnt)/|[A-Z]:\\\\")
-"""Begins a path of somebody's computer."""
+"""Start of an absolute path of a machine."""
 
 
 def cells(path: Path, kind: str) -> list[dict]:

@@ -54,7 +54,7 @@ def test_fit_text_shows_results_and_warnings():
     assert "weak (set by the priors, not by the data): the tilt axis was never moved" in text
     assert "depends on one stop: without move 0 it is lost" in text
     assert "excluded spots: 17\n" in text
-    # A flood of ids helps nobody.
+    # A long list of ids is shortened.
     assert "spots that disagree with all others: 0, 1, 2" in text
     assert ", 19 and 10 more; look at them" in text
 

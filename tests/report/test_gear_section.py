@@ -39,7 +39,7 @@ def geared_evidence(evidence, bands):
 
 
 def test_bands_are_those_of_the_draws(bands):
-    """95 % of the errors where nobody looked lie within 1.96 sds of waves of normal amplitude and random phase."""
+    """95 % of the errors at places without looks lie within 1.96 sds of waves of normal amplitude and random phase."""
     assert [band.axis for band in bands] == ["pan", "tilt"] and gear_bands(calibration()) == ()
     for band in bands:
         assert band.error_deg.shape == band.play_deg.shape == (3, len(band.steps))

@@ -56,25 +56,25 @@ def test_a_sample_without_an_answer_was_accepted(kept):
     folder, _ = kept
     file = folder / "results" / "fit.json"
     for estimator, answer in (("posterior", "accepted"), ("laplace", "laplace")):
-        whole = rewritten(folder, lambda keys, made=estimator: (keys.pop("answer"), keys.update(estimator=made)))
+        whole = rewritten(folder, lambda keys, value=estimator: (keys.pop("answer"), keys.update(estimator=value)))
         try:
             assert results_for(read_axis(folder)).summary.answer == answer
         finally:
             file.write_bytes(whole)
 
 
-def test_results_that_modelled_less_are_fitted_anew(kept, monkeypatch):
-    """0.2.0 knew no creep: its draws have fewer coordinates, which is no damage."""
+def test_results_that_modelled_less_are_fitted_again(kept, monkeypatch):
+    """0.2.0 had no creep: its draws have fewer coordinates, which is no damage."""
     folder, fit = kept
-    file, told = folder / "results" / "fit.json", []
+    file, messages = folder / "results" / "fit.json", []
     name = fit.model.coordinates.names[-1]
     whole = rewritten(folder, lambda keys: keys["parameters"].pop(name))
     monkeypatch.setattr("tvsbayes.single_axis.axis_record.fit_axis", lambda *_, **__: fit)
     try:
-        assert results_for(read_axis(folder), notify=told.append).fit is fit
+        assert results_for(read_axis(folder), notify=messages.append).fit is fit
     finally:
         file.write_bytes(whole)
-    assert told == ["results/ are of a version which modelled less of the axis: fitting first (weighted draws) ..."]
+    assert messages == ["results/ are of a version which modelled less of the axis: fitting first (weighted draws) ..."]
 
 
 def test_strata_have_the_band_of_all_draws(kept):
