@@ -32,7 +32,15 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.plays import Cut
 from tvsbayes.posterior.target import Target
-from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width, centred_count, curvatures
+from tvsbayes.posterior.transport import (
+    BLOCK_ROWS,
+    FAR_ABOVE,
+    Transport,
+    by_width,
+    centred_count,
+    curvatures,
+    positive_factor,
+)
 
 PRECISION = 1e-5
 """Relative, of the map at other scales."""
@@ -277,3 +285,18 @@ def test_a_cut_normal_is_scipys(bound):
     step = 1e-4
     slope = (cut.within(free + step) - cut.within(free - step)) / (2 * step)
     np.testing.assert_allclose(cut.log_slope(free, within)[good], np.log(slope[good]), atol=1e-3)
+
+
+def test_an_indefinite_precision_is_raised_and_the_others_stay():
+    """The map exists at every draw; draws beside one far out are those without it, to the last bit."""
+    root = np.random.default_rng(8).standard_normal((4, 5, 5))
+    precisions = root @ np.swapaxes(root, 1, 2) + np.eye(5)
+    precisions[1] -= 20 * np.eye(5)
+    precisions[:, -1, -1] = FAR_ABOVE
+    precisions[3, 2, 0] = np.nan
+    factors = positive_factor(precisions)
+    assert np.array_equal(factors[::2], np.linalg.cholesky(precisions[::2]))
+    assert np.array_equal(factors[3], np.eye(5))
+    raised = (factors[1] @ factors[1].T)[:-1, :-1] - precisions[1, :-1, :-1]
+    assert raised == pytest.approx(raised[0, 0] * np.eye(4), abs=1e-12)
+    assert np.linalg.eigvalsh(precisions[1, :-1, :-1])[0] + raised[0, 0] == pytest.approx(1.0)

@@ -76,6 +76,23 @@ at 3.7 sd of a stop sd), and the tilt of the frames with the mirrors' offset. Ea
 t of its own."""
 
 
+def positive_factor(bordered: np.ndarray) -> np.ndarray:
+    """Compute Cholesky factors of precisions with an additional last row, of their lower triangles, shape (n, k, k).
+
+    Far out, the functions that span the noise of looks may leave a precision indefinite, or the stops without a factor
+    (NaN). Its diagonal is raised, or it is replaced by 1: any positive definite matrix makes a map, and the weights are
+    those of the density itself.
+    """
+    try:
+        return np.linalg.cholesky(bordered)
+    except np.linalg.LinAlgError:
+        finite = np.isfinite(bordered).all(axis=(1, 2))[:, None, None]
+        raised, diagonal = np.where(finite, bordered, np.eye(bordered.shape[1])), np.arange(bordered.shape[1] - 1)
+        least = np.linalg.eigvalsh(raised[:, :-1, :-1])[:, 0]
+        raised[:, diagonal, diagonal] += np.where(least > 0, 0.0, 1.0 - least)[:, None]
+        return np.linalg.cholesky(raised)
+
+
 @dataclass(frozen=True)
 class Mapped:
     """Points z (n, p) and ln |dy/dw| there (n,)."""
@@ -274,8 +291,7 @@ class Transport:
         whole[:, places:-1, places:-1] += linear.prior[::-1, ::-1]
         whole[:, -1, places:-1] -= score_at_mode
         whole[:, -1, -1] = FAR_ABOVE
-        # NumPy reads the lower triangle.
-        factor = np.linalg.cholesky(whole)
+        factor = positive_factor(whole)
         last = count - 1
         leading, shift = factor[:, :last, :last], factor[:, last, places:last]
         return Conditional(weight, inner, elimination, white, root, leading, shift, later)
@@ -333,7 +349,9 @@ class Transport:
             narrow = self.dimension - self.narrow
             about = self._centred(noise, y[:, self.noise : narrow], given)
             y[:, narrow:] = about.centre + np.linalg.solve(about.turn, (y[:, narrow:] - about.mean)[..., None])[..., 0]
-            log_jacobian -= np.linalg.slogdet(about.turn)[1]
+            # A draw without density has no turn: NaN says so.
+            with np.errstate(invalid="ignore"):
+                log_jacobian -= np.linalg.slogdet(about.turn)[1]
         z = self.from_whitened(y)
         return Mapped(z, log_jacobian + self._log_bend(z))
 
