@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
+from msgspec import structs
 
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.parameters import TARGETS
@@ -39,11 +38,11 @@ def test_plan_writes_a_plan_and_its_exit_code_states_whether_the_target_is_met(a
     monkeypatch.setattr(planner, "plan", lambda *_, **__: plans[0])
     code, document = ask("plan", MOUNTED / "rig.toml", *small)
     assert code == 0 and not document["met"], "the default target is nobody's demand"
-    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(plans[0], met=True))
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: structs.replace(plans[0], met=True))
     code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 5e-3 deg/step", *small)
     assert code == 0 and document["met"]
     # Nothing is left to measure.
-    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(plans[0], steps=()))
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: structs.replace(plans[0], steps=()))
     place = tmp_path / "none.csv"
     code, text, _ = say("plan", MOUNTED / "rig.toml", "-o", place)
     assert code == 0 and not place.exists() and f"nothing written to {place}" in text
