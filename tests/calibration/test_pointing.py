@@ -99,7 +99,6 @@ def test_locate_is_where_the_twin_reads_the_same_angle(rig, approach, request):
         np.testing.assert_allclose(one.locate(pan, tilt, reading, approach).xyz_mm, expected, atol=10 * ROUNDING_MM)
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("rig", ["bent", "wobbling"])
 def test_locate_is_the_law_of_propagation_in_jax(rig, request):
     one = request.getfixturevalue(rig)

@@ -59,7 +59,6 @@ def test_the_table_removes_the_wave_within_the_promise():
     assert promise.without95 == pytest.approx(float(np.quantile(np.abs(before), 0.95)), rel=0.2)
 
 
-@pytest.mark.thorough
 def test_a_part_of_the_period_is_folded_alone_and_another_period_refused():
     fast = compensation_of(results(), Wish("pec", period=PERIOD / 3))
     # The slow wave stays: 3 arcsec, of which 95 % lie within 2.99.

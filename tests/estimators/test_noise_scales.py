@@ -36,7 +36,6 @@ def dense_density(fit, z: np.ndarray) -> float:
     return -0.5 * (np.linalg.slogdet(covariance)[1] + residual @ np.linalg.solve(covariance, residual)) - scale - prior
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("column", [*STOPS, PIXEL, *SCATTER])
 def test_the_density_is_that_of_a_dense_gaussian(mixed_fit, column):
     other = mixed_fit.z.copy()
@@ -46,7 +45,6 @@ def test_the_density_is_that_of_a_dense_gaussian(mixed_fit, column):
     assert change == pytest.approx(dense_density(mixed_fit, other) - dense_density(mixed_fit, mixed_fit.z), abs=1e-4)
 
 
-@pytest.mark.thorough
 def test_what_geometry_took_is_given_back(mixed_fit):
     """The centre is a maximum along every scale, and its pixel noise larger than at the mode of everything."""
     draws, alone = noise_draws(mixed_fit, 32, seed=0), MarginalScales(mixed_fit)

@@ -145,7 +145,6 @@ def fourth_order(function, values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=-1)
 
 
-@pytest.mark.thorough
 def test_beam_jacobian_against_differences(chain):
     states = random_states(50, seed=1)
     _, jacobian = chain(states, jacobian=True)

@@ -42,7 +42,6 @@ def test_the_classics_count_is_the_first_that_suffices(sd, half_width):
     assert n == 2 or not suffices(n - 1)
 
 
-@pytest.mark.thorough
 def test_the_classics_forecast_is_what_its_experiments_do(mounted_rig, knowledge):
     """Scatter, systematic error and stereo part of 400 experiments a direction on a known rig.
 

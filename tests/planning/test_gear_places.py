@@ -212,7 +212,6 @@ def test_what_a_fit_says_at_its_places_is_carried_to_others():
     assert follows[:count] @ gears.root[:count, :count].T @ np.ones(count) != 0
 
 
-@pytest.mark.thorough
 def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
     """The fast sum equals the filter's pass over the arranged plan: errors are columns of both."""
     known, pool = real

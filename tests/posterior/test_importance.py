@@ -237,7 +237,6 @@ def test_a_proposal_that_is_too_narrow_is_fitted_again(too_narrow, sampled, monk
     assert abs(one.mean - two.mean) < SIGMAS * np.hypot(one.mcse_mean, two.mcse_mean)
 
 
-@pytest.mark.thorough
 def test_a_heavy_tail_is_answered_by_another_proposal(sampled, monkeypatch):
     """More draws hardly change its index. With a limit that no weights meet: 3 rounds and 3 more, then 6 and 6."""
     fitted, run, _ = sampled

@@ -140,7 +140,6 @@ def test_ctrl_c_in_the_middle_of_a_step_is_quiet_and_loses_no_step(fitted, tmp_p
     np.testing.assert_array_equal(resumed.z, unbroken.z)
 
 
-@pytest.mark.thorough
 def test_resume_refuses_what_is_no_chain(fitted, long, tmp_path):
     file = tmp_path / "chain.npz"
     with pytest.raises(InputError) as caught:
@@ -154,7 +153,6 @@ def test_resume_refuses_what_is_no_chain(fitted, long, tmp_path):
         assert caught.value.code == "damaged-chain", size
 
 
-@pytest.mark.thorough
 def test_resume_refuses_the_chain_of_other_data_priors_or_seed(fitted, long):
     spot = fitted.campaign.spots[0]
     spots = (replace(spot, u_left_px=spot.u_left_px + 1e-6), *fitted.campaign.spots[1:])
@@ -208,7 +206,6 @@ def test_a_stuck_walker_is_found(fitted, long):
     assert str(walker) in sentence.removeprefix("stuck walkers: ").split(", ")
 
 
-@pytest.mark.thorough
 def test_a_linear_function_is_propagated(long):
     draws = long[0].by_name
     result = long[0].propagate(lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"])
@@ -220,7 +217,6 @@ def test_a_linear_function_is_propagated(long):
     assert result.mcse_mean == pytest.approx(result.sd / np.sqrt(result.ess), rel=0.2)
 
 
-@pytest.mark.thorough
 def test_functions_of_another_shape_or_without_value_are_refused(long):
     with pytest.raises(ValueError, match="first axis"):
         long[0].propagate(lambda p: p["degrees_per_step.left"].mean())
@@ -230,14 +226,12 @@ def test_functions_of_another_shape_or_without_value_are_refused(long):
         long[0].propagate(lambda p: np.full_like(p["degrees_per_step.left"], np.nan))
 
 
-@pytest.mark.thorough
 def test_a_constant_has_no_monte_carlo_error(long):
     result = long[0].propagate(lambda p: np.full_like(p["degrees_per_step.left"], 2.5))
     assert result.mean == 2.5 and result.sd == 0
     assert result.mcse_mean == 0 and result.mcse_sd == 0 and np.all(result.mcse_interval95 == 0)
 
 
-@pytest.mark.thorough
 def test_lost_motion_is_the_play_once_it_is_taken_up(long):
     steps = np.array([0, 1, 3, 1000])
     for direction, axis in (("left", "pan"), ("up", "tilt")):
@@ -250,7 +244,6 @@ def test_lost_motion_is_the_play_once_it_is_taken_up(long):
         long[0].lost_motion_deg("west", steps)
 
 
-@pytest.mark.thorough
 def test_the_left_ratio_agrees_with_laplace(fitted, long):
     laplace = fitted.draws.effective_deg_per_step[:, 0]
     result = long[0].propagate(lambda p: p["effective_deg_per_step.left"])

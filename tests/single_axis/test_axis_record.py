@@ -136,7 +136,6 @@ def test_a_damaged_seed_is_refused(kept, seed):
     assert (caught.value.code, caught.value.column) == ("schema", "seed") and caught.value.remedy
 
 
-@pytest.mark.thorough
 def test_the_mean_play_of_the_positions_read_covers_the_truth_with_a_smaller_u():
     """Twelve simulated axes whose play varies by position: in 99 % of cases the RMS of twelve z is 0.51 to 1.54."""
     z, ratio = [], []
