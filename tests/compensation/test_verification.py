@@ -63,7 +63,7 @@ def test_with_one_homing_errors_are_given_without_their_shift_too():
     shifted = replace(new, readings=tuple(replace(reading, value=reading.value + 0.05) for reading in new.readings))
     check = verify_readings(results().fit, structs.replace(table(), homings=1), shifted)
     aim = table().offset + np.array([new.moves[r.move].command for r in new.readings])
-    left, promised = check.shift_free
+    left, promised = check.shift_free.after, check.shift_free.promised95
     assert left.rms == pytest.approx(np.std([r.value for r in new.readings] - aim)) and left.rms < 0.5 * check.after.rms
     assert promised < check.promised95
     assert "but for one shift common to all" in verification_text(check)

@@ -221,13 +221,9 @@ class WatchedLooks:
         joined = after_each_other(campaign, homed(looks, fit.sides))
         used = np.append(fit.arrays.used, in_sight(joined)[self.first :])
         self.problem = Problem(joined, fit.table, used, np.asarray(fit.arrays.spots.weight)[: self.first])
-        later = self.problem.spots[self.first :]
         self.looks = int(used[self.first :].sum())
-        readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
-        mechanism = fit.space.mechanism
-        self.changes = changes_of(mechanism)
-        # Four pixels give three residuals after elimination of the range; a sighting gives two angles.
-        self.dof = 2 * self.looks if mechanism.sightings else 3 * self.looks + readings
+        self.changes = changes_of(fit.space.mechanism)
+        self.dof = int(self.problem.dof[self.usable].sum())
 
     def departure(self, z: np.ndarray, *, angles: bool = False) -> Departure:
         """Compute the departure of the looks from the first session, both linearised at z, at its noise scales.

@@ -33,6 +33,7 @@ from tvsbayes.results.compensation_record import (
     WRONG_SIGN,
     Compensation,
     ErrorSize,
+    ShiftFree,
     Verdict,
     Verification,
 )
@@ -269,7 +270,7 @@ def verify_readings(
         judgement = judged(trial, seed)
     stops, shift_free = np.arange(len(aim)), None
     if made.shift_matters:
-        shift_free = (size_of(fresh.value - aim, True), bound_of(judgement.promised, aim, stops, True))
+        shift_free = ShiftFree(size_of(fresh.value - aim, True), bound_of(judgement.promised, aim, stops, True))
     return Verification(
         verdict=judgement.verdict,
         p=judgement.p,

@@ -36,7 +36,7 @@ from tvsbayes.results.estimates import CONTRACTION_LIMIT
 from tvsbayes.results.plan_record import Action, actions_of
 from tvsbayes.results.records import Record
 
-CURE_LOOKS = 24
+ADDED_LOOKS_MAX = 24
 """Largest number of looks in an addition."""
 JUDGING, CURING = "evaluating the plan", "searching for more looks"
 JUDGED_SECONDS, EXPECT_COMPILED_SECONDS, CURED_SECONDS = 0.2, 12.0, 1.0
@@ -162,7 +162,7 @@ def appended(steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, run_
 
 
 @dataclass(frozen=True)
-class _Cure:
+class _Remedy:
     """Steps to append to a plan, and the judgement of the longer plan."""
 
     addition: tuple[PlanStep, ...]
@@ -171,7 +171,7 @@ class _Cure:
 
 def _remedy(
     steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates, axis: Axis, before: Judgement
-) -> _Cure | None:
+) -> _Remedy | None:
     """Find the fewest looks after which the axis has no fault, on the present sheet; None if there are none."""
     expectation = LookArrays(possible.looks, knowledge, False).at(knowledge.z, knowledge.space)
     rows = before.rows(axis)
@@ -179,12 +179,12 @@ def _remedy(
     search = Search(expectation.rows[..., :-2], precision, before.gradient[rows], np.zeros(len(rows)), "A")
     sheet = run_plan(steps, knowledge.rig).sheet
     allowed = possible.looks.sheet == (knowledge.sheets.index(sheet) if sheet in knowledge.sheets else 0)
-    picks = np.array(search.among(allowed).greedy(CURE_LOOKS), dtype=int)
+    picks = np.array(search.among(allowed).greedy(ADDED_LOOKS_MAX), dtype=int)
     for count in range(1, len(picks) + 1):
         addition = appended(steps, possible.looks[picks[:count]], knowledge, possible.run_up)
         after = judge((*steps, *addition), knowledge)
         if after.fault(axis) is None:
-            return _Cure(addition, after)
+            return _Remedy(addition, after)
     return None
 
 
@@ -208,7 +208,7 @@ def _fault(
         return PlanFault(axis, text)
     remedy = _remedy(steps, knowledge, possible, axis, plan)
     if remedy is None:
-        return PlanFault(axis, f"{text}; up to {CURE_LOOKS} more looks do not change that on this rig")
+        return PlanFault(axis, f"{text}; up to {ADDED_LOOKS_MAX} more looks do not change that on this rig")
     looks, after = sum(s.action == "look" for s in remedy.addition), remedy.after.u(axis)
     looks_text = f"{looks} more look{'s' * (looks != 1)}, {describe_looks(knowledge.rig, remedy.addition, steps)}"
     text += f"; smallest addition: {looks_text}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"

@@ -84,7 +84,7 @@ def sizes_table(verification: Verification) -> TableView:
         ["after (read)", two_digits(verification.after.rms), two_digits(verification.after.worst)],
     ]
     if verification.shift_free is not None:
-        left, _ = verification.shift_free
+        left = verification.shift_free.after
         rows.append(["after, but for one shift common to all", two_digits(left.rms), two_digits(left.worst)])
     columns = ["", "RMS", "worst"]
     if (points := verification.millimetres) is not None:
@@ -100,7 +100,8 @@ def _promise_text(verification: Verification) -> str:
     points = "" if mm is None else f", of points at {mm.distance_mm:.10g} mm {two_digits(mm.promised95)} mm"
     unit, shift_free = escaped(verification.unit), ""
     if verification.shift_free is not None:
-        shift_free = f"; but for one shift common to all at most {two_digits(verification.shift_free[1])} {unit}"
+        promised95 = two_digits(verification.shift_free.promised95)
+        shift_free = f"; but for one shift common to all at most {promised95} {unit}"
     return f"promised: 95 % of errors at most {two_digits(verification.promised95)} {unit}{points}{shift_free}"
 
 

@@ -168,6 +168,13 @@ class ErrorSize(Record, frozen=True):
     worst: NotNegative
 
 
+class ShiftFree(Record, frozen=True):
+    """Errors of fresh readings less their mean, and the size that 95 % of them have at most by the promise."""
+
+    after: ErrorSize
+    promised95: Positive
+
+
 class Millimetres(Record, frozen=True):
     """Errors of the points of a scanner, at a distance along the beam.
 
@@ -198,8 +205,7 @@ class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         needed: readings needed for a verdict; None where no number suffices, 0 where these do.
         remarks: further remarks, in sentences.
         looks: whether these are looks of two axes aimed by a calibration.
-        shift_free: errors of the fresh readings less their mean, and the promise for these, 95 %; None where the
-            scatter of homings was read.
+        shift_free: the same but for one shift common to all readings; None where the scatter of homings was read.
     """
 
     verdict: Verdict
@@ -214,7 +220,7 @@ class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
     needed: int | None = 0
     remarks: tuple[str, ...] = ()
     looks: bool = False
-    shift_free: tuple[ErrorSize, float] | None = None
+    shift_free: ShiftFree | None = None
     beside: ClassVar = ("unit", "needed", "remarks", "looks", "shift_free")
 
     @property
