@@ -201,11 +201,11 @@ class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         promised95: 95 % of errors of these stops are at most this size, by the promise.
         readings: number used; for a scanner looks, each of which shows both axes.
         millimetres: the same for points; only for a scanner.
+        shift_free: the same but for one shift common to all readings; None where the scatter of homings was read.
         unit: unit of errors; it and what follows are not part of the document.
         needed: readings needed for a verdict; None where no number suffices, 0 where these do.
         remarks: further remarks, in sentences.
         looks: whether these are looks of two axes aimed by a calibration.
-        shift_free: the same but for one shift common to all readings; None where the scatter of homings was read.
     """
 
     verdict: Verdict
@@ -216,12 +216,12 @@ class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
     promised95: Positive
     readings: Count
     millimetres: Millimetres | None = None
+    shift_free: ShiftFree | None = None
     unit: str = ""
     needed: int | None = 0
     remarks: tuple[str, ...] = ()
     looks: bool = False
-    shift_free: ShiftFree | None = None
-    beside: ClassVar = ("unit", "needed", "remarks", "looks", "shift_free")
+    beside: ClassVar = ("unit", "needed", "remarks", "looks")
 
     @property
     def world(self) -> str:
