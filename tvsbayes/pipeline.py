@@ -433,7 +433,7 @@ def verify(
     if isinstance(campaign, AxisCampaign) and isinstance(looks, AxisCampaign):
         from tvsbayes.compensation.verification import verify_axis
 
-        return verify_axis(campaign, looks, made=made, seed=seed, progress=progress)
+        return verify_axis(campaign, looks, made=made, seed=seed, tell=tell, progress=progress)
     if not (isinstance(campaign, Campaign) and isinstance(looks, Campaign)):
         message = "an axis is verified by fresh readings of an axis, a scanner by fresh looks of a scanner"
         raise InputError("usage", message, remedy="give two folders of the same kind of machine")
@@ -463,15 +463,15 @@ def _why_not_stored(campaign: Campaign) -> str:
     hashes, stored = input_hashes(campaign), record.provenance
     changed_inputs = [INPUT_NAMES[name] for name in INPUT_NAMES if stored.inputs.get(name) != hashes[name]]
     version = stored.versions["tvsbayes"]
-    of_older = f"results/ are of tvsbayes {escaped(version, 40)}, which modelled less of the rig"
-    is_older = version != provenance(hashes, 0).versions["tvsbayes"]
-    if is_older and changed_inputs == [INPUT_NAMES["rig"]]:
-        return f"{of_older}, or of another [rig]"
+    of_another = f"results/ are of tvsbayes {escaped(version, 40)}, with another model of the rig"
+    is_another = version != provenance(hashes, 0).versions["tvsbayes"]
+    if is_another and changed_inputs == [INPUT_NAMES["rig"]]:
+        return f"{of_another}, or of another [rig]"
     if changed_inputs:
         return f"results/ are of other {', '.join(changed_inputs)}"
     if not record.summary.converged:
         return "results/ are of a fit that did not converge"
-    return of_older if is_older else "results/ lack what this command needs"
+    return of_another if is_another else "results/ lack what this command needs"
 
 
 def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> JointFit:

@@ -80,10 +80,10 @@ def test_the_reason_for_a_new_fit_is_printed(grid_folder, monkeypatch):
         ((True, now, {"rig": "0" * 64}), "results/ are of other [rig]"),
         (
             (True, "0.0.9", {"rig": "0" * 64}),
-            "results/ are of tvsbayes 0.0.9, which modelled less of the rig, or of another [rig]",
+            "results/ are of tvsbayes 0.0.9, with another model of the rig, or of another [rig]",
         ),
         ((False, now, {}), "results/ are of a fit that did not converge"),
-        ((True, "0.0.9", {}), "results/ are of tvsbayes 0.0.9, which modelled less of the rig"),
+        ((True, "0.0.9", {}), "results/ are of tvsbayes 0.0.9, with another model of the rig"),
         ((True, now, {}), "results/ lack what this command needs"),
     ):
         keep(case[0], case[1], **case[2])

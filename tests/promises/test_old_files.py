@@ -55,7 +55,7 @@ def test_old_results_are_read_and_the_reason_of_a_new_fit_is_given(monkeypatch):
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
     messages: list[str] = []
     assert StoredOrFitted(read_campaign(OLD / "campaign"), messages.append).fit.converged
-    assert "results/ are of tvsbayes 0.1.0, which modelled less of the rig" in messages[0]
+    assert "results/ are of tvsbayes 0.1.0, with another model of the rig" in messages[0]
     record = read_fit(OLD / "campaign" / "results" / "fit.json")
     assert record.summary.converged and record.summary.effective["left"].value == pytest.approx(0.0642, abs=1e-4)
 

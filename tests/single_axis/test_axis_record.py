@@ -74,7 +74,7 @@ def test_results_that_modelled_less_are_fitted_again(kept, monkeypatch):
         assert results_for(read_axis(folder), notify=messages.append).fit is fit
     finally:
         file.write_bytes(whole)
-    assert messages == ["results/ are of a version which modelled less of the axis: fitting first (weighted draws) ..."]
+    assert messages == ["results/ are of a version with another model of the axis: fitting first (weighted draws) ..."]
 
 
 def test_strata_have_the_band_of_all_draws(kept):

@@ -221,7 +221,7 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
     compensation = stored_compensation(data)
     refuse_drive(compensation)
     with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed)
+        results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
         job.begin("choosing stops")
         stops = plan_verification(results.fit, compensation, seed=seed)
     document, text = plain(stops), verify_plan_text(stops)

@@ -318,6 +318,7 @@ def verify_axis(
     *,
     made: Compensation | None = None,
     seed: int = 0,
+    tell: Callable[[str], None] = lambda _: None,
     progress: Show | None = None,
 ) -> Verification:
     """Verify that an axis keeps the promise of its table.
@@ -327,6 +328,7 @@ def verify_axis(
         fresh: readings with the table in force; commands before the correction.
         made: the table; None for the one in `results/compensation.json`.
         seed: seed of all draws.
+        tell: receives the reason where a fit runs first.
         progress: receives the progress.
 
     Raises:
@@ -339,7 +341,7 @@ def verify_axis(
     table = stored_compensation(known) if made is None else made
     refuse_drive(table)
     with Job({"fit": 1.0, "verification": 1.0}, progress) as job:
-        results = results_for(known, progress=job.part("fit"), seed=seed)
+        results = results_for(known, progress=job.part("fit"), seed=seed, notify=tell)
         refuse_answer(results.summary.answer)
         return verify_readings(results.fit, table, new, seed=seed, progress=job.part("verification"))
 

@@ -458,7 +458,7 @@ def _stored_w(folder: Path, names: int, remedy: str) -> np.ndarray:
 
 
 FITTING_FIRST = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
-MODELLED_LESS = "results/ are of a version which modelled less of the axis: fitting first (weighted draws) ..."
+OTHER_MODEL = "results/ are of a version with another model of the axis: fitting first (weighted draws) ..."
 
 
 def results_for(
@@ -497,7 +497,7 @@ def results_for(
         if summary.parameters.keys() >= {name for name in names if not name.startswith("wave_")}:
             w = _stored_w(campaign.path, len(names), remedy)
             return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed))
-        why = MODELLED_LESS
+        why = OTHER_MODEL
     notify(why)
     fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
     if fit.error is not None:
