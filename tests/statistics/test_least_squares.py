@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import optimize
-from support.certified_problems import MODELS, descended, score
+from support.certified_problems import MODELS, score
 
-from tvsbayes.cameras.bundle_adjustment import STATIONARY_SD
 from tvsbayes.statistics.least_squares import KINK_FALL, least_squares_covariance, newton_mode
 
 PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0
@@ -26,42 +24,8 @@ CASES = [
 @pytest.mark.parametrize(("name", "start"), CASES)
 def test_strd(name, start):
     result = score(name, start)
-    print(
-        f"{name:10s} start {start + 1}: {result.parameters:5.1f} {result.errors:5.1f} digits, {result.left:.0e} sd left"
-    )
-    assert result.left <= STATIONARY_SD
     assert result.parameters >= PARAMETER_DIGITS
     assert result.errors >= ERROR_DIGITS
-
-
-@pytest.mark.usefixtures("x64")
-def test_unfinished_run_is_not_converged():
-    """Three steps do not reach the minimum: the remaining step shows it."""
-    b, x = np.array([2.0, 0.5]), np.linspace(0.0, 4.0, 20)
-    y = b[0] * np.exp(-b[1] * x) + 0.01 * np.random.default_rng(1).standard_normal(20)
-
-    def residual(value, data):
-        return data[1] - value[0] * jnp.exp(-value[1] * data[0])
-
-    args = (jnp.asarray(x), jnp.asarray(y))
-    start = np.array([20.0, 5.0])
-    short, full = (descended(residual, start, args, steps) for steps in (3, 2000))
-    assert short.left > STATIONARY_SD and full.left < 1e-6
-    # Ten standard errors (0.01 each) of 20 observations with sd 0.01.
-    assert np.abs(full.value - b).max() < 0.1
-
-
-@pytest.mark.usefixtures("x64")
-def test_perfect_fit_is_converged():
-    """No residual is left whose direction could mean anything."""
-
-    def residual(value, data):
-        return data @ value - data @ jnp.asarray([1.0, -2.0, 3.0])
-
-    design = np.random.default_rng(2).standard_normal((6, 3))
-    end = descended(residual, np.array([5.0, 5.0, 5.0]), jnp.asarray(design))
-    assert end.left == 0
-    np.testing.assert_allclose(end.value, [1.0, -2.0, 3.0], rtol=1e-10)  # the solver's 1e-12, times the condition
 
 
 def test_covariance_is_the_inverse_of_the_normal_matrix():

@@ -108,7 +108,6 @@ class Score:
 
     parameters: float
     errors: float
-    left: float
 
 
 def digits(value: np.ndarray, certified: np.ndarray) -> float:
@@ -119,25 +118,19 @@ def digits(value: np.ndarray, certified: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class End:
-    """Where a descent ended; `left`: what the linear model would still move, in standard errors."""
+    """Where a descent ended."""
 
     value: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
-    left: float
 
 
-def descended(residual, start: np.ndarray, args, steps: int = STEPS) -> End:
+def descended(residual, start: np.ndarray, args) -> End:
     value = descend(
-        lambda at: residuals_and_jacobian(residual, jnp.asarray(at), args), np.asarray(start), TOLERANCE, steps
+        lambda at: residuals_and_jacobian(residual, jnp.asarray(at), args), np.asarray(start), TOLERANCE, STEPS
     ).value
     linear = residuals_and_jacobian(residual, value, args)
-    residuals, jacobian = np.asarray(linear.value), np.asarray(linear.jacobian)
-    sd = np.linalg.norm(residuals) / np.sqrt(max(residuals.size - value.size, 1))
-    left = np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals)
-    # At a perfect fit the residuals are rounding errors and their direction means nothing.
-    rounding = 1e-12 * np.linalg.norm(jacobian @ value)
-    return End(np.asarray(value), residuals, jacobian, 0.0 if left <= rounding else float(left / sd))
+    return End(np.asarray(value), np.asarray(linear.value), np.asarray(linear.jacobian))
 
 
 def score(name: str, start: int) -> Score:
@@ -149,7 +142,7 @@ def score(name: str, start: int) -> Score:
         errors = digits(np.sqrt(np.diag(covariance)), problem.sd)
     except np.linalg.LinAlgError:
         errors = 0.0
-    return Score(digits(end.value, problem.certified), errors, end.left)
+    return Score(digits(end.value, problem.certified), errors)
 
 
 if __name__ == "__main__":
@@ -163,7 +156,4 @@ if __name__ == "__main__":
             with jax.enable_x64(True):
                 result = score(name, start)
             took = time.perf_counter() - begun
-            print(
-                f"{name:10s} start {start + 1}  {result.parameters:5.1f} {result.errors:5.1f}  {took:5.1f} s  "
-                f"{result.left:.0e} sd left"
-            )
+            print(f"{name:10s} start {start + 1}  {result.parameters:5.1f} {result.errors:5.1f}  {took:5.1f} s")
