@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import special, stats
 
 from tvsbayes.statistics.chances import (
     log_chance,
@@ -31,8 +32,6 @@ def test_recursive_residuals_are_independent_and_standard(backwards):
 
 def test_the_log_density_of_student_is_scipys():
     """Few, many and infinitely many degrees of freedom, near and far; gammaln(5e5) is 6e6, rounded at 1e-9."""
-    from scipy import stats
-
     errors, scale = np.array([0.0, 0.3, -40.0, 2.0, 7.0]), np.array([1.0, 0.1, 2.0, 3.0, 0.5])
     dof = np.array([1.0, 2.5, 30.0, 1e6, np.inf])
     expected = np.append(stats.t.logpdf(errors, dof, scale=scale)[:4], stats.norm.logpdf(7.0, scale=0.5))
@@ -41,8 +40,6 @@ def test_the_log_density_of_student_is_scipys():
 
 def test_no_number_of_draws_makes_an_assurance_certain():
     """At 0 and 1 the standard deviation of Beta(1/2, n + 1/2); between them the binomial's."""
-    from scipy import stats
-
     for draws in (20, 200):
         assert share_error(1.0, draws) == share_error(0.0, draws)
         assert share_error(0.0, draws) == pytest.approx(stats.beta(0.5, draws + 0.5).std(), rel=1e-12)
@@ -54,8 +51,6 @@ def test_distributions_are_those_of_scipy_stats():
 
     The log of a probability near 1 has that probability's rounding, 1e-16.
     """
-    from scipy import stats
-
     chi2, dof = np.meshgrid([0.1, 1.0, 10.0, 300.0], [1, 2, 5, 40])
     np.testing.assert_allclose(log_chance(chi2, dof), stats.chi2.logsf(chi2, dof), rtol=1e-12, atol=1e-15)
     for count in (1, 20, 1000):
@@ -69,8 +64,6 @@ def test_distributions_are_those_of_scipy_stats():
 @pytest.mark.parametrize("dof", [2, 60, 180, 600, 6000])
 def test_gross_defects_of_many_looks_are_improbable(dof):
     """Of an even number of degrees of freedom Q is a finite sum; three a look are soon hundreds."""
-    from scipy import special
-
     chi2 = dof + np.array([3e3, 1e4, 1e5, 1e8])
     x, k = 0.5 * chi2[:, None], np.arange(dof // 2)
     expected = special.logsumexp(k * np.log(x) - special.gammaln(k + 1) - x, axis=1)
@@ -78,8 +71,6 @@ def test_gross_defects_of_many_looks_are_improbable(dof):
 
 
 def test_one_way_chance_is_that_of_the_f_test():
-    from scipy import stats
-
     generator = np.random.default_rng(3)
     for shift in (0.0, 0.5, 5.0):
         groups = [generator.standard_normal(n) + shift * k for k, n in enumerate((2, 7, 30))]
