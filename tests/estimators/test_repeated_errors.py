@@ -23,46 +23,41 @@ from support.dense_likelihood import (
     side,
     stop_labels,
 )
-from support.dozen_algebra import NOISE, found_at
 from support.varying_gears import PERIODS_DEG, coordinates_with, perfect_gears, varying_gears
 
 from tvsbayes.estimators import likelihood
+from tvsbayes.estimators.annealed_stage import Fixed, linear_campaign
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space, physical_at
 
 pytestmark = pytest.mark.usefixtures("x64")
 
+NOISE = np.isin(NAMES, NOISE_NAMES)
 LOG_UNIT = 1.0
 """One unit of log density; a covariance of nearly equal places, factored, leaves 1e-8 of it."""
 FINE_UNIT = 1e-8 * LOG_UNIT
 ALGEBRA = 1e-7
 """Relative: dense solves of a covariance of condition 1e8."""
-SCALES = {
-    "rough": {
-        **{"transmission_error_deg.pan": 0.06, "transmission_error_deg.tilt": 0.03},
-        **{"transmission_error_length_deg.pan": 1.5, "transmission_error_length_deg.tilt": 0.4},
-        **{"play_variation_deg.pan": 0.04, "play_variation_deg.tilt": 0.02},
-        **{"drift_deg_per_root_hour.pan": 0.1, "drift_deg_per_root_hour.tilt": 0.3},
-    },
-    "smooth": {
-        **{"transmission_error_deg.pan": 0.01, "transmission_error_deg.tilt": 0.2},
-        **{"transmission_error_length_deg.pan": 40.0, "transmission_error_length_deg.tilt": 12.0},
-        **{"play_variation_deg.pan": 0.15, "play_variation_deg.tilt": 0.001},
-        **{"drift_deg_per_root_hour.pan": 0.02, "drift_deg_per_root_hour.tilt": 0.0},
-    },
-    "periodic": {
-        **{"transmission_error_deg.pan": 0.02, "transmission_error_deg.tilt": 0.02},
-        **{"transmission_error_length_deg.pan": 5.0, "transmission_error_length_deg.tilt": 8.0},
-        **{"play_variation_deg.pan": 0.03, "play_variation_deg.tilt": 0.03},
-        **{"drift_deg_per_root_hour.pan": 0.05, "drift_deg_per_root_hour.tilt": 0.05},
-        **{"harmonic_amplitude_deg.pan.1": 0.08, "harmonic_amplitude_deg.pan.2": 0.03},
-        **{"harmonic_amplitude_deg.tilt.1": 0.05},
-    },
+BY_AXIS = names_of(
+    *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
+    "look_scatter_deg",
+)
+AMPLITUDES_DEG = {
+    **{"harmonic_amplitude_deg.pan.1": 0.08, "harmonic_amplitude_deg.pan.2": 0.03},
+    **{"harmonic_amplitude_deg.tilt.1": 0.05},
 }
-AMPLITUDES = ("harmonic_amplitude_deg.pan.1", "harmonic_amplitude_deg.pan.2", "harmonic_amplitude_deg.tilt.1")
-SCALES = {name: dict.fromkeys(AMPLITUDES, 0.0) | values for name, values in SCALES.items()}
+SCALES = {
+    kind: {name: value * (kind == "periodic") for name, value in AMPLITUDES_DEG.items()}
+    | dict(zip(BY_AXIS, values, strict=True))
+    for kind, values in {
+        "rough": (0.06, 0.03, 1.5, 0.4, 0.04, 0.02, 0.1, 0.3, 0.01, 0.015),
+        "smooth": (0.01, 0.2, 40.0, 12.0, 0.15, 0.001, 0.02, 0.0, 0.03, 0.002),
+        "periodic": (0.02, 0.02, 5.0, 8.0, 0.03, 0.03, 0.05, 0.05, 0.004, 0.02),
+    }.items()
+}
+"""Pan and tilt of each of `BY_AXIS`, and the amplitudes."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +81,12 @@ def varying(dozen) -> Varying:
         return Varying(dozen.campaign, space, arrays, coordinates_of(space, true))
 
 
+def found_at(evaluate, varying: Varying, z: np.ndarray) -> SimpleNamespace:
+    """Density and normal equations at a point, whose noise scales are held."""
+    reduced = linear_campaign(z, varying.space, varying.arrays, Fixed(NOISE, z, np.array(1.0)))
+    return SimpleNamespace(**vars(evaluate(z, varying.space, varying.arrays)), reduced=reduced)
+
+
 @pytest.fixture(scope="module", params=SCALES)
 def point(request, varying, evaluate) -> SimpleNamespace:
     moved = varying.z + np.where(NOISE, 0.0, 0.3 * np.random.default_rng(33).standard_normal(len(NAMES)))
@@ -107,16 +108,10 @@ def test_every_scale_matters(varying, point):
     """Each error left out of the dense covariance is seen a thousand times above what the comparison allows."""
     dense = dense_log_density(varying.campaign, point)
     for name, value in point.values.items():
-        scale = any(part in name for part in ("transmission_error", "play_var", "drift", "amplitude"))
+        scale = any(part in name for part in ("transmission_error", "play_var", "drift", "amplitude", "scatter"))
         if not scale or value < 1e-9:
             continue
-        without = SimpleNamespace(**vars(point))
-        values = {**point.values, name: value * 1.1}
-        count = len(ordered_spots(varying.campaign))
-        residual, slope = without.terms.residual[:count].ravel(), without.terms.slope[:count]
-        covariance = residual_covariance(angle_covariances(varying.campaign, values), slope)
-        chi2 = residual @ np.linalg.solve(covariance, residual)
-        other = without.terms.log_scale[:count].sum() - 0.5 * (np.linalg.slogdet(covariance)[1] + chi2)
+        other = dense_log_density(varying.campaign, point, {**point.values, name: value * 1.1})
         assert abs(other - dense) > 1e3 * FINE_UNIT, name
 
 
@@ -178,6 +173,11 @@ def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying,
     prior = np.where(NOISE, 0.0, point.z)
     value, root = point.reduced.value, point.reduced.jacobian
     assert value @ value == pytest.approx(residual @ solved[:, 0] + prior @ prior, rel=ALGEBRA)
+    # Of residuals in units of the pixel noise alone, with the scatter in the covariance, the squares are the same.
+    count = len(lin.slope)
+    pixels, slope = point.terms.residual[:count].ravel(), point.terms.slope[:count]
+    covariance = residual_covariance(angle_covariances(varying.campaign, point.values), slope)
+    assert value @ value == pytest.approx(pixels @ np.linalg.solve(covariance, pixels) + prior @ prior, rel=ALGEBRA)
     slope = -jacobian.T @ solved[:, 0] + prior
     np.testing.assert_allclose(root.T @ value, slope, atol=ALGEBRA * np.abs(slope).max())
     curvature = jacobian.T @ solved[:, 1:] + np.eye(len(NAMES))

@@ -165,11 +165,20 @@ def residual_covariance(covariance_rad2: np.ndarray, slope: np.ndarray) -> np.nd
     return np.eye(size) + np.einsum("aij,iua,jva->iujv", covariance_rad2, slope, slope).reshape(size, size)
 
 
-def dense_log_density(campaign: Campaign, evaluated: SimpleNamespace, *, persistent: bool = True) -> float:
-    """Log likelihood from the covariance of all residuals written out, without any filter."""
+def dense_log_density(
+    campaign: Campaign,
+    evaluated: SimpleNamespace,
+    values: dict[str, float] | None = None,
+    *,
+    persistent: bool = True,
+) -> float:
+    """Log likelihood from the covariance of all residuals written out, without any filter.
+
+    `values` are those behind the evaluation unless they are given.
+    """
     n = len(ordered_spots(campaign))
     residual, slope = evaluated.terms.residual[:n].ravel(), evaluated.terms.slope[:n]
-    errors = angle_covariances(campaign, physical(evaluated), persistent=persistent)
+    errors = angle_covariances(campaign, values or physical(evaluated), persistent=persistent)
     covariance = residual_covariance(errors, slope)
     chi2 = residual @ np.linalg.solve(covariance, residual)
     return float(evaluated.terms.log_scale[:n].sum() - 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * chi2)
