@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.small_campaign import small_stereo
 from support.written_rows import move_row, spot_row
 
 from tvsbayes.errors import NothingToEstimate
@@ -26,29 +27,17 @@ from tvsbayes.estimators.four_point import (
 from tvsbayes.instrument.campaign import Campaign, Spot
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.instrument.stereo_pair import Stereo, distort, rotation_matrix, triangulate, undistort
+from tvsbayes.instrument.stereo_pair import Stereo, distort, triangulate, undistort
 from tvsbayes.twin.physics import project
 
 ROUNDING_MM = 1e-7
 """Rounding of 1e-13 px through the depth gain Z^2/(f B) of 1 to 2 mm/px and the DLT's SVD, times 10^5."""
 ROUNDING_DEG = 1e-8
 """The same over 100 mm of depth difference: 1e-7 mm / 100 mm = 6e-8 deg, divided by N = 200, times 30."""
-
-
-def make_stereo(covariance: np.ndarray | None = None) -> Stereo:
-    """A pair with strong barrel distortion, f 800 px, 85 mm apart."""
-    return Stereo(
-        image_width=1280,
-        image_height=720,
-        M1=np.array([[802.0, 0.0, 645.0], [0.0, 801.0, 355.0], [0.0, 0.0, 1.0]]),
-        D1=np.array([-0.32, 0.11, 0.0004, -0.0006, -0.015]),
-        M2=np.array([[798.0, 0.0, 633.0], [0.0, 799.0, 362.0], [0.0, 0.0, 1.0]]),
-        D2=np.array([-0.31, 0.10, -0.0003, 0.0005, -0.012]),
-        R=rotation_matrix(np.array([0.004, -0.006, 0.003])),
-        T=np.array([-85.2, 0.3, -0.4]),
-        parameter_covariance=np.zeros((24, 24)) if covariance is None else covariance,
-        rms_px=0.2,
-    )
+STEREO = replace(small_stereo(), parameter_covariance=np.zeros((24, 24)))
+"""A pair with strong barrel distortion, f 800 px, 85 mm apart, known exactly."""
+IDEAL = replace(STEREO, D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))
+"""Parallel cameras without distortion."""
 
 
 def calibration_covariance() -> np.ndarray:
@@ -80,7 +69,7 @@ def make_campaign(
     focal_u: float = 0.0,
 ) -> Campaign:
     """Noise-free campaign of (axis, steps, theta_i, theta_f); each starts at counters 0, 0."""
-    stereo = make_stereo(covariance)
+    stereo = STEREO if covariance is None else replace(STEREO, parameter_covariance=covariance)
     moves = [move_row(0, 0, 0.0, 0, 0, "left", "up")]
     spots: list[Spot] = []
     for number, (axis, steps, theta_i, theta_f) in enumerate(experiments):
@@ -110,7 +99,7 @@ def test_worked_example_of_the_paper():
 
 def test_undistortion_converges_to_the_corners():
     """Re-distorting returns every pixel of the image, corners included."""
-    stereo = make_stereo()
+    stereo = STEREO
     pixels = np.stack(np.meshgrid(np.linspace(0, 1279, 15), np.linspace(0, 719, 9)), axis=-1).reshape(-1, 2)
     normalised = undistort(pixels, stereo.M1, stereo.D1)
     returned = distort(normalised, stereo.D1) @ stereo.M1[:2, :2].T + stereo.M1[:2, 2]
@@ -131,26 +120,12 @@ def test_undistortion_reports_a_pixel_without_origin():
 def test_triangulation_inverts_projection(focal_scale: float):
     """Points all over the shared field come back, with the same focal scale on both sides."""
     rng = np.random.default_rng(1)
-    stereo = make_stereo()
+    stereo = STEREO
     points = np.column_stack((rng.uniform(170, 500, 400), rng.uniform(-200, 100, 400), rng.uniform(-120, 120, 400)))
     pixels = project(points, stereo, focal_scale)
     inside = np.isfinite(pixels).all(axis=1)
     assert inside.sum() > 150
     assert np.abs(triangulate(stereo, pixels[inside], focal_scale) - points[inside]).max() < ROUNDING_MM
-
-
-def test_projection_agrees_with_opencv():
-    """The frame change and the distortion of the test's own optics are OpenCV's."""
-    import cv2
-
-    stereo = make_stereo()
-    points = np.array([[175.0, -60.0, 10.0], [275.0, 20.0, -40.0], [300.0, -80.0, 60.0]])
-    camera = np.column_stack((-points[:, 1], -points[:, 2], points[:, 0]))
-    zero, none = np.zeros((3, 1)), np.zeros((3, 1))
-    rotation, _ = cv2.Rodrigues(stereo.R)
-    left = cv2.projectPoints(camera, zero, none, stereo.M1, stereo.D1)[0].reshape(-1, 2)
-    right = cv2.projectPoints(camera, rotation, stereo.T.reshape(3, 1), stereo.M2, stereo.D2)[0].reshape(-1, 2)
-    assert np.abs(project(points, stereo) - np.hstack((left, right))).max() < 1e-9
 
 
 def test_directions_follow_the_sign_of_the_move():
@@ -242,7 +217,7 @@ def test_the_stereo_covariance_counts_with_its_correlations():
     def function(stereo: Stereo, focal_scale: float) -> float:
         return float(slopes @ stereo.vector) + 3.0 * focal_scale
 
-    variance = stereo_variance(function, make_stereo(covariance), 0.002)
+    variance = stereo_variance(function, replace(STEREO, parameter_covariance=covariance), 0.002)
     # Differences of numbers of order 1000 over steps of 1e-5.
     assert variance == pytest.approx(slopes @ covariance @ slopes + (3.0 * 0.002) ** 2, rel=1e-6)
     assert slopes @ covariance @ slopes != pytest.approx(slopes**2 @ np.diag(covariance), rel=0.2)
@@ -250,9 +225,8 @@ def test_the_stereo_covariance_counts_with_its_correlations():
 
 def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
     """Ideal parallel cameras: a focal length 0.5 % too large divides every tangent by 1.005."""
-    ideal = replace(make_stereo(), D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))
-    pixels = project(four_points(18.5, 30.4, "pan"), ideal).reshape(1, 4, 4)
-    ratio = four_point_ratios(pixels, np.array([200]), "pan", ideal, 1.005)[0]
+    pixels = project(four_points(18.5, 30.4, "pan"), IDEAL).reshape(1, 4, 4)
+    ratio = four_point_ratios(pixels, np.array([200]), "pan", IDEAL, 1.005)[0]
     angles = np.degrees(np.arctan(np.tan(np.radians([18.5, 30.4])) / 1.005))
     # The near and far points share the intercept, which scales with depth and leaves the slope alone.
     assert ratio == pytest.approx((angles[1] - angles[0]) / 200, abs=ROUNDING_DEG)
@@ -265,11 +239,10 @@ def test_slopes_by_pixels_are_those_of_the_closed_form():
     Vertical pixels count for nothing in a pan; the DLT agrees with the closed form in them, where both rows are equal,
     to first order.
     """
-    ideal = replace(make_stereo(), D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))
-    pixels = project(four_points(18.5, 30.4, "pan"), ideal).reshape(4, 4)
+    pixels = project(four_points(18.5, 30.4, "pan"), IDEAL).reshape(4, 4)
 
     def ratio(spots: np.ndarray) -> complex:
-        left, right = ((spots[:, k] - m[0, 2]) / m[0, 0] for k, m in ((0, ideal.M1), (2, ideal.M2)))
+        left, right = ((spots[:, k] - m[0, 2]) / m[0, 0] for k, m in ((0, IDEAL.M1), (2, IDEAL.M2)))
         depth = 85.0 / (left - right)
         across = -left * depth
         after, before = ((across[j] - across[i]) / (depth[j] - depth[i]) for i, j in ((3, 2), (0, 1)))
@@ -279,29 +252,15 @@ def test_slopes_by_pixels_are_those_of_the_closed_form():
     expected = [
         [ratio(pixels + 1j * step * np.eye(16)[4 * p + k].reshape(4, 4)).imag / step for k in (0, 2)] for p in range(4)
     ]
-    slopes = ratio_slopes(pixels, np.array([200]), "pan", ideal)
+    slopes = ratio_slopes(pixels, np.array([200]), "pan", IDEAL)
     assert slopes.ratio[0] == pytest.approx(ratio(pixels).real, abs=ROUNDING_DEG)
     # A difference quotient over 0.01 px of what bends within 10 px: 1e-3 at most.
     assert slopes.by_pixel[0][:, [0, 2]] == pytest.approx(np.array(expected), rel=1e-3)
 
 
-def test_fixed_parameters_are_skipped():
-    """A zero row costs no evaluation and adds no variance."""
-    calls = []
-
-    def function(stereo: Stereo, focal_scale: float) -> float:
-        calls.append(focal_scale)
-        return 3.0 * stereo.vector[0]
-
-    covariance = np.zeros((24, 24))
-    covariance[0, 0] = 4.0
-    assert stereo_variance(function, make_stereo(covariance), 0.0) == pytest.approx(36.0, rel=1e-9)
-    assert len(calls) == 2
-
-
 def test_a_step_out_of_the_lens_model_is_shortened():
     """sqrt(1 - x) at x = 0.99 with sd 1: a tenth of it leads beyond 1; the slope is -1 / (2 sqrt(0.01)) = -5."""
-    start = make_stereo().vector[0]
+    start = STEREO.vector[0]
 
     def function(stereo: Stereo, focal_scale: float) -> float:
         with np.errstate(invalid="ignore"):
@@ -313,8 +272,9 @@ def test_a_step_out_of_the_lens_model_is_shortened():
     step = 0.1 / 16
     slope = (np.sqrt(0.01 - step) - np.sqrt(0.01 + step)) / (2 * step)
     assert slope == pytest.approx(-5.0, rel=0.06)
-    assert stereo_variance(function, make_stereo(covariance), 0.0) == pytest.approx(slope**2, rel=1e-9)
-    assert stereo_variance(function, make_stereo(0 * covariance), 0.01) == pytest.approx(slope**2, rel=1e-9)
+    stated = replace(STEREO, parameter_covariance=covariance)
+    for variance in (stereo_variance(function, stated, 0.0), stereo_variance(function, STEREO, 0.01)):
+        assert variance == pytest.approx(slope**2, rel=1e-9)
 
 
 def _changed(campaign: Campaign, row: int, **changes) -> Campaign:
@@ -373,22 +333,3 @@ def test_nothing_to_estimate():
     assert caught.value.exit_code == 3
     with pytest.raises(NothingToEstimate):
         classic(replace(campaign, spots=()))
-
-
-def test_json_is_the_contract():
-    """Keys of data/docs/commands.md, and a document that any JSON reader takes."""
-    document = json.loads(
-        json.dumps(
-            classic(make_campaign([("pan", 200, 10.0, 22.0), ("pan", 200, 10.0, 22.1)])).as_json(),
-            allow_nan=False,
-        )
-    )
-    assert set(document["directions"]) == {"left", "right", "up", "down"}
-    assert document["directions"]["right"] is None
-    assert {
-        "n", "mean_deg_per_step", "sd_deg_per_step", "u_type_a_deg_per_step", "interval95_type_a",
-        "u_gum_deg_per_step", "interval95_gum",
-    } <= set(document["directions"]["left"])  # fmt: skip
-    assert set(document["experiments"][0]) == {
-        "experiment", "direction", "steps", "theta_i_deg", "theta_f_deg", "deg_per_step",
-    }  # fmt: skip
