@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -41,8 +42,6 @@ def test_a_sentence_has_its_remedy():
     ("path", "to"), [("runs/a b", "runs/a b-mended"), ("mine/", "mine-mended"), (".", "../{}-mended")]
 )
 def test_the_command_can_be_typed_as_it_stands(path, to):
-    from dataclasses import replace
-
     campaign = replace(read_campaign(shipped_data() / "twins" / "grid_twin"), path=Path(path))
     words = shlex.split(mending_command(campaign, "--flip pan_steps").strip("`"))
     assert words[:3] == ["tvsbayes", "import", str(Path(path))]

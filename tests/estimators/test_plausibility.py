@@ -14,7 +14,6 @@ from tvsbayes.cli.main import run
 from tvsbayes.estimators.plausibility import check_campaign, implausible, misfit_causes
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import PIXEL_SDS, PIXELS, Campaign, read_campaign, write_campaign
-from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.stereo_pair import project_pair, rotation_matrix
 from tvsbayes.twin.simulated_campaign import simulate
@@ -45,22 +44,6 @@ def test_the_papers_protocol_is_warned_of_on_both_axes(mounted_rig):
         assert f"{axis} ratio and {axis} backlash are poorly separated: {reason}" in text
 
 
-def test_swapped_cameras_are_suspected(paper_twin):
-    spots = tuple(
-        replace(
-            s,
-            u_left_px=s.u_right_px,
-            v_left_px=s.v_right_px,
-            u_right_px=s.u_left_px,
-            v_right_px=s.v_left_px,
-        )
-        for s in paper_twin.spots
-    )
-    text = warnings_of(replace(paper_twin, spots=spots))
-    assert "are left and right swapped" in text
-    assert "spots 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 374 more triangulate outside" in text
-
-
 def test_lengths_in_metres_and_angles_in_radians_are_suspected(paper_twin):
     metres = replace(paper_twin.stereo, T=paper_twin.stereo.T / 1000)
     assert "is it in metres?" in warnings_of(replace(paper_twin, stereo=metres))
@@ -86,8 +69,7 @@ def test_a_status_that_misses_its_word_is_named(paper_twin):
 
 def test_commands_that_estimate_repeat_what_no_rig_can_have_measured(paper_twin, tmp_path, capfd):
     """Nothing makes a user run `check` first; stdout stays the document."""
-    spots = tuple(replace(s, u_left_px=s.u_right_px, u_right_px=s.u_left_px) for s in paper_twin.spots)
-    write_campaign(replace(paper_twin, spots=spots), tmp_path / "swapped")
+    write_campaign(MISTAKES["cameras swapped"][0](paper_twin, None), tmp_path / "swapped")
     run(["classic", str(tmp_path / "swapped"), "--json"])
     printed = capfd.readouterr()
     assert "warning: spots 0, 1" in printed.err and "swapped" in printed.err
@@ -142,15 +124,15 @@ def test_incomplete_experiments_and_refused_spots_are_counted(paper_twin):
 
 def test_swapped_cameras_and_wrong_units_are_certain(paper_twin):
     """Where exchanged pictures put all spots on sheets; where no lens, no pair and no sheet can be meant."""
-    swapped = corrected(None, paper_twin.spots, Correction(swapped=True)).spots
-    (finding,) = implausible(replace(paper_twin, spots=swapped))
+    swapped = MISTAKES["cameras swapped"][0](paper_twin, None)
+    (finding,) = implausible(swapped)
     assert (finding.code, finding.certain, finding.line) == ("cameras-swapped", True, 2) and "--swap" in finding.remedy
-    in_mm = tuple(replace(s, **{name: 0.003 * getattr(s, name) for name in PIXELS}) for s in paper_twin.spots)
+    assert "spots 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 374 more triangulate outside" in warnings_of(swapped)
     metres = replace(paper_twin.stereo, T=paper_twin.stereo.T / 1000)
     grid = read_campaign(shipped_data() / "twins" / "grid_twin")
     radians = tuple(replace(s, aperture_deg=float(np.radians(s.aperture_deg))) for s in grid.spots)
     for campaign, file in (
-        (replace(paper_twin, spots=in_mm), "spots.csv"),
+        (MISTAKES["centres in millimetres"][0](paper_twin, None), "spots.csv"),
         (replace(paper_twin, stereo=metres), "stereo.json"),
         (replace(grid, spots=radians), "spots.csv"),
     ):
@@ -185,8 +167,8 @@ def test_a_transposed_rotation_is_named(paper_twin):
 
 def test_swapped_pictures_that_contradict_each_other_are_a_doubt(paper_twin):
     """Rows 30 px apart fit no pair, exchanged or not."""
-    swapped = corrected(None, paper_twin.spots, Correction(swapped=True)).spots
-    apart = tuple(replace(s, v_right_px=s.v_right_px + 30) for s in swapped)
+    swapped = MISTAKES["cameras swapped"][0](paper_twin, None)
+    apart = tuple(replace(s, v_right_px=s.v_right_px + 30) for s in swapped.spots)
     (finding,) = implausible(replace(paper_twin, spots=apart))
     assert (finding.code, finding.certain) == ("cameras-swapped", False)
 
