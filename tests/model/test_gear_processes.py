@@ -14,7 +14,7 @@ from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.gear_processes import BlockRoot, GearScales, Places, place_blocks, place_root
 from tvsbayes.model.headlines import SeenLine, effective_deg_per_step, line_deg_per_step
-from tvsbayes.model.laser_path import beam_angles, trace
+from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.model.parameter_space import parameter_space
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -100,7 +100,7 @@ def line():
         bent = ("laser_tilt_deg.x", "mirror1_error_deg", "tilt_axis_skew_deg", "tilt_zero_deg")
         for k, name in enumerate((*bent, "ratio_contrast_deg_per_step.pan", "backlash_deg.pan")):
             z[INDEX[name]] = 0.7 - 0.3 * k
-        model = jax.tree.map(jnp.asarray, space.model(jnp.asarray(z)))
+        model = jax.jit(lambda z: space.model(z))(z)
     steps, on_tilt = np.array([-200.0, 0.0, 300.0, 120.0]), np.array([False, False, False, True])
     pose_rad = np.array([0.05, 0.14])
 
@@ -119,7 +119,7 @@ SECANT = np.array([-1 / 500, 0.0, 1 / 500, 0.0])
 
 
 def azimuth(model, pan_rad: float, tilt_rad: float) -> float:
-    beam = trace(model.optics, jnp.asarray(pan_rad), jnp.asarray(tilt_rad)).direction
+    beam = jax.tree.map(np.asarray, model.optics).leaving(pan_rad, tilt_rad, np).direction
     return float(np.degrees(np.arctan2(beam.y, beam.x)))
 
 
