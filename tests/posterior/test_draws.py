@@ -53,6 +53,8 @@ def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():
     known = Posterior(fit, physical, np.zeros(shape), draws, np.full(shape, 1 / 6), SimpleNamespace(tier=CHAIN), 0, 0.0)
     expected = {"left": (0.122, 0.3), "right": (0.118, 0.3), "up": (0.144, 0.5), "down": (0.136, 0.5)}
     for direction, lost in expected.items():
-        motion = known.lost_motion_deg(direction, np.array([2, 200]))
-        np.testing.assert_allclose(motion.mean, lost, rtol=1e-12)
-        np.testing.assert_allclose(motion.interval95, [lost, lost], rtol=1e-12)
+        motion = known.lost_motion_deg(direction, np.array([0, 2, 200]))
+        np.testing.assert_allclose(motion.mean, (0.0, *lost), rtol=1e-12)
+        np.testing.assert_allclose(motion.interval95, [(0.0, *lost)] * 2, rtol=1e-12)
+    with pytest.raises(ValueError, match="allowed: left"):
+        known.lost_motion_deg("west", np.array([2]))

@@ -7,16 +7,13 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from support.small_posterior import SIGMAS, small_fit
+from support.small_posterior import SEED, SIGMAS, small_run
 
 from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.inference.importance import ROUND, Pool
 from tvsbayes.posterior import homing_mixture
 from tvsbayes.posterior.homing_mixture import Mixture, WayDraws
-from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.target import Target
-
-SEED = 3
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -27,18 +24,9 @@ def double():
 
 
 @pytest.fixture(scope="module")
-def run():
-    """Importance sampling of the shared fit, whose homings are recorded."""
-    fitted, path = small_fit()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: path)
-        return importance_run(fitted, SEED)
-
-
-@pytest.fixture(scope="module")
-def first(run):
-    """The draws of the most probable way."""
-    return WayDraws(run.density, run.pool, SEED)
+def first():
+    """The draws of the most probable way: those of the shared run, whose homings are recorded."""
+    return WayDraws(small_run().density, small_run().pool, SEED)
 
 
 def shared(first: WayDraws, rounds: int = 1) -> WayDraws:
@@ -49,8 +37,9 @@ def shared(first: WayDraws, rounds: int = 1) -> WayDraws:
 
 
 @pytest.fixture(scope="module")
-def second(run, first):
+def second():
     """Two rounds of a way's own draws, by the proposal fitted for the most probable one."""
+    run = small_run()
     target = Target(run.density.fit, run.density.path)
     return WayDraws(target, Pool.empty(run.pool.proposals[-1]), SEED + 1).extended(2, run.pool)
 
@@ -89,7 +78,7 @@ def test_independent_draws_add_their_squared_errors(first, second):
     assert mixture.summary.mcse_mean[column] == pytest.approx(together, rel=0.05)
 
 
-def test_shares_of_the_error_of_a_mean_do_not_depend_on_its_origin(run, first, second, monkeypatch):
+def test_shares_of_the_error_of_a_mean_do_not_depend_on_its_origin(first, second, monkeypatch):
     monkeypatch.setattr(homing_mixture, "END_ERROR_MAX", 1e9)
     shares = Mixture((first, second), 0).shares_of_error
     moved = tuple(replace(way) for way in (first, second))

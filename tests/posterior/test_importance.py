@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.special import gamma
-from support.small_posterior import SIGMAS, small_fit
+from support.small_posterior import SEED, SIGMAS, mapped_already, small_fit, small_run
 from support.tabulated import no_followers
 from support.varying_gears import perfect_gears
 
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.campaign_arrays import spot_constants
-from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.inference import importance
 from tvsbayes.inference.density import Points
@@ -25,16 +25,14 @@ from tvsbayes.inference.importance import Acceptance, Pool, Weighing, k_max, unc
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.inference.tables import Tables
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.parameters import BLOCKS, Prior
+from tvsbayes.instrument.parameters import BLOCKS, INDEX, Prior
 from tvsbayes.pipeline import unusable
-from tvsbayes.posterior.draws import headline_names
+from tvsbayes.posterior.draws import Posterior, headline_names
 from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.posterior.target import Target
 from tvsbayes.results.convergence import MonteCarloError
 from tvsbayes.statistics.weighted_draws import smoothed_weights, weighted_summary
-
-SEED = 3
 
 
 def normal(mean: float, sd: float, dimension: int) -> Independence:
@@ -139,17 +137,19 @@ def test_the_evidence_of_a_normal_posterior_is_laplaces(normal_fit):
 
 
 @pytest.fixture(scope="module")
-def sampled():
-    """(fit, its run) with the map of the shared fit."""
-    fitted, path = small_fit()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: path)
-        run = importance_run(fitted, SEED)
-        return fitted, run, run.density.posterior(run.sample, SEED)
+def posterior() -> Posterior:
+    """Of the shared run."""
+    return small_run().density.posterior(small_run().sample, SEED)
 
 
-def test_a_campaign_is_sampled_in_few_rounds_and_accepted(sampled):
-    fitted, run, posterior = sampled
+@pytest.fixture
+def fitted(monkeypatch) -> JointFit:
+    """The shared fit."""
+    mapped_already(monkeypatch)
+    return small_fit()[0]
+
+
+def test_a_campaign_is_sampled_in_few_rounds_and_accepted(fitted, posterior):
     judged = posterior.convergence.importance
     assert judged.accepted and judged.missing == () and posterior.tier == "importance"
     every = posterior.convergence.monte_carlo_error
@@ -160,24 +160,22 @@ def test_a_campaign_is_sampled_in_few_rounds_and_accepted(sampled):
     assert weights.shape == posterior.z.shape[:2] == (1, judged.draws)
     assert weights.sum() == pytest.approx(1.0, rel=1e-12)
     # The stored density is that of the stored draws.
-    path, z = run.density.path, posterior.z[0, :64]
+    path, z = small_run().density.path, posterior.z[0, :64]
     w = path.to_w(z)
     again = Target(fitted, path)(w) + fitted.log_density - path.mapped(w).log_jacobian
     np.testing.assert_allclose(posterior.log_density[0, :64], again, atol=1e-6)
 
 
-def test_the_same_seed_gives_the_same_draws(sampled, monkeypatch):
-    fitted, run, _ = sampled
-    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
-    again = sample(fitted, "importance", seed=SEED)
-    np.testing.assert_array_equal(again.z, sampled[2].z)
-    np.testing.assert_array_equal(again.weights, sampled[2].weights)
-    assert again.convergence == sampled[2].convergence
+def test_the_same_seed_gives_the_same_draws(fitted, monkeypatch):
+    monkeypatch.setattr(importance, "ROUND", 512)
+    one, again = (importance_run(fitted, SEED, rounds_max=2) for _ in range(2))
+    np.testing.assert_array_equal(again.sample.points.w, one.sample.points.w)
+    np.testing.assert_array_equal(again.sample.weights, one.sample.weights)
+    assert again.sample.convergence == one.sample.convergence
 
 
-def test_draws_of_the_same_weight_say_what_weighted_ones_say(sampled):
+def test_draws_of_the_same_weight_say_what_weighted_ones_say(posterior):
     """Moments of 4000 resampled draws, and of the walkers' starts without replacement."""
-    posterior = sampled[2]
     known = posterior.propagate(lambda p: p["backlash_deg.pan"])
     equal = posterior.resampled(4, 1000)
     assert equal.z.shape[:2] == (4, 1000) and np.ptp(equal.weights) == 0
@@ -187,11 +185,9 @@ def test_draws_of_the_same_weight_say_what_weighted_ones_say(sampled):
     assert abs(values.mean() - known.mean) < allowed
     thinned = posterior.thinned(1000)
     chosen = posterior.by_name["backlash_deg.pan"][posterior.chosen(1000)]
-    from tvsbayes.instrument.parameters import INDEX
-
     np.testing.assert_array_equal(np.asarray(thinned.physical)[:, INDEX["backlash_deg.pan"]], chosen)
     np.testing.assert_array_equal(posterior.coordinates(1000), posterior.z[0, posterior.chosen(1000)])
-    starts = sampled[1].starts(64)
+    starts = small_run().starts(64)
     assert len(np.unique(starts, axis=0)) == 64
 
 
@@ -202,30 +198,34 @@ def narrowed(proposal: Independence, factor: float) -> Independence:
 
 
 @pytest.fixture
-def too_narrow(sampled, monkeypatch):
-    """The run's map, no heavy tails, and a first proposal of half the width."""
-    fitted, run, _ = sampled
-    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
+def too_narrow(fitted, monkeypatch):
+    """Without heavy tails and with a first proposal of half the width."""
     for name in ("HEAVY_SHARE", "COUPLED_SHARE"):
         monkeypatch.setattr(f"tvsbayes.inference.proposal.{name}", 1e-12)
-    first = run.density.first_proposal()
+    first = small_run().density.first_proposal()
     monkeypatch.setattr(Target, "first_proposal", lambda target: narrowed(first, 0.5))
     return fitted
 
 
-@pytest.mark.thorough
-def test_a_proposal_that_is_too_narrow_is_fitted_again(too_narrow, sampled, monkeypatch):
-    """Its draws adapt the next one; they take no part in the answer, which is that of the right proposal."""
-    begun = []
+@pytest.fixture
+def begun(monkeypatch) -> list[Independence]:
+    """The proposals that pools begin with."""
+    proposals = []
 
     def empty(proposal, invalid=0):
-        begun.append(proposal)
+        proposals.append(proposal)
         return Pool(None, (), (), proposal, invalid)
 
     monkeypatch.setattr(Pool, "empty", empty)
+    return proposals
+
+
+@pytest.mark.thorough
+def test_a_proposal_that_is_too_narrow_is_fitted_again(too_narrow, posterior, begun):
+    """Its draws adapt the next one; they take no part in the answer, which is that of the right proposal."""
     run = importance_run(too_narrow, SEED)
-    posterior = run.density.posterior(run.sample, SEED)
-    judged, other = posterior.convergence, sampled[2].convergence
+    again = run.density.posterior(run.sample, SEED)
+    judged, other = again.convergence, posterior.convergence
     assert judged.answer == "accepted" and judged.missing == ()
     # After the narrowed one come refitted proposals.
     assert len(begun) > 1 and run.pool.proposals == (begun[-1],)
@@ -233,25 +233,16 @@ def test_a_proposal_that_is_too_narrow_is_fitted_again(too_narrow, sampled, monk
     # Fitted to draws of a bad proposal it is worth less than a good one, but no tenth of it.
     assert judged.importance.effective_share > 0.1 * other.importance.effective_share
     name = other.importance.least_ess.quantity
-    one, two = (each.propagate(lambda p: p[name]) for each in (posterior, sampled[2]))
+    one, two = (each.propagate(lambda p: p[name]) for each in (again, posterior))
     assert abs(one.mean - two.mean) < SIGMAS * np.hypot(one.mcse_mean, two.mcse_mean)
 
 
-def test_a_heavy_tail_is_answered_by_another_proposal(sampled, monkeypatch):
+def test_a_heavy_tail_is_answered_by_another_proposal(fitted, begun, monkeypatch):
     """More draws hardly change its index. With a limit that no weights meet: 3 rounds and 3 more, then 6 and 6."""
-    fitted, run, _ = sampled
-    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
     monkeypatch.setattr(importance, "K_MAX", -1.0)
-    monkeypatch.setattr(importance, "ROUND", 512)
-    begun = []
-
-    def empty(proposal, invalid=0):
-        begun.append(proposal)
-        return Pool(None, (), (), proposal, invalid)
-
-    monkeypatch.setattr(Pool, "empty", empty)
+    monkeypatch.setattr(importance, "ROUND", 256)
     again = importance_run(fitted, SEED, rounds_max=6 + 12)
-    assert again.pool.proposals == (begun[-1],) and again.pool.counts == (12 * 512,)
+    assert again.pool.proposals == (begun[-1],) and again.pool.counts == (12 * 256,)
     assert again.sample.convergence.answer != "accepted"
 
 
@@ -272,10 +263,8 @@ def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
 
 
 @pytest.mark.thorough
-def test_few_draws_of_a_good_proposal_are_a_rough_answer(sampled, monkeypatch):
+def test_few_draws_of_a_good_proposal_are_a_rough_answer(fitted, monkeypatch):
     """Weights are sound and the mean is known to a tenth of an sd or two; the posterior's numbers are given."""
-    fitted, run, _ = sampled
-    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
     monkeypatch.setattr(importance, "ROUNDS_LEAST", 1)
     monkeypatch.setattr(importance, "ROUND", 512)
     run = importance_run(fitted, SEED, rounds_max=1)
@@ -325,10 +314,7 @@ def test_the_draws_that_an_accepted_answer_takes_follow_from_the_worst_error():
     assert MonteCarloError(0.1, (0.2, 0.2)).within(0.1, 0.2) and not MonteCarloError(0.1, (0.2, 0.21)).within(0.1, 0.2)
 
 
-def test_a_density_without_values_is_refused(sampled, monkeypatch):
-    fitted, run, _ = sampled
-    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
-
+def test_a_density_without_values_is_refused(fitted, monkeypatch):
     def valued(target, w, generator):
         return Points(w, np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0), {})
 
@@ -337,12 +323,12 @@ def test_a_density_without_values_is_refused(sampled, monkeypatch):
         importance_run(fitted, SEED)
 
 
-def test_no_chain_is_kept_or_resumed_without_one(sampled, tmp_path):
+def test_no_chain_is_kept_or_resumed_without_one(fitted, tmp_path):
     for options in ({"checkpoint": tmp_path / "chain.npz"}, {"resume": True}):
         with pytest.raises(ValueError, match=r"chain|checkpoint"):
-            sample(sampled[0], "importance", **options)
+            sample(fitted, "importance", **options)
     with pytest.raises(ValueError, match="allowed: importance, emcee"):
-        sample(sampled[0], "nested")
+        sample(fitted, "nested")
 
 
 @pytest.mark.thorough

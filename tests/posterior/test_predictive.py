@@ -46,34 +46,36 @@ def variances_by_hand(moves, spot) -> tuple[float, float]:
     return result[0], result[1]
 
 
+def taken_again_deg(dozen, physical: np.ndarray, play_deg: np.ndarray, seed: int) -> np.ndarray:
+    """Angles that looks taken again are off by, shape (draws, spots, 2), at plays of these sds (spots, 2)."""
+    caught = []
+
+    def looks(fit, z, error_rad):
+        caught.append(np.degrees(error_rad[:, : len(play_deg)]))
+        return np.zeros((len(z), len(play_deg), 4))
+
+    linearised = SimpleNamespace(play_sd_rad=np.radians(play_deg))
+    fit = SimpleNamespace(campaign=dozen.campaign, arrays=dozen.arrays, linearised=linearised)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tvsbayes.posterior.predictive.looks", looks)
+        generator = np.random.default_rng(seed)
+        # Pixels that err by nothing.
+        assert not looks_again(fit, np.zeros((DRAWS, 1)), physical, no_draw(DRAWS, dozen.arrays), generator).any()
+    return caught[0]
+
+
 @pytest.fixture(scope="module")
 def errors_deg(dozen):
-    """Angles that the looks taken again are off by, shape (draws, spots, 2), and the play's sd at each spot."""
-    spots = ordered_spots(dozen.campaign)
-    play_deg = np.zeros((len(spots), 2))
+    """Of stops, homings and play, and the play's sd at each spot."""
+    play_deg = np.zeros((len(ordered_spots(dozen.campaign)), 2))
     # Two spots of one segment: where the play stands is one place for both.
     play_deg[[4, 5], 1] = PLAY_SD_DEG
-    fit = SimpleNamespace(
-        campaign=dozen.campaign,
-        arrays=dozen.arrays,
-        linearised=SimpleNamespace(play_sd_rad=np.radians(play_deg)),
-    )
     physical = np.ones((DRAWS, len(NAMES)))
     for name, sd in SDS_DEG.items():
         physical[:, INDEX[f"stop_sd_deg.{name}"]] = sd
     for name in ("pixel_scale", *names_of("drift_deg_per_root_hour", "look_scatter_deg")):
         physical[:, INDEX[name]] = 0.0
-    caught = []
-
-    def looks(fit, z, stop_error_rad):
-        caught.append(np.degrees(stop_error_rad[:, : len(spots)]))
-        return np.zeros((len(z), len(spots), 4))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.posterior.predictive.looks", looks)
-        z = np.zeros((DRAWS, 1))
-        assert not looks_again(fit, z, physical, no_draw(DRAWS, dozen.arrays), np.random.default_rng(4)).any()
-    return caught[0], play_deg
+    return taken_again_deg(dozen, physical, play_deg, 4), play_deg
 
 
 def test_every_look_scatters_by_its_direction_its_homing_and_its_play(dozen, errors_deg):
@@ -105,20 +107,11 @@ def test_an_error_is_held_while_its_axis_stands(dozen, errors_deg):
 
 def test_looks_taken_again_scatter_about_their_stops(dozen, monkeypatch):
     """By 0.2 deg of pan and 0.1 of tilt, at every look another; stops, homings and play that err by nothing."""
-    count, caught = len(ordered_spots(dozen.campaign)), []
-
-    def looks(fit, z, error_rad):
-        caught.append(np.degrees(error_rad[:, :count]))
-        return np.zeros((len(z), count, 4))
-
-    monkeypatch.setattr("tvsbayes.posterior.predictive.looks", looks)
+    count = len(ordered_spots(dozen.campaign))
     monkeypatch.setattr("tvsbayes.posterior.predictive.HOME_SD_DEG", 0.0)
-    still = SimpleNamespace(play_sd_rad=np.zeros((count, 2)))
-    fit = SimpleNamespace(campaign=dozen.campaign, arrays=dozen.arrays, linearised=still)
     physical = np.zeros((DRAWS, len(NAMES)))
     physical[:, [INDEX[name] for name in names_of("look_scatter_deg")]] = 0.2, 0.1
-    looks_again(fit, np.zeros((DRAWS, 1)), physical, no_draw(DRAWS, dozen.arrays), np.random.default_rng(5))
-    (errors,) = caught
+    errors = taken_again_deg(dozen, physical, np.zeros((count, 2)), 5)
     tolerance = 5 * np.sqrt(2 / DRAWS)
     np.testing.assert_allclose(errors.var(axis=0), np.full((count, 2), (0.04, 0.01)), rtol=tolerance)
     between = np.corrcoef(errors[..., 0].T)[np.triu_indices(count, 1)]

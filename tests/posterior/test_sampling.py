@@ -8,7 +8,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from support.small_posterior import ROUNDING, SIGMAS, small_fit
+from support.small_posterior import ROUNDING, SEED, SIGMAS, mapped_already, small_fit
 from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NotConverged
@@ -20,7 +20,6 @@ from tvsbayes.posterior.target import Target
 from tvsbayes.results.tiers import CHAIN
 
 LONG, SHORT, BLOCK = 96, 12, 6
-SEED = 3
 NON_NORMAL = 0.2
 """Sds (and share of an sd) by which the posterior of the left ratio may differ from its Laplace approximation: the
 stop scatters, which widen it, have skewed posteriors; a chain of 190 steps shows 0.1 in both."""
@@ -43,8 +42,8 @@ def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
 
 
 def quickly(patch: pytest.MonkeyPatch) -> None:
-    """The map takes seconds and no random number; three small rounds are enough for a start."""
-    patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: small_fit()[1])
+    """Three small rounds are enough for a start."""
+    mapped_already(patch)
     patch.setattr("tvsbayes.inference.importance.ROUND", 512)
     patch.setattr("tvsbayes.inference.importance.ROUNDS_LEAST", 1)
     patch.setattr("tvsbayes.posterior.sampling.importance_run", partial(importance_run, rounds_max=3))
@@ -230,18 +229,6 @@ def test_a_constant_has_no_monte_carlo_error(long):
     result = long[0].propagate(lambda p: np.full_like(p["degrees_per_step.left"], 2.5))
     assert result.mean == 2.5 and result.sd == 0
     assert result.mcse_mean == 0 and result.mcse_sd == 0 and np.all(result.mcse_interval95 == 0)
-
-
-def test_lost_motion_is_the_play_once_it_is_taken_up(long):
-    steps = np.array([0, 1, 3, 1000])
-    for direction, axis in (("left", "pan"), ("up", "tilt")):
-        lost = long[0].lost_motion_deg(direction, steps).draws.reshape(-1, len(steps))
-        k, b = long[0].by_name[f"degrees_per_step.{direction}"], long[0].by_name[f"backlash_deg.{axis}"]
-        expected = np.minimum(k[:, None] * steps, b[:, None])
-        np.testing.assert_array_equal(lost, expected)
-        assert np.all(lost[:, 0] == 0) and np.all(lost[:, 3] == b)
-    with pytest.raises(ValueError, match="allowed: left"):
-        long[0].lost_motion_deg("west", steps)
 
 
 def test_the_left_ratio_agrees_with_laplace(fitted, long):

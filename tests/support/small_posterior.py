@@ -7,16 +7,20 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy import stats
 from support.varying_gears import perfect_rig
 
 from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.inference.importance import ImportanceRun
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
+from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.transport import Transport, transport
 from tvsbayes.twin.simulated_campaign import simulate
 
+SEED = 3
 SIGMAS = 5.0
 """Standard errors: a right value lies farther out in 6 of 10 million runs, and the runs are seeded."""
 ROUNDING = 2.0**-52
@@ -47,3 +51,16 @@ def small_fit() -> tuple[JointFit, Transport]:
     fitted = fit(simulate(rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=21).campaign)
     assert fitted.converged, fitted.problems
     return fitted, transport(fitted)
+
+
+def mapped_already(patch: pytest.MonkeyPatch) -> None:
+    """The map of that fit takes seconds and no random number: it is not made again."""
+    patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: small_fit()[1])
+
+
+@cache
+def small_run() -> ImportanceRun:
+    """Importance sampling of that fit."""
+    with pytest.MonkeyPatch.context() as patch:
+        mapped_already(patch)
+        return importance_run(small_fit()[0], SEED)
