@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
@@ -59,14 +58,6 @@ def test_the_density_of_a_pair_is_one_and_its_draws_follow_it():
     assert many.sum() > 20
     chi2 = np.sum((counts[many] - expected[many]) ** 2 / expected[many])
     assert abs(chi2 - many.sum()) < SIGMAS * np.sqrt(2 * many.sum())
-
-
-def test_followers_go_with_their_leaders():
-    """Mean of the follower at a leader, by regression on draws, within what the heavy part blurs."""
-    draws = followed().draw(100_000, np.random.RandomState(4))
-    inside = np.abs(draws[:, 0]) < 3
-    slope = stats.theilslopes(*draws[inside][:2000].T[::-1])[0]
-    assert slope == pytest.approx(-0.8, abs=0.1)
 
 
 def test_new_values_of_some_coordinates_leave_a_pair_as_it_is():
