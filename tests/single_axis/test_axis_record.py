@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -41,39 +42,33 @@ def test_stored_results_of_an_axis_are_reused(kept):
     np.testing.assert_array_equal(results.fit.w, fit.w)
 
 
-def rewritten(folder, change):
-    """Write `fit.json` as `change` leaves its keys; returns what it was."""
+@pytest.fixture
+def copied(kept, tmp_path):
+    """A copy of the folder that a test may spoil."""
+    return shutil.copytree(kept[0], tmp_path / "a")
+
+
+def rewrite(folder, change) -> None:
+    """Write `fit.json` as `change` leaves its keys."""
     file = folder / "results" / "fit.json"
-    whole = file.read_bytes()
-    keys = json.loads(whole)
+    keys = json.loads(file.read_bytes())
     change(keys)
     file.write_text(json.dumps(keys))
-    return whole
 
 
-def test_a_sample_without_an_answer_was_accepted(kept):
+@pytest.mark.parametrize(("estimator", "answer"), [("posterior", "accepted"), ("laplace", "laplace")])
+def test_a_sample_without_an_answer_was_accepted(copied, estimator, answer):
     """0.2.0 wrote no `answer`: a sampled fit that had converged was an accepted one."""
-    folder, _ = kept
-    file = folder / "results" / "fit.json"
-    for estimator, answer in (("posterior", "accepted"), ("laplace", "laplace")):
-        whole = rewritten(folder, lambda keys, value=estimator: (keys.pop("answer"), keys.update(estimator=value)))
-        try:
-            assert results_for(read_axis(folder)).summary.answer == answer
-        finally:
-            file.write_bytes(whole)
+    rewrite(copied, lambda keys: (keys.pop("answer"), keys.update(estimator=estimator)))
+    assert results_for(read_axis(copied)).summary.answer == answer
 
 
-def test_results_that_modelled_less_are_fitted_again(kept, monkeypatch):
+def test_results_that_modelled_less_are_fitted_again(kept, copied, monkeypatch):
     """0.2.0 had no creep: its draws have fewer coordinates, which is no damage."""
-    folder, fit = kept
-    file, messages = folder / "results" / "fit.json", []
-    name = fit.model.coordinates.names[-1]
-    whole = rewritten(folder, lambda keys: keys["parameters"].pop(name))
+    fit, messages = kept[1], []
+    rewrite(copied, lambda keys: keys["parameters"].pop(fit.model.coordinates.names[-1]))
     monkeypatch.setattr("tvsbayes.single_axis.axis_record.fit_axis", lambda *_, **__: fit)
-    try:
-        assert results_for(read_axis(folder), notify=messages.append).fit is fit
-    finally:
-        file.write_bytes(whole)
+    assert results_for(read_axis(copied), notify=messages.append).fit is fit
     assert messages == ["results/ are of a version with another model of the axis: fitting first (weighted draws) ..."]
 
 
@@ -108,31 +103,20 @@ def npz(**arrays):
     ],
     ids=["cut", "empty", "without w", "narrow", "one draw", "infinite", "text"],
 )
-def test_damaged_draws_are_refused(kept, change):
-    folder, fit = kept
-    file = folder / "results" / "draws.npz"
-    whole = file.read_bytes()
-    try:
-        file.write_bytes(change(whole, fit.w))
-        with pytest.raises(InputError) as caught:
-            results_for(read_axis(folder))
-    finally:
-        file.write_bytes(whole)
+def test_damaged_draws_are_refused(kept, copied, change):
+    file = copied / "results" / "draws.npz"
+    file.write_bytes(change(file.read_bytes(), kept[1].w))
+    with pytest.raises(InputError) as caught:
+        results_for(read_axis(copied))
     assert (caught.value.code, caught.value.file) == ("damaged", "results/draws.npz")
     assert "tvsbayes fit" in caught.value.remedy
 
 
 @pytest.mark.parametrize("seed", ["7", -1, 1.5, True, None])
-def test_a_damaged_seed_is_refused(kept, seed):
-    folder, _ = kept
-    file = folder / "results" / "fit.json"
-    whole = file.read_bytes()
-    try:
-        file.write_text(json.dumps({**json.loads(whole), "seed": seed}))
-        with pytest.raises(InputError) as caught:
-            results_for(read_axis(folder))
-    finally:
-        file.write_bytes(whole)
+def test_a_damaged_seed_is_refused(copied, seed):
+    rewrite(copied, lambda keys: keys.update(seed=seed))
+    with pytest.raises(InputError) as caught:
+        results_for(read_axis(copied))
     assert (caught.value.code, caught.value.column) == ("schema", "seed") and caught.value.remedy
 
 
