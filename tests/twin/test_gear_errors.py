@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.commands import steps
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_SD_DEG
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, Prior
@@ -35,10 +36,8 @@ SCALES = {
 
 def sweep(pans: tuple[int, ...] = (0, 60, 200, 60, 0, -40, 60)) -> tuple[PlanStep, ...]:
     """One homing, then a look at every counter of pan; tilt goes along half as far."""
-    orders: list[tuple] = [("home", 0, 0), ("place", None, None, "d1"), ("look",)]
-    for pan in pans:
-        orders += [("move", pan, pan // 2), ("look",)]
-    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+    there = (order for pan in pans for order in (("move", pan, pan // 2), ("look",)))
+    return steps(("home", 0, 0), ("place", "d1"), ("look",), *there)
 
 
 def quiet(truth: Truth, **known: float) -> Truth:
@@ -253,7 +252,7 @@ def test_the_headline_is_the_line_through_the_looks(mounted_rig):
 def test_unrecorded_homing_sides(mounted_rig):
     """The mirrors stand where the true side puts them, and the campaign does not say which."""
     truth = quiet(draw_truth(mounted_rig, np.random.default_rng(13)).with_gears(), **{"backlash_deg.pan": 1.0})
-    plan = tuple(PlanStep(number, "home", 0, 0) for number in range(30))
+    plan = steps(*[("home", 0, 0)] * 30)
     for side, angle_deg in (("left", -0.5), ("right", 0.5)):
         known, hidden = (
             simulate(mounted_rig, plan, 2, truth, home_approach=(side, "up"), sides_recorded=recorded)

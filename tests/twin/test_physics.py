@@ -67,15 +67,6 @@ def test_nominal_chain_is_a_periscope():
     assert up == pytest.approx([np.cos(0.1), 0.0, np.sin(0.1)], abs=1e-12)
 
 
-def test_mirror_chain_takes_arrays():
-    """Arrays of angles give what single angles give."""
-    psi, beta = np.radians([[10.0, -3.0], [5.0, 2.0]])
-    origins, directions = mirror_chain(psi, beta, VECTOR)
-    for i in range(2):
-        origin, direction = mirror_chain(psi[i], beta[i], VECTOR)
-        assert np.array_equal(origins[i], origin) and np.array_equal(directions[i], direction)
-
-
 def test_effective_ratios_and_offset_of_the_nominal_rig():
     """Nominal: the beam turns as the mirrors do and passes the pan axis at +L, at any pose."""
     parameters = NOMINAL | {"degrees_per_step.left": 0.0601, "degrees_per_step.right": 0.0599}
