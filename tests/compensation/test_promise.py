@@ -123,6 +123,10 @@ def test_no_table_is_made_of_what_is_not_accepted():
         compensation_of(AxisResults(rough, results().fit), Wish())
 
 
-def test_python_makes_the_file_in_one_call():
+def test_python_makes_the_file_in_one_call(monkeypatch):
+    def fitted_before(campaign, **_):
+        return replace(results(), fit=replace(results().fit, campaign=campaign))
+
+    monkeypatch.setattr("tvsbayes.compensation.promise.results_for", fitted_before)
     result = compensate(replace(results().fit.campaign, header={"serial": "A 7"}), "linuxcnc")
     assert result.machine == "A 7" and "machine: A 7" in result.text and result.text.startswith("-20.0")

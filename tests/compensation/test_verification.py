@@ -112,7 +112,8 @@ def test_grblhal_may_begin_in_either_half_of_the_play():
     assert verify_readings(results().fit, structs.replace(result, zero_free=False), shifted).verdict == BROKEN
 
 
-def test_python_verifies_in_one_call():
+def test_python_verifies_in_one_call(monkeypatch):
+    monkeypatch.setattr("tvsbayes.compensation.verification.results_for", lambda *_, **__: results())
     assert verify_axis(results().fit.campaign, fresh(3), made=table()).verdict == KEPT
 
 
