@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +44,6 @@ def beam_of(terms, azimuth_deg, elevation_deg):
 
 def by_another_parser(data, pan, tilt):
     """Direction of x of the tilt link in the mast's frame, by yourdfpy."""
-    from io import BytesIO
-
     yourdfpy = pytest.importorskip("yourdfpy", exc_type=ImportError)
     robot = yourdfpy.URDF.load(BytesIO(data), load_meshes=False, build_scene_graph=True)
     robot.update_cfg({"pan_joint": pan, "tilt_joint": tilt})

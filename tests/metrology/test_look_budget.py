@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.bent_rig import calibration
-from support.bent_rig import calibration as bent_calibration
 from support.geared_rig import geared
 
 from tvsbayes.calibration.optics import GEAR_INPUTS
@@ -19,7 +18,7 @@ from tvsbayes.metrology.look_budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, 
 
 
 def test_coordinate_budgets_by_parameter():
-    one = bent_calibration()
+    one = calibration()
     rng = np.random.default_rng(7)
     noises = (
         "stop error pan",
