@@ -103,6 +103,18 @@ def shared_lengths():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def unflushed():
+    """No waiting for the disk: files of tests need not outlive a power cut, and milliseconds a flush add up.
+
+    Tests of durability follow the calls themselves (`acquisition/test_journal.py`); killed processes flush for real.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        # A descriptor that is none is refused still.
+        patch.setattr(os, "fsync", os.fstat)
+        yield
+
+
 @pytest.fixture
 def x64():
     """float64 for one test; the library itself never changes a global setting."""
