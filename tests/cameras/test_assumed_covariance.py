@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec import structs
+from support.calibration_files import written
 
 from tvsbayes.cameras.assumed_covariance import (
     CORRELATION_FACTOR,
@@ -37,11 +38,6 @@ pytestmark = pytest.mark.thorough
 
 BOARD = Board(9, 6, 25.0)
 BENCHES, NOISE_PX, VIEWS = 12, 0.15, 18
-
-
-@pytest.fixture(scope="module")
-def mounted() -> Stereo:
-    return read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")
 
 
 def corners(stereo: Stereo, pose: np.ndarray, board: Board = BOARD) -> tuple[np.ndarray, np.ndarray]:
@@ -189,9 +185,7 @@ def test_a_stated_uncertainty_replaces_that_of_its_group(mounted):
 def test_stated_values_precede_the_file_and_the_file_precedes_defaults(mounted, tmp_path):
     files = exported(mounted, "opencv")
     files["intrinsics.yml"] += b"avg_reprojection_error: 0.41\nnr_of_frames: 17\nboard_width: 8\nboard_height: 5\n"
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-    paths = [tmp_path / name for name in files]
+    paths = written(tmp_path, files)
     of_file = read_calibration(paths).stereo
     expected = Provenance(0.41, 17, (8, 5))
     assert of_file.assumed_from == with_assumed_covariance(of_file, Provenance(), expected).assumed_from
@@ -220,9 +214,7 @@ def test_cameras_without_a_common_field_are_refused(mounted):
 
 
 def test_command_takes_the_stated_uncertainties(mounted, tmp_path, capsys):
-    for name, data in exported(mounted, "opencv").items():
-        (tmp_path / name).write_bytes(data)
-    named = [part for name in ("intrinsics.yml", "extrinsics.yml") for part in ("--import", str(tmp_path / name))]
+    named = [part for path in written(tmp_path, exported(mounted, "opencv")) for part in ("--import", str(path))]
     facts = ["--rms-px", "0.21", "--views", "20", "--board", "9x6", "--pitch-mm", "25", "--joint"]
     assert run(["stereo", *named, *facts, "-o", str(tmp_path / "stereo.json"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
