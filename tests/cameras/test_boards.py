@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,22 @@ import pytest
 from support.drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
 
 from tvsbayes.cameras import boards
-from tvsbayes.cameras.boards import Board, find_corners, find_views, inner_corners, why_no_board
+from tvsbayes.cameras.boards import Board, View, find_corners, find_views, inner_corners, why_no_board
 from tvsbayes.cameras.picture_pairs import Pairing
 from tvsbayes.errors import InputError, NothingToEstimate
+
+
+def missed_px(corners: np.ndarray, pose: np.ndarray) -> float:
+    """Largest distance from the true corners (n, 4), or from those of the left picture (n, 2).
+
+    In the order of the board or turned by half a turn, which pictures of one board do not determine.
+    """
+    true = true_corners(pose)[:, : corners.shape[1]]
+    return min(np.abs(order - true).max() for order in (corners, corners[::-1]))
+
+
+def of_pair(view: View) -> np.ndarray:
+    return np.hstack([view.left, view.right])
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +51,7 @@ def test_pairs_of_png_and_jpeg_are_found_where_they_are(six_views):
     assert (six_views.image_width, six_views.image_height) == SIZE
     assert six_views.unpaired == six_views.without_board == six_views.other_size == six_views.reordered == ()
     for view, pose in zip(six_views.views, POSES, strict=True):
-        corners = np.hstack([view.left, view.right])
-        turned = corners[::-1]
-        misses = [np.abs(order - true_corners(pose)).max() for order in (corners, turned)]
-        assert min(misses) < FOUND_PX
+        assert missed_px(of_pair(view), pose) < FOUND_PX
 
 
 def test_pictures_of_one_camera_alone_are_named(tmp_path):
@@ -66,9 +77,8 @@ def test_cameras_of_two_picture_sizes(tmp_path, proportion):
     views = find_views(tmp_path, BOARD)
     assert views.right_image_size == (width // 2, height // 2) and not views.other_size
     for view, pose in zip(views.views, POSES[:3], strict=True):
-        corners = np.hstack([view.left, view.right])
         # A corner of a picture of half the size is found with twice the error.
-        assert min(np.abs(order - true_corners(pose)).max() for order in (corners, corners[::-1])) < 2 * FOUND_PX
+        assert missed_px(of_pair(view), pose) < 2 * FOUND_PX
 
 
 def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):
@@ -143,9 +153,7 @@ def test_colours_decide_for_an_inverted_camera(tmp_path):
     left, right = pictures(POSES[0])
     write_pair(tmp_path, "1", [left, right[::-1, ::-1]])
     view = find_views(tmp_path, BOARD).views[0]
-    upright = np.array(SIZE) - 1 - view.right
-    corners = np.hstack([view.left, upright])
-    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (corners, corners[::-1])) < FOUND_PX
+    assert missed_px(np.hstack([view.left, np.array(SIZE) - 1 - view.right]), POSES[0]) < FOUND_PX
 
 
 def test_other_finder_is_used_and_reported(six, monkeypatch, tmp_path):
@@ -153,8 +161,7 @@ def test_other_finder_is_used_and_reported(six, monkeypatch, tmp_path):
     monkeypatch.setattr(boards, "_find_classic", lambda grey, board: None)
     views = find_views(tmp_path, BOARD)
     assert views.by_fallback == ("left1.png", "right1.png")
-    corners = np.hstack([views.views[0].left, views.views[0].right])
-    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (corners, corners[::-1])) < FOUND_PX
+    assert missed_px(of_pair(views.views[0]), POSES[0]) < FOUND_PX
     direct = find_views(tmp_path, BOARD, finder="sector")
     assert direct.by_fallback == ()
     np.testing.assert_array_equal(direct.views[0].left, views.views[0].left)
@@ -166,43 +173,36 @@ def test_large_pictures_are_searched_in_a_smaller_copy(monkeypatch, share):
     monkeypatch.setattr(boards, "SECTOR_PIXELS_MAX", int(share * SIZE[0] * SIZE[1]))
     picture = pictures(POSES[0])[0][:-3, :-1]
     corners, fallback = find_corners(np.ascontiguousarray(picture), BOARD, "sector")
-    assert not fallback
-    # One picture does not determine a half turn.
-    true = true_corners(POSES[0])[:, :2]
-    assert min(np.abs(order - true).max() for order in (corners, corners[::-1])) < FOUND_PX
+    assert not fallback and missed_px(corners, POSES[0]) < FOUND_PX
 
 
 def bomb() -> bytes:
     """A PNG header that announces 30000 x 30000 pixels."""
-    ok, data = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
-    assert ok
-    data = bytearray(data.tobytes())
-    data[16:24] = (30000).to_bytes(4) * 2
-    return bytes(data)
+    data = cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes()
+    return data[:16] + (30000).to_bytes(4) * 2 + data[24:]
 
 
-@pytest.mark.parametrize("kind", ("bomb", "garbage", "damaged", "link", "pipe", "twice"))
+def damaged(data: bytes) -> bytes:
+    """One byte in the middle is another."""
+    return data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 255]) + data[len(data) // 2 + 1 :]
+
+
+HOSTILE = {
+    "bomb": lambda place, good: place.write_bytes(bomb()),
+    "garbage": lambda place, good: place.write_bytes(b"GIF89a" + bytes(100)),
+    "damaged": lambda place, good: place.write_bytes(damaged(good.read_bytes())),
+    "link": lambda place, good: place.symlink_to(shutil.copy(good, place.parents[1] / "outside.png")),
+    "pipe": lambda place, good: os.mkfifo(place),
+    "twice": lambda place, good: shutil.copy(good, good.with_suffix(".jpg")),
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
 def test_hostile_pictures_are_refused_by_name(tmp_path, kind):
     folder = tmp_path / "pictures"
     folder.mkdir()
     write_pair(folder, "1", pictures(POSES[0]))
-    place = folder / "left2.png"
-    if kind == "bomb":
-        place.write_bytes(bomb())
-    elif kind == "garbage":
-        place.write_bytes(b"GIF89a" + bytes(100))
-    elif kind == "damaged":
-        data = bytearray((folder / "left1.png").read_bytes())
-        data[len(data) // 2] ^= 255
-        place.write_bytes(data)
-    elif kind == "link":
-        (tmp_path / "outside.png").write_bytes((folder / "left1.png").read_bytes())
-        place.symlink_to(tmp_path / "outside.png")
-    elif kind == "pipe":
-        os.mkfifo(place)
-    else:
-        place = folder / "left1.jpg"
-        place.write_bytes((folder / "left1.png").read_bytes())
+    HOSTILE[kind](folder / "left2.png", folder / "left1.png")
     with pytest.raises(InputError, match="left1" if kind == "twice" else "left2.png"):
         find_views(folder, BOARD)
 
@@ -213,9 +213,8 @@ def test_all_pictures_that_cannot_be_used_are_named_at_once(tmp_path, kind):
     for name, pose in (("1", POSES[0]), ("2", POSES[1])):
         write_pair(tmp_path, name, pictures(pose))
     for name in ("left1.png", "right2.png"):
-        data = bytearray((tmp_path / name).read_bytes())
-        data[0 if kind == "garbage" else len(data) // 2] ^= 255
-        (tmp_path / name).write_bytes(data)
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(b"?" + data[1:] if kind == "garbage" else damaged(data))
     with pytest.raises(InputError, match=r"left1.png: found .*; likewise right2.png$"):
         find_views(tmp_path, BOARD)
 
@@ -257,12 +256,7 @@ def test_corners_left_unrefined_get_a_wider_window():
 
 @pytest.fixture(scope="module")
 def greys() -> list[np.ndarray]:
-    return [
-        np.ascontiguousarray(pictures(pose)[0][..., :3].mean(axis=2).astype(np.uint8))
-        if pictures(pose)[0].ndim == 3
-        else pictures(pose)[0]
-        for pose in POSES[:2]
-    ]
+    return [pictures(pose)[0] for pose in POSES[:2]]
 
 
 def test_the_size_of_a_board_is_detected(greys):

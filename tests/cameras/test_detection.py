@@ -17,7 +17,7 @@ from tvsbayes.cameras.detection import DETECTING, LEARNING, LEVELLING, detect
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
-from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
+from tvsbayes.instrument.campaign import Campaign, read_campaign, spots_bytes, write_campaign
 from tvsbayes.instrument.stereo_pair import scaled_px, write_stereo
 from tvsbayes.report.command_text import detection_text
 from tvsbayes.twin.physics import cameras_of
@@ -249,7 +249,7 @@ def test_detection_in_place_keeps_rows_and_other_columns(tmp_path, capsys):
     folder = Folder(tmp_path / "c", looks=5, contrast=0.4)
     before = read_campaign(folder.path)
     by_hand = replace(before.spots[0], status="sheet moved")
-    (folder.path / "spots.csv").write_bytes(module_bytes(before, by_hand))
+    (folder.path / "spots.csv").write_bytes(spots_bytes((by_hand, *before.spots[1:])))
     (folder.path / "frames" / "000010_left.png").unlink()
     folder.put(2, "right", picture(None))
     (folder.path / "truth.json").write_text("not read")
@@ -276,12 +276,6 @@ def test_detection_in_place_keeps_rows_and_other_columns(tmp_path, capsys):
     assert run(["detect", str(folder.path)]) == 0
     assert (folder.path / "spots.csv").read_bytes() == once
     assert "no-spot right" in capsys.readouterr().out
-
-
-def module_bytes(campaign, first) -> bytes:
-    from tvsbayes.instrument.campaign import spots_bytes
-
-    return spots_bytes((first, *campaign.spots[1:]))
 
 
 def test_the_table_names_every_status(found_speckled):

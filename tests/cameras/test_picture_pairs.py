@@ -9,62 +9,15 @@ import pytest
 from tvsbayes.cameras.picture_pairs import Pairing, natural_order, paired_pictures
 from tvsbayes.errors import InputError
 
-
-def named(folder, *names: str) -> list[tuple[str, tuple[str, ...]]]:
-    """View and cameras of every picture of a folder with these (empty) files."""
-    for name in names:
-        path = folder / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(b"")
-    return sorted((picture.view, picture.sides) for picture in paired_pictures(folder, most=10))
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("left01.png", "right01.png"),
-        ("01_left.png", "01_right.PNG"),
-        ("01-Left.jpg", "01-RIGHT.jpeg"),
-        ("L01.png", "R01.png"),
-        ("01L.png", "01_r.png"),
-        ("left/01.png", "right/01.png"),
-        ("L/01.png", "R/01.png"),
-        ("cam_left/01_left.png", "cam_right/01_right.png"),
-    ],
-)
-def test_the_camera_is_in_the_name(tmp_path, names):
-    assert named(tmp_path, *names) == [("01", ("left",)), ("01", ("right",))]
-
-
-def test_a_letter_inside_a_word_is_no_camera(tmp_path):
-    """Wide pictures: `rail_3.png` begins with r, `spot_l.png` ends with l, and neither names a camera."""
-    both = ("left", "right")
-    assert named(tmp_path, "rail_3.png", "spot_l.png", ".left1.png", "notes.txt") == [
-        ("rail_3", both),
-        ("spot_l", both),
-    ]
-    assert [picture.sides for picture in paired_pictures(tmp_path, 10, Pairing(swap=True))] == [both[::-1]] * 2
-
-
-def test_two_pictures_of_one_view_and_too_many_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"left1\.jpg and left1\.png"):
-        named(tmp_path, "left1.png", "left1.jpg")
-    with pytest.raises(InputError, match="at most 1"):
-        paired_pictures(tmp_path, most=1)
-    with pytest.raises(InputError, match="readable folder"):
-        paired_pictures(tmp_path / "absent", most=1)
-
-
-def test_natural_order_is_numeric():
-    assert sorted(["a10", "a9", "b1", "a2b"], key=natural_order) == ["a2b", "a9", "a10", "b1"]
-
-
 SIDES = ("left", "right")
 NAMES = {
     "documented": [(f"left{k:02d}.jpg", f"right{k:02d}.JPG") for k in (1, 2, 10)],
     "inside": [(f"ZED_{k}_left.png", f"ZED_{k}_right.png") for k in range(3)],
+    "behind a dash": [(f"{k:02d}-Left.jpg", f"{k:02d}-RIGHT.jpeg") for k in range(3)],
     "letters before": [(f"L{k:02d}.png", f"R{k:02d}.png") for k in range(3)],
     "letters after": [(f"IMG_{k:04d}_l.png", f"IMG_{k:04d}_r.png") for k in range(3)],
+    "letters of two kinds": [(f"{k:02d}L.png", f"{k:02d}_r.png") for k in range(3)],
+    "folders of one letter": [(f"L/{k:02d}.png", f"R/{k:02d}.png") for k in range(3)],
     "folders by side": [(f"LEFT/a{k}.jpeg", f"RIGHT/a{k}.png") for k in range(3)],
     "said twice": [(f"stereoLeft/imageL{k}.png", f"stereoright/imageR{k}.png") for k in range(3)],
     "folder per view": [(f"{k}/left{k}.png", f"{k}/right{k}.png") for k in range(3)],
@@ -84,18 +37,43 @@ def write(folder: Path, names) -> None:
         (folder / name).write_bytes(b"never opened")
 
 
+def pairs_of(folder: Path, pairing: Pairing, most: int = 100) -> list[tuple[str, str]]:
+    """Left and right file of every view."""
+    by_view: dict[str, dict[str, str]] = {}
+    for picture in paired_pictures(folder, most, pairing):
+        (side,) = picture.sides
+        by_view.setdefault(picture.view, {})[side] = picture.path.relative_to(folder).as_posix()
+    return sorted(tuple(pair[side] for side in SIDES) for pair in by_view.values())
+
+
 @pytest.mark.parametrize("swap", (False, True))
 @pytest.mark.parametrize("way", NAMES)
 def test_names_pair_up(tmp_path, way, swap):
     write(tmp_path, [name for pair in NAMES[way] for name in pair])
     (tmp_path / "notes.txt").write_text("ignored")
-    pictures = paired_pictures(tmp_path, 100, Pairing(swap=swap))
-    by_view: dict[str, dict[str, str]] = {}
-    for picture in pictures:
-        by_view.setdefault(picture.view, {})[picture.sides[0]] = picture.path.relative_to(tmp_path).as_posix()
     # Left and right in names decide; a number or a folder does not.
-    sides = SIDES[::-1] if swap and way in UNSURE else SIDES
-    assert sorted(tuple(pair[side] for side in sides) for pair in by_view.values()) == sorted(NAMES[way])
+    turned = swap and way in UNSURE
+    assert pairs_of(tmp_path, Pairing(swap=swap)) == sorted(pair[::-1] if turned else pair for pair in NAMES[way])
+
+
+def test_a_letter_inside_a_word_is_no_camera(tmp_path):
+    """Wide pictures: `rail_3.png` begins with r, `spot_l.png` ends with l, and neither names a camera."""
+    write(tmp_path, ["rail_3.png", "spot_l.png", ".left1.png", "notes.txt"])
+    for swap, sides in ((False, SIDES), (True, SIDES[::-1])):
+        pictures = paired_pictures(tmp_path, 10, Pairing(swap=swap))
+        assert sorted((one.view, one.sides) for one in pictures) == [("rail_3", sides), ("spot_l", sides)]
+
+
+def test_two_pictures_of_one_view_and_no_folder_are_refused(tmp_path):
+    write(tmp_path, ["left1.png", "left1.jpg"])
+    with pytest.raises(InputError, match=r"left1\.jpg and left1\.png"):
+        paired_pictures(tmp_path, most=10)
+    with pytest.raises(InputError, match="readable folder"):
+        paired_pictures(tmp_path / "absent", most=1)
+
+
+def test_natural_order_is_numeric():
+    assert sorted(["a10", "a9", "b1", "a2b"], key=natural_order) == ["a2b", "a9", "a10", "b1"]
 
 
 def test_documented_names_come_first(tmp_path):
@@ -135,26 +113,19 @@ CLOCKS = ("A/t9.png", "A/t10.png", "B/t11.png", "B/t8.png")
 
 
 @pytest.mark.parametrize(
-    ("options", "first", "second"),
+    ("options", "turned"),
     [
-        ({"in_order": True}, "left", "right"),
-        ({"in_order": True, "swap": True}, "right", "left"),
-        ({"globs": ("A/*.png", "B/*.png")}, "left", "right"),
-        ({"globs": ("B/*.png", "A/*.png")}, "right", "left"),
+        ({"in_order": True}, False),
+        ({"in_order": True, "swap": True}, True),
+        ({"globs": ("A/*.png", "B/*.png")}, False),
+        ({"globs": ("B/*.png", "A/*.png")}, True),
     ],
 )
-def test_pairs_as_stated_go_by_their_order(tmp_path, options, first, second):
+def test_pairs_as_stated_go_by_their_order(tmp_path, options, turned):
     """Times of 9 and 10 s belong to 8 and 11 s; files pair by order because no names match."""
     write(tmp_path, CLOCKS)
-    pictures = paired_pictures(tmp_path, 4, Pairing(**options))
-    by_view: dict[str, dict[str, str]] = {}
-    for picture in pictures:
-        (side,) = picture.sides
-        by_view.setdefault(picture.view, {})[side] = picture.path.relative_to(tmp_path).as_posix()
-    assert sorted((pair[first], pair[second]) for pair in by_view.values()) == [
-        ("A/t10.png", "B/t11.png"),
-        ("A/t9.png", "B/t8.png"),
-    ]
+    pairs = ("A/t10.png", "B/t11.png"), ("A/t9.png", "B/t8.png")
+    assert pairs_of(tmp_path, Pairing(**options), 4) == sorted(pair[::-1] if turned else pair for pair in pairs)
 
 
 @pytest.mark.parametrize(
