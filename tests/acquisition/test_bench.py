@@ -23,7 +23,6 @@ from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.twin.physics import project
 from tvsbayes.twin.true_rig import read_truth
 
 
@@ -75,37 +74,12 @@ def test_truth_file_is_that_of_the_run(mounted_rig, tmp_path):
 
 
 def test_pictures_of_the_twin(small_rig, tmp_path):
-    """Renderer, background, detection, journal: spots where the twin has them."""
-    small_rig = perfect_rig(small_rig)
-    instrument = Instrument(small_rig, 7)
-    rng = np.random.default_rng(0)
-    size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
-
-    def renderer(light, look, frame):
-        pixels = project(light.points_mm[None], instrument.truth.stereo, instrument.truth.parameters["focal_scale"])[0]
-        pair = [blob(size, pixels[k], pixels[k + 1], 180.0) + rng.normal(0, 1, (*size, 1)) for k in (0, 2)]
-        return StereoImage(*(np.clip(p, 0, 255).astype(np.uint8) for p in pair))
-
-    folder = tmp_path / "c"
-    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, vision=Vision(centroids, renderer))
-    assert (outcome.ok, outcome.refused) == (2, 0)
-    assert verify(folder).frames == 8
-    names = sorted(p.name for p in (folder / "frames").iterdir())
-    assert names == ["000000_left.png", "000000_right.png", "000001_left.png", "000001_right.png"]
-    campaign, truth = read_campaign(folder), json.loads((folder / "truth.json").read_text())
-    for spot in campaign.spots:
-        pixels = (spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px)
-        # Noise and the threshold move a centroid of a 2 px spot by less than 0.1 px.
-        assert np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels).max() < 0.1
-
-
-def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path):
-    """What `acquire --simulate` does: the twin's cameras rendered, spots fitted with their uncertainty."""
+    """What `acquire --simulate` does: pictures rendered, spots fitted with their sds where the twin has them."""
     # Errors that gears repeat would stand in the truth's angles and be added by `still` once more.
     small_rig, folder = perfect_rig(small_rig), tmp_path / "c"
     vision = Vision(live_detector(small_rig.stereo), twin_renderer(small_rig, 7))
     outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, vision=vision)
-    assert (outcome.ok, outcome.refused) == (2, 0)
+    assert (outcome.ok, outcome.refused) == (2, 0) and verify(folder).frames == 8
     truth = json.loads((folder / "truth.json").read_text())
     for spot in read_campaign(folder).spots:
         pixels = np.array([spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px])
@@ -114,8 +88,9 @@ def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path)
         # Eight coordinates in all, five sds each.
         assert np.all(np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels) < 5 * sds)
     acquire(small_rig, TWO_LOOKS, tmp_path / "d", simulate=True, seed=7, vision=vision)
-    pictures = sorted(path.relative_to(folder) for path in folder.glob("*/*.png"))
-    assert len(pictures) == 8
+    names = [f"{number:06d}_{side}.png" for number in (0, 1) for side in ("left", "right")]
+    pictures = [f"{part}/{name}" for part in ("dark", "frames") for name in names]
+    assert sorted(path.relative_to(folder).as_posix() for path in folder.glob("*/*.png")) == pictures
     for name in ("spots.csv", *pictures):
         assert (folder / name).read_bytes() == (tmp_path / "d" / name).read_bytes(), "same seed, same bytes"
 
@@ -155,8 +130,7 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
         instrument.place("d1" if "d1" in question else "d2", len(questions))
         return ""
 
-    plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
-    plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look"), PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
+    plan = [*TWO_LOOKS, PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
     with (
         StreamedCamera(cameras_before(instrument), frames_per_s=30) as virtual,
         served(instrument.device, 1_000_000) as port,
@@ -187,13 +161,6 @@ def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
     """As after a reboot: the board comes back as ttyACM1, the camera at another address, and both are logged."""
     instrument, lines = Instrument(small_rig, 7), []
     instrument.place("d1", 0)
-    plan = [
-        PlanStep(0, "home", 0, 0),
-        PlanStep(1, "place", target="d1"),
-        PlanStep(2, "look"),
-        PlanStep(3, "move", 60, 10),
-    ]
-    plan += [PlanStep(4, "look")]
     looks = [0]
 
     def failing_once(lit, dark):
@@ -213,7 +180,9 @@ def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
             table = {"port": str(name), "settle_s": 0.0}
             rig = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
             terminal, vision = Terminal(lines.append, ask=lambda question: ""), Vision(failing_once)
-            return acquire(rig, plan, tmp_path / "c", resume=resume, laser_class="3B", vision=vision, terminal=terminal)
+            return acquire(
+                rig, TWO_LOOKS, tmp_path / "c", resume=resume, laser_class="3B", vision=vision, terminal=terminal
+            )
 
     with pytest.raises(DeviceFault, match="has gone"):
         go(False)

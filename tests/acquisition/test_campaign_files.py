@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 from pathlib import Path
 
 import pytest
-from support.bench_runs import HEADER, Failing, Run, small_plan
+from support.bench_runs import HEADER, Run, ctrl_c, small_plan
 
 from tvsbayes.acquisition.campaign_files import behind_journal
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG
@@ -55,11 +54,7 @@ def test_a_table_open_in_another_program_does_not_end_the_run(mounted_rig, tmp_p
 
 def test_what_was_edited_since_is_kept_beside(mounted_rig, tmp_path):
     """A refused spot, and a prior stated in campaign.toml: resuming writes these files again."""
-    Run(
-        mounted_rig,
-        tmp_path / "c",
-        observer=lambda i: Failing(i, 3, lambda instrument: signal.raise_signal(signal.SIGINT)),
-    ).engine.run()
+    Run(mounted_rig, tmp_path / "c", at=3, then=ctrl_c).engine.run()
     spots, header = tmp_path / "c" / "spots.csv", tmp_path / "c" / "campaign.toml"
     edited = spots.read_text().replace(",ok", ",dust", 1)
     assert edited != spots.read_text()
@@ -77,10 +72,6 @@ def test_what_was_edited_since_is_kept_beside(mounted_rig, tmp_path):
         not any("edited" in warning for warning in again.warnings)
         and len(list((tmp_path / "c").glob("*.edited-*"))) == 2
     )
-
-
-def interrupted_at_the_third(instrument) -> Failing:
-    return Failing(instrument, 3, lambda _: signal.raise_signal(signal.SIGINT))
 
 
 @pytest.mark.parametrize("kept", ["half", "created"])
@@ -146,7 +137,7 @@ def test_a_repair_counts_what_follows_a_lost_event(mounted_rig, tmp_path, capsys
 
 def test_what_a_killed_run_left_unfinished_is_removed_at_its_resume(mounted_rig, tmp_path):
     folder = tmp_path / "c"
-    Run(mounted_rig, folder, observer=interrupted_at_the_third).engine.run()
+    Run(mounted_rig, folder, at=3, then=ctrl_c).engine.run()
     (folder / "frames").mkdir()
     unfinished = [folder / ".moves.csv.0123456789ab.tmp", folder / ".campaign.toml.ba9876543210.tmp"]
     unfinished += [folder / "frames" / ".000004_left.png.tmp"]

@@ -10,19 +10,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.bench_runs import RIG_FILE
 from support.grbl_board import BoardLink, GrblBoard
 
 from tvsbayes.acquisition.doctor import contract, examine
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.cameras.capture import CameraSettings, StereoImage
+from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault
-from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
 from tvsbayes.positioner.mechanics import Mechanics
 
-RIG = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
+RIG = read_rig(RIG_FILE)
 
 
 class Camera:
@@ -103,10 +104,20 @@ def test_a_grbl_board_is_examined_by_its_own_rules(tmp_path):
     assert (by_name["homing"].status, by_name["homing"].found) == ("warning", "alarm") and board.steps == [400, 250]
 
 
+def in_bits_of_twelve(camera: Camera, factor: int, *white: int) -> None:
+    """The camera's pictures as 16-bit integers, times a factor."""
+    grab = camera.grab
+
+    def deep() -> StereoImage:
+        pair = grab()
+        return StereoImage(*(picture.astype(np.uint16) * factor for picture in (pair.left, pair.right)), *white)
+
+    camera.grab = deep
+
+
 def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):
     device, camera = bench()
-    grab = camera.grab
-    camera.grab = lambda: (pair := grab(), StereoImage(*(p.astype(np.uint16) * 16 for p in (pair.left, pair.right))))[1]
+    in_bits_of_twelve(camera, 16)
     checks = checks_of(device, camera, tmp_path, laser=True)
     assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}, checks
 
@@ -114,11 +125,7 @@ def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):
 def test_a_dark_picture_is_judged_by_the_bits_that_its_driver_states(tmp_path):
     """Mean 20 of 4095 is a cap on the lens; as 8 bits it would pass."""
     device, camera = bench(level=20.0, texture=10.0)
-    grab = camera.grab
-    camera.grab = lambda: (
-        pair := grab(),
-        StereoImage(*(p.astype(np.uint16) for p in (pair.left, pair.right)), white=4095),
-    )[1]
+    in_bits_of_twelve(camera, 1, 4095)
     check = checks_of(device, camera, tmp_path)["exposure left"]
     assert check.status == "warning" and check.found.startswith("mean 1 of 255") and "cap" in check.remedy
 
@@ -191,7 +198,7 @@ def test_rig_without_hardware_says_what_is_missing(tmp_path):
 @pytest.mark.thorough
 def test_missing_hardware_is_reported_once_and_by_us_alone(tmp_path):
     """In a process of its own: OpenCV and FFmpeg write past Python, FFmpeg at the log level of its first caller."""
-    folder = shipped_data() / "rigs" / "mounted"
+    folder = RIG_FILE.parent
     tables = '[positioner]\nport = "/nowhere/port"\n[cameras]\n'
     environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV_")}
     for cameras in ('left = "/nowhere/left"\nright = "/nowhere/right"\n', 'source = "http://127.0.0.1:9/x.mjpg"\n'):
@@ -233,7 +240,5 @@ def test_contract_of_drivers_that_keep_it_and_of_one_that_does_not(small_rig):
 
 
 def test_contract_needs_the_word_that_the_laser_may_come_on(capsys):
-    from tvsbayes.cli.main import run
-
     assert run(["doctor", "rig.toml", "--contract"]) == 2
     assert "--laser" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from support.bench_runs import HEADER, Failing, Run, raise_error, small_plan
+from support.bench_runs import HEADER, Run, ctrl_c, raise_error, small_plan
 
 from tvsbayes.acquisition.bench import SIMULATED_START
 from tvsbayes.acquisition.campaign_files import check_journal, repair_campaign
@@ -44,7 +44,7 @@ def test_a_run_leaves_a_readable_campaign_with_every_look(mounted_rig, tmp_path)
 
 
 EXITS = {
-    "Ctrl-C": (lambda i: signal.raise_signal(signal.SIGINT), None),
+    "Ctrl-C": (ctrl_c, None),
     "Ctrl-C twice": (lambda i: [signal.raise_signal(signal.SIGINT) for _ in "ab"], KeyboardInterrupt),
     "camera fault": (lambda i: raise_error(DeviceFault("no-frame", "gone")), DeviceFault),
     "detector bug": (lambda i: raise_error(ZeroDivisionError()), ZeroDivisionError),
@@ -67,7 +67,7 @@ EXITS = {
 @pytest.mark.parametrize("name", EXITS)
 def test_laser_is_off_at_every_exit(mounted_rig, tmp_path, name):
     action, error = EXITS[name]
-    run_ = Run(mounted_rig, tmp_path / "c", observer=lambda i: Failing(i, 3, action))
+    run_ = Run(mounted_rig, tmp_path / "c", at=3, then=action)
     if error is None:
         assert run_.engine.run().reason == "interrupted"
     else:
@@ -83,7 +83,7 @@ def test_laser_is_off_at_every_exit(mounted_rig, tmp_path, name):
 
 def test_third_ctrl_c_does_not_keep_the_laser_on(mounted_rig, tmp_path):
     """People press it again and again; the one that hits the closing must not break it off."""
-    run_ = Run(mounted_rig, tmp_path / "c", observer=lambda i: Failing(i, 3, EXITS["Ctrl-C twice"][0]))
+    run_ = Run(mounted_rig, tmp_path / "c", at=3, then=EXITS["Ctrl-C twice"][0])
     exchange = run_.positioner._exchange
 
     def impatient(*words, **options):
@@ -160,9 +160,7 @@ def assert_looks_as_planned(campaign, plan):
 @pytest.mark.parametrize("stop_at", range(1, 8))
 def test_resumed_after_any_look_every_look_is_there_once(mounted_rig, tmp_path, stop_at):
     folder, plan = tmp_path / "c", small_plan()
-    first = Run(
-        mounted_rig, folder, plan, observer=lambda i: Failing(i, stop_at, lambda i: signal.raise_signal(signal.SIGINT))
-    )
+    first = Run(mounted_rig, folder, plan, at=stop_at, then=ctrl_c)
     assert first.engine.run().reason == "interrupted"
     before = read_campaign(folder)
     with pytest.raises(InputError, match="--resume"):
@@ -190,10 +188,8 @@ def test_resumed_after_any_look_every_look_is_there_once(mounted_rig, tmp_path, 
 def test_run_that_was_interrupted_while_it_resumed_goes_on_where_the_plan_stood(mounted_rig, tmp_path):
     """The journal's last motion is then one to a reference look, not the plan's."""
     folder, plan = tmp_path / "c", small_plan()
-    Run(mounted_rig, folder, plan, observer=lambda i: Failing(i, 3, EXITS["Ctrl-C"][0])).engine.run()
-    second = Run(
-        mounted_rig, folder, plan, resume=True, start=1, observer=lambda i: Failing(i, 2, EXITS["camera fault"][0])
-    )
+    Run(mounted_rig, folder, plan, at=3, then=ctrl_c).engine.run()
+    second = Run(mounted_rig, folder, plan, resume=True, start=1, at=2, then=EXITS["camera fault"][0])
     with pytest.raises(DeviceFault):
         second.engine.run()
     assert read_campaign(folder).moves[-1].pan_steps == 0, "of the second reference look; the plan stood at 100"
@@ -264,9 +260,7 @@ def test_resuming_what_is_done_asks_for_nothing(mounted_rig, tmp_path):
 def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(mounted_rig, tmp_path):
     """The device stayed on: its counters pass the history to the resumed run's homing."""
     folder, plan = tmp_path / "c", small_plan()
-    first = Run(
-        mounted_rig, folder, plan, observer=lambda i: Failing(i, 4, lambda i: signal.raise_signal(signal.SIGINT))
-    )
+    first = Run(mounted_rig, folder, plan, at=4, then=ctrl_c)
     first.engine.run()
     second = Run(mounted_rig, folder, plan, resume=True, start=1)
     first.instrument.mechanics.true_steps[0] -= 6
@@ -278,7 +272,7 @@ def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(mounted_rig, tmp
 def test_segment_that_an_alarm_ended_is_not_taken_for_verified(mounted_rig, tmp_path):
     """In alarm the counters are lost; the homing that follows reports no deviation, but there is none to report."""
     folder, plan = tmp_path / "c", small_plan()
-    first = Run(mounted_rig, folder, plan, observer=lambda i: Failing(i, 4, EXITS["device aborted"][0]))
+    first = Run(mounted_rig, folder, plan, at=4, then=EXITS["device aborted"][0])
     with pytest.raises(DeviceFault):
         first.engine.run()
     first.instrument.mechanics.true_steps[0] -= 6
@@ -290,9 +284,7 @@ def test_segment_that_an_alarm_ended_is_not_taken_for_verified(mounted_rig, tmp_
 
 def test_frames_of_an_interrupted_look_are_never_overwritten(mounted_rig, tmp_path):
     folder = tmp_path / "c"
-    Run(
-        mounted_rig, folder, observer=lambda i: Failing(i, 2, lambda i: signal.raise_signal(signal.SIGINT))
-    ).engine.run()
+    Run(mounted_rig, folder, at=2, then=ctrl_c).engine.run()
     (folder / "frames").mkdir()
     (folder / "frames" / "000002_left.png").write_bytes(b"of a look that a crash cut off")
     (folder / "frames" / "screenshot.png").write_bytes(b"of the operator")
@@ -316,7 +308,7 @@ def test_lost_steps_void_their_segment_and_no_other(mounted_rig, tmp_path):
     def slip(instrument):
         instrument.mechanics.missing_steps = [5, 0]
 
-    run_ = Run(mounted_rig, tmp_path / "c", plan, observer=lambda i: Failing(i, 5, slip))
+    run_ = Run(mounted_rig, tmp_path / "c", plan, at=5, then=slip)
     outcome = run_.engine.run()
     assert outcome.lost_segments == (1,) and "5" in outcome.warnings[0]
     campaign = read_campaign(tmp_path / "c")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.bench_runs import Failing, Run, raise_error, small_plan
+from support.bench_runs import Run, raise_error, small_plan
 from support.live_runs import scripted_run
 
 from tvsbayes.acquisition.journal import read_journal
@@ -37,7 +37,7 @@ def run_with(rig, folder, live, at, *whats, **options) -> Run:
         for what in whats:
             live.ask(what)
 
-    return Run(rig, folder, observer=lambda i: Failing(i, at, ask), live=live, **options)
+    return Run(rig, folder, at=at, then=ask, live=live, **options)
 
 
 def test_pause_and_resume_lose_nothing(mounted_rig, tmp_path):
@@ -133,7 +133,7 @@ def test_requests_that_cannot_be_carried_out_are_reported_as_failed(mounted_rig,
         live.ask("pause")
         instrument.device.power_on()
 
-    run = Run(mounted_rig, tmp_path / "c", observer=lambda i: Failing(i, 3, gone), live=live)
+    run = Run(mounted_rig, tmp_path / "c", at=3, then=gone, live=live)
     with pytest.raises(DeviceFault):
         run.engine.run()
     assert states(live) == [("pause", "failed")] and requests(tmp_path / "c") == []

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bench_runs import Failing, Run, raise_error
+from support.bench_runs import Run, raise_error
 
 from tvsbayes.acquisition.live_run import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, LiveRun, SeenLook, temperature
 from tvsbayes.acquisition.observation import DetectedSpot, Observation, TwinObserver
@@ -82,12 +82,7 @@ def test_darkness_is_not_promised_after_a_fault():
 
 def test_an_error_of_the_program_is_reported_too(mounted_rig, tmp_path):
     live = LiveRun()
-    bug = Run(
-        mounted_rig,
-        tmp_path / "c",
-        observer=lambda i: Failing(i, 2, lambda i: raise_error(ZeroDivisionError())),
-        live=live,
-    )
+    bug = Run(mounted_rig, tmp_path / "c", at=2, then=lambda i: raise_error(ZeroDivisionError()), live=live)
     with pytest.raises(ZeroDivisionError):
         bug.engine.run()
     assert (live.latest.reason, live.latest.fault.code) == ("crashed", "ZeroDivisionError") and bug.dark()

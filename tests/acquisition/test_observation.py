@@ -14,6 +14,15 @@ from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.errors import DeviceFault
 
 
+@pytest.fixture
+def homed(mounted_rig):
+    """A simulated instrument and its positioner after homing."""
+    instrument = Instrument(mounted_rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    return instrument, positioner
+
+
 class Scripted:
     """A camera whose n-th pair is `level(n)` grey all over, after `seconds` of exposure."""
 
@@ -56,19 +65,15 @@ def test_pictures_that_are_no_pair_are_refused(small_rig):
         (lambda n: 0 if n == 1 else 100, 0.1, "light"),
     ],
 )
-def test_camera_that_lies_is_a_fault_and_the_laser_is_off(mounted_rig, level, seconds, code):
-    instrument = Instrument(mounted_rig, 1)
-    positioner = instrument.positioner()
-    positioner.home()
+def test_camera_that_lies_is_a_fault_and_the_laser_is_off(homed, level, seconds, code):
+    instrument, positioner = homed
     with pytest.raises(DeviceFault) as caught:
         CameraObserver(Scripted(instrument.clock, level, seconds)).observe(positioner, 0)
     assert caught.value.code == code and not instrument.mechanics.laser_on
 
 
-def test_pictures_without_a_visible_spot_wait_for_detection(mounted_rig):
-    instrument = Instrument(mounted_rig, 1)
-    positioner = instrument.positioner()
-    positioner.home()
+def test_pictures_without_a_visible_spot_wait_for_detection(homed):
+    instrument, positioner = homed
     camera = Scripted(instrument.clock, lambda n: n % 30)
     observation = CameraObserver(camera).observe(positioner, 3)
     assert observation.spot.status == "undetected" and camera.count == 22
@@ -101,20 +106,16 @@ def test_a_spot_that_is_there_without_the_laser_is_a_fault(small_rig):
     assert caught.value.code == "light" and not instrument.mechanics.laser_on
 
 
-def test_changed_background_is_refused(mounted_rig):
-    instrument = Instrument(mounted_rig, 1)
-    positioner = instrument.positioner()
-    positioner.home()
+def test_changed_background_is_refused(homed):
+    instrument, positioner = homed
     camera = Scripted(instrument.clock, lambda n: 90 if n == 1 else n % 30)
     assert CameraObserver(camera).observe(positioner, 3).spot.status == "unsteady"
 
 
 @pytest.mark.parametrize("known", [None, 4095])
-def test_noise_of_twelve_bits_is_no_light(mounted_rig, known):
+def test_noise_of_twelve_bits_is_no_light(homed, known):
     """Dark pictures below 256 counts do not show the bit depth: the driver or the first light does."""
-    instrument = Instrument(mounted_rig, 1)
-    positioner = instrument.positioner()
-    positioner.home()
+    instrument, positioner = homed
     rng, stated = np.random.default_rng(1), [] if known is None else [known]
 
     class Camera:
@@ -134,11 +135,9 @@ def test_noise_of_twelve_bits_is_no_light(mounted_rig, known):
 
 
 @pytest.mark.parametrize("depth", range(0, 12))
-def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
+def test_old_frames_never_become_a_spot_whatever_the_buffer(homed, depth):
     """A camera without any flushing, with a buffer `depth` frames deep: light alone identifies new frames."""
-    instrument = Instrument(mounted_rig, 1)
-    positioner = instrument.positioner()
-    positioner.home()
+    instrument, positioner = homed
     rng = np.random.default_rng(depth)
     queue, moved_to = [], [0]
 

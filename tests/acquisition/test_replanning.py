@@ -5,21 +5,29 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
-from support.bench_runs import Run, small_plan
+from support.bench_runs import RIG_FILE, Run, small_plan
 from support.fits_beside import given_rig, proposing, two_directions
 
-from tvsbayes.acquisition.journal import read_journal
+from tvsbayes.acquisition.journal import Journal, read_journal
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
-from tvsbayes.acquisition.replanning import AdaptOptions, Replanning, adapted_plan
+from tvsbayes.acquisition.replanning import (
+    AdaptOptions,
+    Proposal,
+    Replanning,
+    adapted_entries,
+    adapted_plan,
+    looks_next,
+)
 from tvsbayes.acquisition.running_estimate import EstimateOptions
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.plan import plan_minutes
+from tvsbayes.instrument.plan import PlanStep, plan_minutes, write_plan
 
 
 def ahead(sheet: str = "d2", step: int = 5, ratio: float = 1.0, accepted: bool = True):
@@ -81,10 +89,6 @@ def test_weights_that_cannot_be_used_end_no_run(mounted_rig, tmp_path):
 
 def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
     """The largest request, with the longest counters and u."""
-    from tvsbayes.acquisition.journal import Journal
-    from tvsbayes.acquisition.replanning import Proposal, adapted_entries, looks_next
-    from tvsbayes.instrument.plan import PlanStep
-
     assert (looks_next(12), looks_next(100)) == (8, 30)
     count = looks_next(100_000)
     pairs = [(PlanStep(0, "move", -12345, -12345), PlanStep(0, "look")) for _ in range(count)]
@@ -96,13 +100,19 @@ def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
 
 
 def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
-    from tvsbayes.files.disk import shipped_data
-    from tvsbayes.instrument.plan import write_plan
-
     monkeypatch.setattr("tvsbayes.cli.acquire_command.propose_looks", partial(given_rig, "d2", 5, 1.0, True))
     write_plan(small_plan(4), tmp_path / "plan.csv")
-    rig, plan = shipped_data() / "rigs" / "mounted" / "rig.toml", tmp_path / "plan.csv"
-    words = ["acquire", rig, plan, tmp_path / "c", "--simulate", "--centroids", "--adapt", "--target-u", "8e-4"]
+    words = [
+        "acquire",
+        RIG_FILE,
+        tmp_path / "plan.csv",
+        tmp_path / "c",
+        "--simulate",
+        "--centroids",
+        "--adapt",
+        "--target-u",
+        "8e-4",
+    ]
     assert run([*map(str, words), "--json"]) == 0
     estimate = json.loads(capsys.readouterr().out)["estimate"]
     assert (estimate["tier"], estimate["looks"]) == ("importance", 15)
@@ -158,8 +168,6 @@ def test_a_resumed_run_has_the_plan_of_the_interrupted_one(mounted_rig, tmp_path
 
 
 def test_a_damaged_change_of_plan_is_refused(mounted_rig, tmp_path):
-    from types import SimpleNamespace
-
     data = {"row": 3, "looks": 4, "why": "", "steps": [{"action": "fly"}]}
     for entries, fault in ((data, "fly"), ({**data, "row": "3"}, "row")):
         with pytest.raises(InputError, match=f"line 7: .*{fault}.*entries of the event adapted"):

@@ -45,14 +45,10 @@ def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_pa
 @pytest.mark.parametrize(("enabled", "shown"), [(None, False), (True, True), (False, False)])
 def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, enabled, shown):
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
-    wish = EstimateOptions(two_directions, enabled=enabled)
-    texts = []
-
-    def show(progress):
-        texts.append(progress.estimate)
-
+    wish, texts = EstimateOptions(two_directions, enabled=enabled), []
+    terminal = Terminal(show=lambda progress: texts.append(progress.estimate))
     outcome = acquire(
-        mounted_rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=wish, terminal=Terminal(show=show)
+        mounted_rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=wish, terminal=terminal
     )
     assert (outcome.reason, outcome.looks) == ("done", 16)
     assert texts[-1] == ("left 0.0600(10), right 0.0600(10)" if shown else "")

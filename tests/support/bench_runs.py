@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import signal
 from pathlib import Path
 
 from tvsbayes.acquisition.bench import SIMULATED_START, Bench
@@ -17,6 +18,7 @@ from tvsbayes.instrument.plan import PlanStep
 RIG_FILE = shipped_data() / "rigs" / "mounted" / "rig.toml"
 
 
+SPOT_SD_PX = 0.08
 HEADER = {"name": "test", "created": SIMULATED_START.isoformat(), "synthetic": True, "seed": 5}
 
 
@@ -42,9 +44,11 @@ def small_plan(experiments: int = 2, rehome: bool = False) -> list[PlanStep]:
 
 
 class Run:
-    """An acquisition whose parts a test can reach."""
+    """An acquisition whose parts a test can reach; at its look number `at` something happens, with the laser on."""
 
-    def __init__(self, rig, folder, plan=None, *, resume=False, start=0, operator=None, observer=None, **options):
+    def __init__(
+        self, rig, folder, plan=None, *, at=0, then=None, resume=False, start=0, operator=None, observer=None, **options
+    ):
         self.folder, self.plan = Path(folder), plan or small_plan()
         self.instrument = Instrument(rig, 5, start)
         self.lit_while_moving = []
@@ -59,13 +63,14 @@ class Run:
         self.stop = StopKey()
         clock = self.instrument.clock
         offset = 1000.0 * start
+        seen = observer(self.instrument) if observer else TwinObserver(self.instrument, SPOT_SD_PX)
         self.engine = Acquisition(
             rig,
             self.plan,
             begin(self.folder, rig, self.plan, resume, HEADER),
             Bench(
                 self.positioner,
-                observer(self.instrument) if observer else TwinObserver(self.instrument, 0.08),
+                Failing(seen, at, then) if then else seen,
                 operator(self) if operator else SimulatedOperator(self.instrument),
                 clock,
                 lambda: SIMULATED_START + datetime.timedelta(seconds=offset + clock.monotonic()),
@@ -82,8 +87,8 @@ class Run:
 class Failing:
     """An observer that does something at its n-th look, with the laser on."""
 
-    def __init__(self, instrument, at, action):
-        self.inner, self.left, self.action = TwinObserver(instrument, 0.08), at, action
+    def __init__(self, inner: TwinObserver, at, action):
+        self.inner, self.left, self.action = inner, at, action
 
     def observe(self, positioner, spot):
         self.left -= 1
@@ -95,3 +100,7 @@ class Failing:
 
 def raise_error(error):
     raise error
+
+
+def ctrl_c(_instrument) -> None:
+    signal.raise_signal(signal.SIGINT)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 from pathlib import Path
 
@@ -36,9 +38,6 @@ def waiting(folder: Path, looks: int) -> Estimate:
 
 def killed(folder: Path, looks: int) -> Estimate:
     """The first call ends its process as the kernel does where memory is short."""
-    import os
-    import signal
-
     if looks == 12:
         os.kill(os.getpid(), signal.SIGKILL)
     return Estimate(looks, {"left": 0.06}, {"left": float(os.getpid())})

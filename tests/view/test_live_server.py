@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip("tornado", reason="the extra live is not installed")
 
-from support.bench_runs import Failing, Run
+from support.bench_runs import Run
 
 from tvsbayes.acquisition.live_run import LiveRun, SeenLook
 from tvsbayes.errors import InputError
@@ -244,7 +244,7 @@ def test_a_server_that_dies_does_not_disturb_the_run(mounted_rig, tmp_path):
             page.end()
             page._thread.join()
 
-        outcome = Run(mounted_rig, tmp_path / "c", observer=lambda i: Failing(i, 3, dies), live=live).engine.run()
+        outcome = Run(mounted_rig, tmp_path / "c", at=3, then=dies, live=live).engine.run()
     assert (outcome.reason, outcome.ok) == ("done", 8) and len(read_campaign(tmp_path / "c").spots) == 8
 
 
