@@ -27,6 +27,12 @@ def connected(device: SimulatedDevice, settings=None) -> SerialPositioner:
     return SerialPositioner(lambda: ModelLink(device), SETTINGS if settings is None else settings, device.clock)
 
 
+def homed(device: SimulatedDevice, settings=None) -> SerialPositioner:
+    positioner = connected(device, settings)
+    positioner.home()
+    return positioner
+
+
 def test_a_session_from_connection_to_close():
     device = simulated()
     positioner = connected(device)
@@ -44,8 +50,7 @@ def test_a_session_from_connection_to_close():
 
 def test_a_laser_left_on_is_off_in_motion():
     device = simulated()
-    positioner = connected(device)
-    positioner.home()
+    positioner = homed(device)
     lit = []
     device.mechanics.moved = lambda axis, steps: lit.append(device.mechanics.laser_on)
     positioner.laser(True)
@@ -55,9 +60,7 @@ def test_a_laser_left_on_is_off_in_motion():
 
 def test_a_second_program_goes_on_in_the_same_sequence():
     device = simulated()
-    first = connected(device)
-    first.home()
-    first.close()
+    homed(device).close()
     second = connected(device)
     assert second.home().known is False, "what happened before this connection is not known"
     assert second.move_to(5, 5).tilt_steps == 5
@@ -86,8 +89,7 @@ def test_refusals_and_alarms_are_named(action, code):
 def test_motion_stopped_from_outside_is_no_arrival():
     """Even at the very counters ordered: the device's report on this motion counts, not its counters."""
     device = simulated()
-    positioner = connected(device)
-    positioner.home()
+    positioner = homed(device)
     original = device.model._finish_if_at_rest
 
     def stopped():
@@ -102,8 +104,7 @@ def test_motion_stopped_from_outside_is_no_arrival():
 
 def test_lost_steps_show_at_the_next_homing():
     device = simulated()
-    positioner = connected(device)
-    positioner.home()
+    positioner = homed(device)
     device.mechanics.missing_steps = [4, 0]
     positioner.move_to(100, 0)
     report = positioner.home()
@@ -126,8 +127,7 @@ def test_homing_after_an_alarm_compares_nothing(order, compared):
 
 def test_close_darkens_though_another_program_has_counted_on():
     device = simulated()
-    positioner = connected(device)
-    positioner.home()
+    positioner = homed(device)
     positioner.laser(True)
     device.model.receive(request(4_000_000_000, "MA", 50, 0), device.clock.now_us)
     positioner.close()
@@ -139,9 +139,7 @@ def test_close_darkens_though_another_program_has_counted_on():
 
 def test_a_device_that_never_answers_is_darkened_all_the_same():
     device = simulated()
-    before = connected(device)
-    before.home()
-    before.laser(True)
+    homed(device).laser(True)
     device.model._write = lambda line: None
     # A watchdog that leaves the light on for any client.
     device.model._settings["wd"] = 10**6
@@ -153,8 +151,7 @@ def test_a_device_that_never_answers_is_darkened_all_the_same():
 @pytest.mark.parametrize("words", [("MA", 300, 0), ("HOME",)])
 def test_close_in_mid_motion_stops_the_motors(words):
     device = simulated()
-    positioner = connected(device)
-    positioner.home()
+    positioner = homed(device)
     positioner.move_to(0, 0)
     positioner._command(*words)
     positioner.close()
@@ -236,12 +233,17 @@ class Plug:
             raise OSError(5, "Input/output error")
 
 
-@pytest.mark.parametrize("reset", [False, True])
-def test_unplugged_and_plugged_in_again(reset):
+def plugged_in() -> tuple[SimulatedDevice, Plug, SerialPositioner]:
     device = simulated()
     plug = Plug(device)
     positioner = SerialPositioner(plug.open, SETTINGS, device.clock)
     positioner.home()
+    return device, plug, positioner
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_unplugged_and_plugged_in_again(reset):
+    device, plug, positioner = plugged_in()
     positioner.laser(True)
     plug.pulled_until_us = device.clock.now_us + 5_000_000
     if reset:
@@ -254,10 +256,7 @@ def test_unplugged_and_plugged_in_again(reset):
 
 
 def test_unplugged_for_good_is_reported_in_time():
-    device = simulated()
-    plug = Plug(device)
-    positioner = SerialPositioner(plug.open, SETTINGS, device.clock)
-    positioner.home()
+    device, plug, positioner = plugged_in()
     plug.pulled_until_us = 10**12
     start = device.clock.monotonic()
     with pytest.raises(DeviceFault) as caught:
@@ -267,10 +266,7 @@ def test_unplugged_for_good_is_reported_in_time():
 
 
 def test_another_program_meanwhile_is_noticed():
-    device = simulated()
-    plug = Plug(device)
-    positioner = SerialPositioner(plug.open, SETTINGS, device.clock)
-    positioner.home()
+    device, plug, positioner = plugged_in()
     plug.pulled_until_us = device.clock.now_us + 1_000_000
     device.model.receive(request(500, "MA", 10, 10), device.clock.now_us)
     with pytest.raises(PositionLost) as caught:
@@ -288,8 +284,7 @@ def test_state_reads_as_the_model_says():
 
 @pytest.mark.parametrize(("axis", "last"), [(0, -300), (0, 200), (1, -150), (1, 100)])
 def test_the_last_step_inside_a_limit_is_reached_and_the_next_refused(axis, last):
-    positioner = connected(simulated(), LIMITS)
-    positioner.home()
+    positioner = homed(simulated(), LIMITS)
     inside, outside = [0, 0], [0, 0]
     inside[axis], outside[axis] = last, last + (1 if last > 0 else -1)
     state = positioner.move_to(*inside)
@@ -304,8 +299,7 @@ def test_the_last_step_inside_a_limit_is_reached_and_the_next_refused(axis, last
 @pytest.mark.parametrize("field", ["pan_steps", "tilt_steps", "pan_target_steps", "tilt_target_steps"])
 def test_done_at_another_place_is_no_arrival(field, monkeypatch):
     """A step lost between the counter and the answer; the sequence and the status are those of an arrival."""
-    positioner = connected(simulated(), LIMITS)
-    positioner.home()
+    positioner = homed(simulated(), LIMITS)
     truth = DeviceModel.state.fget
 
     def lie(device):

@@ -23,6 +23,13 @@ def connected(board: GrblBoard, **changes) -> GrblPositioner:
     return GrblPositioner(lambda: BoardLink(board), settings, board.clock)
 
 
+def homed(settings: dict[int, float] | None = None, **changes) -> tuple[GrblBoard, GrblPositioner]:
+    board = GrblBoard(settings)
+    positioner = connected(board, **changes)
+    positioner.home()
+    return board, positioner
+
+
 def test_slow_ramps_are_waited_for():
     """Full speed of 100 mm/s at 5 mm/s^2 takes 20 s, and as long to stop."""
     assert connected(GrblBoard({120: 5.0}))._board.ramps_s == 40.0
@@ -67,9 +74,7 @@ def test_a_session_from_connection_to_close(laser, speed):
 
 @pytest.mark.parametrize("laser", ["M3", "M8"])
 def test_a_laser_left_on_is_off_in_motion(laser):
-    board = GrblBoard()
-    positioner = connected(board, laser=laser)
-    positioner.home()
+    board, positioner = homed(laser=laser)
     positioner.laser(True)
     assert not positioner.move_to(100, 20).laser_on and not board.lit_in_motion
     assert positioner.laser(True).laser_on and board.laser_on
@@ -77,9 +82,7 @@ def test_a_laser_left_on_is_off_in_motion(laser):
 
 def test_light_behind_a_motion_is_cut_as_reported():
     """An order of another program, in mid-motion."""
-    board = GrblBoard()
-    positioner = connected(board)
-    positioner.home()
+    board, positioner = homed()
     reported = positioner._status_report
 
     def lit():
@@ -177,9 +180,7 @@ def test_an_alarm_is_left_by_homing():
 
 def test_an_interrupted_order_does_not_answer_the_next():
     """Ctrl-C between an order and its ok, then laser off: that ok is not taken for this one's."""
-    board = GrblBoard()
-    positioner = connected(board)
-    positioner.home()
+    board, positioner = homed()
     positioner.laser(True)
     link, read = positioner._link, positioner._link.read
 
@@ -208,18 +209,14 @@ def test_a_board_that_is_set_otherwise_is_refused_by_its_setting(settings, colum
 
 
 def test_laser_mode_is_no_matter_of_a_coolant_output():
-    board = GrblBoard({32: 1})
-    positioner = connected(board, laser="M8")
-    positioner.home()
+    board, positioner = homed({32: 1}, laser="M8")
     assert positioner.laser(True).laser_on and board.laser_on
     positioner.close()
     assert not board.laser_on
 
 
 def test_light_without_a_watchdog_has_to_be_accepted():
-    board = GrblBoard()
-    positioner = connected(board, unwatched=False)
-    positioner.home()
+    board, positioner = homed(unwatched=False)
     with pytest.raises(DeviceFault, match="unwatched_laser") as caught:
         positioner.laser(True)
     assert caught.value.code == "laser" and not board.laser_on
@@ -247,9 +244,7 @@ def test_more_power_than_the_board_has_is_refused():
     with pytest.raises(InputError, match=r"found 300; allowed: at most 255, the board's \$30") as caught:
         connected(GrblBoard({30: 255}), laser_power=300.0)
     assert caught.value.column == "positioner.options.laser_power"
-    board = GrblBoard({30: 255})
-    positioner = connected(board, laser_power=255.0)
-    positioner.home()
+    board, positioner = homed({30: 255}, laser_power=255.0)
     assert positioner.laser(True).laser_on and "M3 S255" in board.orders
 
 
@@ -266,9 +261,7 @@ def test_our_own_firmware_under_this_driver_is_named():
 
 
 def test_an_unplugged_board_is_named():
-    board = GrblBoard()
-    positioner = connected(board)
-    positioner.home()
+    _, positioner = homed()
     positioner._link.gone = True
     with pytest.raises(DeviceFault) as caught:
         positioner.move_to(1, 1)
@@ -280,9 +273,7 @@ def test_an_unplugged_board_is_named():
 @pytest.mark.parametrize("lit", [True, False])
 def test_loss_of_a_lit_board_has_the_remedy_to_cut_its_light_first(lost, code, lit):
     """No order reaches it any more, and it has no watchdog that ends the light."""
-    board = GrblBoard()
-    positioner = connected(board)
-    positioner.home()
+    board, positioner = homed()
     positioner.laser(lit)
     setattr(positioner._link if lost == "gone" else board, lost, True)
     with pytest.raises(DeviceFault) as caught:

@@ -6,6 +6,8 @@ import pytest
 
 from tvsbayes.positioner.protocol import (
     REPLY_CHARS_MAX,
+    SEQUENCE_MAX,
+    DeviceState,
     FrameError,
     Reply,
     crc16,
@@ -13,6 +15,7 @@ from tvsbayes.positioner.protocol import (
     frame,
     parse_answer,
     request,
+    state_text,
     unframe,
 )
 
@@ -42,14 +45,19 @@ def test_what_is_no_frame_is_refused_by_kind(line, kind):
     assert caught.value.kind == kind
 
 
-def test_longest_reply_fits_and_is_read_back():
-    worst = (
-        f"<{2**32 - 1} err argument b={2**32 - 1} st=unhomed p={-(2**31)},{-(2**31)} t={-(2**31)},{-(2**31)} "
-        f"d={2**32 - 1} l=0 h={-(2**31)},{-(2**31)} e=watchdog"
-    )
-    assert len(frame(worst)) - 1 <= REPLY_CHARS_MAX
-    reply = parse_answer(frame(worst)[:-1])
-    assert isinstance(reply, Reply) and reply.error == "argument" and reply.state.pan_steps == -(2**31)
+def test_longest_replies_fit_and_are_read_back():
+    """Numbers of full length everywhere: the core's buffers, and what the driver takes for a line."""
+    highest, lowest = 2**32 - 1, -(2**31)
+    state = DeviceState(highest, "unhomed", *[lowest] * 4, SEQUENCE_MAX, False, *[lowest] * 2, "watchdog", 3, 3)
+    text = state_text(state)
+    for body in (
+        f"<0 ok {text} fw=1.1.0 proto=2 q={SEQUENCE_MAX}",
+        f"<{SEQUENCE_MAX} err argument {text} v=-100000000",
+    ):
+        line = frame(body)
+        assert len(line) - 1 <= REPLY_CHARS_MAX
+        reply = parse_answer(line[:-1])
+        assert isinstance(reply, Reply) and reply.state == state
 
 
 @pytest.mark.parametrize(
