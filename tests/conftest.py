@@ -210,10 +210,15 @@ def bent():
 @pytest.fixture(scope="session")
 def wobbling():
     """The same with transmission errors on both axes and aperture readings as azimuths."""
-    from support.bent_rig import BENT, WOBBLE, calibration
-    from support.two_poses import PERIODS_DEG
+    from support.bent_rig import BENT, PERIODS_DEG, WOBBLE, calibration
 
     return calibration(BENT | WOBBLE, azimuth=True, period_deg=PERIODS_DEG)
+
+
+@pytest.fixture(params=["bent", "wobbling"])
+def either(request):
+    """The bent rig, and the wobbling one."""
+    return request.getfixturevalue(request.param)
 
 
 @pytest.fixture(scope="session")

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
-from support.bent_rig import BENT, WOBBLE, calibration
+from support.bent_rig import BENT, PERIODS_DEG, WOBBLE, calibration
+from support.c_headers import answers_of_header, needs_compiler
 from support.geared_rig import geared
-from support.two_poses import PERIODS_DEG
 
 from tvsbayes.calibration.aiming import Direction, Point, mirror_angles
 from tvsbayes.calibration.c_header import calibration_header
@@ -67,7 +65,7 @@ def python_answer(one, kind: int, target: tuple[float, float, float], sides: tup
     return [2 if s.extrapolated else 1, *counters, *signs, int(s.extrapolated)]
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+@needs_compiler
 @pytest.mark.parametrize(
     ("periods", "azimuth", "vary"), [({}, False, False), (PERIODS_DEG, True, False), ({}, False, True)]
 )
@@ -75,18 +73,13 @@ def test_the_c_header_finds_the_same_counters(tmp_path, periods, azimuth, vary):
     """The way back: mirror angles to 1e-9 deg, the same whole counters, sides, limits and extrapolation."""
     one = calibration(BENT | (WOBBLE if periods else {}), period_deg=periods, azimuth=azimuth)
     one = replace(geared(one) if vary else one, range_steps=np.array([[-150.0, 250.0], [-90.0, 80.0]]))
-    (tmp_path / "tvs_calibration.h").write_text(calibration_header(one))
-    (tmp_path / "inverse.c").write_text(INVERSE)
-    strict = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
-    subprocess.run(["cc", *strict, "inverse.c", "-o", "inverse", "-lm"], cwd=tmp_path, check=True)
     points = [(1, x, y, z) for x in (40.0, 300.0, 1000.0, 5000.0) for y in (-350.0, 20.0, 130.0) for z in (-60.0, 90.0)]
     points += [(1, -50.0, 0.0, 0.0), (1, 1e-3, 0.0, 900.0), (1, 600.0, 0.0, 0.0)]
     directions = [(0, a, e, 0.0) for a in (-89.0, -20.0, 3.0, 24.0) for e in (-9.0, 0.0, 5.0)] + [(0, 95.0, 0.0, 0.0)]
     requests = [(*target, *sides) for target in points + directions for sides in product((1, -1, 0), repeat=2)]
-    text = "".join(" ".join(map(repr, row)) + "\n" for row in requests)
-    done = subprocess.run([tmp_path / "inverse"], input=text, capture_output=True, text=True, check=True)
+    answers = answers_of_header(tmp_path, calibration_header(one), INVERSE, requests)
     codes = set()
-    for (kind, x, y, z, *sides), line in zip(requests, done.stdout.splitlines(), strict=True):
+    for (kind, x, y, z, *sides), line in zip(requests, answers, strict=True):
         *numbers, pan_deg, tilt_deg, reading = line.split()
         wanted = python_answer(one, kind, (x, y, z), tuple(sides))
         assert list(map(int, numbers))[: len(wanted)] == wanted, (kind, x, y, z, sides)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -17,13 +16,17 @@ import numpy as np
 import pytest
 from support.bent_rig import (
     BENT,
+    PERIODS_DEG,
+    POSES,
+    ROUNDING,
+    ROUNDING_MM,
     WOBBLE,
     calibration,
 )
+from support.c_headers import answers_of_header, needs_compiler
 from support.geared_rig import geared
 from support.refusals import refusal
 from support.small_campaign import small_campaign
-from support.two_poses import PERIODS_DEG, POSES
 
 from tvsbayes.calibration.c_header import calibration_header
 from tvsbayes.calibration.calibration_file import (
@@ -42,14 +45,6 @@ from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import HARMONIC_NAMES
-
-ROUNDING_MM = 1e-9
-"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
-
-
-ROUNDING = 1e-12
-"""Of a hundred operations on numbers of order 1."""
-
 
 PRINTED = 5e-15
 """Of numbers with fifteen significant digits, as exports have them: half a unit of the last one of 1.00..."""
@@ -128,7 +123,9 @@ def test_exports_print_what_a_double_keeps_and_say_what_they_are(bent):
 
 @pytest.mark.parametrize("name", ["*/ int x; /*", "??/", "a\\\nb", "\u00fc"])
 def test_a_strangers_name_ends_no_comment(bent, name):
-    head = calibration_header(bent, Origin(name, "", "2026-02-01", "1.0")).split("#ifndef")[0]
+    """Nor what a results file calls its estimator."""
+    one = replace(bent, estimator=f"laplace {name}")
+    head = calibration_header(one, Origin(name, "", "2026-02-01", "1.0")).split("#ifndef")[0]
     assert head.count("*/") == head.count("/*") == 1 and "??" not in head and "\\" not in head and head.isascii()
 
 
@@ -351,23 +348,18 @@ int main(void)
 """
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+@needs_compiler
 @pytest.mark.parametrize("periods", [{}, PERIODS_DEG, {"pan": 25.0, "tilt": 360.0}])
 @pytest.mark.parametrize(("azimuth", "vary"), [(False, False), (True, False), (False, True)])
 def test_the_c_header_computes_the_same(tmp_path, periods, azimuth, vary):
     one = calibration(BENT | (WOBBLE if periods else {}), period_deg=periods, azimuth=azimuth)
     one = geared(one) if vary else one
-    (tmp_path / "tvs_calibration.h").write_text(calibration_header(one))
-    (tmp_path / "main.c").write_text(MAIN)
-    strict = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
-    subprocess.run(["cc", *strict, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
     poses = (*POSES, (2600, 90, 110.0), (350, 10, 120.0), (-799.5, 3, 95.0), (-850, 500.25, 100.0), (-400, 300, 95.0))
     # The last one meets the other nappe of the cone, which no reading is of.
     poses = (*poses, (-50, 200, 179.8))
     requests = [(pan, tilt, left, up, reading) for (pan, tilt, reading), left, up in product(poses, (1, -1), (1, -1))]
-    text = "".join(" ".join(map(repr, row)) + "\n" for row in requests)
-    done = subprocess.run([tmp_path / "main"], input=text, capture_output=True, text=True, check=True)
-    rows = [list(map(float, line.split())) for line in done.stdout.splitlines()]
+    answers = answers_of_header(tmp_path, calibration_header(one), MAIN, requests)
+    rows = [list(map(float, line.split())) for line in answers]
     refused, count = 0, len(INPUT_NAMES)
     for (pan, tilt, left, up, reading), (code, u_pan, u_tilt, *numbers) in zip(requests, rows, strict=True):
         approach = ("left" if left > 0 else "right", "up" if up > 0 else "down")
@@ -388,13 +380,6 @@ def test_the_c_header_computes_the_same(tmp_path, periods, azimuth, vary):
             assert refusal(lambda a=(pan, tilt, reading, approach): one.locate(*a)).code in CODES
             refused += 1
     assert refused >= 4
-
-
-def test_words_of_a_stranger_do_not_end_the_comment_of_the_header(bent):
-    spoilt = replace(bent, estimator="laplace */ int evil; /* ??/")
-    header = calibration_header(spoilt, Origin("mine */ int worse; /*", "", "2026-01-01", "0.2.0"))
-    comment = header[: header.index("#ifndef")]
-    assert comment.count("/*") == comment.count("*/") == 1 and "?" not in comment
 
 
 def test_the_c_header_states_its_error_and_overshoot(bent):

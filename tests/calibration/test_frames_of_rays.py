@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bent_rig import AXES, BENT, TWIN_SIDE, calibration, twin_angle_deg
+from support.bent_rig import AXES, BENT, ROUNDING, ROUNDING_MM, TWIN_SIDE, calibration, twin_angle_deg
 
 from tvsbayes.calibration.drawn_looks import drawn
 from tvsbayes.calibration.frames import EXTRINSICS_NAMES, P_INPUTS
@@ -19,8 +19,6 @@ from tvsbayes.twin.physics import Sheet, light_on_sheet, mirror_chain
 STEPS, APPROACH = (200.0, -120.0), ("left", "down")
 POSE = np.array([0.05, -0.12, 0.4, 12.0, 85.0, -40.0])
 POSE_SD = np.array([2e-3, 2e-3, 3e-3, 0.5, 0.4, 0.6])
-ROUNDING_MM, ROUNDING = 1e-9, 1e-12
-"""Of a hundred operations on lengths up to 1000 mm, and on numbers of order 1."""
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bent_rig import BENT, calibration
+from support.bent_rig import BENT, ROUNDING, ROUNDING_MM, calibration
 from support.geared_rig import KNOWN, SD_DEG, STEPS, constant, geared
 
 from tvsbayes.calibration.gear_table import COUNTERS_MAX, NO_GEARS, GearTable, regular_counters, table_of
@@ -14,10 +14,6 @@ from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.coordinates.error_map import error_map
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of
 
-ROUNDING = 1e-12
-"""Of a hundred operations on numbers of order 1."""
-ROUNDING_MM = 1e-9
-"""Of those on lengths up to 1000 mm."""
 HALF_STEP_DEG = 0.0363
 """Half of the larger ratio of the bent rig, and 3 % for the slope of the gears' errors."""
 

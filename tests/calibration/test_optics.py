@@ -8,19 +8,13 @@ from itertools import product
 import jax
 import numpy as np
 import pytest
-from support.bent_rig import AXES, BENT, SD, twin_angle_deg, twin_ray_at
+from support.bent_rig import AXES, BENT, PERIODS_DEG, ROUNDING, ROUNDING_MM, SD, twin_angle_deg, twin_ray_at
 from support.jax_meeting import meeting
 from support.published_equations import published_point
-from support.two_poses import PERIODS_DEG
 
 from tvsbayes.calibration.optics import TO_RAD, beam_deg_per_step, output_deg, range_components
 from tvsbayes.twin.physics import aperture_angle_deg, local_deg_per_step
 from tvsbayes.twin.true_rig import with_derived
-
-ROUNDING = 1e-12
-"""Of a hundred operations on numbers of order 1."""
-ROUNDING_MM = 1e-9
-"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
 
 
 def test_transmission_error_is_that_of_wheel_or_pinion(wobbling):

@@ -13,6 +13,10 @@ from support.bent_rig import (
     BENT,
     NO_NOISE_DEG,
     NOMINAL,
+    PERIODS_DEG,
+    POSES,
+    ROUNDING,
+    ROUNDING_MM,
     WOBBLE,
     calibration,
     twin_points,
@@ -21,7 +25,6 @@ from support.bent_rig import (
 from support.jax_meeting import jax_carry, jax_law
 from support.printed_vector import LAST_6, LAST_9, LAST_12, VECTOR
 from support.refusals import refusal
-from support.two_poses import POSES
 
 from tvsbayes.calibration.drawn_looks import drawn
 from tvsbayes.calibration.located_point import DIVERGING_SHARE
@@ -31,19 +34,11 @@ from tvsbayes.errors import InputError
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.twin.physics import to_tvs
 
-ROUNDING_MM = 1e-9
-"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
-
-
-ROUNDING = 1e-12
-"""Of a hundred operations on numbers of order 1."""
-
-
 SIDES = tuple(product(("left", "right", "unknown"), ("up", "down", "unknown")))
 
 
 @pytest.mark.parametrize("approach", SIDES)
-@pytest.mark.parametrize("periods", [{}, {"pan": 360.0, "tilt": 40.0}, {"pan": 25.0, "tilt": 360.0}])
+@pytest.mark.parametrize("periods", [{}, PERIODS_DEG, {"pan": 25.0, "tilt": 360.0}])
 def test_ray_is_the_twins(approach, periods):
     values = BENT | (WOBBLE if periods else {})
     one = calibration(values, {}, period_deg=periods)
@@ -87,49 +82,35 @@ def test_sides_differ_by_the_play(bent):
     assert math.degrees(azimuth[0] - azimuth[1]) == pytest.approx(bent.estimates["backlash_deg.pan"], rel=0.1)
 
 
-@pytest.mark.parametrize("rig", ["bent", "wobbling"])
 @pytest.mark.parametrize("approach", [("left", "up"), ("right", "unknown"), ("unknown", "down")])
-def test_locate_is_where_the_twin_reads_the_same_angle(rig, approach, request):
-    one = request.getfixturevalue(rig)
+def test_locate_is_where_the_twin_reads_the_same_angle(either, approach):
     for pan, tilt, reading in POSES:
-        origin, direction = twin_ray(one.estimates, (pan, tilt), approach, one.period_deg)
-        true = reading - one.estimates["aperture_zero_deg"]
-        expected = twin_points(origin[None], direction[None], one.estimates["baseline_mm"], true, one.azimuth)[0]
+        origin, direction = twin_ray(either.estimates, (pan, tilt), approach, either.period_deg)
+        true = reading - either.estimates["aperture_zero_deg"]
+        expected = twin_points(origin[None], direction[None], either.estimates["baseline_mm"], true, either.azimuth)[0]
         # Bisection of 1e5 mm ends at rounding of the angle: 1e-13 deg times 100 mm per degree.
-        np.testing.assert_allclose(one.locate(pan, tilt, reading, approach).xyz_mm, expected, atol=10 * ROUNDING_MM)
+        np.testing.assert_allclose(either.locate(pan, tilt, reading, approach).xyz_mm, expected, atol=10 * ROUNDING_MM)
 
 
-@pytest.mark.parametrize("rig", ["bent", "wobbling"])
-def test_locate_is_the_law_of_propagation_in_jax(rig, request):
-    one = request.getfixturevalue(rig)
+def test_locate_is_the_law_of_propagation_in_jax(either):
+    """Derivatives are those of every input that varies and of unit noise, with an unknown place in the play too."""
     cases = [(*pose, side) for pose in POSES for side in SIDES]
     pan, tilt, reading = np.array([a[:3] for a in cases]).T
     settings = settings_of(pan, tilt, reading, [a[3] for a in cases])
-    law, numpy = jax_law(one, settings), locate_linear(one, settings)
-    varies = np.diag(one.covariance_with_noise) > 0
+    law, numpy = jax_law(either, settings), locate_linear(either, settings)
+    varies = np.diag(either.covariance_with_noise) > 0
+    assert varies.sum() >= 20
     slopes = np.asarray(law.jacobian)[..., varies]
     np.testing.assert_allclose(numpy.value, law.value, atol=ROUNDING_MM)
     np.testing.assert_allclose(numpy.jacobian[..., varies], slopes, rtol=ROUNDING, atol=ROUNDING * np.abs(slopes).max())
     for i, (pan, tilt, reading, approach) in enumerate(cases):
-        point = one.locate(pan, tilt, reading, approach)
+        point = either.locate(pan, tilt, reading, approach)
         np.testing.assert_allclose(point.xyz_mm, law.value[i], atol=ROUNDING_MM)
+        by_input = either.derivatives(pan, tilt, reading, approach)[:, varies]
+        np.testing.assert_allclose(by_input, slopes[i], rtol=ROUNDING, atol=ROUNDING * np.abs(slopes[i]).max())
         scale = np.sqrt(np.outer(np.diag(numpy.covariance[i]), np.diag(numpy.covariance[i])))
         assert np.abs((point.covariance_mm2 - law.covariance[i]) / scale).max() < 100 * ROUNDING
         np.testing.assert_allclose(point.u95_mm, NORMAL_95 * np.sqrt(np.diag(point.covariance_mm2)), rtol=ROUNDING)
-
-
-@pytest.mark.parametrize("rig", ["bent", "wobbling"])
-def test_derivatives_are_the_jacobian_of_jax(rig, request):
-    """Of every input that varies and unit noise, an unknown place in the play before the wheel's error included."""
-    one = request.getfixturevalue(rig)
-    varies = np.diag(one.covariance_with_noise) > 0
-    assert varies.sum() >= 20
-    cases = list(product(POSES, SIDES))
-    pan, tilt, reading = np.array([pose for pose, _ in cases]).T
-    law = jax_law(one, settings_of(pan, tilt, reading, [side for _, side in cases]))
-    for (pose, side), expected in zip(cases, np.asarray(law.jacobian)[..., varies], strict=True):
-        slopes = one.derivatives(*pose, side)[:, varies]
-        np.testing.assert_allclose(slopes, expected, rtol=ROUNDING, atol=ROUNDING * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("azimuth", [False, True])

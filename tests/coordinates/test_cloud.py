@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from plyfile import PlyData
-from support.bent_rig import calibration
+from support.bent_rig import ROUNDING_MM, calibration
 
 from tvsbayes.coordinates import cloud_files
 from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
@@ -24,8 +24,6 @@ from tvsbayes.errors import InputError
 SIMPLE = {"nominal": SimpleCalibration({"left": 0.06, "right": 0.05, "up": 0.07, "down": 0.08}, 170.0, 70.0, 88.0, 0.0)}
 FLOAT32 = 2.0**-23
 """Relative step of what a PLY holds."""
-ROUNDING_MM = 1e-9
-"""Of a hundred operations on lengths up to 1000 mm; in deg of an angle seen from 100 mm more than enough too."""
 BEHIND_DEG = 150.0
 """A reading that no beam of these looks meets."""
 
@@ -57,6 +55,7 @@ def test_points_are_those_of_the_law_and_of_the_published_equations():
     np.testing.assert_allclose(np.cross(along, ray.direction, axis=0), 0.0, atol=ROUNDING_MM)
     sight = block.simple_xyz_mm["nominal"] - [0.0, 70.0 - 170.0, 0.0]
     angle = np.degrees(np.arccos(sight[:, 1] / np.linalg.norm(sight, axis=1)))
+    # In deg of an angle seen from 100 mm the same is more than enough.
     np.testing.assert_allclose(angle, np.array(rows.aperture_deg)[met], atol=ROUNDING_MM)
 
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from support.bent_rig import BENT, NO_NOISE_DEG, NOMINAL, calibration, twin_points, twin_ray
+from support.bent_rig import BENT, NO_NOISE_DEG, NOMINAL, ROUNDING_MM, calibration, twin_points, twin_ray
 from support.published_equations import published_point
 
 from tvsbayes.calibration.optics import range_components
@@ -16,9 +16,6 @@ from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_ca
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 from tvsbayes.twin.physics import aperture_angle_deg
-
-ROUNDING_MM = 1e-9
-"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
 
 
 def direction_result(mean: float) -> DirectionResult:

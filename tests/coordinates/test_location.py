@@ -14,8 +14,9 @@ from support.bent_rig import (
     NO_NOISE_DEG,
     NOISE_DEG,
     NOMINAL,
+    ROUNDING_MM,
     SD,
-    WOBBLE,
+    TWIN_SIDE,
     calibration,
     twin_angle_deg,
     twin_points,
@@ -29,16 +30,9 @@ from tvsbayes.calibration.located_point import DIVERGING_SHARE
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.location import BLOCK, carry, locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
-from tvsbayes.twin.physics import aperture_angle_deg
-
-ROUNDING_MM = 1e-9
-"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
-
+from tvsbayes.statistics.intervals import NORMAL_95
 
 A_MM = 200.0
-
-
-NORMAL_95 = 1.959963984540054
 
 
 BENT_SETTINGS = ((130.0, 90.0, 60.0, ("left", "up")), (-60.0, -70.0, 70.0, ("right", "unknown")))
@@ -47,13 +41,12 @@ BENT_SETTINGS = ((130.0, 90.0, 60.0, ("left", "up")), (-60.0, -70.0, 70.0, ("rig
 def cloud(one: Calibration, inputs, angle_noise_deg, reading_noise_deg, setting, place=None) -> np.ndarray:
     """Points (draws, 3) by the twin alone: gears, mirrors, frames, and bisection for the reading."""
     pan, tilt, reading, approach = setting
-    start = {"left": -0.5, "up": -0.5, "right": 0.5, "down": 0.5}
     rays = []
     for i, row in enumerate(inputs):
         values = dict(zip(INPUT_NAMES, row, strict=True))
         angles = []
         for axis, name in enumerate(("pan", "tilt")):
-            where = place[i, axis] if approach[axis] == "unknown" else start[approach[axis]]
+            where = place[i, axis] if approach[axis] == "unknown" else TWIN_SIDE[approach[axis]]
             steps = (pan, tilt)[axis]
             angles.append(
                 twin_angle_deg(values, name, steps, where, one.period_deg.get(name)) + angle_noise_deg[i, axis]
@@ -73,36 +66,28 @@ def stop_sd_deg(noise: np.ndarray, approach: tuple[str, str]) -> np.ndarray:
     return np.stack([pan, tilt], axis=1)
 
 
-@pytest.fixture(scope="module", params=["in-plane", "azimuth"])
-def bent(request) -> Calibration:
-    """The azimuth's rig has transmission errors, of the wheel and of the pinion."""
-    if request.param == "in-plane":
-        return calibration()
-    return calibration(BENT | WOBBLE, azimuth=True, period_deg={"pan": 360.0, "tilt": 40.0})
-
-
-def test_every_draw_goes_through_the_twins_optics(bent):
+def test_every_draw_goes_through_the_twins_optics(either):
     """The unit noises of a draw, put through the twin with its parameters, give that draw of the point."""
-    sample = drawn(bent, DRAWS, 4)
+    sample = drawn(either, DRAWS, 4)
     unit = sample.noise
     assert np.abs(unit[:, 2:4]).max() <= 0.5
     for setting in BENT_SETTINGS:
-        carried = carry(bent, sample, settings_of(*setting[:3], setting[3]))
+        carried = carry(either, sample, settings_of(*setting[:3], setting[3]))
         assert np.isfinite(carried).all()
-        stop = unit[:, :2] * stop_sd_deg(bent.noise, setting[3])
-        expected = cloud(bent, bent.inputs, stop, unit[:, 4] * bent.noise[:, 4], setting, unit[:, 2:4])
+        stop = unit[:, :2] * stop_sd_deg(either.noise, setting[3])
+        expected = cloud(either, either.inputs, stop, unit[:, 4] * either.noise[:, 4], setting, unit[:, 2:4])
         # Bisection of 1e5 mm: rounding of the angle, 1e-13 deg, times at most 100 mm per degree.
         np.testing.assert_allclose(carried[:, 0], expected, atol=100 * ROUNDING_MM)
 
 
-def test_mean_and_covariance_are_a_monte_carlo_by_the_twin(bent):
+def test_mean_and_covariance_are_a_monte_carlo_by_the_twin(either):
     """Same distribution, other draws of the noises: means and standard deviations within Monte Carlo errors."""
     rng = np.random.default_rng(12)
     for setting in BENT_SETTINGS:
         place = rng.uniform(-0.5, 0.5, (DRAWS, 2))
-        stop = rng.standard_normal((DRAWS, 2)) * stop_sd_deg(bent.noise, setting[3])
-        points = cloud(bent, bent.inputs, stop, rng.standard_normal(DRAWS) * bent.noise[:, 4], setting, place)
-        point = locate(bent, *setting, draws=DRAWS)
+        stop = rng.standard_normal((DRAWS, 2)) * stop_sd_deg(either.noise, setting[3])
+        points = cloud(either, either.inputs, stop, rng.standard_normal(DRAWS) * either.noise[:, 4], setting, place)
+        point = locate(either, *setting, draws=DRAWS)
         assert point.refused == (None,) and point.draws == DRAWS
         sd = points.std(axis=0)
         # Five standard errors of the difference of two means, two variances and correlations, of DRAWS each.
@@ -287,16 +272,3 @@ def test_each_cause_alone_has_its_sensitivity(cause):
     wide = 0.95 * math.sqrt(3) if cause == "play" else NORMAL_95
     bound = 5 * 2.67 / math.sqrt(2 * DRAWS) * u * np.abs(slope).max()
     assert np.abs(point.u95_mm[0] - wide * u * np.abs(slope)).max() < bound
-
-
-def test_readings_and_points_of_the_library_are_the_twins():
-    """A point sent through the twin's reading comes back, whichever convention, through the whole library."""
-    for azimuth in (False, True):
-        one = calibration(BENT, {}, NO_NOISE_DEG, azimuth=azimuth)
-        origin, direction = twin_ray_at(
-            BENT, twin_angle_deg(BENT, "pan", 70, -0.5), twin_angle_deg(BENT, "tilt", 40, -0.5)
-        )
-        point = origin + 420.0 * direction
-        reading = aperture_angle_deg(point, BENT["baseline_mm"], "azimuth" if azimuth else "in-plane")
-        law = locate_linear(one, settings_of(70.0, 40.0, float(reading) + BENT["aperture_zero_deg"]))
-        np.testing.assert_allclose(law.value[0], point, atol=10 * ROUNDING_MM)

@@ -71,6 +71,14 @@ NOISE_DEG: dict[str, float] = dict(zip(NOISE_NAMES, (0.05, 0.03, 0.04, 0.06, 0.0
 NO_NOISE_DEG: dict[str, float] = dict.fromkeys(NOISE_NAMES, 0.0)
 DRAWS = 1000
 AXES = ("pan", "tilt")
+PERIODS_DEG = {"pan": 360.0, "tilt": 40.0}
+"""The wheel's error on one axis, the pinion's on the other."""
+POSES = ((130.0, 90.0, 66.0), (-60.0, -70.0, 75.0))
+"""Counters and readings of two points 300 to 700 mm away."""
+ROUNDING = 1e-12
+"""Of a hundred operations on numbers of order 1."""
+ROUNDING_MM = 1e-9
+"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
 
 
 def calibration(
