@@ -22,6 +22,15 @@ def written(path, data: bytes):
     return read_foreign(path)
 
 
+def saved(path, *rows):
+    """A table of cells in the sheet of a workbook."""
+    book = openpyxl.Workbook()
+    for row in rows:
+        book.active.append(row)
+    book.save(path)
+    return read_foreign(path)
+
+
 def as_text(separator: str, point: str = ".") -> str:
     lines = [list(ROWS[0]), *([a, b.replace(".", point), c] for a, b, c in ROWS[1:])]
     return "".join(separator.join(line) + "\r\n" for line in lines)
@@ -78,11 +87,8 @@ def test_lines_above_the_names_are_left_out(tmp_path, above):
 
 
 def test_lines_above_the_names_of_a_sheet(tmp_path):
-    book = openpyxl.Workbook()
-    for row in (("Protocol 7",), (), ("Pan", "XL"), (200, 640.25), (400, 641.5)):
-        book.active.append(row)
-    book.save(tmp_path / "t.xlsx")
-    assert read_foreign(tmp_path / "t.xlsx").columns == {"Pan": ("200", "400"), "XL": ("640.25", "641.5")}
+    table = saved(tmp_path / "t.xlsx", ("Protocol 7",), (), ("Pan", "XL"), (200, 640.25), (400, 641.5))
+    assert table.columns == {"Pan": ("200", "400"), "XL": ("640.25", "641.5")}
 
 
 def test_remarks_in_few_rows_hide_no_names_below_other_lines(tmp_path):
@@ -136,16 +142,11 @@ def test_sheets_of_a_workbook(tmp_path):
 
 def test_numbers_of_a_workbook_beside_texts_with_decimal_commas(tmp_path):
     """Numeric cells have no notation; texts beside them are read by theirs."""
-    book = openpyxl.Workbook()
-    for row in (("t", "XL", "n"), (61.5, "885,203", 7), (62.25, "1.024,5", "8")):
-        book.active.append(row)
-    book.save(tmp_path / "t.xlsx")
-    table = read_foreign(tmp_path / "t.xlsx")
+    rows = ("t", "XL", "n"), (61.5, "885,203", 7), (62.25, "1.024,5", "8")
+    table = saved(tmp_path / "t.xlsx", *rows)
     assert table.columns == {"t": ("61.5", "62.25"), "XL": ("885.203", "1024.5"), "n": ("7", "8")}
     assert {type(cell) for cells in table.columns.values() for cell in cells} == {str}
-    book.active.append((63.0, "9.5", 9))
-    book.save(tmp_path / "t.xlsx")
-    assert read_foreign(tmp_path / "t.xlsx").columns["XL"] == ("885,203", "1.024,5", "9.5")
+    assert saved(tmp_path / "t.xlsx", *rows, (63.0, "9.5", 9)).columns["XL"] == ("885,203", "1.024,5", "9.5")
 
 
 def bomb() -> bytes:
