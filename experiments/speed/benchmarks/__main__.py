@@ -14,41 +14,34 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import json
 import os
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 
 
-@dataclass(frozen=True)
-class Part:
-    """What `--help` and the checks before a run need, without importing anything heavy."""
-
-    about: str
-    needs: tuple[str, ...] = ()
-
-
 PARTS = {
-    "lm": Part("least squares of the fit against scipy.optimize.least_squares"),
-    "strd": Part("NIST's StRD problems: digits and time against scipy", ("pytest",)),
-    "posterior": Part("effective draws per CPU second against two NUTS and the stretch move", ("blackjax", "numpyro")),
-    "spots": Part("spot centres against photutils, and against only decoding the pictures", ("photutils",)),
-    "stereo": Part("stereo calibration against cv2.stereoCalibrate"),
-    "study": Part("campaigns per minute, serial against processes"),
-    "start": Part("commands in fresh processes, cold and warm, against bare imports"),
-    "memory": Part("peak memory per command"),
-    "scaling": Part("time and memory of the fit against the number of spots"),
+    "lm": "least squares of the fit against scipy.optimize.least_squares",
+    "strd": "NIST's StRD problems: digits and time against scipy",
+    "posterior": "effective draws per CPU second against two NUTS and the stretch move",
+    "spots": "spot centres against photutils, and against only decoding the pictures",
+    "stereo": "stereo calibration against cv2.stereoCalibrate",
+    "study": "campaigns per minute, serial against processes",
+    "start": "commands in fresh processes, cold and warm, against bare imports",
+    "memory": "peak memory per command",
+    "scaling": "time and memory of the fit against the number of spots",
 }
+NEEDS = {"strd": ("pytest",), "posterior": ("blackjax", "numpyro"), "spots": ("photutils",)}
 INSTALL = "pip install -c .ci/constraints.txt -e '.[bench,test]'"
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    listed = "\n".join(f"  {name:10s} {part.about}" for name, part in PARTS.items())
+    listed = "\n".join(f"  {name:10s} {about}" for name, about in PARTS.items())
     cli = argparse.ArgumentParser(
         prog="python -m experiments.speed.benchmarks",
         description=f"{__doc__}\nparts:\n{listed}\n\nThe peers come with the extra bench: {INSTALL}",
@@ -56,23 +49,19 @@ def parser() -> argparse.ArgumentParser:
     )
     cli.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help="default: all")
     cli.add_argument("--repeats", type=int, default=5, help="turns of each contender (5); costly cases take fewer")
-    cli.add_argument(
-        "--sizes",
-        type=int,
-        nargs="+",
-        default=[100, 1_000, 10_000],
-        help="spots in the part scaling (100 1000 10000; 100000 takes ten minutes or more by itself)",
-    )
+    sizes = "spots in the part scaling (100 1000 10000; 100000 takes ten minutes or more by itself)"
+    cli.add_argument("--sizes", type=int, nargs="+", default=[100, 1_000, 10_000], help=sizes)
     cli.add_argument("--limit", type=float, default=480.0, help="seconds after which a size counts as too long (480)")
     cli.add_argument("--table", action="store_true", help="measure nothing, write the table from the rows there are")
     cli.add_argument("--fresh", action="store_true", help="set the rows aside and measure anew")
     cli.add_argument("--worker", choices=PARTS, help=argparse.SUPPRESS)
+    cli.add_argument("--spots", type=int, help=argparse.SUPPRESS)
     return cli
 
 
 def absent(parts: list[str]) -> dict[str, list[str]]:
     """Packages that chosen parts need and this environment lacks."""
-    lacking = {name: [n for n in PARTS[name].needs if importlib.util.find_spec(n) is None] for name in parts}
+    lacking = {name: [n for n in NEEDS.get(name, ()) if importlib.util.find_spec(n) is None] for name in parts}
     return {name: packages for name, packages in lacking.items() if packages}
 
 
@@ -99,8 +88,11 @@ def environment(part: str) -> dict[str, str]:
 def main() -> int:
     """Measure the parts one after the other, then write the table."""
     arguments = parser().parse_args()
-    if arguments.repeats < 1:
-        parser().error("--repeats must be 1 or more")
+    if arguments.spots is not None:
+        from experiments.speed.benchmarks.scaling import one_size
+
+        print(json.dumps(one_size(arguments.spots)))
+        return 0
     if arguments.worker:
         measured(arguments.worker, arguments)
         return 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.speed.benchmarks.measure import Bench, Case, Column, command_cost
@@ -61,12 +60,7 @@ def measure(bench: Bench) -> None:
             raise SystemExit(f"failed: {', '.join(failed)}")
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     columns = (Column("rss_mib", "peak memory, MiB", "{:.0f}"), Column("wall_s", "wall s"), Column("cpu_s", "CPU s"))
     return [Case(NAME, "Compilation cache as the user has it.", columns, ours="")]
-
-
-def remarks(rows: Sequence[Mapping]) -> list[str]:
-    """None."""
-    return []

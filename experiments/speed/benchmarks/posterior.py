@@ -141,7 +141,7 @@ def measure(bench: Bench) -> None:
     bench.interleaved(NAME, works, repeats)
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     about = (
         "Worst bulk effective draws of all free parameters over the process' CPU seconds, compilation apart. "

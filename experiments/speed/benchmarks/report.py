@@ -44,9 +44,9 @@ def write(path: Path, parts: list[str]) -> None:
             continue
         module = importlib.import_module(f".{part}", __package__)
         page += [f"## {module.TITLE}", ""]
-        for case in module.cases(chosen):
+        for case in module.cases():
             page += table(case, chosen)
-        remarks = [f"- {line}" for line in module.remarks(chosen)]
-        page += [*remarks, ""] if remarks else []
+        if remarks := [f"- {line}" for line in module.remarks(chosen)] if hasattr(module, "remarks") else []:
+            page += [*remarks, ""]
     path.write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
     print(f"wrote {path.name} from {len(rows)} rows")

@@ -1,18 +1,42 @@
-"""Time and memory of the fit against the number of spots, by `fit_speed --spots`, a process for each size."""
+"""Time and memory of the fit against the number of spots, a process for each size."""
 
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
+import sys
+import tempfile
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from experiments.speed.benchmarks.measure import Bench, Case, Column, command_cost
-from experiments.speed.fit_speed import ONE_SIZE
 
 TITLE = "The fit against the number of spots"
 NAME = "Mixed campaigns of the mounted rig"
+
+
+def one_size(spots: int) -> dict[str, float]:
+    """Fit a mixed campaign of about this many spots."""
+    from experiments.common.clock import seconds
+    from experiments.common.rigs import mounted_rig
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.instrument.campaign import read_campaign, write_campaign
+    from tvsbayes.instrument.protocols import mixed_protocol
+    from tvsbayes.twin.simulated_campaign import simulate
+
+    # Four spots an experiment, four directions.
+    campaign = simulate(mounted_rig(), mixed_protocol(repeats=max(1, spots // 16)), seed=1).campaign
+    with tempfile.TemporaryDirectory() as folder:
+        write_campaign(campaign, Path(folder) / "c")
+        reading = seconds(lambda: read_campaign(Path(folder) / "c"))
+    # The largest is fitted once: its compilation, which the smaller rows show, is small beside its run time.
+    first = seconds(lambda: fit(campaign))
+    warm = seconds(lambda: fit(campaign)) if spots < 10_000 else first
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"spots": len(campaign.spots), "reading_s": reading, "first_s": first, "warm_s": warm, "memory_mib": memory}
 
 
 def measure(bench: Bench, sizes: Sequence[int], limit_s: float) -> None:
@@ -21,7 +45,7 @@ def measure(bench: Bench, sizes: Sequence[int], limit_s: float) -> None:
         contender = f"{spots} asked"
         if 0 in bench.there(NAME, contender):
             continue
-        command = [*ONE_SIZE, str(spots)]
+        command = (sys.executable, "-m", "experiments.speed.benchmarks", "--spots", str(spots))
         try:
             text, cost = command_cost(command, limit_s=limit_s)
         except subprocess.TimeoutExpired:
@@ -31,7 +55,7 @@ def measure(bench: Bench, sizes: Sequence[int], limit_s: float) -> None:
         bench.keep(NAME, contender, 0, {**json.loads(text), "cpu_s": cost["cpu_s"], "rss_mib": cost["rss_mib"]})
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     columns = (
         Column("spots", "spots", "{:.0f}"),

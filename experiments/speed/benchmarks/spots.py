@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,7 +130,7 @@ def measure(bench: Bench) -> None:
         bench.interleaved(NAME, works)
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     about = (
         "Error of one coordinate against the twin's true centre. Seconds from file to centre on one thread; ours hold "
@@ -146,8 +146,3 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
         Column("ok", "centres of 96", "{:.0f}"),
     )
     return [Case(NAME, about, columns, "ms", OURS)]
-
-
-def remarks(rows: Sequence[Mapping]) -> list[str]:
-    """None."""
-    return []

@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.speed.benchmarks.measure import Bench, Case, Column, command_cost
@@ -93,7 +93,7 @@ def measure(bench: Bench) -> None:
             bench.interleaved(COMMANDS, warm)
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     columns = (Column("wall_s", "wall s"), Column("cpu_s", "CPU s"), Column("rss_mib", "peak memory, MiB", "{:.0f}"))
     about = "On the shipped paper twin (384 spots)."
@@ -101,8 +101,3 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
         Case(FLOOR, "`python -c ...`", columns, ours=""),
         Case(COMMANDS, about, columns, "cpu_s", UNIT),
     ]
-
-
-def remarks(rows: Sequence[Mapping]) -> list[str]:
-    """None."""
-    return []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -104,7 +103,7 @@ def measure(bench: Bench) -> None:
         bench.interleaved(NAME, {OURS: ours, SEPARATE: opencv(False), TOGETHER: opencv(True)})
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     about = (
         "From corners (found once, by `find_views`) to the calibration, compiled. Errors against the true rig: rms of "
@@ -121,8 +120,3 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
         Column("rotation_mrad", "rotation error, mrad", "{:.3f}"),
     )
     return [Case(NAME, about, columns, "cpu_s")]
-
-
-def remarks(rows: Sequence[Mapping]) -> list[str]:
-    """None."""
-    return []

@@ -134,7 +134,7 @@ def measure(bench: Bench) -> None:
         bench.interleaved(NAME, {name: problems.row_of(solve) for name, solve in solvers.items()})
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     about = (
         "Digits agree with the certified values (at most 11 are printed by NIST): of the worst parameter of a fit, and "

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.speed.benchmarks.measure import Bench, Case, Column
@@ -65,7 +64,7 @@ def measure(bench: Bench) -> None:
     bench.interleaved(NAME, {name: engine(name) for name in WORKERS}, min(bench.repeats, REPEATS))
 
 
-def cases(rows: Sequence[Mapping]) -> list[Case]:
+def cases() -> list[Case]:
     """Tables of the part."""
     about = (
         f"{CAMPAIGNS} campaigns: simulated, fitted, compared with the planner's prediction; wall clock, compilation "
@@ -78,8 +77,3 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
         Column("first_s", "s to the first"),
     )
     return [Case(NAME, about, columns, "steady", "serial")]
-
-
-def remarks(rows: Sequence[Mapping]) -> list[str]:
-    """None."""
-    return []
