@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 
 from experiments.cameras.stereo_coverage import OPENCV_PAIRS, chi2
-from experiments.common.command_line import act, study_parser
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.command_line import study
+from experiments.common.rows import output
 from tvsbayes.cameras.assumed_covariance import (
     CORRELATION_FACTOR,
     GROUPS,
@@ -200,15 +200,8 @@ def real(arguments: argparse.Namespace) -> None:
     REAL.write_text(json.dumps(rows))
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every bench is calibrated in every way."""
-    tasks = [(way, seed) for seed in range(arguments.n) for way in WAYS]
-    run_rows(whiten, tasks, arguments.rows, ("way", "seed"), arguments.cores)
-
-
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Markdown on stdout."""
-    rows = read_rows(arguments.rows)
     kept = [row for row in rows if row["rms_px"] <= RMS_MAX_PX]
     groups = [*GROUPS, "all 24"]
 
@@ -248,12 +241,6 @@ def table(arguments: argparse.Namespace) -> None:
     print("Where nothing is stated, RMS and views are those of a careless calibration.")
 
 
-def main() -> None:
-    """Command line of the study."""
-    command = study_parser(__doc__, ROWS, n=160, actions=("poses", "real", "run", "table"))
-    command.add_argument("--opencv", type=Path, default=OPENCV_PAIRS, help="opencv-doc's pictures (%(default)s)")
-    act(command, poses=poses, real=real, run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    options = {"--opencv": {"type": Path, "default": OPENCV_PAIRS, "help": "opencv-doc's pictures (%(default)s)"}}
+    study(__file__, __doc__, whiten, ("way", "seed"), WAYS, table, 160, options, poses=poses, real=real)

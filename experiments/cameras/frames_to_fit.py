@@ -27,10 +27,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy import stats
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import by_seed, study
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig, pixels_of, shipped_plan, shipped_twin
-from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.cameras.detection import detect
 from tvsbayes.estimators.four_point import classic
@@ -47,7 +46,6 @@ from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth, read_truth
 
 SOURCES = ("centroids", "frames")
-ROWS = output(__file__, "frames_to_fit.jsonl")
 COORDINATES = ("u left", "v left", "u right", "v right")
 
 
@@ -138,9 +136,9 @@ def compared(summary: FitSummary, known: Mapping[str, float]) -> Iterator[tuple[
         yield name, known[name], summary.parameters[name]
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(every: list[dict]) -> None:
     """Markdown of the campaigns on stdout."""
-    rows = {source: [r for r in read_rows(arguments.rows) if r["source"] == source] for source in SOURCES}
+    rows = {source: [r for r in every if r["source"] == source] for source in SOURCES}
     good = {source: {r["seed"]: r for r in rows[source] if r["converged"]} for source in SOURCES}
     both = sorted(set(good["centroids"]) & set(good["frames"]))
     n = len(both)
@@ -246,25 +244,17 @@ def report(place: Path, twin: str) -> None:
         )
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows; seeds in the outer loop: an interrupted run leaves pairs."""
-    tasks = [(source, seed) for seed in range(1, arguments.n + 1) for source in SOURCES]
-    run_rows(one_campaign, tasks, arguments.rows, ("source", "seed"), arguments.cores)
-
-
 def paper(arguments: argparse.Namespace) -> None:
     """The paper's whole protocol from frames."""
     for twin in arguments.twins:
         report(rendered(arguments.folder, twin), twin)
 
 
-def main() -> None:
-    """Command line of the study."""
-    command = study_parser(__doc__, ROWS, n=12, actions=("run", "table", "paper"))
-    command.add_argument("folder", type=Path, nargs="?")
-    command.add_argument("twins", nargs="*", default=["mounted", "table1"])
-    act(command, run=run, table=table, paper=paper)
+def tasks(of: argparse.Namespace) -> list[tuple]:
+    """Seeds from 1 on."""
+    return by_seed(SOURCES, of.n + 1)[len(SOURCES) :]
 
 
 if __name__ == "__main__":
-    main()
+    options = {"folder": {"type": Path, "nargs": "?"}, "twins": {"nargs": "*", "default": ["mounted", "table1"]}}
+    study(__file__, __doc__, one_campaign, ("source", "seed"), tasks, table, 12, options, paper=paper)

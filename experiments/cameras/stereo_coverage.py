@@ -34,8 +34,8 @@ from experiments.common.board_views import (
     scenes,
     true_corners,
 )
-from experiments.common.command_line import act, study_parser
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.command_line import study
+from experiments.common.rows import output
 from tvsbayes.cameras.boards import View, find_views
 from tvsbayes.cameras.stereo_calibration import calibrate_stereo
 from tvsbayes.errors import TvsError
@@ -123,9 +123,8 @@ def halves(arguments: argparse.Namespace) -> None:
     HALVES.write_text(json.dumps({"splits": rows, "factor": whole.correlation_factor, "rms_px": whole.stereo.rms_px}))
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Markdown on stdout."""
-    rows = read_rows(arguments.rows)
     print("# Is the covariance of a stereo calibration true?\n")
     print(
         "Written by `python -m experiments.cameras.stereo_coverage table`. chi2/24 of the true parameters should be 1;"
@@ -174,18 +173,5 @@ def table(arguments: argparse.Namespace) -> None:
         print(f"\n{words}")
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every rig is calibrated under every condition."""
-    tasks = [(condition, seed) for seed in range(arguments.n) for condition in arguments.conditions]
-    run_rows(calibrate, tasks, arguments.rows, ("condition", "seed"), arguments.cores)
-
-
-def main() -> None:
-    """Command line of the study."""
-    command = study_parser(__doc__, ROWS, n=50, actions=("run", "halves", "table"))
-    command.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=CONDITIONS)
-    act(command, run=run, halves=halves, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, calibrate, ("condition", "seed"), CONDITIONS, table, 50, halves=halves)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from experiments.common.headlines import LEAST_CONTRACTION, marked, rms_limits
-from experiments.common.rows import commit, commits_of, read_rows
+from experiments.common.rows import commit, commits_of
 from tvsbayes.errors import TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.model.compilation_cache import use_compilation_cache
@@ -84,11 +83,11 @@ def _quantities(
     return result
 
 
-def tables(arguments: argparse.Namespace, text: str, titles: Mapping[str, str], what: str) -> None:
+def tables(every: Sequence[dict], text: str, titles: Mapping[str, str], what: str) -> None:
     """Text, and a table for each kind that has rows; `what`: a word for what is drawn."""
     print(text)
     for kind, title in titles.items():
-        rows = [row for row in read_rows(arguments.rows) if row["kind"] == kind]
+        rows = [row for row in every if row["kind"] == kind]
         good = [row for row in rows if row["answer"] in USABLE]
         if not good:
             continue

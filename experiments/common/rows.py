@@ -27,6 +27,11 @@ def output(script: str, name: str) -> Path:
     return OUTPUT / Path(script).resolve().parent.relative_to(ROOT / "experiments") / name
 
 
+def rows_of(script: str) -> Path:
+    """Where a script keeps its rows: `output/QUESTION/SCRIPT.jsonl`."""
+    return output(script, Path(script).with_suffix(".jsonl").name)
+
+
 def read_rows(path: Path) -> list[dict]:
     """All complete rows; a torn last line is ignored."""
     rows = []

@@ -10,15 +10,14 @@ pairs of sides, each seen on two sheets: 12 looks, new in each world. Another ma
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
-from experiments.common.rows import ROOT, output, read_rows, run_rows
+from experiments.common.command_line import study
+from experiments.common.rows import ROOT
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.compensation.verification import SCENARIOS
 from tvsbayes.errors import TvsError
@@ -31,7 +30,6 @@ from tvsbayes.results.compensation_record import APPLIED, BROKEN, CANNOT_TELL, K
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
-ROWS = output(__file__, "aimed_scanners.jsonl")
 RIG = ROOT / "data" / "rigs" / "mounted" / "rig.toml"
 RUN_UP_STEPS = 40
 SIDES = (("left", "up"), ("right", "down"), ("left", "down"), ("right", "up"))
@@ -122,14 +120,8 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     return {**row, "cpu_s": time.process_time() - began}
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Make the rows."""
-    run_rows(one_rig, [(seed,) for seed in range(arguments.n)], arguments.rows, ("seed",), arguments.cores)
-
-
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Print the page."""
-    rows = read_rows(arguments.rows)
     good = [row for row in rows if "error" not in row]
     print("# Aimed scanners: what became of the calibration\n")
     print(f"By `experiments.compensation.aimed_scanners`: {len(rows)} drawn rigs, {len(rows) - len(good)} refused; 12")
@@ -146,10 +138,5 @@ def table(arguments: argparse.Namespace) -> None:
         print(f"| {unit} | " + " | ".join(f"{v:.3g}" for v in np.median([row[key] for row in good], axis=0)) + " |")
 
 
-def main() -> None:
-    """Make rows or print them."""
-    act(study_parser(__doc__, ROWS, 20), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_rig, ("seed",), [()], table, 20)

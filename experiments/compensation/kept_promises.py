@@ -15,14 +15,13 @@ worlds applied and not applied are `TELLING` standard deviations apart for its 1
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
-from experiments.common.rows import git, output, read_rows, run_rows
+from experiments.common.command_line import study
+from experiments.common.rows import git
 from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
@@ -37,7 +36,6 @@ from tvsbayes.single_axis.predicted_stops import predicted_stops
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import AxisTruth, draw_axis
 
-ROWS = output(__file__, "kept_promises.jsonl")
 WISHES = {
     "csv": Wish("csv"),
     "csv, 0.01 mm": Wish("csv", resolution=0.01),
@@ -115,19 +113,13 @@ def one_axis(task: tuple[int]) -> dict[str, object]:
     return {**row, "seconds": time.perf_counter() - began}
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Make the rows."""
-    run_rows(one_axis, [(seed,) for seed in range(arguments.n)], arguments.rows, ("seed",), arguments.cores)
-
-
 def share(hits: int, of: int) -> str:
     """As 95.1 % (n of m)."""
     return f"{100 * hits / of:.1f} % ({hits} of {of})" if of else "none"
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Print the page."""
-    rows = read_rows(arguments.rows)
     good = [row for row in rows if "error" not in row]
     print("# Promised, applied, kept: drawn axes\n")
     print(
@@ -162,10 +154,5 @@ def worlds_table(tests: list[dict]) -> None:
     print(f"\nFalse BROKEN: {share(broken, len(tests))}; up to {100 * high:.1f} % would be usual at 1 %.")
 
 
-def main() -> None:
-    """Make rows or print them."""
-    act(study_parser(__doc__, ROWS, 300), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_axis, ("seed",), [()], table, 300)

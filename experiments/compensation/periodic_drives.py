@@ -11,13 +11,12 @@ drive, but for their mean.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
-from experiments.common.rows import commit, commits_of, output, read_rows, run_rows
+from experiments.common.command_line import study
+from experiments.common.rows import commit, commits_of
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensation_of
@@ -30,7 +29,6 @@ from tvsbayes.single_axis.waves import WavePeriods
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import SimulatedAxis, drive_of, simulate_axis
 
-ROWS = output(__file__, "periodic_drives.jsonl")
 READINGS = 40
 RATE, RECORD_S, LOGGED = 15.0, 1600.0, 400
 
@@ -88,14 +86,8 @@ def one_drive(task: tuple[int]) -> dict[str, object]:
     return {**row, "rms": [float(np.sqrt(np.mean(e**2))) for e in (before, after)]}
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Rows of drawn drives."""
-    run_rows(one_drive, [(seed,) for seed in range(arguments.n)], arguments.rows, ("seed",), arguments.cores)
-
-
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The page."""
-    rows = read_rows(arguments.rows)
     done = [row for row in rows if "promised" in row]
     there = [row for row in rows if row["there"]]
     print("# Tables of one period, of drives at constant rate\n")
@@ -117,4 +109,4 @@ def table(arguments: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    act(study_parser(__doc__, ROWS, 100), run=run, table=table)
+    study(__file__, __doc__, one_drive, ("seed",), [()], table, 100)

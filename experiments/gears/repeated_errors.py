@@ -20,7 +20,7 @@ import time
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.headlines import (
     HEADLINES,
     judged,
@@ -31,7 +31,6 @@ from experiments.common.headlines import (
     verdict,
 )
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.true_looks import TrueLooks
 from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.fitted_calibration import calibration_of
@@ -46,7 +45,6 @@ from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
-ROWS = output(__file__, "repeated_errors.jsonl")
 PROTOCOLS = ("paper", "mixed", "grid", "planned")
 WORLDS = (("pinion", 0.05), ("pinion", 0.1), ("pinion", 0.2), ("tooth", 0.05), ("step", 0.1), ("warm-up", 0.1))
 ROUNDS = 8
@@ -209,9 +207,9 @@ def _overview(by_case: dict[str, dict[str, list[dict]]]) -> None:
     print()
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The study's page."""
-    by_case = cases(read_rows(arguments.rows))
+    by_case = cases(rows)
     print("# Gears that repeat their errors\n")
     print("Written by `python -m experiments.gears.repeated_errors table`; what was done stands in the script.\n")
     _overview(by_case)
@@ -222,19 +220,12 @@ def table(arguments: argparse.Namespace) -> None:
         _effort(case)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Seeds in the outer loop: an interrupted run leaves balanced designs."""
-    tasks = [("priors", 0.0, p, s) for s in range(arguments.n) for p in PROTOCOLS]
-    tasks += [(w, size, "mixed", s) for s in range(arguments.worlds) for w, size in WORLDS]
-    run_rows(one_rig, tasks, arguments.rows, ("world", "size_deg", "protocol", "seed"), arguments.cores)
-
-
-def main() -> None:
-    """Run the study or print its page."""
-    parser = study_parser(__doc__, ROWS, n=300)
-    parser.add_argument("--worlds", type=int, default=40, help="rigs of each world that no prior holds")
-    act(parser, run=run, table=table)
+def tasks(of: argparse.Namespace) -> list[tuple[str, float, str, int]]:
+    """Rigs by the priors, then those of other worlds."""
+    every = [("priors", 0.0, p, s) for s in range(of.n) for p in PROTOCOLS]
+    return every + [(w, size, "mixed", s) for s in range(of.worlds) for w, size in WORLDS]
 
 
 if __name__ == "__main__":
-    main()
+    options = {"--worlds": {"type": int, "default": 40, "help": "rigs of each world that no prior holds"}}
+    study(__file__, __doc__, one_rig, ("world", "size_deg", "protocol", "seed"), tasks, table, 300, options)

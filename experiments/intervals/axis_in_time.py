@@ -10,12 +10,10 @@ false one. Amplitude, period and phase are tested on the waves that are there, g
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
-from experiments.common.rows import commit, commits_of, output, read_rows, run_rows
+from experiments.common.command_line import study
+from experiments.common.rows import commit, commits_of
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -24,7 +22,6 @@ from tvsbayes.single_axis.waves import WavePeriods
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
 from tvsbayes.twin.simulated_axis import simulate_axis
 
-ROWS = output(__file__, "axis_in_time.jsonl")
 LEVELS = (0.5, 0.95)
 SURE = 0.95
 """Probability from which on a wave is claimed."""
@@ -103,12 +100,6 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     return {**row, "waves": waves}
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Rows of drawn axes."""
-    tasks = [(protocol, seed) for seed in range(arguments.n) for protocol in PROTOCOLS]
-    run_rows(one_axis, tasks, arguments.rows, ("protocol", "seed"), arguments.cores)
-
-
 TEXT = """# Axes that creep, follow the temperature and make waves
 
 Made by `python -m experiments.intervals.axis_in_time`: axes drawn from the priors and fitted by `fit --quick`. Shares
@@ -136,9 +127,8 @@ def _line(protocol: str, name: str, scores: list[dict]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(every: list[dict]) -> None:
     """Both tables."""
-    every = read_rows(arguments.rows)
     rows = [row for row in every if not row["problems"]]
     print(TEXT.format(axes=len(every), commit=commits_of(every)))
     for protocol, what in PROTOCOLS.items():
@@ -163,10 +153,5 @@ def table(arguments: argparse.Namespace) -> None:
             print("| " + " | ".join([*cells, str(refused)]) + " |")
 
 
-def main() -> None:
-    """Carry out the action of the command line."""
-    act(study_parser(__doc__, ROWS, 200), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_axis, ("protocol", "seed"), PROTOCOLS, table, 200)

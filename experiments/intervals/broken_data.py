@@ -12,13 +12,12 @@ for that number of rigs. Nothing is left out for looking bad; rigs that did not 
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.headlines import (
     HEADLINES,
     judged,
@@ -29,14 +28,12 @@ from experiments.common.headlines import (
     verdict,
 )
 from experiments.common.rigs import PIXELS, drawn_truth, mounted_rig, pixels_of, small_plan, unseen, with_pixels
-from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS = output(__file__, "broken_data.jsonl")
 BROKEN = {
     "clean": "nothing broken",
     "outliers 2 %": "2 % of the spots off by 10 stated sds in one camera, any direction",
@@ -127,9 +124,8 @@ def _limits(n: int, blank: str = "") -> None:
     print(f"| bounds at 1e-4, N = {n} | {blank}{rms_limits(n)} | {level_limits(n)} | |")
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Plain beside robust under every broken condition."""
-    rows = read_rows(arguments.rows)
     print("# Data that break the model: Laplace, plain and robust\n")
     print(
         "Written by `python -m experiments.intervals.broken_data table` after `run`. **!** marks a figure outside its"
@@ -174,16 +170,5 @@ def table(arguments: argparse.Namespace) -> None:
         print()
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Campaigns that break the model; seeds in the outer loop: an interrupted run leaves balanced designs."""
-    tasks = [(c, s) for s in range(arguments.n) for c in BROKEN]
-    run_rows(broken_rig, tasks, arguments.rows, ("condition", "seed"), arguments.cores)
-
-
-def main() -> None:
-    """Command line."""
-    act(study_parser(__doc__, ROWS, n=60), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, broken_rig, ("condition", "seed"), BROKEN, table, 60)

@@ -11,22 +11,19 @@ importance.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.drawn_instruments import scored, tables
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.rows import output, run_rows
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
 from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS = output(__file__, "heads.jsonl")
 KINDS = ("sightings", "spots")
 PAN_STEPS, TILT_STEPS = (-1500, -800, -200, 400, 900, 1500), (100, 400, 800, 1200)
 
@@ -66,12 +63,6 @@ def one_head(task: tuple[str, int]) -> dict[str, object]:
     return scored(task, simulate(head_of(kind), plan_of(kind, seed), seed), names)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """So many heads of each kind."""
-    tasks = [(kind, seed) for seed in range(arguments.n) for kind in KINDS]
-    run_rows(one_head, tasks, arguments.rows, ("kind", "seed"), arguments.cores)
-
-
 TEXT = """# Coverage over drawn pan-tilt heads
 
 Made by `python -m experiments.intervals.heads`. Heads drawn from the default priors of their kind (ratios 0.05(2)
@@ -80,11 +71,10 @@ deg/step of heads with sightings), simulated with the twin's optics, fitted and 
 a tenth of the prior's variance in the median head, which is not judged. Bounds are two-sided at 1e-4."""
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """A table for each kind."""
-    tables(arguments, TEXT, {kind: f"Heads with {kind}" for kind in KINDS}, "head")
+    tables(rows, TEXT, {kind: f"Heads with {kind}" for kind in KINDS}, "head")
 
 
 if __name__ == "__main__":
-    cli = study_parser(__doc__, ROWS, 30)
-    act(cli, run=run, table=table)
+    study(__file__, __doc__, one_head, ("kind", "seed"), KINDS, table, 30)

@@ -12,12 +12,11 @@ as "prior" and not judged: its interval is the prior's own.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.headlines import (
     HEADLINES,
     MEAN_RATIOS,
@@ -31,7 +30,6 @@ from experiments.common.headlines import (
     verdict,
 )
 from experiments.common.rigs import drawn_rig, shipped_plan, unseen
-from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -40,7 +38,6 @@ from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import simulate
 
 PROTOCOLS = ("paper", "mixed", "grid")
-ROWS = output(__file__, "laplace_coverage.jsonl")
 
 
 def one_rig(task: tuple[str, int]) -> dict[str, object]:
@@ -73,13 +70,6 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
     return row
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every (protocol, seed) is there."""
-    # Seeds in the outer loop: an interrupted run leaves balanced protocols.
-    tasks = [(p, s) for s in range(arguments.n) for p in arguments.protocols]
-    run_rows(one_rig, tasks, arguments.rows, ("protocol", "seed"), arguments.cores)
-
-
 def joint_table(good: list[dict]) -> None:
     """Coverage and RMS z of the headlines of one protocol, and of the mean ratios (`degrees_per_step`) behind them."""
     print(f"| quantity | contraction | RMS z | {level_titles()} | verdict | with sd x {SHRINK} |")
@@ -106,9 +96,8 @@ def classic_table(campaigns: list[dict]) -> None:
     print()
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Markdown tables of everything that came out."""
-    rows = read_rows(arguments.rows)
     print("# Coverage of the joint and the classic estimator\n")
     print(f"Written by `python -m experiments.intervals.laplace_coverage table`; {NOTE}.\n")
     for protocol in PROTOCOLS:
@@ -130,12 +119,5 @@ def table(arguments: argparse.Namespace) -> None:
             print(f"- {r['protocol']} seed {r['seed']}: {'; '.join(r['problems'])}")
 
 
-def main() -> None:
-    """Command line."""
-    command = study_parser(__doc__, ROWS, n=300)
-    command.add_argument("--protocols", nargs="+", default=PROTOCOLS, choices=PROTOCOLS)
-    act(command, run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_rig, ("protocol", "seed"), PROTOCOLS, table, 300)

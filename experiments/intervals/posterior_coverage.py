@@ -21,7 +21,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import by_seed, study
 from experiments.common.headlines import (
     HEADLINES,
     MEAN_RATIOS,
@@ -36,7 +36,7 @@ from experiments.common.headlines import (
     verdict,
 )
 from experiments.common.rigs import drawn_rig, shipped_plan, unseen
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import read_rows
 from experiments.common.uniformity import DRAWS
 from experiments.intervals.sbc import CLEAN, FEW
 from experiments.intervals.sbc import ROWS as SBC_ROWS
@@ -48,7 +48,6 @@ from tvsbayes.results.records import plain
 from tvsbayes.statistics.chances import LEVELS, binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS = output(__file__, "posterior_coverage.jsonl")
 PROTOCOLS = ("paper", "mixed", "grid")
 TITLES = {TIERS[0]: "Tier 1, importance sampling", TIERS[1]: "Tier 2, emcee"}
 ALL = HEADLINES + MEAN_RATIOS
@@ -190,15 +189,8 @@ def table_small(rows: list[dict]) -> None:
         print()
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Shipped protocols, fitted and sampled; seeds in the outer loop: an interrupted run leaves balanced designs."""
-    tasks = [(arguments.tier, p, s) for s in range(arguments.n) for p in arguments.protocols]
-    run_rows(one_rig, tasks, arguments.rows, ("tier", "protocol", "seed"), arguments.cores)
-
-
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The page."""
-    rows = read_rows(arguments.rows)
     print("# Coverage of the sampled posterior\n")
     print("Written by `python -m experiments.intervals.posterior_coverage table`; what is in it and how it was made")
     print(f"stands in the script. {NOTE}; rig i has seed i. Gears repeat their")
@@ -210,13 +202,11 @@ def table(arguments: argparse.Namespace) -> None:
     table_small(read_rows(SBC_ROWS))
 
 
-def main() -> None:
-    """Command line."""
-    command = study_parser(__doc__, ROWS, n=1000)
-    command.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=PROTOCOLS)
-    command.add_argument("--tier", choices=TIERS, default=TIERS[0])
-    act(command, run=run, table=table)
+def tasks(of: argparse.Namespace) -> list[tuple]:
+    """Of one tier."""
+    return [(of.tier, *task) for task in by_seed(PROTOCOLS, of.n)]
 
 
 if __name__ == "__main__":
-    main()
+    tier = {"--tier": {"default": TIERS[0], "choices": TIERS}}
+    study(__file__, __doc__, one_rig, ("tier", "protocol", "seed"), tasks, table, 1000, tier)

@@ -11,15 +11,13 @@ The paper's protocol measures one direction after the other, which a creep resem
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.drawn_instruments import USABLE, scored, tables
 from experiments.common.rigs import creeping_rig, shipped_plan
-from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.assessment.gear_waves import gear_periods
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.parameters import RIG_PRIORS, names_of
@@ -28,7 +26,6 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
-ROWS = output(__file__, "rig_in_time.jsonl")
 PROTOCOLS = {"paper": "The paper's, one direction after the other", "mixed": "Mixed directions", "grid": "Grid"}
 NAMES = names_of("backlash_deg", "creep_deg", "thermal_deg_per_K")
 PERIOD_DEG = 12.0
@@ -78,12 +75,6 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
     return scored(task, simulated, NAMES, _waves)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """So many rigs of each protocol."""
-    tasks = [(protocol, seed) for seed in range(arguments.n) for protocol in PROTOCOLS]
-    run_rows(one_rig, tasks, arguments.rows, ("kind", "seed"), arguments.cores)
-
-
 TEXT = """# Coverage over scanners that creep, follow the temperature and make waves
 
 Made by `python -m experiments.intervals.rig_in_time`. Mounted rigs drawn from their priors, whose zeros creep (sd 0.05
@@ -102,13 +93,13 @@ one phase of the wave. Those of the grid are not.
 |---|---|---|---|---|---|---|"""
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """A table for each protocol, and one of the waves."""
-    tables(arguments, TEXT, PROTOCOLS, "rig")
+    tables(rows, TEXT, PROTOCOLS, "rig")
     print(WAVES_TEXT.format(sure=SURE))
     for kind, title in PROTOCOLS.items():
-        rows = [row for row in read_rows(arguments.rows) if row["kind"] == kind and row["answer"] in USABLE]
-        waves = [row["waves"] for row in rows if row.get("waves")]
+        mine = (row for row in rows if row["kind"] == kind and row["answer"] in USABLE)
+        waves = [row["waves"] for row in mine if row.get("waves")]
         if not waves:
             continue
         low, high = binomial_bounds(len(waves), 0.95)
@@ -119,5 +110,4 @@ def table(arguments: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    cli = study_parser(__doc__, ROWS, 300)
-    act(cli, run=run, table=table)
+    study(__file__, __doc__, one_rig, ("kind", "seed"), PROTOCOLS, table, 300)

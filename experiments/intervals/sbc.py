@@ -37,12 +37,12 @@ import jax
 import numpy as np
 from scipy import stats
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import by_seed, study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import physical_of
 from experiments.common.headlines import SHRINK
 from experiments.common.rigs import creeping_rig, dense_plan, small_plan, unseen
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import output
 from experiments.common.uniformity import ALPHA, BAND_SAMPLES, DRAWS, FAULT_SIMULATIONS, Band, pit_values
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import fit
@@ -234,9 +234,8 @@ def design_row(design: Design, p: dict[str, float]) -> str:
     return f"| {' | '.join(map(str, (*cells, word, 'passes' if design.clean else 'FAILS')))} |"
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The study's page and picture."""
-    rows = read_rows(arguments.rows)
     title, words = (
         "Simulation-based calibration of the posterior",
         "ECDF differences of the two densities and the four worst quantities",
@@ -303,19 +302,12 @@ def clean_part(design: Design, p: dict[str, float], pictured: bool) -> None:
     print()
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every simulation is there, variant by variant in turn."""
-    tasks = [(arguments.tier, v, s) for s in range(arguments.n) for v in arguments.variants]
-    run_rows(one_simulation, tasks, arguments.rows, ("tier", "variant", "seed"), arguments.cores)
-
-
-def main() -> None:
-    """Command line."""
-    command = study_parser(__doc__, ROWS, n=1000)
-    command.add_argument("--variants", nargs="+", default=[CLEAN], choices=VARIANTS)
-    command.add_argument("--tier", choices=TIERS, default=TIERS[0])
-    act(command, run=run, table=table)
+def tasks(of: argparse.Namespace) -> list[tuple]:
+    """Of one tier."""
+    return [(of.tier, *task) for task in by_seed(of.variants, of.n)]
 
 
 if __name__ == "__main__":
-    main()
+    options = {"--variants": {"nargs": "+", "default": [CLEAN], "choices": VARIANTS}}
+    options["--tier"] = {"default": TIERS[0], "choices": TIERS}
+    study(__file__, __doc__, one_simulation, ("tier", "variant", "seed"), tasks, table, 1000, options)

@@ -15,15 +15,13 @@ to rig: 20 more points per rig show that, apart.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.calibration.pointing import Calibration
@@ -33,7 +31,6 @@ from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.statistics.chances import BOUND, binomial_bounds
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
-ROWS = output(__file__, "located_points.jsonl")
 PROTOCOL = "mixed"
 RANGE_MM = 250.0, 1200.0
 WITHIN = 20
@@ -98,9 +95,8 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     return {**row, "seconds": time.perf_counter() - start}
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The study's page."""
-    rows = read_rows(arguments.rows)
     good = [r for r in rows if r["converged"]]
     print("# Coverage of located points\n")
     print("Written by `python -m experiments.millimetres.located_points table`; what was done stands in the script.\n")
@@ -145,15 +141,5 @@ def table(arguments: argparse.Namespace) -> None:
     print(f"{sum(seconds) / 60:.0f} core minutes, median {np.median(seconds):.1f} s a rig.")
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every rig is there."""
-    run_rows(one_rig, [(seed,) for seed in range(arguments.n)], arguments.rows, ("seed",), arguments.cores)
-
-
-def main() -> None:
-    """Command line."""
-    act(study_parser(__doc__, ROWS, n=1000), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_rig, ("seed",), [()], table, 1000)

@@ -15,17 +15,15 @@ located_points.md.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import by_seed, study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.rigs import TWINS, mounted_rig, shipped_plan, shipped_twin
-from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
@@ -35,7 +33,6 @@ from tvsbayes.report.drawing import BLACK, ESTIMATOR_STYLE
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS = output(__file__, "ranges.jsonl")
 FIGURE = Path(__file__).with_suffix(".png")
 RANGES_MM = 300.0, 1000.0, 2000.0, 5000.0
 PROTOCOLS = ("paper", "mixed")
@@ -138,9 +135,8 @@ def drawn_table(protocol: str, every: Sequence[dict]) -> None:
         print(f"| {reach / 1000:g} | {' | '.join(cells)} | {stated:.1f} | {times:.1f} | {held} |")
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The page."""
-    rows = read_rows(arguments.rows)
     good = [r for r in rows if r["converged"]]
     title, words = "Millimetres: nominal, classic and joint against the truth", "RMS error against range, two protocols"
     print(title_and_figure(__file__, title, FIGURE, words))
@@ -182,16 +178,6 @@ def draw(rows) -> None:
         figure.legend(loc="outside lower center", ncols=4)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until twins and drawn rigs are there."""
-    tasks = [(twin, -1) for twin in TWINS] + [(p, seed) for seed in range(arguments.n) for p in PROTOCOLS]
-    run_rows(one_row, tasks, arguments.rows, ("name", "seed"), arguments.cores)
-
-
-def main() -> None:
-    """Command line."""
-    act(study_parser(__doc__, ROWS, n=20), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    twins = [(twin, -1) for twin in TWINS]
+    study(__file__, __doc__, one_row, ("name", "seed"), lambda of: twins + by_seed(PROTOCOLS, of.n), table, 20)

@@ -18,12 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import fit_from_truth
 from experiments.common.headlines import true_headlines
 from experiments.common.rigs import drawn_truth, mounted_rig
-from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.protocols import four_point_protocol
@@ -31,7 +30,7 @@ from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.report.drawing import ESTIMATOR_STYLE
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS, FIGURE = output(__file__, "bias.jsonl"), Path(__file__).with_suffix(".png")
+FIGURE = Path(__file__).with_suffix(".png")
 LEVELS = {
     "misalignment": (0.0, 0.25, 0.5, 1.0, 2.0),
     "backlash": (0.0, 0.1, 0.25, 0.5, 1.0),
@@ -107,12 +106,11 @@ def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
     return row
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every campaign is there: first the classic ones, then fits, seed by seed."""
+def tasks(of: argparse.Namespace) -> list[tuple[str, float, int, bool]]:
+    """First the classic ones, then fits, seed by seed."""
     cells = [(factor, level) for factor, levels in LEVELS.items() for level in levels]
-    tasks = [(*cell, seed, False) for seed in range(arguments.n) for cell in cells]
-    tasks += [(*cell, seed, True) for seed in range(arguments.fits) for cell in cells]
-    run_rows(one_campaign, tasks, arguments.rows, ("factor", "level", "seed", "joint"), arguments.cores)
+    every = [(*cell, seed, False) for seed in range(of.n) for cell in cells]
+    return every + [(*cell, seed, True) for seed in range(of.fits) for cell in cells]
 
 
 def cell(rows: list[dict], axis: str, estimator: str) -> dict[str, float]:
@@ -134,9 +132,8 @@ def cell(rows: list[dict], axis: str, estimator: str) -> dict[str, float]:
     return figures
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Markdown and figure of everything that came out."""
-    rows = read_rows(arguments.rows)
     title = "Bias and coverage, one imperfection at a time"
     print(title_and_figure(__file__, title, FIGURE, "Bias, error and coverage against imperfections"))
     print("Written by `python -m experiments.paper.bias table`; see the script for the campaigns.\n")
@@ -209,12 +206,6 @@ def figure(shown: dict[tuple[str, str, str], list[tuple[float, dict[str, float]]
         axes[1, 0].legend()
 
 
-def main() -> None:
-    """Command line."""
-    command = study_parser(__doc__, ROWS, n=200)
-    command.add_argument("--fits", type=int, default=20, help="of these many are fitted (%(default)s)")
-    act(command, run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    options = {"--fits": {"type": int, "default": 20, "help": "of these many are fitted (%(default)s)"}}
+    study(__file__, __doc__, one_campaign, ("factor", "level", "seed", "joint"), tasks, table, 200, options)

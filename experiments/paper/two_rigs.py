@@ -34,10 +34,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.rigs import mounted_rig, unseen
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import output
 from experiments.paper.table1 import paper_values
 from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
 from tvsbayes.assessment.summary import summarise
@@ -54,8 +54,7 @@ from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.report.drawing import BLACK, BLUE, RED
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS, PLANNED = output(__file__, "two_rigs.jsonl"), output(__file__, "two_rigs_planned.csv")
-FIGURE = Path(__file__).with_suffix(".png")
+PLANNED, FIGURE = output(__file__, "two_rigs_planned.csv"), Path(__file__).with_suffix(".png")
 CAMPAIGNS = ("paper, as published", "paper, sides recorded", "mixed", "grid", "planned")
 MODELS = {"play": ModelChoice(per_axis=True), "ratios": ModelChoice(no_backlash=True), "both": ModelChoice()}
 CONTRAST_U = 0.005
@@ -140,14 +139,13 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
     }
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every machine has every campaign under every seed."""
+def tasks(of: argparse.Namespace) -> list[tuple[str, str, int]]:
+    """Every machine, every campaign, every seed; the planned looks are there before workers ask for them."""
     use_compilation_cache()
     PLANNED.parent.mkdir(parents=True, exist_ok=True)
     if not PLANNED.exists():
         write_plan(plan_of("planned"), PLANNED)
-    tasks = [(kind, name, seed) for seed in range(arguments.n) for name in CAMPAIGNS for kind in RIGS]
-    run_rows(one_row, tasks, arguments.rows, ("kind", "campaign", "seed"), arguments.cores)
+    return [(kind, name, seed) for seed in range(of.n) for name in CAMPAIGNS for kind in RIGS]
 
 
 def weight_log10(row) -> float | None:
@@ -214,9 +212,8 @@ def classic_part() -> None:
     print(f"{pan:.0f} deg in pan and {tilt:.0f} deg in tilt at the end of the paper's 96 experiments.\n")
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The page and its figure."""
-    rows = read_rows(arguments.rows)
     print(title_and_figure(__file__, "Two rigs, one Table 1", FIGURE, "Evidence for play against literal ratios"))
     print("Written by `python -m experiments.paper.two_rigs table` after `run`; what was done stands in the script.\n")
     classic_part()
@@ -282,10 +279,5 @@ def draw(rows) -> None:
         figure.legend(loc="outside lower center", ncols=2)
 
 
-def main() -> None:
-    """Command line."""
-    act(study_parser(__doc__, ROWS, n=8), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_row, ("kind", "campaign", "seed"), tasks, table, 8)

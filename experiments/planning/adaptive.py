@@ -14,7 +14,6 @@ bisection where Laplace meets it, then upwards until the sampled posterior does.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -24,9 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.acquisition import session
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.replanning import (
@@ -50,7 +48,6 @@ from tvsbayes.statistics.chances import share_interval95
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.twin.true_rig import Truth
 
-ROWS = output(__file__, "adaptive.jsonl")
 TARGET = 3e-4
 MINUTES = 40.0
 BUCKET = 48
@@ -189,21 +186,14 @@ def one_run(task: tuple[str, int]) -> dict[str, object]:
     return {"plan": name, "seed": seed, **row, "cpu_s": time.process_time() - start}
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every rig is there."""
-    tasks = [(name, seed) for name in (ADAPTIVE, *FIXED) for seed in range(arguments.n)]
-    run_rows(one_run, tasks, arguments.rows, ("plan", "seed"), arguments.cores)
-
-
 def share(hits: int, count: int) -> str:
     """With its 95 % interval."""
     low, high = share_interval95(hits, count)
     return f"{hits} of {count}, {100 * hits / count:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Markdown tables."""
-    rows = read_rows(arguments.rows)
     groups: dict[tuple[str, str], list[dict]] = {}
     for name in (ADAPTIVE, *FIXED):
         for row in rows:
@@ -260,10 +250,5 @@ def confirmed_part(rows: list[dict]) -> None:
     print(f"first time. Its worst u over Laplace's: {middle:.2f} in the median ({low:.2f} to {high:.2f}).")
 
 
-def main() -> None:
-    """Command line."""
-    act(study_parser(__doc__, ROWS, n=50), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_run, ("plan", "seed"), (ADAPTIVE, *FIXED), table, 50)

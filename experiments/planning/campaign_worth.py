@@ -24,11 +24,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import output
 from experiments.common.worth import CAUSES, Worth, full_turn_plan, searched_family, worth_of_plan
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import Prior
@@ -85,7 +85,7 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
     return {"name": name, **study_row(StudyJob(rig, tuple(steps), parse_target(DEFAULT_TARGET), SEED), index).as_json()}
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Curves, split and refits."""
     use_compilation_cache()
     knowledge = prior_knowledge(mounted_rig())
@@ -113,7 +113,7 @@ def table(arguments: argparse.Namespace) -> None:
             shares = " | ".join(f"{100 * w.shares[c]:.0f} %" for c in CAUSES)
             left = 100 * (w.floor / w.u.max()) ** 2
             print(f"| {name} | {w.spots} | {u} | {shares} | {1e4 * w.floor:.2f} | {left:.0f} % |")
-    refits(read_rows(arguments.rows))
+    refits(rows)
     draw(curves)
 
 
@@ -154,18 +154,12 @@ def draw(curves: Mapping[str, list[Worth]]) -> None:
         figure.legend(loc="outside lower center", ncols=3)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every point is refitted on every rig."""
+def tasks(_: argparse.Namespace) -> list[tuple[str, int]]:
+    """Every point on every rig; the planner's looks are there before workers ask for them."""
     use_compilation_cache()
     planned_family(prior_knowledge(mounted_rig()))
-    tasks = [(name, index) for index in range(RIGS) for name in CHECKED]
-    run_rows(one_row, tasks, arguments.rows, ("name", "index"), arguments.cores)
-
-
-def main() -> None:
-    """Command line."""
-    act(study_parser(__doc__, ROWS), run=run, table=table)
+    return [(name, index) for index in range(RIGS) for name in CHECKED]
 
 
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_row, ("name", "index"), tasks, table)

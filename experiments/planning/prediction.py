@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import by_seed, study
 from experiments.common.headlines import SHRINK
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import output
 from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import read_plan, write_plan
 from tvsbayes.model.compilation_cache import use_compilation_cache
@@ -38,6 +38,7 @@ from tvsbayes.studies.study_job import StudyJob, study_row
 
 ROWS, DESIGNS = output(__file__, "prediction.jsonl"), output(__file__, "designs.json")
 NAMES = ("paper", "grid", "n80", "n95")
+KEYS = ("name", "index")
 SEED = 2025
 """Of the campaigns; the planner's own draws have seed 0."""
 DRAWS = 400
@@ -76,15 +77,9 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
     return {"name": name, **study_row(job_of(name), index).as_json()}
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every (design, index) is there; designs in the inner loop, so that they stay balanced."""
-    tasks = [(name, index) for index in range(arguments.n) for name in arguments.designs]
-    run_rows(one_row, tasks, arguments.rows, ("name", "index"), arguments.cores)
-
-
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Markdown of everything that came out."""
-    rows, kept = read_rows(arguments.rows), json.loads(DESIGNS.read_text())
+    kept = json.loads(DESIGNS.read_text())
     print("# Predicted and actual uncertainty of plans\n")
     print("Written by `python -m experiments.planning.prediction table`; bounds at 1e-4.\n")
     for name in NAMES:
@@ -139,12 +134,6 @@ def table(arguments: argparse.Namespace) -> None:
         print(f"- {row['name']} {row['index']}: {'; '.join(row['problems'])}")
 
 
-def main() -> None:
-    """Command line."""
-    command = study_parser(__doc__, ROWS, n=1000, actions=("designs", "run", "table"))
-    command.add_argument("--designs", nargs="+", default=NAMES, choices=NAMES)
-    act(command, designs=designs, run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    more = {"--designs": {"nargs": "+", "default": NAMES, "choices": NAMES}}
+    study(__file__, __doc__, one_row, KEYS, lambda of: by_seed(of.designs, of.n), table, 1000, more, designs=designs)

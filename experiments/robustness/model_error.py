@@ -22,11 +22,10 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.fits import fit_from_truth
 from experiments.common.headlines import judged, true_headlines
 from experiments.common.rigs import PIXELS, mounted_rig, pixels_of, shipped_plan, unseen, with_pixels
-from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.residuals import residual_causes, stop_residuals
 from tvsbayes.assessment.score_tests import validate
@@ -37,7 +36,6 @@ from tvsbayes.results.records import plain
 from tvsbayes.twin.physics import inside_images, mirror_chain, project
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS = output(__file__, "model_error.jsonl")
 SIZES = {
     "pinion": (0.02, 0.05, 0.15),
     "tooth": (0.02, 0.05, 0.15),
@@ -137,14 +135,14 @@ def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
     return row
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every campaign is there; turn by turn, so that an interrupted run is balanced."""
-    tasks: list[tuple[str, float, int]] = []
-    share = -(-arguments.clean // arguments.n)
-    for seed in range(arguments.n):
-        tasks += [("clean", 0.0, s) for s in range(seed * share, min((seed + 1) * share, arguments.clean))]
-        tasks += [(defect, size, seed) for defect, sizes in SIZES.items() for size in sizes]
-    run_rows(one_campaign, tasks, arguments.rows, ("defect", "size", "seed"), arguments.cores)
+def tasks(of: argparse.Namespace) -> list[tuple[str, float, int]]:
+    """Turn by turn, so that an interrupted run is balanced."""
+    every: list[tuple[str, float, int]] = []
+    share = -(-of.clean // of.n)
+    for seed in range(of.n):
+        every += [("clean", 0.0, s) for s in range(seed * share, min((seed + 1) * share, of.clean))]
+        every += [(defect, size, seed) for defect, sizes in SIZES.items() for size in sizes]
+    return every
 
 
 def rms_z(rows: list[dict], inflated: bool) -> float:
@@ -160,9 +158,8 @@ def clopper_pearson(hits: int, count: int) -> str:
     return f"{100 * hits / count:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """Markdown of everything that came out."""
-    rows = read_rows(arguments.rows)
     good = [r for r in rows if "validation" in r and r["converged"]]
     clean = [r for r in good if r["defect"] == "clean"]
     level = clean[0]["validation"]["level"]
@@ -222,12 +219,6 @@ def table(arguments: argparse.Namespace) -> None:
         print(f"- {r['defect']} {r['size']:g}, seed {r['seed']}: {'; '.join(r['problems'])}")
 
 
-def main() -> None:
-    """Command line."""
-    command = study_parser(__doc__, ROWS, n=20)
-    command.add_argument("--clean", type=int, default=200, help="campaigns without a defect (%(default)s)")
-    act(command, run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    options = {"--clean": {"type": int, "default": 200, "help": "campaigns without a defect (%(default)s)"}}
+    study(__file__, __doc__, one_campaign, ("defect", "size", "seed"), tasks, table, 20, options)

@@ -24,10 +24,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.reference_samplers import Setting
 from experiments.common.rigs import TWINS, dense_plan, mounted_rig, small_plan, twin_campaign
-from experiments.common.rows import output, read_rows, run_rows
 from experiments.sampler.nuts_reference import hamiltonian
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.campaign import Campaign, read_campaign
@@ -38,7 +37,6 @@ from tvsbayes.posterior.sampling import TIERS, sample
 from tvsbayes.results.records import plain
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS = output(__file__, "agreement.jsonl")
 DENSE, FEW = "60 spots", "12 stops"
 CASES = (*TWINS, DENSE, FEW)
 SEED = 1
@@ -153,9 +151,8 @@ def compare(one: Mapping[str, Mapping[str, float]], other: Mapping[str, Mapping[
     return " | ".join([*cells, verdict])
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(rows: list[dict]) -> None:
     """The page."""
-    rows = read_rows(arguments.rows)
     print("# Importance sampling, the chain and NUTS\n")
     print("Written by `python -m experiments.sampler.agreement table` after `run`.\n")
     of = {(r["case"], r["tier"]): r for r in rows}
@@ -225,19 +222,11 @@ def chain_cells(row: dict | None) -> list[str]:
     return [*cells, "yes" if row["accepted"] else "NO", f"{row['cpu_s']:.1f}"]
 
 
-def run(arguments: argparse.Namespace) -> None:
+def tasks(_: argparse.Namespace) -> list[tuple[str, str]]:
     """Tier 1 of every case first."""
-    tasks = [(tier, case) for tier in TIERS for case in (*CASES, *arguments.campaigns)]
-    tasks += [(POOLED, case) for case in TWINS] + [(NUTS, case) for case in SETTINGS]
-    run_rows(one_case, tasks, arguments.rows, ("tier", "case"), arguments.cores)
-
-
-def main() -> None:
-    """Command line."""
-    command = study_parser(__doc__, ROWS)
-    command.add_argument("--campaigns", nargs="+", default=[], metavar="FOLDER", help="beside the shipped cases")
-    act(command, run=run, table=table)
+    every = [(tier, case) for tier in TIERS for case in CASES]
+    return every + [(POOLED, case) for case in TWINS] + [(NUTS, case) for case in SETTINGS]
 
 
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_case, ("tier", "case"), tasks, table)

@@ -13,14 +13,12 @@ means of it compared by Welch's t test at 1 %.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, study_parser
+from experiments.common.command_line import study
 from experiments.common.rigs import mounted_rig
-from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.comparison import watched_looks
 from tvsbayes.comparison.watched_looks import (
     CHANGES,
@@ -45,7 +43,6 @@ from tvsbayes.statistics.chances import share_interval95
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
-ROWS = output(__file__, "power.jsonl")
 FIRST_DAY = four_point_protocol(repeats=6, steps=(100, 200))
 BUCKET = 192
 SAME_DAYS, SIZES = 6, (1.0, 4.0)
@@ -80,8 +77,9 @@ def classic_alarm(first: Campaign, second: Campaign, direction: str) -> bool:
     return min(map(len, ratios)) > 1 and float(stats.ttest_ind(*ratios, equal_var=False).pvalue) <= FALSE_ALARM_RATE
 
 
-def one_rig(seed: int) -> dict[str, object]:
+def one_rig(task: tuple[int]) -> dict[str, object]:
     """All second days of a rig."""
+    (seed,) = task
     use_compilation_cache()
     rig = mounted_rig()
     first = simulate(rig, FIRST_DAY, seed)
@@ -121,25 +119,15 @@ def day(
     return {"what": what, "times": times, **entries, "classic": classic_alarm(first, other, direction)}
 
 
-def one_task(task: tuple[int]) -> dict[str, object]:
-    """The row for `run_rows`."""
-    return one_rig(*task)
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every rig is there."""
-    run_rows(one_task, [(seed,) for seed in range(arguments.n)], arguments.rows, ("seed",), arguments.cores)
-
-
 def share(hits: int, count: int) -> str:
     """With its 95 % interval."""
     low, high = share_interval95(hits, count)
     return f"{100 * hits / count:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
 
 
-def table(arguments: argparse.Namespace) -> None:
+def table(every: list[dict]) -> None:
     """Markdown table of alarms and powers."""
-    rows = [r for r in read_rows(arguments.rows) if r["converged"]]
+    rows = [r for r in every if r["converged"]]
     days = [day for row in rows for day in row["days"]]
     print("# False alarms and power of a watched calibration\n")
     print("Written by `python -m experiments.watching.power table`.\n")
@@ -175,10 +163,5 @@ def table(arguments: argparse.Namespace) -> None:
         print(f"| {change.what}, {change.size:g} {change.unit} | {len(needed)} of {len(rows)} | {middle} |")
 
 
-def main() -> None:
-    """Command line."""
-    act(study_parser(__doc__, ROWS, n=20), run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, one_rig, ("seed",), [()], table, 20)
