@@ -36,11 +36,7 @@ from tvsbayes.single_axis.predicted_stops import predicted_stops
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import AxisTruth, draw_axis
 
-WISHES = {
-    "csv": Wish("csv"),
-    "csv, 0.01 mm": Wish("csv", resolution=0.01),
-    "grblhal": Wish("grblhal", in_force=200.0),
-}
+WISHES = {"csv": Wish("csv"), "csv, 0.01 mm": Wish("csv", resolution=0.01), "grblhal": Wish("grblhal", in_force=200.0)}
 TRAVEL, POSITIONS, HOMINGS, READ_U = 40.0, 9, 3, 0.002
 HOME = AxisPrior(0.0002 * TRAVEL, 0.5)
 PROMISED, VERIFIED = 8, 12

@@ -37,10 +37,7 @@ def main() -> None:
     campaign = twin_campaign("paper_twin")
     calibration = calibration_of(fit(campaign))
     priors = campaign.rig.priors
-    simple = {
-        "nominal": simple_calibration(priors),
-        "classic": simple_calibration(priors, classic(campaign)),
-    }
+    simple = {"nominal": simple_calibration(priors), "classic": simple_calibration(priors, classic(campaign))}
     pan, tilt = (np.linspace(*ends, 5).round() for ends in calibration.range_steps)
     errors_mm = error_map(calibration, pan, tilt, RANGES_MM, simple=simple)
     print(

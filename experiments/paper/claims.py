@@ -12,24 +12,28 @@ both backlashes were known.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import print_only
-from experiments.common.rigs import mounted_rig, shipped_plan, shipped_twin, twin_campaign
+from experiments.common.rigs import mounted_rig, numbered, shipped_plan, shipped_twin, twin_campaign
 from experiments.common.rows import ROOT
-from experiments.common.worth import full_turn_plan, worth_of
 from experiments.paper.table1 import paper_values
 from tvsbayes.assessment.causes import headline_causes
 from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.protocols import four_point_protocol, mixed_protocol, paper_protocol
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.protocols import RUN_UP_STEPS, four_point_protocol, mixed_protocol, paper_protocol
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
+from tvsbayes.planning.limits import MANY_TIMES, split_of
+from tvsbayes.planning.looks import covariance_of
+from tvsbayes.planning.target import parse_target, sensitivity
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -41,6 +45,9 @@ KNOWN = 1e8
 """Precision of a coordinate that is taken as known; a prior's own is 1."""
 CAMERAS = "stereo calibration", "focal_scale"
 CHOSEN = ("left", "up")
+TURN_STEPS = 6000
+"""A full turn of pan at 0.06 deg/step."""
+Parts = dict[str, float]
 PLAIN, FOURFOLD = "the paper's 96 experiments", "the same four times over"
 
 
@@ -200,28 +207,6 @@ def known(knowledge: Knowledge, names: tuple[str, ...]) -> Knowledge:
     return replace(knowledge, precision=precision)
 
 
-@dataclass(frozen=True)
-class Parts:
-    """What u of a ratio consists of after a campaign: spots, u (1e-4 deg/step), shares of the variance in percent.
-
-    Attributes:
-        cameras: of stereo and focal scale.
-        backlash, contrast: what would go if both backlashes, or both contrasts, were known.
-        floor: what a hundred such campaigns leave.
-        u_without: were both backlashes known.
-        u_cameras: the cameras' part.
-    """
-
-    spots: int
-    u: float
-    cameras: float
-    backlash: float
-    contrast: float
-    floor: float
-    u_without: float
-    u_cameras: float
-
-
 def plans() -> dict[str, tuple]:
     """Campaigns of claim 5, each of one or more plans."""
     both = dict.fromkeys(DIRECTIONS, ("reversed", "cleared"))
@@ -237,31 +222,53 @@ def plans() -> dict[str, tuple]:
     }
 
 
+def full_turn_plan(looks: int) -> tuple[PlanStep, ...]:
+    """`looks` poses near and a turn later on each of two sheets, from either side of both axes."""
+    # Neighbours differ in tilt, and in eight looks each axis is reached from either side at either end.
+    poses = ((0, -90), (200, 90), (70, 90), (140, -90), (200, -90), (0, 90), (140, 90), (70, -90))
+    orders: list[tuple] = [("home", 0, 0)]
+    for number, sheet in enumerate(("d1", "d3")):
+        orders.append(("place", None, None, sheet))
+        for at in (0, TURN_STEPS)[:: 1 if number == 0 else -1]:
+            for look in range(looks):
+                pan, tilt = poses[look % len(poses)]
+                pan_run_up = RUN_UP_STEPS * (1 if look % 2 == 0 else -1)
+                tilt_run_up = RUN_UP_STEPS * (1 if look // 2 % 2 == 0 else -1)
+                orders += [("move", at + pan - pan_run_up, tilt - tilt_run_up), ("move", at + pan, tilt), ("look",)]
+    return numbered(orders)
+
+
+def parts_of(quantity: str, fisher: np.ndarray, pose_rad: np.ndarray, known_of: Mapping[str, Knowledge]) -> Parts:
+    """What u of a ratio consists of after looks: u and its parts in 1e-4 deg/step, shares in percent.
+
+    `cameras`: of stereo and focal scale; `backlash`, `contrast`: what would go if both backlashes, or both contrasts,
+    were known, as in that knowledge; `floor`: what a hundred such campaigns leave.
+    """
+    target, knowledge = parse_target(f"u({quantity}) <= 2e-4 deg/step"), known_of["as it is"]
+    at = {name: sensitivity(target, of.z, of.space, of.rig.table, pose_rad) for name, of in known_of.items()}
+    u, without, one_ratio = (at[name].value(covariance_of(of.precision + fisher)) for name, of in known_of.items())
+    shares = split_of(knowledge, fisher, None, at["as it is"])
+    cameras = shares.get("stereo calibration", 0.0) + shares.get("focal scale", 0.0)
+    floor = at["as it is"].value(covariance_of(knowledge.precision + MANY_TIMES * fisher))
+    parts = {"u": 1e4 * u, "u_without": 1e4 * without, "u_cameras": 1e4 * u * np.sqrt(cameras)}
+    parts |= {"backlash": 100 * (1 - (without / u) ** 2), "contrast": 100 * (1 - (one_ratio / u) ** 2)}
+    return parts | {"cameras": 100 * cameras, "floor": 100 * (floor / u) ** 2}
+
+
 def parts_of_plans() -> dict[str, dict[str, Parts]]:
     """By campaign and direction."""
     knowledge = prior_knowledge(mounted_rig())
-    exact = known(knowledge, ("backlash_deg.pan", "backlash_deg.tilt"))
-    contrasts = known(knowledge, ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt"))
+    known_of = {
+        "as it is": knowledge,
+        "backlashes": known(knowledge, ("backlash_deg.pan", "backlash_deg.tilt")),
+        "contrasts": known(knowledge, ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt")),
+    }
     results: dict[str, dict[str, Parts]] = {}
-    for name, parts in plans().items():
-        informations = [information_of(part, knowledge) for part in parts]
+    for name, plan in plans().items():
+        informations = [information_of(part, knowledge) for part in plan]
         fisher, pose = sum(f.fisher for f in informations), informations[0].pose_rad
         spots = sum(int(f.expectation.seen.sum()) for f in informations)
-        for quantity in CHOSEN:
-            w = worth_of(knowledge, fisher, pose, spots, quantity)
-            without = worth_of(exact, fisher, pose, spots, quantity)
-            one_ratio = worth_of(contrasts, fisher, pose, spots, quantity)
-            u = float(w.u[0])
-            results.setdefault(name, {})[quantity] = Parts(
-                spots=spots,
-                u=1e4 * u,
-                cameras=100 * w.shares["cameras"],
-                backlash=100 * (1 - (without.u[0] / u) ** 2),
-                contrast=100 * (1 - (one_ratio.u[0] / u) ** 2),
-                floor=100 * (w.floor / u) ** 2,
-                u_without=1e4 * float(without.u[0]),
-                u_cameras=1e4 * u * np.sqrt(w.shares["cameras"]),
-            )
+        results[name] = {q: {"spots": spots, **parts_of(q, fisher, pose, known_of)} for q in CHOSEN}
     return results
 
 
@@ -279,10 +286,12 @@ def fifth(results: dict[str, dict[str, Parts]]) -> None:
     """What the variance of k consists of after 96 experiments, and what lowers it."""
     base, twin = results[PLAIN], cameras_of_the_twin()
     text = (
-        f"plain go and return: {base['left'].cameras:.0f} % (left), {base['up'].cameras:.0f} % (up), expected; "
+        f"plain go and return: {base['left']['cameras']:.0f} % (left), {base['up']['cameras']:.0f} % (up), expected; "
         f"paper twin, whose right and up starts are cleared: {twin['left']:.0f} %, {twin['up']:.0f} %, fitted"
     )
-    plain, cleared = ([35 <= v <= 65 for v in values] for values in ([b.cameras for b in base.values()], twin.values()))
+    plain, cleared = (
+        [35 <= v <= 65 for v in values] for values in ([b["cameras"] for b in base.values()], twin.values())
+    )
     if all(plain) and all(cleared):
         verdict = "holds"
     elif all(cleared):
@@ -290,14 +299,14 @@ def fifth(results: dict[str, dict[str, Parts]]) -> None:
     else:
         verdict = "does not hold"
     row("5. stereo and focal scale in the variance of k after 96 experiments", "about half", text, verdict)
-    rest = all(b.backlash > 50 * (1 - b.cameras / 100) for b in base.values())
+    rest = all(b["backlash"] > 50 * (1 - b["cameras"] / 100) for b in base.values())
     row(
         "5. separation of k from backlash",
         "most of the rest",
-        f"plain go and return: {base['left'].backlash:.0f} % (left), {base['up'].backlash:.0f} % (up) of all",
+        f"plain go and return: {base['left']['backlash']:.0f} % (left), {base['up']['backlash']:.0f} % (up) of all",
         "holds" if rest else "does not hold for both axes",
     )
-    gain = {q: results[FOURFOLD][q].u / base[q].u for q in base}
+    gain = {q: results[FOURFOLD][q]["u"] / base[q]["u"] for q in base}
     row(
         "5. repeats of one move do not help",
         "no help",
@@ -314,8 +323,11 @@ def what_lowers(results: dict[str, dict[str, Parts]]) -> None:
     print("| u if backlash were known | contrast | left after 100 such campaigns |\n|" + "---|" * 10)
     for name, by_direction in results.items():
         for quantity, p in by_direction.items():
-            print(f"| {name} | {p.spots} | {quantity} | {p.u:.2f} | {p.cameras:.0f} % | {p.u_cameras:.2f} ", end="")
-            print(f"| {p.backlash:.0f} % | {p.u_without:.2f} | {p.contrast:.0f} % | {p.floor:.0f} % |")
+            print(
+                f"| {name} | {p['spots']} | {quantity} | {p['u']:.2f} | {p['cameras']:.0f} % | {p['u_cameras']:.2f} ",
+                end="",
+            )
+            print(f"| {p['backlash']:.0f} % | {p['u_without']:.2f} | {p['contrast']:.0f} % | {p['floor']:.0f} % |")
     print("\nPan is better off than tilt in the plain protocol: its first start is the homing's, recorded as reached")
     print("from the left, the one cleared start of the campaign.")
 

@@ -222,8 +222,7 @@ def table(rows: list[dict]) -> None:
     print("misled: for the wrong one. Contrast and backlash (medians over the seeds, sd of the model with both) in")
     print("1e-3 deg/step and deg; z of the contrast: largest of pan and tilt, |contrast| / sd, median.\n")
     print(
-        "| campaign | truth | seeds | converged | told apart | undecided | misled | 20 to 1 against the truth ",
-        end="",
+        "| campaign | truth | seeds | converged | told apart | undecided | misled | 20 to 1 against the truth ", end=""
     )
     print("| log10 factor: median (range) | effective ratios in their 95 % intervals ", end="")
     print("| contrast pan | contrast tilt | z | backlash pan | backlash tilt | tilt over pan ratio |\n|" + "---|" * 16)

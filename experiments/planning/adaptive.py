@@ -27,12 +27,7 @@ from experiments.common.command_line import study
 from experiments.common.rigs import mounted_rig, shipped_plan
 from tvsbayes.acquisition import session
 from tvsbayes.acquisition.journal import read_journal
-from tvsbayes.acquisition.replanning import (
-    AdaptOptions,
-    Replanning,
-    adapted_plan,
-    looks_next,
-)
+from tvsbayes.acquisition.replanning import AdaptOptions, Replanning, adapted_plan, looks_next
 from tvsbayes.acquisition.running_estimate import FIRST_LOOKS, GROWTH, EstimateOptions
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cli.acquire_command import laplace_estimate, proposal_of, propose_looks

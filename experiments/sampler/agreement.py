@@ -85,12 +85,7 @@ def one_case(task: tuple[str, str]) -> dict[str, object]:
     fit_cpu_s = time.process_time() - cpu
     if tier == POOLED:
         each = [summary(sample(joint, tier=TIERS[0], seed=SEED + k)) for k in range(SEEDS)]
-        return {
-            "tier": tier,
-            "case": case,
-            "accepted": True,
-            "quantities": average(each),
-        }
+        return {"tier": tier, "case": case, "accepted": True, "quantities": average(each)}
     posterior = sample(joint, tier=tier, seed=SEED, max_minutes=MAX_MINUTES)
     row: dict[str, object] = {"tier": tier, "case": case, "cpu_s": time.process_time() - cpu, "fit_cpu_s": fit_cpu_s}
     row |= {"wall_s": time.perf_counter() - wall, "spots": len(campaign.spots)}

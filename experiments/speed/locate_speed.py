@@ -72,11 +72,7 @@ def peer(calibration, pan: float, tilt: float, reading: float, seed: int = 0) ->
         w = origin + np.array([0.0, 0.5 * one["baseline_mm"], 0.0])
         c2 = np.cos(b) ** 2
         roots = np.roots(
-            [
-                direction[1] ** 2 - c2,
-                2 * (w[1] * direction[1] - c2 * (w @ direction)),
-                w[1] ** 2 - c2 * (w @ w),
-            ]
+            [direction[1] ** 2 - c2, 2 * (w[1] * direction[1] - c2 * (w @ direction)), w[1] ** 2 - c2 * (w @ w)]
         ).real
         good = [r for r in roots if r > 0 and (w[1] + r * direction[1]) * np.cos(b) >= 0]
         out.append(origin + (min(good) if good else np.nan) * direction)

@@ -83,13 +83,7 @@ class Contenders:
         """Emcee's default move."""
         run = stretch(self.joint, self.walkers, self.path)
         rate = run.ess / run.cpu_s
-        return {
-            "ess": run.ess,
-            "cpu_s": run.cpu_s,
-            "wall_s": run.wall_s,
-            "rate": rate,
-            "trusted_s": TRUSTED / rate,
-        }
+        return {"ess": run.ess, "cpu_s": run.cpu_s, "wall_s": run.wall_s, "rate": rate, "trusted_s": TRUSTED / rate}
 
     def hamiltonian(self, sampler: Callable[..., Run]) -> Callable[[int], dict[str, object]]:
         """NUTS in sheared coordinates."""

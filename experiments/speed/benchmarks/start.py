@@ -97,7 +97,4 @@ def cases() -> list[Case]:
     """Tables of the part."""
     columns = (Column("wall_s", "wall s"), Column("cpu_s", "CPU s"), Column("rss_mib", "peak memory, MiB", "{:.0f}"))
     about = "On the shipped paper twin (384 spots)."
-    return [
-        Case(FLOOR, "`python -c ...`", columns, ours=""),
-        Case(COMMANDS, about, columns, "cpu_s", UNIT),
-    ]
+    return [Case(FLOOR, "`python -c ...`", columns, ours=""), Case(COMMANDS, about, columns, "cpu_s", UNIT)]
