@@ -83,11 +83,11 @@ def _quantities(
     return result
 
 
-def tables(every: Sequence[dict], text: str, titles: Mapping[str, str], what: str) -> None:
+def tables(drawn: Sequence[dict], text: str, titles: Mapping[str, str], what: str) -> None:
     """Text, and a table for each kind that has rows; `what`: a word for what is drawn."""
     print(text)
     for kind, title in titles.items():
-        rows = [row for row in every if row["kind"] == kind]
+        rows = [row for row in drawn if row["kind"] == kind]
         good = [row for row in rows if row["answer"] in USABLE]
         if not good:
             continue

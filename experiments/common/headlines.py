@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import BLOCKS, INDEX
+from tvsbayes.posterior.draws import Posterior
 from tvsbayes.statistics.chances import BOUND, LEVELS, binomial_bounds, rms_bounds
 from tvsbayes.studies import study_job
 from tvsbayes.twin.true_rig import Truth
@@ -29,6 +31,8 @@ SHRINK = 0.8
 """A table whose sds are multiplied by this has to fail, or its test could not."""
 LEAST_CONTRACTION = 0.1
 """Below it an interval is the prior's own and is not judged."""
+JUDGED = f"RMS z | {' | '.join(f'{100 * level:.0f} %' for level in LEVELS)} | verdict"
+"""Headings of the cells of a `Verdict`."""
 OUTSIDE = " **!**"
 """Marks a figure that is outside its bounds."""
 NOTE = f"**!** marks a figure outside its bounds at {BOUND:.0e}".replace("e-0", "e-")
@@ -57,22 +61,22 @@ def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> di
     }
 
 
-def judged(draws, centre, prior_draws, true: Mapping[str, float], weights: np.ndarray | None = None) -> dict[str, dict]:
+def judged(found: JointFit | Posterior, truth: Truth, campaign: Campaign) -> dict[str, dict[str, float]]:
     """PIT, also of draws shrunk about the centre by `SHRINK`, z and contraction of every headline.
 
     Args:
-        draws: a `Derived` with leading axes.
-        centre: one without; None takes the draws' mean.
-        prior_draws: as the draws.
-        true: of `true_headlines`.
-        weights: of the draws, of sum 1, with their leading axes; equal if None.
+        found: a fit, whose centre is its mode, or a posterior, whose centre is its mean.
+        truth: of the campaign's rig.
+        campaign: whose looks define the truth's ratios.
     """
-    prior = headlines(prior_draws)
-    middle = None if centre is None else headlines(centre)
+    fit = found.fit if isinstance(found, Posterior) else found
+    draws = headlines(found.draws)
+    middle = None if isinstance(found, Posterior) else headlines(fit.mode)
+    prior, true = headlines(fit.prior_draws), true_headlines(truth, campaign, fit.reference_pose_rad)
     result = {}
-    for name, values in headlines(draws).items():
+    for name, values in draws.items():
         values = values.ravel()
-        weight = np.full(values.shape, 1 / values.size) if weights is None else weights.ravel()
+        weight = found.weights.ravel() if middle is None else np.full(values.shape, 1 / values.size)
         mean = weight @ values
         at = float(mean if middle is None else middle[name])
         variance = weight @ (values - mean) ** 2
@@ -90,34 +94,25 @@ def marked(text: str, inside: bool) -> str:
     return text + ("" if inside else OUTSIDE)
 
 
-def level_titles() -> str:
-    """Headings of the columns of `LEVELS`."""
-    return " | ".join(f"{100 * level:.0f} %" for level in LEVELS)
-
-
-def level_limits(count: int) -> str:
-    """Bounds of the columns of `LEVELS`, in percent."""
-    return " | ".join(f"{100 * low:.0f}-{100 * high:.0f}" for low, high in (binomial_bounds(count, x) for x in LEVELS))
-
-
 def rms_limits(count: int) -> str:
     """Bounds of an RMS z."""
     low, high = rms_bounds(count)
     return f"{low:.2f}-{high:.2f}"
 
 
+def limits(count: int) -> str:
+    """Bounds of the columns of `JUDGED`, without the verdict."""
+    shares = (f"{100 * low:.0f}-{100 * high:.0f}" for low, high in (binomial_bounds(count, level) for level in LEVELS))
+    return " | ".join([rms_limits(count), *shares])
+
+
 @dataclass(frozen=True)
 class Verdict:
     """RMS z and coverage of one quantity over many rigs: cells of a table, and whether all are within bounds."""
 
-    cells: tuple[str, ...]
+    cells: str
     within: bool
     prior: bool
-
-    @property
-    def word(self) -> str:
-        """The last cell of a row."""
-        return "prior" if self.prior else ("within" if self.within else "OUTSIDE")
 
 
 def verdict(entries: Sequence[Mapping[str, float]], shrunk: bool = False) -> Verdict:
@@ -134,4 +129,5 @@ def verdict(entries: Sequence[Mapping[str, float]], shrunk: bool = False) -> Ver
         inside.append(low <= share <= high)
         cells.append(marked(f"{100 * share:.1f}", inside[-1]))
     prior = float(np.median([e["contraction"] for e in entries])) < LEAST_CONTRACTION
-    return Verdict(tuple(cells), all(inside), prior)
+    word = "prior" if prior else "within" if all(inside) else "OUTSIDE"
+    return Verdict(" | ".join([*cells, word]), all(inside), prior)

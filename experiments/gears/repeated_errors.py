@@ -21,15 +21,8 @@ import time
 import numpy as np
 
 from experiments.common.command_line import study
-from experiments.common.headlines import (
-    HEADLINES,
-    judged,
-    level_limits,
-    level_titles,
-    rms_limits,
-    true_headlines,
-    verdict,
-)
+from experiments.common.headlines import HEADLINES, JUDGED, judged, limits, verdict
+from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.true_looks import TrueLooks
 from experiments.common.worlds import campaign_of
@@ -42,7 +35,6 @@ from tvsbayes.inference.importance import K_MAX
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 PROTOCOLS = ("paper", "mixed", "grid", "planned")
@@ -107,7 +99,6 @@ def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
         start = time.process_time()
         try:
             result = fit(simulated.campaign, model=choice)
-            true = true_headlines(simulated.truth, simulated.campaign, result.reference_pose_rad)
             posterior = sample(result, "importance", seed=seed)
             weights = posterior.convergence.importance
             calibration = calibration_of(result, posterior if posterior.converged else None, seed=seed)
@@ -117,7 +108,7 @@ def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
                 "pareto_k": weights.pareto_k,
                 "least_ess": weights.least_ess.value,
                 "shift_named": any("zero" in w.text for w in weak_directions(result, moved_directions(result))),
-                "headlines": judged(posterior.draws, None, result.prior_draws, true, posterior.weights),
+                "headlines": judged(posterior, simulated.truth, simulated.campaign),
                 "points": located(calibration, looks_at(simulated, calibration.range_steps, seed), seed),
                 "cpu_s": time.process_time() - start,
             }
@@ -133,14 +124,12 @@ def accepted(rows: list[dict], name: str) -> list[dict]:
 
 def _headlines(entries_of: dict[str, list[dict]]) -> None:
     """Both models' headlines."""
-    print(f"| quantity | gears | RMS z | {level_titles()} | verdict |\n|" + "---|" * (len(LEVELS) + 4))
+    print(heading("quantity | gears", JUDGED))
     for name, entries in entries_of.items():
-        count = len(entries)
-        print(f"| bounds at 1e-4, N = {count} | {name} | {rms_limits(count)} | {level_limits(count)} | |")
+        print(f"| bounds at 1e-4, N = {len(entries)} | {name} | {limits(len(entries))} | |")
     for quantity in HEADLINES:
         for name, entries in entries_of.items():
-            judged = verdict([entry["headlines"][quantity] for entry in entries])
-            print(f"| {quantity} | {name} | {' | '.join(judged.cells)} | {judged.word} |")
+            print(line(quantity, name, verdict([entry["headlines"][quantity] for entry in entries]).cells))
     print()
 
 
@@ -196,10 +185,10 @@ def _overview(by_case: dict[str, dict[str, list[dict]]]) -> None:
         for name in MODELS:
             if name not in case:
                 continue
-            judged = {q: verdict([entry["headlines"][q] for entry in case[name]]) for q in HEADLINES}
+            found = {q: verdict([entry["headlines"][q] for entry in case[name]]) for q in HEADLINES}
             rms = {q: float(np.sqrt(np.mean([e["headlines"][q]["z"] ** 2 for e in case[name]]))) for q in HEADLINES}
             worst = max(rms, key=lambda q: abs(np.log(rms[q])))
-            outside = ", ".join(q for q, v in judged.items() if v.word == "OUTSIDE") or "none"
+            outside = ", ".join(q for q, v in found.items() if not (v.prior or v.within)) or "none"
             points = [np.array([[e["points"][p]["z2"], e["points"][p]["points"]] for e in case[name]]) for p in PLACES]
             of_points = (f"{np.sqrt(z2 / (3 * n)):.2f}" for z2, n in (part.sum(axis=0) for part in points))
             cells = f"{rms[worst]:.2f} ({worst}) | {outside} | {' | '.join(of_points)}"

@@ -18,20 +18,12 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
-from experiments.common.headlines import (
-    HEADLINES,
-    judged,
-    level_limits,
-    level_titles,
-    rms_limits,
-    true_headlines,
-    verdict,
-)
+from experiments.common.headlines import HEADLINES, JUDGED, judged, limits, verdict
+from experiments.common.page import heading, line
 from experiments.common.rigs import PIXELS, drawn_truth, mounted_rig, pixels_of, small_plan, unseen, with_pixels
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import simulate
 
 BROKEN = {
@@ -93,47 +85,35 @@ def broken_rig(task: tuple[str, int]) -> dict[str, object]:
             entry: dict[str, object] = {"converged": result.converged, "problems": list(result.problems)}
             entry["excluded"] = len(result.excluded_spots)
             entry["suspect"] = len(result.suspect_spots)
-            entry["values"] = judged(
-                result.draws,
-                result.mode,
-                result.prior_draws,
-                true_headlines(truth, result.campaign, result.reference_pose_rad),
-            )
+            entry["values"] = judged(result, truth, result.campaign)
         except Exception as error:
             entry = {"converged": False, "problems": [repr(error)]}
         row[name] = {**entry, "seconds": time.perf_counter() - start}
     return row
 
 
-def _widths(rows: list[dict]) -> dict[tuple[int, str], float]:
-    """Posterior sd over prior sd of the plain fit of every clean rig, by seed and quantity."""
-    return {
-        (r["seed"], name): np.sqrt(1 - entry["contraction"])
-        for r in rows
-        if r["condition"] == "clean" and r["plain"]["converged"]
-        for name, entry in r["plain"]["values"].items()
-    }
+def _width(rows: list[dict], by: str, name: str, clean: dict[int, dict]) -> float:
+    """Median width of an interval over that of the plain fit of the same rig, clean."""
+    pairs = [(r[by]["values"][name], clean[r["seed"]][name]) for r in rows if r[by]["converged"] and r["seed"] in clean]
+    return float(np.median([np.sqrt(1 - one["contraction"]) / np.sqrt(1 - of["contraction"]) for one, of in pairs]))
 
 
-def _header(names: str) -> None:
-    print(f"| {names} | RMS z | {level_titles()} | verdict |")
-    print("|" + "---|" * (names.count("|") + len(LEVELS) + 3))
+TEXT = """# Data that break the model: Laplace, plain and robust
 
+Written by `python -m experiments.intervals.broken_data table` after `run`. **!** marks a figure outside its
+bounds at 1e-4; rig i has seed i. Two shared cores.
 
-def _limits(n: int, blank: str = "") -> None:
-    print(f"| bounds at 1e-4, N = {n} | {blank}{rms_limits(n)} | {level_limits(n)} | |")
+96 spots per rig: both axes swept there and back twice at four placements (d1, d2, d3, d2).
+
+`sd` is the median width of the interval over that of the plain fit of the same rig, clean.
+"""
 
 
 def table(rows: list[dict]) -> None:
     """Plain beside robust under every broken condition."""
-    print("# Data that break the model: Laplace, plain and robust\n")
-    print(
-        "Written by `python -m experiments.intervals.broken_data table` after `run`. **!** marks a figure outside its"
-    )
-    print("bounds at 1e-4; rig i has seed i. Two shared cores.\n")
-    print("96 spots per rig: both axes swept there and back twice at four placements (d1, d2, d3, d2).\n")
-    print("`sd` is the median width of the interval over that of the plain fit of the same rig, clean.\n")
-    widths = _widths(rows)
+    print(TEXT)
+    plain = {r["seed"]: r["plain"] for r in rows if r["condition"] == "clean"}
+    clean = {seed: fit["values"] for seed, fit in plain.items() if fit["converged"]}
     for condition, words in BROKEN.items():
         chosen = [r for r in rows if r["condition"] == condition]
         if not chosen:
@@ -141,27 +121,16 @@ def table(rows: list[dict]) -> None:
         print(f"## {condition}: {words}\n")
         good = {by: [r[by] for r in chosen if r[by]["converged"]] for by in ("plain", "robust")}
         for by, entries in good.items():
-            excluded = np.mean([e["excluded"] for e in entries])
-            suspect = np.mean([e["suspect"] for e in entries])
-            seconds = np.median([e["seconds"] for e in entries])
-            print(
-                f"- {by}: {len(entries)} of {len(chosen)} rigs converged, {excluded:.2f} spots excluded and "
-                f"{suspect:.2f} suspect per rig, median {seconds:.1f} s"
-            )
-        print()
-        _header("quantity | fit | sd")
-        _limits(min(map(len, good.values())), "| | ")
+            excluded, suspect = (np.mean([e[key] for e in entries]) for key in ("excluded", "suspect"))
+            print(f"- {by}: {len(entries)} of {len(chosen)} rigs converged, {excluded:.2f} spots excluded and ", end="")
+            print(f"{suspect:.2f} suspect per rig, median {np.median([e['seconds'] for e in entries]):.1f} s")
+        print("\n" + heading("quantity | fit | sd", JUDGED))
+        least = min(map(len, good.values()))
+        print(f"| bounds at 1e-4, N = {least} | | | {limits(least)} | |")
         for name in HEADLINES:
             for by, entries in good.items():
-                judged = verdict([e["values"][name] for e in entries])
-                width = np.median(
-                    [
-                        np.sqrt(1 - r[by]["values"][name]["contraction"]) / widths[r["seed"], name]
-                        for r in chosen
-                        if r[by]["converged"] and (r["seed"], name) in widths
-                    ]
-                )
-                print(f"| {name} | {by} | {width:.2f} | {' | '.join(judged.cells)} | {judged.word} |")
+                width = _width(chosen, by, name, clean)
+                print(line(name, by, f"{width:.2f}", verdict([e["values"][name] for e in entries]).cells))
         print()
         for r in chosen:
             for by in good:

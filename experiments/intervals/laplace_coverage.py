@@ -17,24 +17,13 @@ import time
 import numpy as np
 
 from experiments.common.command_line import study
-from experiments.common.headlines import (
-    HEADLINES,
-    MEAN_RATIOS,
-    NOTE,
-    SHRINK,
-    judged,
-    level_limits,
-    level_titles,
-    rms_limits,
-    true_headlines,
-    verdict,
-)
+from experiments.common.headlines import HEADLINES, JUDGED, MEAN_RATIOS, NOTE, SHRINK, judged, limits, verdict
+from experiments.common.page import heading, line
 from experiments.common.rigs import drawn_rig, shipped_plan, unseen
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import simulate
 
 PROTOCOLS = ("paper", "mixed", "grid")
@@ -54,12 +43,11 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
         return {**row, "converged": False, "problems": [repr(error)]}
     row["seconds"] = time.perf_counter() - start
     row["converged"], row["problems"] = result.converged, list(result.problems)
-    true = true_headlines(truth, campaign, result.reference_pose_rad)
-    row["joint"] = judged(result.draws, result.mode, result.prior_draws, true)
+    row["joint"], true = judged(result, truth, campaign), truth.effective_deg_per_step(campaign)
     if protocol != "grid":
         row["classic"] = {
             direction: {
-                "true": true[f"effective {direction}"],
+                "true": true[direction],
                 "mean": r.mean_deg_per_step,
                 "type_a": r.interval95_type_a,
                 "gum": r.interval95_gum,
@@ -72,15 +60,14 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
 
 def joint_table(good: list[dict]) -> None:
     """Coverage and RMS z of the headlines of one protocol, and of the mean ratios (`degrees_per_step`) behind them."""
-    print(f"| quantity | contraction | RMS z | {level_titles()} | verdict | with sd x {SHRINK} |")
-    print("|" + "---|" * (len(LEVELS) + 5))
-    print(f"| bounds at 1e-4 | | {rms_limits(len(good))} | {level_limits(len(good))} | | |")
+    print(heading("quantity | contraction", JUDGED, f"with sd x {SHRINK}"))
+    print(f"| bounds at 1e-4 | | {limits(len(good))} | | |")
     for name in HEADLINES + MEAN_RATIOS:
         entries = [r["joint"][name] for r in good]
         contraction = float(np.median([e["contraction"] for e in entries]))
-        judged, shrunk = verdict(entries), verdict(entries, shrunk=True)
-        failed = "prior" if judged.prior else ("passes" if shrunk.within else "fails")
-        print(f"| {name} | {contraction:.4f} | {' | '.join(judged.cells)} | {judged.word} | {failed} |")
+        found, shrunk = verdict(entries), verdict(entries, shrunk=True)
+        failed = "prior" if found.prior else ("passes" if shrunk.within else "fails")
+        print(line(name, f"{contraction:.4f}", found.cells, failed))
     print()
 
 

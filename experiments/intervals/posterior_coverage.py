@@ -22,19 +22,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from experiments.common.command_line import by_seed, study
-from experiments.common.headlines import (
-    HEADLINES,
-    MEAN_RATIOS,
-    NOTE,
-    SHRINK,
-    judged,
-    level_limits,
-    level_titles,
-    marked,
-    rms_limits,
-    true_headlines,
-    verdict,
-)
+from experiments.common.headlines import HEADLINES, JUDGED, MEAN_RATIOS, NOTE, SHRINK, judged, limits, marked, verdict
+from experiments.common.page import heading, line
 from experiments.common.rigs import drawn_rig, shipped_plan, unseen
 from experiments.common.rows import read_rows
 from experiments.common.uniformity import DRAWS
@@ -71,9 +60,7 @@ def one_rig(task: tuple[str, str, int]) -> dict[str, object]:
     try:
         result = fit(simulated.campaign)
         row |= {"converged": result.converged, "problems": list(result.problems)}
-        prior = result.prior_draws
-        true = true_headlines(simulated.truth, simulated.campaign, result.reference_pose_rad)
-        row["laplace"] = judged(result.draws, result.mode, prior, true)
+        row["laplace"] = judged(result, simulated.truth, simulated.campaign)
         row["fit_cpu_s"] = time.process_time() - start
         start = time.process_time()
         posterior = sample(result, tier=tier, seed=seed, max_minutes=MAX_MINUTES)
@@ -81,7 +68,7 @@ def one_rig(task: tuple[str, str, int]) -> dict[str, object]:
         row["sampled"] = bool(posterior.converged)
         row["problems"] = [*result.problems, *posterior.convergence.missing]
         row["sampling"] = plain(posterior.convergence.sampling)
-        row["posterior"] = judged(posterior.draws, None, prior, true, posterior.weights)
+        row["posterior"] = judged(posterior, simulated.truth, simulated.campaign)
     except Exception as error:
         row["problems"] = [*row.get("problems", []), repr(error)]
     return row
@@ -94,18 +81,17 @@ def _share_held(entries: Sequence[dict], level: float) -> float:
 
 def coverage(good: list[dict], every: list[dict]) -> None:
     """Laplace beside posterior on the rigs `good`; 95 % also on `every` rig that has draws."""
-    print(f"| quantity | by | RMS z | {level_titles()} | verdict | 95 %, all {len(every)} |")
-    print("|" + "---|" * (len(LEVELS) + 5))
-    print(f"| bounds at 1e-4, N = {len(good)} | | {rms_limits(len(good))} | {level_limits(len(good))} | | |")
+    print(heading("quantity | by", JUDGED, f"95 %, all {len(every)}"))
+    print(f"| bounds at 1e-4, N = {len(good)} | | {limits(len(good))} | | |")
     low, high = binomial_bounds(len(every), LEVELS[-1])
     failing = 0
     for name in ALL:
         for by in ("laplace", "posterior"):
             entries = [r[by][name] for r in good]
-            judged = verdict(entries)
+            found = verdict(entries)
             share = _share_held([r[by][name] for r in every], LEVELS[-1])
             whole = marked(f"{100 * share:.1f}", low <= share <= high)
-            print(f"| {name} | {by} | {' | '.join(judged.cells)} | {judged.word} | {whole} |")
+            print(line(name, by, found.cells, whole))
         failing += not verdict(entries, shrunk=True).within
     print(f"\nWith draws shrunk about their mean by {SHRINK}: {failing} of {len(ALL)} quantities OUTSIDE.\n")
 
@@ -176,15 +162,14 @@ def table_small(rows: list[dict]) -> None:
         good = [r for r in rows if r["variant"] == variant and r["converged"]]
         if not good:
             continue
-        limits = [binomial_bounds(len(good), level) for level in LEVELS]
         print(f"### {words}: {len(good)} rigs\n")
-        print(f"| quantity | {level_titles()} | verdict |")
-        print("|---|" + "---|" * (len(LEVELS) + 1))
-        print(f"| bounds at 1e-4, N = {len(good)} | {level_limits(len(good))} | |")
+        print(heading("quantity", JUDGED.removeprefix("RMS z | ")))
+        print(f"| bounds at 1e-4, N = {len(good)} | {limits(len(good)).partition(' | ')[2]} | |")
         for name in SMALL_HEADLINES:
             pit = np.array([(r["ranks"][name] + 0.5) / (DRAWS + 1) for r in good])
             held = [float(np.mean(np.abs(pit - 0.5) <= level / 2)) for level in LEVELS]
-            within = all(a <= h <= b for h, (a, b) in zip(held, limits, strict=True))
+            bounds = [binomial_bounds(len(good), level) for level in LEVELS]
+            within = all(low <= share <= high for share, (low, high) in zip(held, bounds, strict=True))
             print(f"| {name} | {' | '.join(f'{100 * h:.1f}' for h in held)} | {'within' if within else 'OUTSIDE'} |")
         print()
 

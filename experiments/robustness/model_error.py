@@ -24,7 +24,7 @@ from scipy import stats
 
 from experiments.common.command_line import study
 from experiments.common.fits import fit_from_truth
-from experiments.common.headlines import judged, true_headlines
+from experiments.common.headlines import judged
 from experiments.common.rigs import PIXELS, mounted_rig, pixels_of, shipped_plan, unseen, with_pixels
 from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.residuals import residual_causes, stop_residuals
@@ -127,9 +127,7 @@ def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
         row["validate_s"] = time.process_time() - start
         row["validation"] = plain(validation)
         row["grouped"] = sorted({c.name for c in residual_causes(stop_residuals(fit)) if c.suspicious})
-        row["values"] = judged(
-            fit.draws, fit.mode, fit.prior_draws, true_headlines(truth, campaign, fit.reference_pose_rad)
-        )
+        row["values"] = judged(fit, truth, campaign)
     except Exception as error:
         row |= {"converged": False, "problems": [repr(error)]}
     return row
