@@ -49,14 +49,8 @@ def run(arguments: argparse.Namespace) -> None:
     sys.exit(result.returncode)
 
 
-def main() -> None:
-    """The command line."""
-    cli = parser(__doc__)
-    cli.add_argument("action", choices=("run",))
+if __name__ == "__main__":
+    cli = parser(__doc__, run=run)
     cli.add_argument("--seconds", type=int, default=600, help="how long (%(default)s)")
     cli.add_argument("--seed", type=int, default=1, help="of the first input (%(default)s)")
-    act(cli, run=run)
-
-
-if __name__ == "__main__":
-    main()
+    act(cli)

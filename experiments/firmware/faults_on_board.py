@@ -16,11 +16,13 @@ import platform
 import shutil
 import threading
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from experiments.common.command_line import act, parser
-from experiments.common.rows import ROOT, append_row, commit, output, read_rows
+from experiments.common.page import heading
+from experiments.common.rigs import mounted_rig, numbered
+from experiments.common.rows import append_row, commit, output, read_rows
 from tvsbayes.acquisition.bench import SIMULATED_START, Bench
 from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
 from tvsbayes.acquisition.engine import Acquisition
@@ -31,7 +33,6 @@ from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.session import begin
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.instrument.rig import read_rig
 from tvsbayes.positioner.emulated_board import EMULATOR, EmulatedBoard
 
 ROWS, SCRATCH = output(__file__, "faults-on-board.jsonl"), output(__file__, "faults-scratch")
@@ -42,21 +43,14 @@ DARK_S = 6.0
 IN_MOTION_S = 0.15
 
 
-@dataclass(frozen=True)
-class Fault:
-    """Orders to the bench.
-
-    Attributes:
-        name: what fails.
-        order: in the words of `firmware/emulated/board.cpp`; empty for a run in which nothing fails.
-        lit: with the laser on; otherwise in the motion that follows.
-        expected: how `acquire` must end.
-    """
+class Fault(NamedTuple):
+    """What fails, by an order in the words of `firmware/emulated/board.cpp`, with the laser on or in the next motion."""
 
     name: str
     order: str
     lit: bool
     expected: str
+    """How `acquire` must end."""
 
 
 FAULTS = (
@@ -76,24 +70,15 @@ FAULTS = (
 )
 
 
-@dataclass
 class Observer:
-    """The twin's looks, with a fault at one of them, and where the motors stood at each.
+    """The twin's looks, with a fault at one of them, and where the motors stood at each."""
 
-    Attributes:
-        instrument: the twin behind the board.
-        sd_px: of its centroids.
-        fault: what happens.
-        true: whether counters and motors agreed, look by look.
-        dark_s: time from the fault until the pin was low, None where the laser was off.
-    """
-
-    instrument: EmulatedInstrument
-    sd_px: float
-    fault: Fault
-    true: list[bool] = field(default_factory=list)
-    dark_s: float | None = None
-    timer: threading.Timer | None = None
+    def __init__(self, instrument: EmulatedInstrument, sd_px: float, fault: Fault):
+        self.instrument, self.fault, self.twin = instrument, fault, TwinObserver(instrument, sd_px)
+        # Whether counters and motors agreed, look by look; time from the fault until the pin was low.
+        self.true: list[bool] = []
+        self.dark_s: float | None = None
+        self.timer: threading.Timer | None = None
 
     def observe(self, positioner, spot):
         """See `observation.Observer`."""
@@ -107,34 +92,26 @@ class Observer:
             while board.laser_pin() and time.monotonic() - start < DARK_S:
                 time.sleep(0.002)
             self.dark_s = time.monotonic() - start
-        observation = TwinObserver(self.instrument, self.sd_px).observe(positioner, spot)
+        observation = self.twin.observe(positioner, spot)
         if number == AT_LOOK and self.fault.order and not self.fault.lit:
             self.timer = threading.Timer(IN_MOTION_S, board.order, [self.fault.order])
             self.timer.start()
         return observation
 
 
-def plan() -> list[PlanStep]:
+def plan() -> tuple[PlanStep, ...]:
     """Twelve looks at one sheet, moves of both axes, homed again before the eighth and the eleventh."""
-    steps: list[tuple] = [("home", 0, 0), ("move", 40, 0), ("move", 0, 0), ("place", "d1")]
+    orders: list[tuple] = [("home", 0, 0), ("move", 40, 0), ("move", 0, 0), ("place", None, None, "d1")]
     for number in range(12):
-        if number in (7, 10):
-            steps.append(("home", 0, 0))
-        steps += [("move", 60 if number % 2 else -60, 20 * (number % 3)), ("look", number // 4, number % 4 + 1)]
-    rows = []
-    for row, (action, *rest) in enumerate(steps):
-        if action == "place":
-            rows.append(PlanStep(row, action, target=rest[0]))
-        elif action == "look":
-            rows.append(PlanStep(row, action, experiment=rest[0], point=rest[1]))
-        else:
-            rows.append(PlanStep(row, action, *rest))
-    return rows
+        orders += [("home", 0, 0)] * (number in (7, 10))
+        orders.append(("move", 60 if number % 2 else -60, 20 * (number % 3)))
+        orders.append(("look", None, None, None, number // 4, number % 4 + 1))
+    return numbered(orders)
 
 
 def run_one(fault: Fault, folder: Path) -> dict:
     """A run with a fault, and what became of it."""
-    rig, steps = read_rig(ROOT / "data" / "rigs" / "mounted" / "rig.toml"), plan()
+    rig, steps = mounted_rig(), plan()
     header = {"name": "faults", "created": SIMULATED_START.isoformat(), "synthetic": True, "seed": SEED}
     with EmulatedBoard() as board:
         instrument = EmulatedInstrument(rig, SEED, 0, board)
@@ -157,14 +134,8 @@ def run_one(fault: Fault, folder: Path) -> dict:
     wrong = sum(spot.status == "ok" and not true for spot, true in zip(spots, observer.true, strict=False))
     statuses = [spot.status for spot in spots]
     counts = {status: statuses.count(status) for status in dict.fromkeys(statuses)}
-    return {
-        "said": reason,
-        "message": message,
-        "dark_s": observer.dark_s,
-        "pin_at_end": pin,
-        "wrong": wrong,
-        "looks": counts,
-    }
+    row = {"said": reason, "message": message, "dark_s": observer.dark_s}
+    return row | {"pin_at_end": pin, "wrong": wrong, "looks": counts}
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -173,12 +144,8 @@ def run(arguments: argparse.Namespace) -> None:
     shutil.rmtree(SCRATCH, ignore_errors=True)
     for number, fault in enumerate(FAULTS):
         SCRATCH.mkdir(parents=True, exist_ok=True)
-        row = {
-            "fault": fault.name,
-            "expected": fault.expected,
-            "commit": commit(),
-            **run_one(fault, SCRATCH / str(number)),
-        }
+        row = {"fault": fault.name, "expected": fault.expected, "commit": commit()}
+        row |= run_one(fault, SCRATCH / str(number))
         append_row(ROWS, row)
         print({key: row[key] for key in ("fault", "said", "dark_s", "pin_at_end", "wrong", "looks")}, flush=True)
 
@@ -189,14 +156,11 @@ def table(arguments: argparse.Namespace) -> None:
     good = [row for row in rows if row["said"] == row["expected"] and not row["pin_at_end"] and not row["wrong"]]
     print("# Faults of firmware and bench in the middle of a run\n")
     print(f"Commit {rows[0]['commit']}, Python {platform.python_version()}, {EMULATOR}, machine mps2-an500.\n")
+    print(f"{len(good)} of {len(rows)} runs end as they must, dark, with no look counted wrongly.", end=" ")
     print(
-        f"{len(good)} of {len(rows)} runs end as they must, dark, with no look counted wrongly. The laser pin is read"
+        "The laser pin is read\nfrom outside the processor. Seconds are those of a busy computer: the board falls behind and catches up.\n"
     )
-    print("from outside the processor. Seconds are those of a busy computer: the board falls behind and catches up.\n")
-    print(
-        "| fault | `acquire` said | pin low after | pin at the end | looks | counted wrongly |\n"
-        "|---|---|---|---|---|---|"
-    )
+    print(heading("fault | `acquire` said | pin low after | pin at the end | looks | counted wrongly"))
     for row in rows:
         dark = "-" if row["dark_s"] is None else f"{row['dark_s']:.2f} s"
         looks = ", ".join(f"{count} {status}" for status, count in row["looks"].items())
@@ -204,12 +168,5 @@ def table(arguments: argparse.Namespace) -> None:
         print(f"| {row['fault']} | {row['said']} | {dark} | {pin} | {looks} | {row['wrong']} |")
 
 
-def main() -> None:
-    """The command line."""
-    cli = parser(__doc__)
-    cli.add_argument("action", choices=("run", "table"))
-    act(cli, run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    act(parser(__doc__, run=run, table=table))
