@@ -44,7 +44,7 @@ IN_MOTION_S = 0.15
 
 
 class Fault(NamedTuple):
-    """What fails, by an order in the words of `firmware/emulated/board.cpp`, with the laser on or in the next motion."""
+    """What fails, by an order in the words of `firmware/emulated/board.cpp`: laser on, or in the next motion."""
 
     name: str
     order: str
@@ -105,7 +105,7 @@ def plan() -> tuple[PlanStep, ...]:
     for number in range(12):
         orders += [("home", 0, 0)] * (number in (7, 10))
         orders.append(("move", 60 if number % 2 else -60, 20 * (number % 3)))
-        orders.append(("look", None, None, None, number // 4, number % 4 + 1))
+        orders.append(("look", None, None, "", number // 4, number % 4 + 1))
     return numbered(orders)
 
 
@@ -157,9 +157,8 @@ def table(arguments: argparse.Namespace) -> None:
     print("# Faults of firmware and bench in the middle of a run\n")
     print(f"Commit {rows[0]['commit']}, Python {platform.python_version()}, {EMULATOR}, machine mps2-an500.\n")
     print(f"{len(good)} of {len(rows)} runs end as they must, dark, with no look counted wrongly.", end=" ")
-    print(
-        "The laser pin is read\nfrom outside the processor. Seconds are those of a busy computer: the board falls behind and catches up.\n"
-    )
+    print("The laser pin is read\nfrom outside the processor.", end=" ")
+    print("Seconds are those of a busy computer: the board falls behind and catches up.\n")
     print(heading("fault | `acquire` said | pin low after | pin at the end | looks | counted wrongly"))
     for row in rows:
         dark = "-" if row["dark_s"] is None else f"{row['dark_s']:.2f} s"
