@@ -21,6 +21,7 @@ import numpy as np
 
 from experiments.common.command_line import study
 from experiments.common.headlines import marked
+from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
@@ -104,8 +105,7 @@ def table(rows: list[dict]) -> None:
     lost = [str(r["seed"]) for r in rows if not r["converged"]]
     print(f" (left out: seeds {', '.join(lost)})." if lost else ".")
     print(f"Bounds are two-sided at {BOUND:g} for the number of rigs; **!** marks a figure outside them.\n")
-    print("| counters | rigs | refused | x | y | z | ellipsoid | RMS z x, y, z | law validated at 2 digits |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print(heading("counters | rigs | refused | x | y | z | ellipsoid | RMS z x, y, z | law validated at 2 digits"))
     for kind in KINDS:
         chosen = [r[kind] for r in good if not r[kind]["refused"]]
         n = len(chosen)

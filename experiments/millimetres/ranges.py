@@ -23,6 +23,7 @@ import numpy as np
 
 from experiments.common.command_line import by_seed, study
 from experiments.common.figures import page_figure, title_and_figure
+from experiments.common.page import heading
 from experiments.common.rigs import TWINS, mounted_rig, shipped_plan, shipped_twin
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
@@ -94,8 +95,7 @@ def twins_table(good: Sequence[dict]) -> None:
     """Errors of the shipped twins."""
     print("## The shipped twins\n")
     print("RMS over 25 poses; one rig each: a calibration's error is common to all its points.\n")
-    print("| twin | range, m | nominal | classic | joint | joint, stated | inside 95 %: x, y, z | ellipsoid |")
-    print("|" + "---|" * 8)
+    print(heading("twin | range, m | nominal | classic | joint | joint, stated | inside 95 %: x, y, z | ellipsoid"))
     for twin in TWINS:
         chosen = [r for r in good if r["name"] == twin]
         for k, reach in enumerate(RANGES_MM if chosen else ()):
@@ -121,8 +121,7 @@ def drawn_table(protocol: str, every: Sequence[dict]) -> None:
     print(f"\n## Drawn rigs, {what}: {len(every)}, {len(chosen)} converged\n")
     print("Median over the rigs of each rig's RMS over its 25 poses (least to largest rig). Intervals: one pose of")
     print("each rig (the middle), since the poses of one rig share its error.\n")
-    print("| range, m | nominal | classic | joint | joint, stated | classic / joint | middle pose held |")
-    print("|" + "---|" * 7)
+    print(heading("range, m | nominal | classic | joint | joint, stated | classic / joint | middle pose held"))
     low, high = binomial_bounds(len(chosen), 0.95)
     for k, reach in enumerate(RANGES_MM):
         per_rig = {n: np.array([_rms(_flat([r], "error_mm", k, n)) for r in chosen]) for n in ESTIMATORS}

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import print_only
+from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig, shipped_plan
 from tvsbayes.estimators.four_point import classic, four_point_angle_deg, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
@@ -48,8 +49,7 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
     folder = shipped_data() / "twins" / "paper_twin"
     campaign = read_campaign(folder)
     directions = classic(campaign).directions
-    print("| direction | n, paper | mean | sd | n, twin | mean | sd | (mean - paper's) / u | sd / paper's |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print(heading("direction | n, paper | mean | sd | n, twin | mean | sd | (mean - paper's) / u | sd / paper's"))
     for name in DIRECTIONS:
         n, mean, sd = paper[name]
         r = directions[name]

@@ -20,6 +20,7 @@ import numpy as np
 
 from experiments.common.command_line import print_only
 from experiments.common.figures import page_figure, title_and_figure
+from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig
 from experiments.common.worth import UNREACHED, searched_family
 from tvsbayes.instrument.plan import PlanStep
@@ -155,8 +156,7 @@ def main() -> None:
     print("| plan | spots | minutes | u | what it consists of | floor | what sets it |\n|---|---|---|---|---|---|---|")
     print("\n".join(result.rows.values()))
     print("\n## To the uncertainty of a protocol\n")
-    print("| as good as | u | spots | minutes | planned: spots | planned: minutes | times faster |")
-    print("|---|---|---|---|---|---|---|")
+    print(heading("as good as | u | spots | minutes | planned: spots | planned: minutes | times faster"))
     for name in ("paper", "mixed", "grid"):
         one = result.curves[name][-1 if name != "grid" else 0]
         enough = next((p for p in result.curves["planned"] if p.value <= one.value), None)

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
+from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig
 from tvsbayes.comparison import watched_looks
 from tvsbayes.comparison.watched_looks import (
@@ -137,8 +138,7 @@ def table(every: list[dict]) -> None:
         f"after {homings:.0f} homings in {minutes:.1f} minutes. In brackets 95 % intervals of the counts; days of one"
     )
     print("rig share its first day, so that they are somewhat wider in truth.\n")
-    print("| moved | size | MOVED, counted | stated at least | named right, of MOVED | classic |")
-    print("|---|---|---|---|---|---|")
+    print(heading("moved | size | MOVED, counted | stated at least | named right, of MOVED | classic"))
     groups = [
         (NOTHING, 0.0, "", None),
         *((c.what, t, f"{t * c.size:g} {c.unit}", n) for n, c in enumerate(CHANGES) for t in SIZES),
