@@ -16,34 +16,18 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
+from experiments.common.drawn_axes import drive
 from experiments.common.rows import commit, commits_of
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.errors import TvsError
 from tvsbayes.results.compensation_record import Compensation
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
-from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
-from tvsbayes.single_axis.waves import WavePeriods
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import SimulatedAxis, drive_of, simulate_axis
 
 READINGS = 40
-RATE, RECORD_S, LOGGED = 15.0, 1600.0, 400
-
-
-def template(seed: int) -> AxisCampaign:
-    """A log of 400 readings in 1600 s with seeing, and a period of 60 to 600 s that is looked for."""
-    times = np.sort(np.random.default_rng([seed, 99]).uniform(0.0, RECORD_S, LOGGED))
-    readings = tuple(Reading(k, 0, RATE * float(t), 0.5, "ok", float(t)) for k, t in enumerate(times))
-    stated = {
-        "per_command": AxisPrior(1.0, 1e-3),
-        "transmission_error": AxisPrior(0.0, 5.0),
-        "reading_scale": AxisPrior(1.0, 0.0),
-    }
-    periods = WavePeriods((), ((60.0, 600.0),), True)
-    return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, periods)
 
 
 def errors_of(axis: SimulatedAxis, table: Compensation | None, span: float, seed: int) -> np.ndarray:
@@ -73,7 +57,7 @@ def errors_of(axis: SimulatedAxis, table: Compensation | None, span: float, seed
 def one_drive(task: tuple[int]) -> dict[str, object]:
     """Draw, read, fit and compensate one drive."""
     (seed,) = task
-    axis = simulate_axis(template(seed), seed=seed)
+    axis = simulate_axis(drive(seed), seed=seed)
     row: dict[str, object] = {"seed": seed, "commit": commit(), "there": any(w.amplitude > 0 for w in axis.truth.waves)}
     try:
         table = compensation_of(results_for(axis.campaign, seed=seed), Wish("pec"), seed=seed)

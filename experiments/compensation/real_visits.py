@@ -2,7 +2,7 @@
 
     python -m experiments.compensation.real_visits AXES ROTARY > experiments/compensation/real_visits.md
 
-AXES holds tables of ISO 230-2 runs as `experiments.real.axis_files` takes them; a visit is a cycle. ROTARY is a table
+AXES holds tables of ISO 230-2 runs as in `experiments.common.printed_runs`; a visit is a cycle. ROTARY is a table
 of a geared axis with an encoder (`place_deg`, `side`, `repeat`, `time_s`, `encoder_counts`); a visit is a repeat. Of
 every reading left out the error is counted: as it is, from the nominal line through the others (offset alone); after
 taking off one constant play; the mean of the others at its command and side; what the table of `compensate` expects

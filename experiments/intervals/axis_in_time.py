@@ -13,16 +13,16 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.common.command_line import study
+from experiments.common.drawn_axes import drive, scored, scores_line
+from experiments.common.page import line
 from experiments.common.rows import commit, commits_of
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_periods import wave_samples
 from tvsbayes.single_axis.waves import WavePeriods
-from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
 from tvsbayes.twin.simulated_axis import simulate_axis
 
-LEVELS = (0.5, 0.95)
 SURE = 0.95
 """Probability from which on a wave is claimed."""
 PROTOCOLS = {
@@ -46,30 +46,17 @@ def _stops(places: np.ndarray, seed: int) -> tuple[AxisMove, ...]:
 
 def template(protocol: str, seed: int) -> AxisCampaign:
     """Moves, statements and requested periods."""
-    rng = np.random.default_rng([seed, 99])
     if protocol == "drive":
-        times = np.sort(rng.uniform(0.0, 1600.0, 400))
-        readings = tuple(Reading(k, 0, 15.0 * float(t), 0.5, "ok", float(t)) for k, t in enumerate(times))
-        stated = {
-            "per_command": AxisPrior(1.0, 1e-3),
-            "transmission_error": AxisPrior(0.0, 5.0),
-            "reading_scale": AxisPrior(1.0, 0.0),
-        }
-        periods = WavePeriods((), ((60.0, 600.0),), True)
-        return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": 15.0}, periods)
+        return drive(seed)
     stated = {"per_command": AxisPrior(0.01, 0.002)}
     if protocol == "stops":
-        places = np.sort(rng.choice(np.arange(-2000.0, 2001.0, 10.0), 24, replace=False))
+        places = np.sort(np.random.default_rng([seed, 99]).choice(np.arange(-2000.0, 2001.0, 10.0), 24, replace=False))
         periods = WavePeriods((8.0,), ((2.5, 7.0),))
         return AxisCampaign("deg", _stops(places, seed), (), stated, periods=periods)
     moves = tuple(
         AxisMove(m.move, m.segment, m.time_s, m.command, m.approach) for m in _stops(np.linspace(-2000, 2000, 10), seed)
     )
     return AxisCampaign("deg", moves, (), stated | {"creep": AxisPrior(0.0, 0.1)})
-
-
-def _scored(draws: np.ndarray, true: float) -> dict[str, float]:
-    return {"z": float((draws.mean() - true) / draws.std()), "below": float(np.mean(draws < true))}
 
 
 def one_axis(task: tuple[str, int]) -> dict[str, object]:
@@ -82,7 +69,7 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     row["problems"] = list(fit.missing)
     for name in PARAMETERS:
         if name in draws and draws[name].std() > 0 and not (protocol == "drive" and name == "backlash"):
-            row[name] = _scored(draws[name], true[name])
+            row[name] = scored(draws[name], true[name])
     samples, truths = wave_samples(fit), axis.truth.waves
     # Of a range that holds one wave, what was added to it is a false one.
     waves: list[dict[str, object]] = [
@@ -91,11 +78,11 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     for wave, sample in zip(truths, samples, strict=False):
         one: dict[str, object] = {"there": bool(wave.amplitude > 0), "probability": sample.probability}
         if wave.amplitude > 0:
-            one["amplitude"] = _scored(sample.amplitude, wave.amplitude)
+            one["amplitude"] = scored(sample.amplitude, wave.amplitude)
             phase = sample.phase_deg()
-            one["phase"] = _scored(phase, phase.mean() + (wave.phase_deg - phase.mean() + 180.0) % 360.0 - 180.0)
+            one["phase"] = scored(phase, phase.mean() + (wave.phase_deg - phase.mean() + 180.0) % 360.0 - 180.0)
             if sample.wave.known is None:
-                one["period"] = _scored(np.log(sample.true_period), float(np.log(wave.period)))
+                one["period"] = scored(np.log(sample.true_period), float(np.log(wave.period)))
         waves.append(one)
     return {**row, "waves": waves}
 
@@ -116,17 +103,6 @@ WAVES_TEXT = """
 |---|---|---|---|---|---|"""
 
 
-def _line(protocol: str, name: str, scores: list[dict]) -> str:
-    below = np.array([score["below"] for score in scores])
-    cells = [protocol, f"`{name}`", str(len(scores))]
-    for level in LEVELS:
-        low, high = binomial_bounds(len(scores), level)
-        cells += [f"{100 * np.mean(np.abs(below - 0.5) <= level / 2):.0f} %", f"{low:.2f} to {high:.2f}"]
-    low, high = rms_bounds(len(scores))
-    cells += [f"{np.sqrt(np.mean(np.square([score['z'] for score in scores]))):.2f}", f"{low:.2f} to {high:.2f}"]
-    return "| " + " | ".join(cells) + " |"
-
-
 def table(every: list[dict]) -> None:
     """Both tables."""
     rows = [row for row in every if not row["problems"]]
@@ -135,11 +111,11 @@ def table(every: list[dict]) -> None:
         mine = [row for row in rows if row["protocol"] == protocol]
         for name in PARAMETERS:
             if scores := [row[name] for row in mine if name in row]:
-                print(_line(f"{protocol}: {what}", name, scores))
+                print(scores_line(f"{protocol}: {what}", name, scores))
         waves = [wave for row in mine for wave in row["waves"] if wave["there"]]
         for name in ("amplitude", "period", "phase"):
             if scores := [wave[name] for wave in waves if name in wave]:
-                print(_line(protocol, name, scores))
+                print(scores_line(protocol, name, scores))
     print(WAVES_TEXT)
     for protocol in PROTOCOLS:
         mine = [row for row in rows if row["protocol"] == protocol]
@@ -150,7 +126,7 @@ def table(every: list[dict]) -> None:
             chances = [wave["probability"] for wave in waves if wave["there"] is there]
             cells += [str(len(chances)), str(sum(chance > SURE for chance in chances))]
         if waves:
-            print("| " + " | ".join([*cells, str(refused)]) + " |")
+            print(line(*cells, refused))
 
 
 if __name__ == "__main__":

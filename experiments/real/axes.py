@@ -1,6 +1,7 @@
 """Do the intervals hold on real axes, and on simulated ones?
 
-    python -m experiments.real.axes run FOLDER                        # tables as experiments.real.axis_files takes them
+    python -m experiments.real.axes run FOLDER                        # tables as in experiments.common.printed_runs
+    python -m experiments.real.axes folders FOLDER OUT                # axis folders from them: OUT/NAME of every table
     python -m experiments.real.axes simulate --n 100 --cores 0 1      # drawn axes of three protocols, resumable
     python -m experiments.real.axes table > experiments/real/axes.md
     python -m experiments.real.axes figure                            # of what `run` found, for data/docs/real.md
@@ -18,21 +19,21 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.command_line import parser
+from experiments.common.command_line import act, by_seed, parser
+from experiments.common.drawn_axes import rms, scored, scores_line
 from experiments.common.figures import page_figure, title_and_figure
+from experiments.common.page import line
 from experiments.common.printed_runs import axis_of, tables_of
 from experiments.common.rows import append_row, output, read_rows, run_rows
 from tvsbayes.report.drawing import BLUE, RED
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, write_axis
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.held_out_positions import hold_out_positions
-from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
 from tvsbayes.twin.simulated_axis import simulate_axis
 
 HELD, DRAWN = output(__file__, "axes_held.jsonl"), output(__file__, "axes_drawn.jsonl")
 FIGURE = Path("data/docs/real_axes.png")
-LEVELS = (0.5, 0.95)
 QUANTITIES = ("per_command", "backlash")
 PROTOCOLS = {
     "iso": "9 positions, 5 runs to and fro beyond both ends",
@@ -79,16 +80,19 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     kept = tuple(r for r in drawn.campaign.readings if r.move in read)
     result = fit_axis(AxisCampaign("deg", drawn.campaign.moves, kept, moves.stated), tier="importance", seed=seed)
     row: dict[str, object] = {"protocol": protocol, "seed": seed, "problems": list(result.missing)}
-    for name in QUANTITIES:
-        draws, true = result.draws[name], drawn.truth.parameters[name]
-        row[name] = {"z": float((draws.mean() - true) / draws.std()), "below": float(np.mean(draws < true))}
-    return row
+    return row | {name: scored(result.draws[name], drawn.truth.parameters[name]) for name in QUANTITIES}
 
 
 def simulate(arguments: argparse.Namespace) -> None:
     """Rows of drawn axes."""
-    tasks = [(protocol, seed) for seed in range(arguments.n) for protocol in PROTOCOLS]
-    run_rows(one_axis, tasks, DRAWN, ("protocol", "seed"), arguments.cores)
+    run_rows(one_axis, by_seed(PROTOCOLS, arguments.n), DRAWN, ("protocol", "seed"), arguments.cores)
+
+
+def folders(arguments: argparse.Namespace) -> None:
+    """Axis folders."""
+    for table in tables_of(arguments.folder):
+        write_axis(axis_of(table), arguments.out / table.stem)
+        print(arguments.out / table.stem)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -103,18 +107,13 @@ def run(arguments: argparse.Namespace) -> None:
         print(file.stem, f"{held.rms_z:.2f}", *held.warnings)
 
 
-def _rms(z: list[float]) -> str:
-    return f"{np.sqrt(np.mean(np.square(z))):.2f}" if z else ""
-
-
 def _held_lines(name: str, rows: list[dict]) -> str:
     inner, ends = [r for r in rows if not r["end"]], [r for r in rows if r["end"]]
     z = [r["z"] for r in inner]
     inside = sum(r["inside"] for r in inner) / sum(r["rows"] for r in inner)
     within = np.mean(np.abs(z) <= 1.96)
-    cells = [name, str(len(inner)), _rms(z), f"{np.abs(z).max():.1f}", f"{100 * within:.0f} %", f"{100 * inside:.0f} %"]
-    cells += [_rms([r["z"] for r in ends]), _rms([r["classic_z"] for r in inner])]
-    return "| " + " | ".join(cells) + " |"
+    cells = [name, len(inner), rms(z), f"{np.abs(z).max():.1f}", f"{100 * within:.0f} %", f"{100 * inside:.0f} %"]
+    return line(*cells, rms([r["z"] for r in ends]), rms([r["classic_z"] for r in inner]))
 
 
 HELD_TEXT = """Made by `python -m experiments.real.axes`. Axes: figures printed in the test reports of the public
@@ -146,15 +145,9 @@ def table(_: argparse.Namespace) -> None:
     print(DRAWN_TEXT)
     for protocol, what in PROTOCOLS.items():
         rows = [r for r in drawn if r["protocol"] == protocol]
+        refused = str(sum(bool(r["problems"]) for r in rows))
         for name in QUANTITIES if rows else ():
-            below = np.array([r[name]["below"] for r in rows])
-            cells = [f"{protocol}: {what}", f"`{name}`", str(len(rows))]
-            for level in LEVELS:
-                low, high = binomial_bounds(len(rows), level)
-                cells += [f"{100 * np.mean(np.abs(below - 0.5) <= level / 2):.0f} %", f"{low:.2f} to {high:.2f}"]
-            low, high = rms_bounds(len(rows))
-            cells += [_rms([r[name]["z"] for r in rows]), f"{low:.2f} to {high:.2f}"]
-            print("| " + " | ".join([*cells, str(sum(bool(r["problems"]) for r in rows))]) + " |")
+            print(scores_line(f"{protocol}: {what}", name, [r[name] for r in rows], refused))
 
 
 def figure(_: argparse.Namespace) -> None:
@@ -177,16 +170,10 @@ def figure(_: argparse.Namespace) -> None:
         axes.legend()
 
 
-def main() -> None:
-    """Carry out the action of the command line."""
-    cli = parser(__doc__)
-    cli.add_argument("action", choices=("run", "simulate", "table", "figure"))
-    cli.add_argument("folder", type=Path, nargs="?", help="of tables, for run")
+if __name__ == "__main__":
+    cli = parser(__doc__, run=run, folders=folders, simulate=simulate, table=table, figure=figure)
+    cli.add_argument("folder", type=Path, nargs="?", help="of tables, for run and folders")
+    cli.add_argument("out", type=Path, nargs="?", help="for folders")
     cli.add_argument("--n", type=int, default=100, help="drawn axes of each protocol (%(default)s)")
     cli.add_argument("--cores", type=int, nargs="+", default=[0], metavar="CORE")
-    arguments = cli.parse_args()
-    {"run": run, "simulate": simulate, "table": table, "figure": figure}[arguments.action](arguments)
-
-
-if __name__ == "__main__":
-    main()
+    act(cli)

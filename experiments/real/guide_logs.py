@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.command_line import parser
+from experiments.common.command_line import act, parser
+from experiments.common.page import line
 from experiments.common.rows import append_row, output, read_rows
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
@@ -60,16 +61,9 @@ def run(arguments: argparse.Namespace) -> None:
             began = time.process_time()
             result = fit_axis(campaign_of(logged, file.name), tier="importance")
             summary = summarise_axis(result)
-            row = {
-                "file": file.name,
-                "run": logged.number,
-                "mount": logged.mount,
-                "frames": summary.readings,
-                "span_s": float(result.rows.time_s[-1] - result.rows.time_s[0]),
-                "problems": list(summary.problems),
-                "periods": [plain(one) for one in summary.periods],
-                "cpu_s": time.process_time() - began,
-            }
+            row = {"file": file.name, "run": logged.number, "mount": logged.mount, "frames": summary.readings}
+            row |= {"span_s": float(result.rows.time_s[-1] - result.rows.time_s[0]), "problems": list(summary.problems)}
+            row |= {"periods": [plain(one) for one in summary.periods], "cpu_s": time.process_time() - began}
             append_row(ROWS, row)
             print(file.name, logged.number, f"{row['cpu_s']:.1f} s", *summary.problems)
 
@@ -95,11 +89,6 @@ z: difference over both u.
 |---|---|---|---|"""
 
 
-def published_of(row: dict) -> float | None:
-    """Period of the mount's worm, s."""
-    return next((period for name, period in PUBLISHED_S.items() if name in row["mount"]), None)
-
-
 def table(_: argparse.Namespace) -> None:
     """A line for every run, then the nights of one mount."""
     print(TEXT)
@@ -108,14 +97,14 @@ def table(_: argparse.Namespace) -> None:
         every = [wave for wave in row["periods"] if wave["probability"] > SURE]
         first, further = (every or row["periods"])[0], every[1:]
         value, (low, high) = first["period"]["value"], first["period"]["interval95"]
-        published = published_of(row)
+        published = next((period for name, period in PUBLISHED_S.items() if name in row["mount"]), None)
         cells = [f"`{row['file']}`, {row['run']}", str(row["frames"])]
         cells += [f"{value:.2f}({first['period']['sd']:.2f})", f"{low:.2f} to {high:.2f}"]
         cells += [f"{value**2 / (2 * row['span_s']):.1f}"]
         cells += [f"{first['amplitude']['value']:.2f}({first['amplitude']['sd']:.2f})"]
         cells += ["", ""] if published is None else [f"{published}", "yes" if low <= published <= high else "no"]
         cells += [", ".join(f"{w['amplitude']['value']:.2f} every {w['period']['value']:.1f}" for w in further)]
-        print("| " + " | ".join([*cells, f"{row['cpu_s']:.0f}"]) + " |")
+        print(line(*cells, f"{row['cpu_s']:.0f}"))
         if row["file"] in NIGHTS and published is not None and abs(value / published - 1) < NEAR:
             amplitude = first["amplitude"]
             nights.setdefault(row["file"], []).append((row["run"], amplitude["value"], amplitude["sd"]))
@@ -125,18 +114,11 @@ def table(_: argparse.Namespace) -> None:
         weight = others[:, 2] ** -2
         mean, u = float(weight @ others[:, 1] / weight.sum()), float(weight.sum() ** -0.5)
         for number, value, sd in runs:
-            cells = [f"{NIGHTS[file]}, {number}", f"{value:.2f}({sd:.2f})", f"{mean:.2f}({u:.2f})"]
-            print("| " + " | ".join([*cells, f"{(value - mean) / np.hypot(sd, u):.1f}"]) + " |")
-
-
-def main() -> None:
-    """Carry out the action of the command line."""
-    cli = parser(__doc__)
-    cli.add_argument("action", choices=("run", "table"))
-    cli.add_argument("folder", type=Path, nargs="?", help="of logs, for run")
-    arguments = cli.parse_args()
-    {"run": run, "table": table}[arguments.action](arguments)
+            cells = (f"{NIGHTS[file]}, {number}", f"{value:.2f}({sd:.2f})", f"{mean:.2f}({u:.2f})")
+            print(line(*cells, f"{(value - mean) / np.hypot(sd, u):.1f}"))
 
 
 if __name__ == "__main__":
-    main()
+    cli = parser(__doc__, run=run, table=table)
+    cli.add_argument("folder", type=Path, nargs="?", help="of logs, for run")
+    act(cli)

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.command_line import parser
+from experiments.common.command_line import act, parser
 from experiments.common.rows import append_row, output, read_rows
+from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.head.pointing_model import PointingModel, pointing_model
 from tvsbayes.head.pointing_table import AZIMUTH_FROM_DEG, Star, campaign_of, read_stars
@@ -106,19 +107,12 @@ def night(file: Path) -> dict[str, object]:
         "classic_rms": ARCSEC * classic.rms_deg,
         "joint": {n: stated(*term) for n, term in TERMS.items()},
         "gears": {name: stated(name) for name in GEARS},
-        "weak": _weak(model),
+        "weak": [weak.text for weak in weak_directions(model, moved_directions(model))],
         "answer": posterior.convergence.answer,
         "problems": list(model.problems),
         "left_out": predicted(campaign),
         "cpu_s": time.process_time() - began,
     }
-
-
-def _weak(model) -> list[str]:
-    """Weak directions in words."""
-    from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
-
-    return [weak.text for weak in weak_directions(model, moved_directions(model))]
 
 
 def between(folder: Path) -> dict[str, object]:
@@ -152,7 +146,8 @@ posterior."""
 
 def table(_: argparse.Namespace) -> None:
     """Terms of each night, stars left out, and one night against the other."""
-    rows = [row for row in read_rows(ROWS) if row["file"] != "between"]
+    every = read_rows(ROWS)
+    rows = [row for row in every if row["file"] != "between"]
     print(TEXT)
     for row in rows:
         held = row["left_out"]
@@ -177,18 +172,13 @@ def table(_: argparse.Namespace) -> None:
     for name in TERMS:
         off, u = two[name][0] - one[name][0], np.hypot(one[name][1], two[name][1])
         print(f"| {name} | {off:+.2f} ({u:.2f}) | {off / u:+.1f} |")
-    for row in read_rows(ROWS):
+    for row in every:
         if row["file"] == "between":
             text = "\nNight two, arcsec RMS: {:.1f} without terms, {:.1f} by those of night one, {:.2f} by its own."
             print(text.format(row["before"], row["after"], row["own"]))
 
 
 if __name__ == "__main__":
-    cli = parser(__doc__)
-    parts = cli.add_subparsers(required=True)
-    running = parts.add_parser("run", help="fit every table of a folder")
-    running.add_argument("folder", type=Path)
-    running.set_defaults(act=run)
-    parts.add_parser("table", help="print the page").set_defaults(act=table)
-    chosen = cli.parse_args()
-    chosen.act(chosen)
+    cli = parser(__doc__, run=run, table=table)
+    cli.add_argument("folder", type=Path, nargs="?", help="of tables, for run")
+    act(cli)
