@@ -7,9 +7,8 @@
 `run` draws bench i of a seed (`strange_bench`: other optics, cameras, lenses, gears and noise; a stereo calibration
 that OpenCV made of noisy corners), writes its files and does what their owner would: `import` of the table, `stereo
 --import` of the calibration (or, for a third of the benches, `tvsbayes`' own calibration of the same corners, with its
-covariance), `fit --quick`. `--fresh` makes `fit` a process of its own, with imports and loading of compiled functions
-in its CPU seconds. A folder holds benches as folders with `looks.csv`, `rig_stereo.yml` and `truth.json`; one whose
-truth states no `approach` came from the left and from below.
+covariance), `fit --quick`. A folder holds benches as folders with `looks.csv`, `rig_stereo.yml` and `truth.json`; one
+whose truth states no `approach` came from the left and from below.
 
 `page` prints the share that was answered (sampled: accepted or rough) and accepted by importance sampling, coverage of
 the 95 % intervals and RMS z of every headline with two-sided bounds at 1e-4 for that number of benches, and CPU seconds
@@ -27,10 +26,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
 from functools import cache
-from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -39,11 +36,10 @@ from scipy import special
 
 from experiments.common.command_line import act, parser
 from experiments.common.headlines import SHRINK, marked
-from experiments.common.rows import commit, output, read_rows, run_rows
+from experiments.common.rows import commit, read_rows, rows_of, run_rows
 from experiments.intervals.strange_bench import AXES, SIDES, Bench, Calibration, bench
 from tvsbayes.statistics.chances import BOUND, binomial_bounds, rms_bounds
 
-ROWS = output(__file__, "strangers.jsonl")
 KEYS = ("seed", "folder", "bench")
 APPROACH = {"pan": "left", "tilt": "up"}
 RATIO, CONTRAST = "effective_deg_per_step", "effective_contrast_deg_per_step"
@@ -89,20 +85,13 @@ def import_cpu_s() -> float:
     return min(spent)
 
 
-def tvsbayes(*words: object, fresh: bool = False) -> dict:
+def tvsbayes(*words: object) -> dict:
     """The JSON document of a command, with its exit code under "exit"."""
-    arguments = [*map(str, words), "--json"]
-    if fresh:
-        done = subprocess.run(
-            [sys.executable, "-m", "tvsbayes", *arguments], capture_output=True, text=True, check=False
-        )
-        return {**json.loads(done.stdout), "exit": done.returncode}
     # Here: it brings typer, which the page does without.
-    from tvsbayes.cli.main import run as run_command
+    from experiments.common.console import quietly
 
-    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()):
-        code = run_command(arguments)
-    return {**json.loads(out.getvalue()), "exit": code}
+    code, out, _ = quietly(*map(str, words), "--json")
+    return {**json.loads(out), "exit": code}
 
 
 def write_calibration(data: Calibration, size: tuple[int, int], file: Path) -> None:
@@ -130,10 +119,10 @@ def _demand(document: dict) -> None:
         raise RuntimeError(json.dumps(document.get("error")))
 
 
-def one_bench(task: tuple[int | None, str | None, str], fresh: bool = False) -> Row:
+def one_bench(task: tuple[int | None, str | None, str]) -> Row:
     """One bench, from its files to its headlines; whatever fails is recorded as a failure."""
     seed, folder, name = task
-    row: Row = dict(zip(KEYS, task, strict=True)) | {"commit": commit(), "fresh": fresh, "answer": "refused"}
+    row: Row = dict(zip(KEYS, task, strict=True)) | {"commit": commit(), "answer": "refused"}
     with TemporaryDirectory() as place:
         drawn = None if seed is None else bench(seed, int(name))
         files = Path(place) / "bench" if folder is None else Path(folder) / name
@@ -149,7 +138,7 @@ def one_bench(task: tuple[int | None, str | None, str], fresh: bool = False) -> 
         try:
             campaign_of(files, drawn, approach, Path(place) / "campaign")
             row["import_cpu_s"], start = import_cpu_s(), cpu_s()
-            document = tvsbayes("fit", Path(place) / "campaign", "--quick", fresh=fresh)
+            document = tvsbayes("fit", Path(place) / "campaign", "--quick")
             row |= {"cpu_s": cpu_s() - start, "exit": document["exit"]}
             row |= answer_of(document) | {"headlines": headlines_of(document, truth)}
             for name, below in chances_below(Path(place) / "campaign", row["headlines"]).items():
@@ -157,11 +146,6 @@ def one_bench(task: tuple[int | None, str | None, str], fresh: bool = False) -> 
         except Exception as error:
             row["problems"] = [repr(error)]
     return row
-
-
-def one_fresh_bench(task: tuple[int | None, str | None, str]) -> Row:
-    """`one_bench` with its `fit` in a process of its own."""
-    return one_bench(task, fresh=True)
 
 
 def _looks_seen(table: Path) -> int:
@@ -177,10 +161,6 @@ def answer_of(document: dict) -> Row:
     answer = document.get("answer")
     if "estimator" not in document:
         answer = "refused"
-    elif answer is None:
-        # Releases before 0.3 state no answer.
-        posterior = document["estimator"] == "posterior"
-        answer = "accepted" if posterior else "laplace" if sampling else "not converged"
     elif not document["converged"] and answer in ANSWERED:
         answer = "not converged"
     return {
@@ -322,8 +302,7 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         place = arguments.folder.resolve()
         tasks = [(None, str(place), file.parent.name) for file in sorted(place.glob("*/truth.json"))]
-    one = one_fresh_bench if arguments.fresh else one_bench
-    run_rows(one, tasks, arguments.rows, KEYS, range(arguments.jobs))
+    run_rows(one_bench, tasks, arguments.rows, KEYS, range(arguments.jobs))
 
 
 def page(arguments: argparse.Namespace) -> None:
@@ -354,18 +333,11 @@ def page(arguments: argparse.Namespace) -> None:
         coverage(part)
 
 
-def main() -> None:
-    """Command line."""
-    command = parser(__doc__)
-    command.add_argument("action", choices=("run", "page"))
-    command.add_argument("--n", type=int, default=300, help="how many (%(default)s)")
-    command.add_argument("--seed", type=int, default=0, help="of the benches (%(default)s)")
-    command.add_argument("--jobs", type=int, default=1, help="processes, each pinned to a core (%(default)s)")
-    command.add_argument("--folder", type=Path, help="benches of somebody else, instead of drawn ones")
-    command.add_argument("--fresh", action="store_true", help="every fit in a process of its own")
-    command.add_argument("--rows", type=Path, default=ROWS, help="file of rows (%(default)s)")
-    act(command, run=run, page=page)
-
-
 if __name__ == "__main__":
-    main()
+    cli = parser(__doc__, run=run, page=page)
+    cli.add_argument("--n", type=int, default=300, help="how many (%(default)s)")
+    cli.add_argument("--seed", type=int, default=0, help="of the benches (%(default)s)")
+    cli.add_argument("--jobs", type=int, default=1, help="processes, each pinned to a core (%(default)s)")
+    cli.add_argument("--folder", type=Path, help="benches of somebody else, instead of drawn ones")
+    cli.add_argument("--rows", type=Path, default=rows_of(__file__), help="file of rows (%(default)s)")
+    act(cli)

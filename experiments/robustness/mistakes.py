@@ -1,30 +1,32 @@
 """Which mistakes in a campaign's tables `check` sees, and how often it accuses a sound campaign.
 
-    python -m experiments.robustness.mistakes [--seeds 60] [--sound 500] [--also FOLDER ...]
+    python -m experiments.robustness.mistakes [--seeds 60] [--sound 500]
 
 Mistakes are made in every one of the shipped twins and of simulations of the mounted rig after its four plans. Sound
 campaigns are drawn by the twin from all protocols, from what `tvsbayes plan` proposes (plans/RIG_SEED.csv: `tvsbayes
 plan data/rigs/RIG/rig.toml --draws 20 --minutes 30 --seed SEED`) and from random grids and steps, on rigs near and far
 from the shipped ones, and cut at many looks. A finding is any of `estimators.plausibility.implausible`: warnings of
-what a plan cannot tell are none. `--also` makes the mistakes in campaigns of others too.
+what a plan cannot tell are none.
 """
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from experiments.common.command_line import parser
+from experiments.common.page import heading, line
+from experiments.common.rigs import PIXELS, TWINS, mounted_rig, shipped_plan, twin_campaign
 from tvsbayes.estimators.plausibility import implausible
 from tvsbayes.estimators.spot_pattern import SPOTS_MIN
 from tvsbayes.files.disk import shipped_data, write_atomically
-from tvsbayes.instrument.campaign import Campaign, Spot, read_campaign
+from tvsbayes.instrument.campaign import Campaign, Spot
 from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.plan import PlanStep, read_plan
@@ -34,7 +36,6 @@ from tvsbayes.instrument.stereo_pair import pair_doubts
 from tvsbayes.twin.simulated_campaign import simulate
 
 PLANS = ("paper", "paper_twin", "mixed", "grid")
-PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 Change = Callable[[Campaign, np.random.Generator], Campaign]
 
 
@@ -175,13 +176,11 @@ MISTAKES: dict[str, tuple[Change, str]] = {
 
 def good_campaigns(seeds: int) -> dict[str, Campaign]:
     """The shipped twins and simulated campaigns."""
-    data = shipped_data()
-    rig = read_rig(data / "rigs" / "mounted" / "rig.toml")
-    campaigns = {name: read_campaign(data / "twins" / name) for name in ("paper_twin", "grid_twin")}
+    rig, campaigns = mounted_rig(), {name: twin_campaign(name) for name in TWINS}
     for plan in PLANS:
-        steps = read_plan(data / "rigs" / "mounted" / f"{plan}.csv")
         for seed in range(seeds):
-            campaigns[f"{plan} {seed}"] = simulate(rig, steps, seed=1000 + seed, aperture=seed % 2 == 0).campaign
+            run = simulate(rig, shipped_plan(plan), seed=1000 + seed, aperture=seed % 2 == 0)
+            campaigns[f"{plan} {seed}"] = run.campaign
     return campaigns
 
 
@@ -294,53 +293,33 @@ def sound_table(count: int) -> list[str]:
             doubted=bool(all_of_it),
             doubts=sum(map(bool, findings_of.values())),
         )
-    lines = [
-        f"{count} sound campaigns, each whole and cut at every look up to {FIRST_LOOKS} and {CUTS} later ones:",
-        "",
-    ]
+    title = f"{count} sound campaigns, each whole and cut at every look up to {FIRST_LOOKS} and {CUTS} later ones:"
     columns = ("campaigns", "asked", "accused", "doubted", "doubts")
-    lines.append("| rig | campaigns | asked | campaigns accused (certain) | campaigns doubted | cuts doubted |")
-    lines.append("|---|---|---|---|---|---|")
+    titles = "rig | campaigns | asked | campaigns accused (certain) | campaigns doubted | cuts doubted"
     rows = {**counts, "all": sum(counts.values(), Counter())}
-    lines += [f"| {name} | {' | '.join(str(row[c]) for c in columns)} |" for name, row in rows.items()]
+    lines = [title, "", heading(titles), *(line(name, *(row[c] for c in columns)) for name, row in rows.items())]
     return lines + [""] * bool(kinds) + [f"said of sound ones, {n} times: {kind}" for kind, n in kinds.most_common()]
-
-
-def others_table(folders: Sequence[Path]) -> list[str]:
-    """Findings in campaigns of others, and in mistakes made in them."""
-    lines = ["| campaign | sound | pan sign | tilt sign | spots one move early |", "|---|---|---|---|---|"]
-    for folder in folders:
-        campaign, cells = read_campaign(folder), []
-        for name in ("none", "pan sign", "tilt sign", "spots one move early"):
-            findings = implausible(MISTAKES[name][0](campaign, np.random.default_rng(1)))
-            cells.append(", ".join(f"{f.code}{' (certain)' * f.certain}" for f in findings) or "-")
-        lines.append(f"| {folder.name} | {' | '.join(cells)} |")
-    return lines
 
 
 def table(seeds: int, sound: int) -> str:
     """How many campaigns with each mistake are accused, and how many by its name."""
     good = good_campaigns(seeds)
     lines = [f"{len(good)} campaigns: 2 shipped twins, {seeds} simulated ones of each plan ({', '.join(PLANS)})", ""]
-    lines += ["| mistake | warned of | by its name | certain |", "|---|---|---|---|"]
+    lines.append(heading("mistake | warned of | by its name | certain"))
     for name, (change, words) in MISTAKES.items():
         answers = [implausible(change(c, np.random.default_rng(k))) for k, c in enumerate(good.values())]
         named = sum(bool(words and re.search(words, "\n".join(f.sentence for f in findings))) for findings in answers)
         certain = sum(any(f.certain for f in findings) for findings in answers)
-        lines.append(f"| {name} | {sum(map(bool, answers))} | {named if words else '-'} | {certain} |")
+        lines.append(line(name, sum(map(bool, answers)), named if words else "-", certain))
     return "\n".join([*lines, "", *sound_table(sound)]).rstrip() + "\n"
 
 
 def main() -> None:
     """Write the table beside this file."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=60)
-    parser.add_argument("--sound", type=int, default=500)
-    parser.add_argument("--also", type=Path, nargs="+", help="campaign folders of others, printed alone")
-    wish = parser.parse_args()
-    if wish.also:
-        print("\n".join(others_table(wish.also)))
-        return
+    cli = parser(__doc__)
+    cli.add_argument("--seeds", type=int, default=60)
+    cli.add_argument("--sound", type=int, default=500)
+    wish = cli.parse_args()
     text = table(wish.seeds, wish.sound)
     print(text)
     heading = "# Mistakes that `check` sees\n\n`python -m experiments.robustness.mistakes`\n\n"

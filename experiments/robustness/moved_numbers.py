@@ -276,13 +276,7 @@ def table(_: argparse.Namespace) -> None:
                 print(f"| `{after['asked']}` | {' | '.join(cells)} | {why if moved else 'bit-equal'} |")
 
 
-def main() -> None:
-    """Command line."""
-    command = parser(__doc__)
-    command.add_argument("action", choices=("run", "table"))
-    command.add_argument("own", type=Path, nargs="*", metavar="FOLDER", help="a campaign or axis folder")
-    act(command, run=run, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    cli = parser(__doc__, run=run, table=table)
+    cli.add_argument("own", type=Path, nargs="*", metavar="FOLDER", help="a campaign or axis folder")
+    act(cli)

@@ -25,11 +25,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from experiments.common.command_line import parser
-from experiments.common.rows import ROOT, append_row, commit, output, read_rows
+from experiments.common.command_line import act, parser
+from experiments.common.rows import ROOT, append_row, commit, read_rows, rows_of
 from experiments.robustness.planted_faults import unpack
 
-ROWS = output(__file__, "mutations.jsonl")
 SETTINGS = """[mutmut]
 source_paths=
     tvsbayes
@@ -79,7 +78,7 @@ def mutated(root: Path, name: str) -> dict[str, str]:
     return {"function": re.sub(r"^x_?", "", function.replace("ǁ", ".")).lstrip("."), "old": old, "new": new}
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Append a row of a module."""
     module = arguments.module
     package, _, name = module.removeprefix("tvsbayes/").rpartition("/")
@@ -95,30 +94,19 @@ def run(arguments: argparse.Namespace) -> int:
         used = resource.getrusage(resource.RUSAGE_CHILDREN)
         outcomes = dict(re.findall(r"^\s*(\S+): (.+)$", mutmut(root, "results", "--all", "true"), re.MULTILINE))
         survivors = [mutated(root, key) for key, outcome in outcomes.items() if outcome == "survived"]
-    row = {
-        "module": module,
-        "tests": tests,
-        "mutants": len(outcomes),
-        "seen": sum(outcome in SEEN for outcome in outcomes.values()),
-        "untested": sum(outcome == "no tests" for outcome in outcomes.values()),
-        "survivors": survivors,
-        "cpu_s": round(used.ru_utime + used.ru_stime, 1),
-        "date": str(datetime.date.today()),
-        "commit": revision,
-    }
+    row = {"module": module, "tests": tests, "mutants": len(outcomes), "survivors": survivors, "commit": revision}
+    row["seen"] = sum(outcome in SEEN for outcome in outcomes.values())
+    row["untested"] = sum(outcome == "no tests" for outcome in outcomes.values())
+    row |= {"cpu_s": round(used.ru_utime + used.ru_stime, 1), "date": str(datetime.date.today())}
     append_row(arguments.rows, row)
     print(f"{module}: {row['seen']} of {row['mutants']} seen, {len(survivors)} survive, {row['untested']} untested")
-    return 0
 
 
 TEXT = """# Mutants that no test sees
 
 Written by `python -m experiments.robustness.mutations table`: the latest run of each module. mutmut changes one
 operator, number, argument or word at a time, and runs the tests that reach the function.
-{remarks}
-| module | tests | mutants | seen | survive | reached by none | CPU s | of |
-|---|---|---|---|---|---|---|---|"""
-REMARKS = """
+
 The mathematics are `model` (2202 mutants), `estimators` (5653), `posterior` (5269), `single_axis` (6993) and
 `statistics` (1440), counted on 25 November 2026. A mutant of a module without JAX costs 0.1 to 0.2 CPU seconds where
 its tests are fast: `statistics` and `single_axis` are 20 to 140 CPU minutes, by how many of their mutants need a fit. A
@@ -126,13 +114,15 @@ mutant that JAX has to compile costs 3 to 30 CPU seconds: some 2000 CPU minutes 
 
 Survivors of these sorts are left: an order of equal numbers (`kind="stable"`), a bound met with probability zero
 (`>` for `>=`), a type or a default that NumPy has anyway, a constant that cancels, a guard against rounding.
-"""
+
+| module | tests | mutants | seen | survive | reached by none | CPU s | of |
+|---|---|---|---|---|---|---|---|"""
 
 
-def table(arguments: argparse.Namespace) -> int:
+def table(arguments: argparse.Namespace) -> None:
     """The page: counts of every module, then what survives."""
     rows = {row["module"]: row for row in read_rows(arguments.rows)}
-    print(TEXT.format(remarks=REMARKS))
+    print(TEXT)
     for module, row in sorted(rows.items()):
         tests = ", ".join(f"`{test.removeprefix('tests/')}`" for test in row["tests"])
         counts = (row["mutants"], row["seen"], len(row["survivors"]), row["untested"], f"{row['cpu_s']:.0f}")
@@ -142,24 +132,12 @@ def table(arguments: argparse.Namespace) -> int:
         for one in row["survivors"]:
             before, after = (f"`{one[part]}`".replace("|", "\\|") for part in ("old", "new"))
             print(f"| {one['function']} | {before} | {after} |")
-    return 0
-
-
-def main() -> None:
-    """The command."""
-    cli = parser(__doc__)
-    cli.add_argument("--rows", type=Path, default=ROWS)
-    commands = cli.add_subparsers(required=True)
-    for command in (run, table):
-        one = commands.add_parser(command.__name__, help=command.__doc__)
-        one.set_defaults(command=command)
-        if command is run:
-            one.add_argument("module", help="path from the root")
-            one.add_argument("--tests", nargs="+", help="paths from the root")
-            one.add_argument("--processes", type=int, default=2, help="mutants at a time (%(default)s)")
-    arguments = cli.parse_args()
-    raise SystemExit(arguments.command(arguments))
 
 
 if __name__ == "__main__":
-    main()
+    cli = parser(__doc__, run=run, table=table)
+    cli.add_argument("module", nargs="?", help="path from the root")
+    cli.add_argument("--tests", nargs="+", help="paths from the root")
+    cli.add_argument("--processes", type=int, default=2, help="mutants at a time (%(default)s)")
+    cli.add_argument("--rows", type=Path, default=rows_of(__file__))
+    act(cli)

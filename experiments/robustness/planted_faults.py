@@ -2,7 +2,6 @@
 
     python -m experiments.robustness.planted_faults run       # resumable; --only REGEX: of sentence, place and test
     python -m experiments.robustness.planted_faults table > experiments/robustness/planted_faults.md
-    python -m experiments.robustness.planted_faults check     # every entry finds its place and its test
 
 The faults stand in `faults/listing.py`. `run` unpacks HEAD into temporary folders, one for each process, plants a fault
 there, and runs the test that the entry names; all these tests have to pass without a fault first. A row is made again
@@ -28,12 +27,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 
-from experiments.common.command_line import parser
-from experiments.common.rows import ROOT, append_row, commit, output, read_rows
+from experiments.common.command_line import act, parser
+from experiments.common.rows import ROOT, append_row, commit, output, read_rows, rows_of
 from experiments.robustness.faults.changes import Sources
 from experiments.robustness.faults.listing import FAULTS, Fault, misfits, tests_of
 
-ROWS = output(__file__, "planted_faults.jsonl")
 COMPILED = output(__file__, "planted_faults_compiled")
 LIMIT_S = 900
 """Tests that take longer count as failed: a loop that never ends is a fault that CI sees."""
@@ -113,8 +111,8 @@ def valid_rows(path: Path, root: Path = ROOT) -> dict[str, dict]:
     return {row["sentence"]: row for row in read_rows(path) if now.get(row.get("sentence")) == row.get("digest")}
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Append a row for every fault that has none; the number of survivors among those selected."""
+def run(arguments: argparse.Namespace) -> None:
+    """Append a row for every fault that has none; exit code 1 where a selected one survives."""
     if problems := misfits():
         raise SystemExit("\n".join(["the list does not fit the tree:", *problems]))
     # One commit from beginning to end, whatever is committed meanwhile.
@@ -147,10 +145,10 @@ def run(arguments: argparse.Namespace) -> int:
                 append_row(arguments.rows, rows[row["sentence"]])
     caught = sum(rows[fault.sentence]["failed"] for fault in chosen)
     print(f"{caught} of {len(chosen)} seen")
-    return len(chosen) - caught
+    raise SystemExit(caught < len(chosen))
 
 
-def table(arguments: argparse.Namespace) -> int:
+def table(arguments: argparse.Namespace) -> None:
     """The Markdown table of what was run at the present state of the package and its tests."""
     rows = valid_rows(arguments.rows)
     done = [rows[fault.sentence] for fault in FAULTS if fault.sentence in rows]
@@ -171,31 +169,12 @@ def table(arguments: argparse.Namespace) -> int:
             verdict = f"`{row['first'].removeprefix('tests/')}`" if row["failed"] else "**SURVIVED**"
             seconds = f"{row['seconds']:.0f}"
         print(f"| {fault.sentence} | `{fault.place}` | `{fault.change!r}` | {verdict} | {seconds} |")
-    return len(FAULTS) - caught
-
-
-def check(arguments: argparse.Namespace) -> int:
-    """Say what of the list no longer fits the tree."""
-    problems = misfits()
-    print("\n".join(problems) or f"{len(FAULTS)} faults fit the tree")
-    return len(problems)
-
-
-def main() -> None:
-    """The command; exit code 1 where a fault survives or the list does not fit the tree."""
-    cli = parser(__doc__)
-    cli.add_argument("--rows", type=Path, default=ROWS)
-    commands = cli.add_subparsers(required=True)
-    for command in (run, table, check):
-        one = commands.add_parser(command.__name__, help=command.__doc__.splitlines()[0])
-        one.set_defaults(command=command)
-        if command is run:
-            one.add_argument("--only", default="", help="regular expression found in sentence, place or test")
-            one.add_argument("--again", action="store_true", help="rows that are there count for nothing")
-            one.add_argument("--processes", type=int, default=2, help="each with a copy of the tree (%(default)s)")
-    arguments = cli.parse_args()
-    raise SystemExit(bool(arguments.command(arguments)))
 
 
 if __name__ == "__main__":
-    main()
+    cli = parser(__doc__, run=run, table=table)
+    cli.add_argument("--rows", type=Path, default=rows_of(__file__))
+    cli.add_argument("--only", default="", help="regular expression found in sentence, place or test")
+    cli.add_argument("--again", action="store_true", help="rows that are there count for nothing")
+    cli.add_argument("--processes", type=int, default=2, help="each with a copy of the tree (%(default)s)")
+    act(cli)

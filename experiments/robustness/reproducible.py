@@ -12,6 +12,7 @@ different amounts of time are compared over the steps that both made.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import os
@@ -25,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.command_line import parser
+from experiments.common.command_line import act, parser
 from experiments.common.headlines import headlines
 from experiments.common.rigs import dense_plan, mounted_rig
 from experiments.common.rows import commit, output
@@ -76,8 +77,9 @@ def file_of(name: str) -> Path:
     return output(__file__, f"reproducible-{name}.json")
 
 
-def run(name: str, cold: bool, short: bool) -> None:
+def run(arguments: argparse.Namespace) -> None:
     """All numbers of one process."""
+    name, cold = arguments.name, arguments.cold
     began = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
         os.environ["TVSBAYES_CACHE"] = str(Path(scratch) / "cache" if cold else CACHE)
@@ -103,7 +105,7 @@ def run(name: str, cold: bool, short: bool) -> None:
         with np.load(chain) as file:
             document["steps"] = len(file["w"])
             document["chain"] = exact(file["w"][:STEPS_COMPARED])
-        if not short:
+        if not arguments.short:
             document["study"] = studied(rig, plan, Path(scratch))
         document["cpu_s"] = time.process_time() - began
     file_of(name).parent.mkdir(parents=True, exist_ok=True)
@@ -157,7 +159,7 @@ def chains(one: dict, other: dict) -> str:
     )
 
 
-def table() -> None:
+def table(_: argparse.Namespace) -> None:
     """Markdown."""
     runs = {
         path.stem.removeprefix("reproducible-"): json.loads(path.read_text())
@@ -191,21 +193,9 @@ def table() -> None:
     )
 
 
-def main() -> None:
-    """See the module."""
-    cli = parser(__doc__)
-    commands = cli.add_subparsers(dest="what", required=True)
-    one = commands.add_parser("run")
-    one.add_argument("name")
-    one.add_argument("--cold", action="store_true")
-    one.add_argument("--short", action="store_true")
-    commands.add_parser("table")
-    arguments = cli.parse_args()
-    if arguments.what == "run":
-        run(arguments.name, arguments.cold, arguments.short)
-    else:
-        table()
-
-
 if __name__ == "__main__":
-    main()
+    cli = parser(__doc__, run=run, table=table)
+    cli.add_argument("name", nargs="?", help="of a run")
+    cli.add_argument("--cold", action="store_true", help="with an empty compilation cache")
+    cli.add_argument("--short", action="store_true", help="without the study")
+    act(cli)

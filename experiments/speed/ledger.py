@@ -184,12 +184,5 @@ def table(_: argparse.Namespace) -> None:
         print(f"| lines of {folder}/ | {' | '.join(str(entry['lines'].get(folder, '')) for entry in entries)} | |")
 
 
-def main() -> None:
-    """Command line."""
-    command = parser(__doc__)
-    command.add_argument("action", choices=("append", "table"))
-    act(command, append=append, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    act(parser(__doc__, append=append, table=table))

@@ -113,12 +113,5 @@ def table(_: argparse.Namespace) -> None:
     print("- more: [strangers](../intervals/strangers.md), [posterior](../intervals/posterior_coverage.md).")
 
 
-def main() -> None:
-    """Command line."""
-    command = parser(__doc__)
-    command.add_argument("action", choices=("measure", "table"))
-    act(command, measure=measure, table=table)
-
-
 if __name__ == "__main__":
-    main()
+    act(parser(__doc__, measure=measure, table=table))
