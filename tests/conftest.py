@@ -28,8 +28,9 @@ import numpy as np
 import pytest
 from xdist.scheduler import LoadFileScheduling
 
+from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
-from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 pytest_plugins = [
@@ -231,9 +232,14 @@ def paper_fit():
 
 
 @pytest.fixture(scope="session")
-def mixed_fit(mounted_rig: Rig):
-    """A fit of two step counts, reversed and cleared starts: the play is seen."""
-    from tvsbayes.estimators.joint_fit import fit
-    from tvsbayes.instrument.protocols import four_point_protocol
+def mixed_run(mounted_rig: Rig) -> SimulatedCampaign:
+    """A campaign of two step counts, reversed and cleared starts: the play is seen."""
+    return simulate(mounted_rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=3)
 
-    return fit(simulate(mounted_rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=3).campaign)
+
+@pytest.fixture(scope="session")
+def mixed_fit(mixed_run: SimulatedCampaign):
+    """Its fit."""
+    from tvsbayes.estimators.joint_fit import fit
+
+    return fit(mixed_run.campaign)

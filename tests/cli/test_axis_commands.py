@@ -7,7 +7,8 @@ import json
 import jsonschema
 import pytest
 from support.axes import campaign, drawn, runs
-from support.commands import DATA, ESTIMATE_KEYS, assert_error
+from support.commands import ESTIMATE_KEYS, assert_error
+from support.fit_documents import shipped_schema
 
 from tvsbayes.single_axis.axis_campaign import write_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -37,7 +38,7 @@ def test_fit_and_commands_that_use_it(ask, say, folder, tmp_path):
     kept = json.loads((folder / "results" / "fit.json").read_text())
     assert kept["per_command"] == document["per_command"] and set(kept["inputs"]) == {"moves", "readings", "axis"}
 
-    schema = json.loads((DATA / "schemas" / "axis-fit-1.schema.json").read_text())
+    schema = shipped_schema("axis-fit-1")
     jsonschema.validate(kept, schema)
     assert set(kept) == set(schema["properties"])
 

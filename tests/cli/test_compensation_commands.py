@@ -8,8 +8,9 @@ from dataclasses import replace
 import jsonschema
 import numpy as np
 import pytest
-from support.commands import DATA, PAPER_TWIN, assert_error
+from support.commands import PAPER_TWIN, assert_error
 from support.compensated import driven, results, to_and_fro, true_axis
+from support.fit_documents import shipped_schema
 
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import stored_compensation
@@ -27,10 +28,6 @@ def folder(tmp_path):
     return tmp_path / "stage"
 
 
-def schema(name: str):
-    return json.loads((DATA / "schemas" / f"{name}-1.schema.json").read_text())
-
-
 def drive(folder, place, factors):
     """Fresh readings under the table in a folder's results."""
     commands, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
@@ -44,18 +41,16 @@ def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path, no_picture
     code, document = ask("compensate", folder, "--to", "linuxcnc", "-o", out, "--applied-by", "host")
     assert code == 0 and document["applied_by"] == "host" and out.read_text().startswith("-20.0000000")
     kept = json.loads((folder / "results" / "compensation.json").read_text())
-    jsonschema.validate(kept, schema("compensation"))
-    assert set(kept) == set(schema("compensation")["properties"]) and kept["table"] == document["table"]
+    schema = shipped_schema("compensation-1")
+    jsonschema.validate(kept, schema)
+    assert set(kept) == set(schema["properties"]) and kept["table"] == document["table"]
 
     code, planned = ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")
-    assert (
-        code == 0
-        and planned["enough"]
-        and (tmp_path / "plan.csv").read_text().startswith("step,command,direction,read")
-    )
+    assert code == 0 and planned["enough"]
+    assert (tmp_path / "plan.csv").read_text().startswith("step,command,direction,read")
 
     code, document = ask("verify", folder, drive(folder, tmp_path / "kept", (1.0, 1.0)))
-    jsonschema.validate(document, schema("verification"))
+    jsonschema.validate(document, shipped_schema("verification-1"))
     assert set(document) == {"verdict", "p", "worlds", "before", "after", "promised95", "readings"}
     assert (code, document["verdict"]) == (0, "KEPT")
     code, _, _ = say("report", folder)
@@ -92,13 +87,7 @@ def test_too_few_readings_give_no_verdict(ask, folder, tmp_path):
     assert code == 3 and document["verdict"] == "CANNOT TELL"
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        ("compensate", PAPER_TWIN, "--to", "csv"),
-        ("plan", "--verify"),
-    ],
-)
+@pytest.mark.parametrize("line", [("compensate", PAPER_TWIN, "--to", "csv"), ("plan", "--verify")])
 def test_scanners_are_refused_with_a_remedy(ask, line):
     code, document = ask(*line)
     assert code == 2

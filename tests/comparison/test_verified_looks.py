@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
+from support.fit_documents import shipped_schema
 
 from experiments.compensation.aimed_scanners import AIMS, aimed
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks, verify_looks
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.report.compensation_text import aim_plan_text, verification_text
 from tvsbayes.results.compensation_record import (
@@ -30,13 +28,10 @@ from tvsbayes.twin.simulated_campaign import simulate
 
 pytestmark = pytest.mark.thorough
 
-SCHEMAS = Path(__file__).resolve().parents[2] / "data" / "schemas"
-
 
 @pytest.fixture(scope="module")
-def truth(mounted_rig):
-    """Of the rig that `mixed_fit` was made from."""
-    return simulate(mounted_rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=3).truth
+def truth(mixed_run):
+    return mixed_run.truth
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +71,7 @@ def test_errors_are_those_of_the_mirrors(mounted_rig, mixed_fit, truth, calibrat
     np.testing.assert_allclose(far.after.rms, near.after.rms)
     text = verification_text(near)
     assert text.startswith("KEPT: applied") and "12 looks that the calibration aimed" in text and "at 1000 mm" in text
-    jsonschema.validate(near.as_json(), json.loads((SCHEMAS / "verification-1.schema.json").read_text()))
+    jsonschema.validate(near.as_json(), shipped_schema("verification-1"))
 
 
 def test_another_machine_is_none_of_the_worlds(mounted_rig, mixed_fit, truth, calibration):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
+from support.dense_spots import dense_covariance
+from support.fit_documents import shipped_schema
 
-from tests.support.dense_spots import dense_covariance
-from tvsbayes.cli.main import run
 from tvsbayes.comparison import watched_looks
 from tvsbayes.comparison.watched_looks import (
     CHANGES,
@@ -37,13 +35,10 @@ from tvsbayes.twin.true_rig import Truth
 
 pytestmark = pytest.mark.thorough
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 @pytest.fixture(scope="module")
-def truth(mounted_rig) -> Truth:
-    """Of the rig that `mixed_fit` was made from."""
-    return simulate(mounted_rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=3).truth
+def truth(mixed_run) -> Truth:
+    return mixed_run.truth
 
 
 def next_day(rig, truth: Truth, seed: int = 11, repeats: int = 1, **changed: float) -> Campaign:
@@ -143,7 +138,7 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
     assert null.probability(-50.0) == pytest.approx(8 * np.exp(-50), rel=1e-9)
 
 
-def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monkeypatch, capsys):
+def test_the_command_keeps_a_table(ask, say, mounted_rig, mixed_fit, truth, tmp_path, monkeypatch):
     monkeypatch.setattr("tvsbayes.pipeline.StoredOrFitted.fit", mixed_fit)
     for name, campaign in (
         ("old", mixed_fit.campaign),
@@ -151,23 +146,22 @@ def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monk
         ("knocked", next_day(mounted_rig, truth, extrinsics__translation_mm__y=5.0)),
     ):
         write_campaign(campaign, tmp_path / name)
-    old, same, knocked, table = (str(tmp_path / name) for name in ("old", "same", "knocked", "nights.csv"))
-    assert run(["watch", old, same, "--append", table]) == 3
-    text = capsys.readouterr().out
-    assert text.startswith("CANNOT TELL (p = ") and "cannot see 0.3 % of ratio: pan: pan counters further apart" in text
-    assert run(["watch", old, knocked, "--append", table, "--json"]) == 1
-    document = json.loads(capsys.readouterr().out)
-    jsonschema.validate(document, json.loads((ROOT / "data/schemas/watch-1.schema.json").read_text()))
-    assert document["verdict"] == "MOVED" and document["looks"] == 16 and document["false_alarm_rate"] == 0.01
+    old, same, knocked, table = (tmp_path / name for name in ("old", "same", "knocked", "nights.csv"))
+    code, text, _ = say("watch", old, same, "--append", table)
+    assert code == 3 and text.startswith("CANNOT TELL (p = ")
+    assert "cannot see 0.3 % of ratio: pan: pan counters further apart" in text
+    code, document = ask("watch", old, knocked, "--append", table)
+    jsonschema.validate(document, shipped_schema("watch-1"))
+    assert (code, document["verdict"], document["looks"], document["false_alarm_rate"]) == (1, "MOVED", 16, 0.01)
     assert document["moved"][0]["what"] == "positioner: shift along y" and document["moved"][0]["unit"] == "mm"
-    head, first, second = (tmp_path / "nights.csv").read_text().splitlines()
+    head, first, second = table.read_text().splitlines()
     assert head == "time,verdict,p,looks,moved"
     assert first.split(",")[1] == "CANNOT TELL" and "positioner: shift along y" in second
     # A table that takes no line: the result is out once, with what went wrong.
-    (tmp_path / "other.csv").write_text("night,what\n")
-    assert run(["watch", old, same, "--append", str(tmp_path / "other.csv"), "--json"]) == 2
-    document = json.loads(capsys.readouterr().out)
-    assert (document["verdict"], document["error"]["code"]) == ("CANNOT TELL", "header")
-    assert (tmp_path / "other.csv").read_text() == "night,what\n"
+    other = tmp_path / "other.csv"
+    other.write_text("night,what\n")
+    code, document = ask("watch", old, same, "--append", other)
+    assert (code, document["verdict"], document["error"]["code"]) == (2, "CANNOT TELL", "header")
+    assert other.read_text() == "night,what\n"
     assert set(HELPS) == {change.what for change in (*CHANGES, *SIGHTED_CHANGES)}
     assert set(REMEDIES) == {what.split(":")[0] for what in HELPS}

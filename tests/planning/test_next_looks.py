@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.commands import MOUNTED
 
-from tvsbayes.cli.main import run
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.plan import PlanStep, run_plan
@@ -123,24 +122,25 @@ def test_the_posterior_confirms_on_request(begun_fit, mounted_rig, proposal, mon
         assert high - low == pytest.approx(6 * ratio.sd) and low < ratio.value < high
 
 
-def test_the_command_prints_them(begun_fit, mounted_rig, tmp_path, monkeypatch, capsys):
-    from tvsbayes.files.disk import shipped_data
-
-    rig = str(shipped_data() / "rigs" / "mounted" / "rig.toml")
+def test_the_command_prints_them(ask, say, begun_fit, monkeypatch):
+    rig = MOUNTED / "rig.toml"
     monkeypatch.setattr("tvsbayes.pipeline.StoredOrFitted.fit", begun_fit)
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", lambda _: begun_fit.campaign)
-    assert run(["plan", rig, "--given", "mine", "--next", "8", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert sum(step["action"] == "look" for step in document["steps"]) == len(document["after_each"]) == 8
+    code, document = ask("plan", rig, "--given", "mine", "--next", 8)
+    assert code == 0 and sum(step["action"] == "look" for step in document["steps"]) == len(document["after_each"]) == 8
     assert document["steps"][0]["action"] == "place" and "most per minute" in document["why"]
     assert document["confirmed"] is None
-    assert run(["plan", rig, "--confirm", "1"]) == 2 and "for --next" in capsys.readouterr().err
     monkeypatch.setattr("tvsbayes.planning.next_looks.confirmation", lambda _: SAMPLED)
-    assert run(["plan", rig, "--given", "mine", "--next", "2", "--confirm", "1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["confirmed"] == SAMPLED.as_json()
-    assert run(["plan", rig, "--given", "mine", "--next", "2", "--confirm", "1"]) == 0
-    assert (
-        "u by importance sampling, whose weights must not be used, deg/step: left 3.00e-04" in capsys.readouterr().out
-    )
-    assert run(["plan", rig, "--next", "8"]) == 2 and "--given" in capsys.readouterr().err
-    assert run(["plan", rig, "--given", "mine", "--next", "8", "-o", "x.csv"]) == 2
+    confirmed = ("plan", rig, "--given", "mine", "--next", 2, "--confirm", 1)
+    code, document = ask(*confirmed)
+    assert (code, document["confirmed"]) == (0, SAMPLED.as_json())
+    code, text, _ = say(*confirmed)
+    assert code == 0
+    assert "u by importance sampling, whose weights must not be used, deg/step: left 3.00e-04" in text
+    for wrong, word in (
+        (("--confirm", 1), "for --next"),
+        (("--next", 8), "--given"),
+        (("--given", "mine", "--next", 8, "-o", "x.csv"), "-o"),
+    ):
+        code, _, log = say("plan", rig, *wrong)
+        assert code == 2 and word in log

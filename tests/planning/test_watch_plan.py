@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
+from support.commands import MOUNTED
+from support.fit_documents import shipped_schema
 
-from tvsbayes.cli.main import run
 from tvsbayes.comparison.watched_looks import CHANGES, POWER_MIN, WatchedLooks, null_distribution, powers
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.joint_fit import fit
@@ -23,8 +22,7 @@ from tvsbayes.twin.simulated_campaign import simulate
 
 pytestmark = pytest.mark.thorough
 
-ROOT = Path(__file__).resolve().parents[2]
-RIG = ROOT / "data" / "rigs" / "mounted" / "rig.toml"
+RIG = MOUNTED / "rig.toml"
 NAMES = [change.what for change in CHANGES]
 
 
@@ -113,7 +111,7 @@ def test_a_short_budget_is_kept_or_refused(watched_fit, monkeypatch):
         watch_plan(watched_fit, read_rig(RIG), minutes=0.5)  # a placement alone takes one
 
 
-def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_the_plan(ask, say, watched_fit, planned, tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(
         "tvsbayes.planning.watch_plan.watch_plan", lambda *rest, **named: calls.append((rest[1], named)) or planned
@@ -121,16 +119,15 @@ def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch
     monkeypatch.setattr("tvsbayes.pipeline.StoredOrFitted.fit", watched_fit)
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", lambda _: watched_fit.campaign)
     out, rig = tmp_path / "looks.csv", read_rig(RIG)
-    assert run(["plan", str(RIG), "--given", "mine", "--watch", "--minutes", "3", "-o", str(out), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    jsonschema.validate(document, json.loads((ROOT / "data/schemas/watch-plan-1.schema.json").read_text()))
+    code, document = ask("plan", RIG, "--given", "mine", "--watch", "--minutes", "3", "-o", out)
+    jsonschema.validate(document, shipped_schema("watch-plan-1"))
     steps = read_plan(out)
-    assert document["plan"] == str(out) and sum(step.action == "look" for step in steps) == document["looks"]
+    assert (code, document["plan"]) == (0, str(out))
+    assert sum(step.action == "look" for step in steps) == document["looks"]
     assert plan_minutes(rig, steps) == pytest.approx(document["minutes"], abs=1e-9)
-    assert run(["plan", "mine", "--watch"]) == 0
-    assert calls[0][0].costs_s == rig.costs_s and calls[1][0] is None
+    code, text, _ = say("plan", "mine", "--watch")
+    assert code == 0 and calls[0][0].costs_s == rig.costs_s and calls[1][0] is None
     assert [named["minutes"] for _, named in calls] == [3, 10]
-    text = capsys.readouterr().out
     assert "no number of looks improves that: the campaign determines it too poorly: add about" in text
-    assert run(["plan", "mine", "--watch", "--target", "u(worst) <= 1e-4 deg/step"]) == 2
-    assert "--target is for targets" in capsys.readouterr().err
+    code, _, log = say("plan", "mine", "--watch", "--target", "u(worst) <= 1e-4 deg/step")
+    assert code == 2 and "--target is for targets" in log

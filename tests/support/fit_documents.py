@@ -1,4 +1,4 @@
-"""Kept documents of `fit.json`, their schema, and copies with one value of their own."""
+"""Shipped schemas; kept documents of `fit.json`, and copies with one value of their own."""
 
 from __future__ import annotations
 
@@ -17,10 +17,14 @@ KEPT = Path(__file__).parents[1] / "data"
 OLD = sorted(KEPT.glob("fit-*.json"))
 
 
+def shipped_schema(name: str) -> dict:
+    """A schema by its name and version, such as `watch-1`."""
+    return json.loads((shipped_data() / "schemas" / f"{name}.schema.json").read_text())
+
+
 def schema_of(document: dict) -> dict:
     """The schema that the document names."""
-    version = document["format"].removeprefix("tvsbayes-fit/")
-    return json.loads((shipped_data() / "schemas" / f"fit-{version}.schema.json").read_text())
+    return shipped_schema(f"fit-{document['format'].removeprefix('tvsbayes-fit/')}")
 
 
 def problems(document: object, schema: dict) -> list[str]:
