@@ -27,19 +27,24 @@ class Viewed:
 
 
 @pytest.fixture(scope="session")
-def viewed(tmp_path_factory) -> Viewed:
-    """Fitted without sampling."""
-    from tvsbayes.pipeline import calibrate
-
-    place = tmp_path_factory.mktemp("viewed")
+def unfitted_twin(tmp_path_factory) -> Path:
+    """Without results."""
     twin = read_campaign(TWIN)
     spots = tuple(with_pixels(s, "undetected") if s.spot == UNDETECTED else s for s in twin.spots)
-    folder = place / "fitted"
+    folder = tmp_path_factory.mktemp("viewed") / "bare"
     write_campaign(replace(twin, spots=spots, path=None), folder)
     (folder / "frames").mkdir()
     grey = np.random.default_rng(1).integers(0, 40, (72, 128), dtype=np.uint8)
     (folder / frame_name(PICTURED, "left")).write_bytes(png_bytes(grey))
-    bare = place / "bare"
-    shutil.copytree(folder, bare)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def viewed(unfitted_twin) -> Viewed:
+    """Fitted without sampling."""
+    from tvsbayes.pipeline import calibrate
+
+    folder = unfitted_twin.parent / "fitted"
+    shutil.copytree(unfitted_twin, folder)
     calibrate(read_campaign(folder), folder / "results", sampled=False)
-    return Viewed(folder, bare)
+    return Viewed(folder, unfitted_twin)
