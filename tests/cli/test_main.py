@@ -9,12 +9,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from support.commands import (
-    PAPER_TWIN,
-    assert_error,
-)
+from support.commands import PAPER_TWIN, assert_error
 
 from tvsbayes.cli.main import main, run
+from tvsbayes.pipeline import SAMPLING
+from tvsbayes.posterior.sampling import walking
+from tvsbayes.progress import Progress
+from tvsbayes.results.tiers import CHAIN
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
@@ -120,22 +121,24 @@ def test_a_closed_pipe_changes_no_exit_code(monkeypatch, arguments):
     assert (done.returncode, with_json.returncode, with_json.stderr) == (2, 2, "")
 
 
-def test_interrupt_under_json_is_a_document_too(ask, monkeypatch):
-    def interrupted(path):
-        raise KeyboardInterrupt
+@pytest.fixture
+def reading(monkeypatch):
+    """What reading a campaign raises: `reading(error)`."""
 
-    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", interrupted)
-    monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", interrupted)
+    def fail(error: BaseException) -> None:
+        def broken(path):
+            raise error
+
+        monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", broken)
+        monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", broken)
+
+    return fail
+
+
+def test_an_interrupt_is_130_and_under_json_a_document(ask, say, reading):
+    reading(KeyboardInterrupt())
     code, document = ask("check", "x")
     assert (code, document["error"]["code"]) == (130, "interrupted")
-
-
-def test_interrupt_is_130(say, monkeypatch):
-    def interrupted(path):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", interrupted)
-    monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", interrupted)
     code, out, log = say("classic", PAPER_TWIN)
     assert (code, out) == (130, "")
     assert "interrupted" in log
@@ -156,10 +159,6 @@ def test_interrupt_after_the_command_is_130_too(monkeypatch):
 @pytest.mark.parametrize(("blocks", "kept"), [(0, False), (1, True)])
 def test_an_interrupted_fit_with_a_stored_chain_names_resume(say, monkeypatch, blocks, kept):
     """The chain is announced once when it begins; before its first block of steps none is stored."""
-    from tvsbayes.pipeline import SAMPLING
-    from tvsbayes.posterior.sampling import walking
-    from tvsbayes.progress import Progress
-    from tvsbayes.results.tiers import CHAIN
 
     def interrupted(*_, progress, **__):
         for _ in range(1 + blocks):
@@ -169,17 +168,12 @@ def test_an_interrupted_fit_with_a_stored_chain_names_resume(say, monkeypatch, b
     monkeypatch.setattr("tvsbayes.cli.estimate_commands.compile_for", lambda tell: None)
     monkeypatch.setattr("tvsbayes.cli.estimate_commands.calibrate", interrupted)
     code, out, log = say("fit", PAPER_TWIN)
-    assert (code, out) == (130, "") and ("go on with --resume" in log) == kept
+    assert (code, out) == (130, "") and ("chain.npz; go on with --resume" in log) == kept
 
 
-def test_a_bug_is_no_bad_input(monkeypatch):
+def test_a_bug_is_no_bad_input(reading):
     """Only errors a user can act on become exit codes; anything else must not be hidden."""
-
-    def broken(path):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", broken)
-    monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", broken)
+    reading(RuntimeError("a bug"))
     with pytest.raises(RuntimeError, match="a bug"):
         run(["classic", str(PAPER_TWIN)])
 

@@ -14,11 +14,7 @@ import pytest
 from support.commands import MOUNTED
 from support.pseudo_terminal import needs_pseudo_terminals
 
-from tvsbayes.cli.progress_bar import chain_progress
-from tvsbayes.pipeline import FITTING, SAMPLING
-from tvsbayes.posterior.sampling import walking
-from tvsbayes.progress import Progress, time_left
-from tvsbayes.results.tiers import CHAIN
+from tvsbayes.progress import time_left
 
 SCRIPT = """
 import sys, threading
@@ -134,13 +130,3 @@ def test_the_document_of_a_command_is_separate_from_the_bar(tmp_path):
 )
 def test_time_left_in_words(seconds, text):
     assert time_left(seconds) == text
-
-
-@pytest.mark.parametrize(("blocks", "hint"), [(0, False), (1, False), (3, True)])
-def test_an_interrupted_fit_names_its_stored_chain(capsys, blocks, hint):
-    with pytest.raises(KeyboardInterrupt), chain_progress("go on with --resume") as show:
-        show(Progress(FITTING, 0.5, 1.0, None))
-        for _ in range(blocks):
-            show(Progress(f"{SAMPLING}: {walking(CHAIN)}", 0.7, 2.0, None))
-        raise KeyboardInterrupt
-    assert ("chain.npz; go on with --resume" in capsys.readouterr().err) == hint
