@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from support.small_campaign import seen_steps, small_campaign
 from tvsbayes.assessment.fitted_calibration import calibration_of_draws
 from tvsbayes.calibration.calibration_file import CALIBRATION_FORMAT, calibration_bytes, load_calibration
 from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
@@ -51,18 +49,10 @@ def folder(tmp_path) -> Path:
     return folder
 
 
-@pytest.fixture
-def ask(capsys):
-    """Run a command with --json: exit code, and the one document on stdout."""
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is no JSON")
-
-    def run_json(*arguments: object) -> tuple[int, dict[str, Any]]:
-        code = run([*map(str, arguments), "--json"])
-        return code, json.loads(capsys.readouterr().out, parse_constant=refuse)
-
-    return run_json
+def table_of(path: Path, *rows: str) -> Path:
+    """A file of points with these rows."""
+    path.write_text("\n".join(("tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach", *rows)) + "\n")
+    return path
 
 
 def test_locate_one_point(ask, folder):
@@ -79,36 +69,37 @@ def test_locate_one_point(ask, folder):
     sd = np.sqrt(np.diag(document["covariance_mm2"]))
     np.testing.assert_allclose(document["xyz_mm"], by_hand.xyz_mm, atol=0.25 * sd.max())
     assert ask("locate", folder, *POINT)[1] == document
+    from_right = ask("locate", folder, *POINT, "--pan-approach", "right")[1]["linear"]["xyz_mm"]
+    by_hand = load_calibration(folder).locate(100, 20, 70.0, ("right", "up"))
+    np.testing.assert_allclose(from_right, by_hand.xyz_mm, rtol=1e-9)
+    assert from_right[0] != document["linear"]["xyz_mm"][0]
 
 
-def test_counters_that_no_look_reached_are_told(ask, folder, tmp_path, capsys):
+def test_counters_that_no_look_reached_are_told(ask, say, folder, tmp_path):
     """In JSON, in the text, of one point, of many, and of the counters for a target."""
     (low, high), _ = load_calibration(folder).range_steps.astype(int).tolist()
     far = ("--pan-steps", high + 1, "--tilt-steps", 20, "--aperture-deg", 70)
     assert ask("locate", folder, *POINT)[1]["extrapolated"] is False
     assert ask("locate", folder, *far)[1]["extrapolated"] is True
-    rows = ["tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach"]
-    rows += [f"20,{n},{deg},left,up" for n in (low - 1, low, high) for deg in (70, 175)]
-    points = tmp_path / "points.csv"
-    points.write_text("\n".join(rows) + "\n")
+    rows = [f"20,{n},{deg},left,up" for n in (low - 1, low, high) for deg in (70, 175)]
+    points = table_of(tmp_path / "points.csv", *rows)
     entries = ask("locate", folder, "--points", points)[1]["points"]
     assert [entry["extrapolated"] for entry in entries] == [True, True, False, False, False, False]
     assert "refused" in entries[1] and entries[0]["xyz_mm"]
     for direction, flagged in ((0.0, False), (-40.0, True)):
         command = ("steps-for", folder, "--azimuth-deg", direction, "--elevation-deg", 1.0)
         assert ask(*command)[1]["extrapolated"] is flagged
-        assert run([*map(str, command)]) == 0
-        assert ("EXTRAPOLATED" in capsys.readouterr().out) is flagged
+        code, text, _ = say(*command)
+        assert code == 0 and ("EXTRAPOLATED" in text) is flagged
     for options, count in ((POINT, 0), (far, 2)):
-        assert run([*map(str, ("locate", folder, *options))]) == 0
-        text = capsys.readouterr().out
-        assert text.count("EXTRAPOLATED") == count
+        code, text, _ = say("locate", folder, *options)
+        assert code == 0 and text.count("EXTRAPOLATED") == count
         # The axis and the range of the looks.
         assert (f"pan {high + 1} lies outside {low} to {high}" in text) is bool(count) and "tilt 20 lies" not in text
     assert entries[0]["unseen"] == f"pan {low - 1} lies outside {low} to {high}" and entries[2]["unseen"] == ""
 
 
-def test_no_point_is_behind_the_scanner(ask, folder, tmp_path, capsys):
+def test_no_point_is_behind_the_scanner(ask, say, folder, tmp_path):
     """A point behind the scanner is refused by name: one point, many points, a cloud."""
     back = load_calibration(folder)
     turned = next(n for n in range(2000, 4000, 10) if back.ray(n, 20).direction[0] < -0.5)
@@ -120,34 +111,25 @@ def test_no_point_is_behind_the_scanner(ask, folder, tmp_path, capsys):
         back.locate(turned, 20, reading)
     with pytest.raises(InputError, match="no mirror angles"):
         back.steps_for(aim.origin_mm + 500 * aim.direction)
-    points, out = tmp_path / "points.csv", tmp_path / "cloud.csv"
-    points.write_text(
-        f"tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach\n20,{turned},{reading},left,up\n20,100,70,left,up\n"
-    )
+    points = table_of(tmp_path / "points.csv", f"20,{turned},{reading},left,up", "20,100,70,left,up")
+    out = tmp_path / "cloud.csv"
     entries = ask("locate", folder, "--points", points)[1]["points"]
     assert entries[0]["refused"]["code"] == "behind" and "refused" not in entries[1]
     document = ask("locate", folder, "--points", points, "--cloud", out)[1]
     assert (document["written"], document["refused"]) == (1, 1)
     assert "behind" in (tmp_path / "cloud.refused.csv").read_text()
     assert set(document["checked"]) == {"points", "held", "off_mm", "most_off_mm"}
-    run([*map(str, ("locate", folder, "--points", points, "--cloud", out))])
-    text = capsys.readouterr().out
-    assert (
-        "1 point," in text
-        and "of 1 point carried" in text
-        and "1 look has no point (behind 1)" in text
-        and "1 points" not in text
-    )
+    text = say("locate", folder, "--points", points, "--cloud", out)[1]
+    assert "1 point," in text and "of 1 point carried" in text and "1 points" not in text
+    assert "1 look has no point (behind 1)" in text
 
 
 @pytest.mark.parametrize("cloud", [False, True])
 def test_points_of_a_spreadsheet_are_read(ask, folder, tmp_path, cloud):
     """Semicolons and decimal commas, as a spreadsheet in much of the world saves them."""
-    header = ["tilt_steps", "pan_steps", "aperture_deg", "pan_approach", "tilt_approach"]
-    rows = [header, ["20", "100", "70.5", "left", "up"], ["20", "100", "69.25", "left", "up"]]
-    ours, theirs = tmp_path / "ours.csv", tmp_path / "theirs.csv"
-    ours.write_text("\n".join(",".join(row) for row in rows) + "\n")
-    theirs.write_text("\n".join(";".join(row).replace(".", ",") for row in rows) + "\n")
+    ours = table_of(tmp_path / "ours.csv", "20,100,70.5,left,up", "20,100,69.25,left,up")
+    theirs = tmp_path / "theirs.csv"
+    theirs.write_text(ours.read_text().replace(",", ";").replace(".", ","))
     outputs = []
     for file in (ours, theirs):
         out = ("--cloud", tmp_path / f"{file.stem}.ply") if cloud else ()
@@ -163,21 +145,9 @@ def test_points_of_a_spreadsheet_are_read(ask, folder, tmp_path, cloud):
     assert (document["error"]["line"], document["error"]["column"]) == (3, "aperture_deg")
 
 
-def test_sides_differ_by_the_backlash(ask, folder):
-    left = ask("locate", folder, *POINT)[1]["linear"]["xyz_mm"]
-    right = ask("locate", folder, *POINT, "--pan-approach", "right")[1]["linear"]["xyz_mm"]
-    calibration = load_calibration(folder)
-    rays = [calibration.ray(100, 20, (side, "up")).direction for side in ("left", "right")]
-    angle = np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))
-    assert angle == pytest.approx(calibration.estimates["backlash_deg.pan"], rel=0.02)
-    assert left[0] != right[0]
-
-
 def test_points_from_a_file_keep_their_order_and_refuse_one_by_one(ask, folder, tmp_path):
-    rows = ["tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach"]
-    rows += ["20,100,70,left,up", "20,100,150,left,up", "-20,0,75,right,down", "20,100,70,unknown,unknown"]
-    points = tmp_path / "points.csv"
-    points.write_text("\n".join(rows) + "\n")
+    rows = "20,100,70,left,up", "20,100,150,left,up", "-20,0,75,right,down", "20,100,70,unknown,unknown"
+    points = table_of(tmp_path / "points.csv", *rows)
     code, document = ask("locate", folder, "--points", points)
     assert code == 0
     entries = document["points"]
@@ -200,8 +170,7 @@ def test_points_from_a_file_keep_their_order_and_refuse_one_by_one(ask, folder, 
     ],
 )
 def test_invalid_points_are_refused_with_line_and_column(ask, folder, tmp_path, row, code, column):
-    points = tmp_path / "points.csv"
-    points.write_text(f"tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach\n20,100,70,left,up\n{row}\n")
+    points = table_of(tmp_path / "points.csv", "20,100,70,left,up", row)
     exit_code, document = ask("locate", folder, "--points", points)
     assert exit_code == 2
     error = document["error"]
@@ -228,23 +197,10 @@ def test_budget_adds_up(ask, folder):
     np.testing.assert_allclose(variance, np.diag(document["linear"]["covariance_mm2"]), rtol=1e-9)
 
 
-def test_steps_for_a_point_leads_back_to_it(ask, folder):
-    wanted = (700.0, 20.0, 40.0)
-    code, answer = ask("steps-for", folder, *(x for k, v in zip("xyz", wanted, strict=True) for x in (f"--{k}-mm", v)))
-    assert code == 0
-    again = ask(
-        "locate",
-        folder,
-        *("--pan-steps", answer["pan_steps"], "--tilt-steps", answer["tilt_steps"]),
-        *("--aperture-deg", answer["aperture_deg"]),
-    )[1]["linear"]["xyz_mm"]
-    np.testing.assert_allclose(again, answer["xyz_mm"], atol=1e-6)
-    # Half a step on each axis, as seen from the positioner.
-    reach = np.linalg.norm(np.subtract(wanted, answer["ray"]["origin_mm"]))
-    half_step_mm = reach * np.radians(0.5 * np.hypot(0.06, 0.07)) * 1.05
-    assert np.linalg.norm(np.subtract(again, wanted)) < half_step_mm
-    assert answer["via_pan_steps"] < answer["pan_steps"]
-    assert answer["via_tilt_steps"] < answer["tilt_steps"]
+def test_steps_for_a_point_are_those_of_the_library(ask, folder):
+    code, answer = ask("steps-for", folder, "--x-mm", 700, "--y-mm", 20, "--z-mm", 40)
+    expected = json.loads(json.dumps(load_calibration(folder).steps_for((700.0, 20.0, 40.0)).as_json()))
+    assert code == 0 and {**answer, **expected} == answer
 
 
 def test_limits_of_a_rig_are_kept(ask, folder, tmp_path):
@@ -270,28 +226,26 @@ def test_limits_of_a_rig_are_kept(ask, folder, tmp_path):
     assert (code, document["error"]["code"]) == (2, "outside-limits")
 
 
-def test_exports_are_read_back(folder, ask, capsys, tmp_path):
-    assert run(["steps-for", str(folder), "--export", "json"]) == 0
+def test_exports_are_read_back(folder, ask, say, tmp_path):
+    code, text, _ = say("steps-for", folder, "--export", "json")
     path = tmp_path / "calibration.json"
-    path.write_text(capsys.readouterr().out)
-    assert json.loads(path.read_text())["format"] == CALIBRATION_FORMAT
+    path.write_text(text)
+    assert code == 0 and json.loads(path.read_text())["format"] == CALIBRATION_FORMAT
     stored, exported = load_calibration(folder), load_calibration(path)
     point = (600.0, 10.0, 30.0)
     expected, answer = (each.steps_for(point) for each in (stored, exported))
     assert (expected.pan_steps, expected.tilt_steps) == (answer.pan_steps, answer.tilt_steps)
     # Fifteen digits of every number.
     np.testing.assert_allclose(expected.u95_mm, answer.u95_mm, rtol=1e-12)
-    assert run(["steps-for", str(folder), "--export", "header"]) == 0
-    header = capsys.readouterr().out
-    assert "Expected error (posterior, 95 %)" in header
+    code, header, _ = say("steps-for", folder, "--export", "header")
+    assert code == 0 and "Expected error (posterior, 95 %)" in header
     assert "@" not in header.split("#ifndef")[0] and "Campaign: " in header
     for kind in ("header", "json"):
         place = tmp_path / f"out.{kind}"
-        assert run(["steps-for", str(folder), "--export", kind, "--out", str(place)]) == 0
-        assert str(place) in capsys.readouterr().out.replace("\n", "")
+        code, text, _ = say("steps-for", folder, "--export", kind, "--out", place)
+        assert code == 0 and str(place) in text.replace("\n", "")
     assert (tmp_path / "out.header").read_text() == header
-    assert run(["compensate", str(folder), "--to", "header"]) == 0
-    assert capsys.readouterr().out == header
+    assert say("compensate", folder, "--to", "header")[:2] == (0, header)
     before = (folder / "moves.csv").read_bytes()
     code, _ = ask("compensate", folder, "--to", "header", "-o", folder / "moves.csv")
     assert code == 2 and (folder / "moves.csv").read_bytes() == before
@@ -329,11 +283,9 @@ def test_damaged_results_are_refused_and_not_replaced(ask, folder):
 
 
 @pytest.mark.parametrize("ending", ["ply", "csv"])
-def test_a_file_of_points_becomes_a_cloud(ask, folder, tmp_path, capsys, ending):
-    rows = ["tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach"]
-    rows += ["20,100,70,left,up", "20,100,150,left,up", "-20,0,75,right,down", "20,5000,70,left,up"]
-    points, out = tmp_path / "points.csv", tmp_path / f"cloud.{ending}"
-    points.write_text("\n".join(rows) + "\n")
+def test_a_file_of_points_becomes_a_cloud(ask, say, folder, tmp_path, ending):
+    rows = "20,100,70,left,up", "20,100,150,left,up", "-20,0,75,right,down", "20,5000,70,left,up"
+    points, out = table_of(tmp_path / "points.csv", *rows), tmp_path / f"cloud.{ending}"
     code, document = ask("locate", folder, "--points", points, "--cloud", out)
     assert code == 0 and out.exists() and document["cloud"] == str(out)
     entries = ask("locate", folder, "--points", points)[1]["points"]
@@ -342,8 +294,8 @@ def test_a_file_of_points_becomes_a_cloud(ask, folder, tmp_path, capsys, ending)
     assert document["refused_file"] == str(tmp_path / "cloud.refused.csv") and 0 < document["checked"]["points"] <= 4
     assert {"x", "sd_x", "nominal_x"} <= set(document["columns"])
     assert document["extrapolated"] == sum(e["extrapolated"] for e, good in zip(entries, valid, strict=True) if good)
-    assert run([*map(str, ("locate", folder, "--points", points, "--cloud", out))]) == 0
-    assert "cloud.refused.csv" in capsys.readouterr().out
+    code, text, _ = say("locate", folder, "--points", points, "--cloud", out)
+    assert code == 0 and "cloud.refused.csv" in text
     before = points.read_bytes()
     assert ask("locate", folder, "--points", points, "--cloud", points)[0] == 2 and points.read_bytes() == before
 
