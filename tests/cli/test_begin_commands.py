@@ -12,6 +12,7 @@ from support.commands import MOUNTED, assert_error, steps
 from support.drawn_pictures import drawn, pairs
 
 from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign
+from tvsbayes.instrument.rig import RigTable, read_rig
 from tvsbayes.instrument.stereo_pair import write_stereo
 from tvsbayes.twin.frames import write_frames
 from tvsbayes.twin.simulated_campaign import simulate
@@ -30,6 +31,8 @@ def test_new_campaign_lacks_only_its_stereo_calibration(ask, say, tmp_path):
     assert code == 0
     assert (document["moves"], document["spots"]) == (1, 0)
     assert ask("check", out / "rig.toml")[0] == 0
+    # The templates state nothing but the default priors.
+    assert read_campaign(out).rig == read_rig(out / "rig.toml").table == RigTable()
     code, text, log = say("new", out)
     assert (code, text) == (2, "")
     assert "nothing is overwritten" in log

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from support.commands import MOUNTED
 
 IGNORED = [
     ("fit c --no-sample --max-minutes 3", "--max-minutes is for a sampler"),
@@ -57,9 +58,7 @@ def test_options_without_effect_are_refused(ask, line, message):
 
 def test_a_unit_is_for_files_that_state_none(ask, tmp_path):
     """Files of other programs leave the unit of T open; that of ours is stated."""
-    from tvsbayes.files.disk import shipped_data
-
-    pair = shipped_data() / "rigs" / "mounted" / "stereo.json"
+    pair = MOUNTED / "stereo.json"
     for option in (("--import-unit", "m"), ("--image-size", "1280x720")):
         code, document = ask("stereo", "--import", pair, *option)
         assert (code, document["error"]["code"]) == (2, "usage") and "other programs" in document["error"]["message"]

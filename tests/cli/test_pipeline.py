@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from msgspec import structs
@@ -16,10 +17,13 @@ from support.waits import check_forward, doings
 import tvsbayes
 from tvsbayes.cli.app import report_line
 from tvsbayes.errors import InputError
+from tvsbayes.estimators import joint_fit
+from tvsbayes.estimators.joint_fit import restored
 from tvsbayes.instrument.campaign import input_hashes, read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compiled import Traces
 from tvsbayes.pipeline import FITTING, SUMMARISING, StoredOrFitted, calibrate, compile_for
+from tvsbayes.results.stored_draws import stored_mode
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once")
 
@@ -27,9 +31,6 @@ pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once"
 @pytest.mark.thorough
 def test_stored_results_are_reused(grid_folder, monkeypatch):
     """`compare` and `plan --given` start from results/: the same model, mode and draws, no second fit."""
-    from tvsbayes.estimators.joint_fit import restored
-    from tvsbayes.results.stored_draws import stored_mode
-
     campaign = read_campaign(grid_folder)
     assert stored_mode(campaign) is None
     results = tvsbayes.calibrate(campaign, grid_folder / "results", model=ModelChoice(per_axis=True), sampled=False)
@@ -91,8 +92,6 @@ def test_the_reason_for_a_new_fit_is_printed(grid_folder, monkeypatch):
 
 
 def test_the_first_compilation_is_announced(tmp_path, capsys, monkeypatch):
-    import jax
-
     monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
     monkeypatch.setattr(Traces, "used", None)
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
@@ -110,8 +109,13 @@ def test_the_first_compilation_is_announced(tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().err == ""
 
 
-def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path):
-    """Document and draws are equal except for the command; without a folder nothing is written."""
+def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path, monkeypatch):
+    """Document and draws are equal except for the command; without a folder nothing is written.
+
+    The fit is that of another seed, which other tests share; the seed that it is asked for is looked at.
+    """
+    fit, seeds = joint_fit.fit, []
+    monkeypatch.setattr(joint_fit, "fit", lambda *args, seed, **rest: seeds.append(seed) or fit(*args, seed=0, **rest))
     assert ask("fit", grid_folder, "--no-sample", "--seed", 4)[0] == 0
     campaign = read_campaign(grid_folder)
     states = []
@@ -127,7 +131,8 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
         assert sorted(one) == sorted(other)
         for name in one:
             np.testing.assert_array_equal(one[name], other[name])
-    assert tvsbayes.calibrate(campaign, sampled=False, seed=4).files == {}
+    assert tvsbayes.calibrate(campaign, sampled=False, seed=4).files == {} and seeds == [4, 4, 4]
+    assert mine.provenance.seed == 4
 
 
 @pytest.mark.thorough

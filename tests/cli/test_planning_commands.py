@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import pytest
 from msgspec import structs
+from support.commands import MOUNTED
 
-from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.planning import planner
 
 pytestmark = pytest.mark.usefixtures("small_searches", "own_compilation_cache")
-
-
-MOUNTED = shipped_data() / "rigs" / "mounted"
 
 
 @pytest.mark.parametrize("more", [(), ("--watch",)])
@@ -65,11 +62,8 @@ def test_check_takes_a_rig_with_a_plan(ask):
     assert code == 2 and document["error"]["code"] == "usage"
 
 
-def test_study_states_the_assurance_of_the_users_target(ask, tmp_path, monkeypatch):
-    from support.invented_studies import invented
-
-    monkeypatch.setattr("tvsbayes.studies.study_job.study_row", invented)
-    monkeypatch.setattr("tvsbayes.studies.executors.study_row", invented)
+@pytest.mark.usefixtures("quick")
+def test_study_states_the_assurance_of_the_users_target(ask, tmp_path):
     rows = ("--n", 8, "--rows", tmp_path / "rows.jsonl")
     target = ("--target", "u(worst) <= 1e-3 deg/step")
     code, document = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows, *target)
