@@ -18,7 +18,9 @@ from support.package_imports import MODULES, ORDER, imports_of, room
 from support.printed_pages import first_difference
 
 import tvsbayes
+from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED
 from tvsbayes.cli.main import app, run
+from tvsbayes.errors import TvsError
 from tvsbayes.instrument.parameters import RIG_PRIORS, unit_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -106,12 +108,6 @@ def test_a_command_begins_with_its_commonest_use(name):
     assert part.startswith(f"```console\n$ tvsbayes {name}"), part[:60]
 
 
-def test_long_pages_are_two_thirds_of_what_they_were():
-    """In words, compared with version 0.2.0."""
-    for page, words in {"commands": 7204, "formulation": 7183}.items():
-        assert len(read(f"data/docs/{page}.md").split()) <= words * 2 / 3, page
-
-
 def options_of(name: str) -> set[str]:
     parameters = [p for p in GROUP.commands[name].params if not getattr(p, "hidden", False)]
     return {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
@@ -143,9 +139,6 @@ def test_every_option_of_a_command_is_explained(name):
 
 
 def test_exit_codes_are_those_of_the_errors():
-    from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED
-    from tvsbayes.errors import TvsError
-
     codes = [int(code) for code in re.findall(r"^\| (\d+) \|", section(COMMANDS, "Exit codes"), flags=re.MULTILINE)]
 
     def codes_of(error: type[TvsError]) -> set[int]:

@@ -91,13 +91,6 @@ def test_the_index_names_every_script_and_only_scripts():
     assert named == runnable - {"speed.benchmarks.child"}
 
 
-def test_an_answer_of_the_index_is_a_line():
-    """At most the width of a page, links apart; details are on the page."""
-    rows = [line.split(" | ") for line in (FOLDER / "README.md").read_text(encoding="utf-8").splitlines()]
-    answers = [re.sub(r"(?:; )?\[[^\]]*\]\([^)]*\)", "", row[1]) for row in rows if len(row) == 4]
-    assert len(answers) > 40 and [answer for answer in answers if len(answer) > 120] == []
-
-
 @pytest.mark.parametrize("page", sorted(FOLDER.rglob("*.md")), ids=lambda path: str(path.relative_to(FOLDER)))
 def test_commands_on_pages_are_scripts(page):
     """As `python -m experiments.question.script`, with a page beside its script."""

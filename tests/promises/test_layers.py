@@ -16,12 +16,14 @@ from support.package_imports import (
     imported,
     imports_of,
     inside,
-    parsed,
     reachable,
     room,
     running,
+    running_imports_of,
 )
 from support.tests_of import files_importing
+
+from tvsbayes.model.compiled import sources_of
 
 ROOT = Path(__file__).resolve().parents[2]
 HARDWARE = ("positioner", "cameras", "acquisition")
@@ -103,8 +105,6 @@ def test_no_cycles(inner):
 
 def test_traces_belong_to_all_that_a_module_imports(inner):
     """For every compiled function: what determines a trace determines its name in the cache."""
-    from tvsbayes.model.compiled import sources_of
-
     for name in ("estimators.likelihood", "estimators.annealed_stage", "model.headlines", "planning.looks"):
         modules = {
             path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".")
@@ -121,12 +121,12 @@ def test_only_drivers_import_hardware_packages(inner):
 
 def test_without_jax():
     """No module of the JAX-free side imports JAX, neither at the top nor in functions."""
-    imports = {name: imported(running(parsed(name))) for name in MODULES}
+    imports = {name: running_imports_of(name) for name in MODULES}
     graph = inside(imports)
+    with_jax = {name for name, others in imports.items() if {other.split(".")[0] for other in others} & JAX_FAMILY}
     for name in MODULES:
         if room(name) in JAX_FREE_PACKAGES:
-            for module in {name, *reachable(graph, name)}:
-                assert not {other.split(".")[0] for other in imports[module]} & JAX_FAMILY, f"{name} by {module}"
+            assert not {name, *reachable(graph, name)} & with_jax, name
 
 
 def test_twin_shares_no_formula_with_the_estimators(inner):

@@ -27,13 +27,6 @@ def test_readme_is_short_and_warns_of_the_laser():
     assert "808 nm laser is invisible and likely class 3B" in README
 
 
-def test_pictures_are_beside_their_text():
-    """The demo's in the README, the instrument's beside its axes."""
-    conventions = (ROOT / "data" / "docs" / "conventions.md").read_text(encoding="utf-8")
-    assert re.search(r"!\[[^]]+\]\(data/tutorial/demo\.svg\)", README.split("\n## ")[0])
-    assert re.search(r"!\[[^]]+\]\(\.\./tutorial/rig\.svg\)", conventions)
-
-
 def test_constraints_pin_every_direct_dependency():
     """A dependency without a pin would be tested at a varying version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

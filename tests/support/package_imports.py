@@ -72,14 +72,16 @@ def imported(tree: ast.AST, modules: frozenset[str] | None = None) -> set[str]:
     return names
 
 
-def parsed(name: str) -> ast.AST:
-    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
-
-
 @cache
 def imports_of(name: str) -> set[str]:
     """Of a module of the package, types included."""
-    return imported(parsed(name))
+    return imported(ast.parse(MODULES[name].read_text(encoding="utf-8")))
+
+
+def running_imports_of(name: str) -> set[str]:
+    """Of a module of the package when it runs."""
+    text = MODULES[name].read_text(encoding="utf-8")
+    return imported(running(ast.parse(text))) if "TYPE_CHECKING" in text else imports_of(name)
 
 
 def inside(imports: dict[str, set[str]]) -> dict[str, set[str]]:
