@@ -2,42 +2,37 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-from support.reported_twin import BATCH, PLANNED, evidence_of
+from support.reported_twin import BATCH, PLANNED, evidence_of, stored
 from support.small_results import small_summary
 
 from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
 from tvsbayes.errors import InputError
 from tvsbayes.report.evidence import CANNOT_TELL, MET, NOT_MET, Criterion, criterion
 from tvsbayes.report.scanner_document import criteria_table, report_document, verdict_of
+from tvsbayes.results.comparison_record import stored_hold_out
 from tvsbayes.results.compensation_record import APPLIED, KEPT, VERIFICATION_FORMAT, WORLDS
+from tvsbayes.results.plan_record import stored_plan
 
-STORED = {"compare.json": "held_out", "plan.json": "planned", "verification.json": "verified"}
+READERS = {"compare.json": stored_hold_out, "plan.json": stored_plan}
 
 
-@pytest.mark.parametrize("name", STORED)
-def test_results_that_belong_to_other_data_are_not_reported(reported, name):
+def test_results_that_belong_to_other_data_are_not_reported(reported):
     """Results of another campaign are left out."""
-    (reported / "results" / name).write_text(json.dumps({"inputs": {"moves": "0"}}))
-    try:
-        assert getattr(evidence_of(reported), STORED[name]) is None
-    finally:
-        (reported / "results" / name).unlink()
+    other = {"inputs": {"moves": "0"}}
+    with stored(reported, {name: other for name in (*READERS, "verification.json")}):
+        shown = evidence_of(reported)
+    assert (shown.held_out, shown.planned, shown.verified) == (None, None, None)
 
 
-@pytest.mark.parametrize("name", ["compare.json", "plan.json"])
+@pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("content", [{}, {"held_out": None, "target": 3}, {"held_out": {"verdict": "x"}, "target": {}}])
 def test_results_of_unknown_origin_are_refused_by_name(reported, evidence, name, content):
-    path = reported / "results" / name
-    path.write_text(json.dumps({"inputs": evidence.fit.provenance.inputs, **content}))
-    try:
-        with pytest.raises(InputError, match=f"results/{name}"):
-            evidence_of(reported)
-    finally:
-        path.unlink()
+    inputs = evidence.fit.provenance.inputs
+    document = {"inputs": inputs, **content}
+    with stored(reported, {name: document}), pytest.raises(InputError, match=f"results/{name}"):
+        READERS[name](evidence.campaign, inputs)
 
 
 @pytest.mark.parametrize(
@@ -52,14 +47,11 @@ def test_results_of_unknown_origin_are_refused_by_name(reported, evidence, name,
     ],
 )
 def test_a_damaged_plan_is_refused_by_key(reported, evidence, key, value, column):
-    path = reported / "results" / "plan.json"
-    path.write_text(json.dumps({"inputs": evidence.fit.provenance.inputs, **PLANNED, key: value}))
-    try:
-        with pytest.raises(InputError) as caught:
-            evidence_of(reported)
-        assert caught.value.column == column
-    finally:
-        path.unlink()
+    inputs = evidence.fit.provenance.inputs
+    document = {"inputs": inputs, **PLANNED, key: value}
+    with stored(reported, {"plan.json": document}), pytest.raises(InputError) as caught:
+        stored_plan(evidence.campaign, inputs)
+    assert caught.value.column == column
 
 
 @pytest.mark.parametrize(
@@ -92,15 +84,11 @@ def test_a_verification_of_this_calibration_is_reported_with_millimetres(reporte
     worlds = dict.fromkeys(WORLDS, 0.01) | {APPLIED: 0.96}
     file = {"verdict": KEPT, "p": 0.4, "worlds": worlds, "before": size, "after": size, "promised95": 0.05}
     file |= {"readings": 12, "millimetres": mm, "format": VERIFICATION_FORMAT, "inputs": evidence.fit.provenance.inputs}
-    path = reported / "results" / "verification.json"
     table = content_sha256(calibration_json(load_calibration(reported)))
-    try:
-        path.write_text(json.dumps({**file, "table": table}))
+    with stored(reported, {"verification.json": {**file, "table": table}}):
         [section] = [s for s in report_document(evidence_of(reported)).sections if s.title.startswith("Applied")]
-        path.write_text(json.dumps({**file, "table": "0" * 64}))
+    with stored(reported, {"verification.json": {**file, "table": "0" * 64}}):
         assert evidence_of(reported).verified is None
-    finally:
-        path.unlink()
     assert "KEPT: 12 fresh looks" in section.text[0] and "at 1000 mm 5.2 mm" in section.text[0]
     cells = [cell for row in section.tables[0].rows for cell in row]
     assert {"38", "1.8", "4.1"} <= set(cells)

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from msgspec import structs
-from support.reported_twin import PLANNED, Nodes, evidence_of, report_html
+from support.reported_twin import PLANNED, Nodes, evidence_of, first_words, report_html, stored, words
 from support.small_results import estimate
 
 from tvsbayes.calibration.calibration_file import load_calibration
@@ -30,14 +30,7 @@ from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.document import Document, Issue, Section, Verdict
 from tvsbayes.report.fit_sections import _parameters
-from tvsbayes.report.page import (
-    BROWSERS,
-    page_html,
-    print_to_pdf,
-    prose,
-    replace_page,
-    typeset,
-)
+from tvsbayes.report.page import BROWSERS, page_html, print_to_pdf, prose, replace_page, typeset
 from tvsbayes.report.parameter_words import (
     cause_in_words,
     name_in_words,
@@ -135,7 +128,7 @@ def test_the_first_page_has_results_and_customer(page, evidence, no_pictures):
         (page, "measured 2026-01-15 instrument not recorded serial number not recorded operator not recorded"),
         (page, "laboratory not stated customer not stated"),
     ):
-        first = " ".join(" ".join(Nodes(source.split(b"<nav")[0] + b"</header></body></html>").text).split())
+        first = first_words(source)
         assert phrase in first and "What to do next" in first
         for row in (*(f"{d}, deg/step" for d in DIRECTIONS), "backlash pan, deg", "backlash tilt, deg"):
             assert row in first
@@ -149,14 +142,10 @@ def test_the_first_page_has_results_and_customer(page, evidence, no_pictures):
 
 def test_millimetres_without_aperture_readings_state_their_source(evidence, no_pictures):
     """All calibrations share what is stated of the aperture: they are compared by their beams alone."""
-
-    def text(e) -> str:
-        return " ".join(" ".join(Nodes(report_html(e)).text).split())
-
-    assert text(evidence).count(NO_APERTURE) == 1
+    assert words(report_html(evidence)).count(NO_APERTURE) == 1
     first, *others = evidence.campaign.spots
     read = replace(evidence.campaign, spots=(replace(first, aperture_deg=70.0), *others))
-    assert NO_APERTURE not in text(replace(evidence, campaign=read))
+    assert NO_APERTURE not in words(report_html(replace(evidence, campaign=read)))
 
 
 def test_a_step_is_given_in_millimetres(evidence, no_pictures):
@@ -166,7 +155,7 @@ def test_a_step_is_given_in_millimetres(evidence, no_pictures):
         ratios = [evidence.fit.summary.effective[side].value for side in (one, other)]
         mm = float(re.search(rf"(\S+)\(\d[\d.]*\) mm in {axis}", sentence)[1])
         assert mm == pytest.approx(evidence.range_mm * math.radians(sum(ratios) / 2), rel=1e-2)
-    assert sentence in " ".join(" ".join(Nodes(report_html(evidence)).text).split())
+    assert sentence in words(report_html(evidence))
 
 
 def test_a_long_cell_wraps_and_is_not_cut(evidence, no_pictures):
@@ -179,11 +168,10 @@ def test_a_long_cell_wraps_and_is_not_cut(evidence, no_pictures):
 def test_warnings_of_check_are_on_the_first_page(evidence, no_pictures):
     """The page outlives the terminal: an interrupted run is not usable without a word of it."""
     doubted = replace(evidence, criteria=(), doubts=("whether steps were lost in segment 0 is not known",))
-    first = " ".join(" ".join(Nodes(report_html(doubted).split(b"<nav")[0] + b"</header></body></html>").text).split())
-    assert (
-        "see the warnings of check. No limit" in first and "check warns: whether steps were lost in segment 0" in first
-    )
-    assert "check warns" not in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
+    first = first_words(report_html(doubted))
+    assert "see the warnings of check. No limit" in first
+    assert "check warns: whether steps were lost in segment 0" in first
+    assert "check warns" not in words(report_html(replace(evidence, criteria=())))
 
 
 def test_equal_ratios_share_a_row(evidence):
@@ -196,10 +184,8 @@ def test_equal_ratios_share_a_row(evidence):
     # A narrow screen hides one column by its place: every row has all cells.
     for shown in (answer_table(evidence.fit.summary, evidence.classic), answer_table(alike, None)):
         assert {len(row) for row in shown.rows} == {len(shown.columns)}
-    assert [row[0] for row in answer_table(alike, evidence.classic).rows][:2] == [
-        "left, deg/step",
-        "right, deg/step",
-    ]
+    apart = [row[0] for row in answer_table(alike, evidence.classic).rows]
+    assert apart[:2] == ["left, deg/step", "right, deg/step"]
 
 
 def test_the_half_width_of_an_asymmetric_interval_is_left_out():
@@ -311,7 +297,7 @@ def test_traceability_agrees_with_the_certificate(evidence, no_pictures):
         ({}, "Not traceable", False),
     ):
         campaign = replace(evidence.campaign, header=header | more)
-        text = " ".join(" ".join(Nodes(report_html(replace(evidence, campaign=campaign))).text).split())
+        text = words(report_html(replace(evidence, campaign=campaign)))
         trace = traceability(campaign)
         assert trace.declared is declared and trace.statement.startswith(begin)
         assert trace.statement in text and ("As declared by the user" in text) == declared
@@ -337,17 +323,17 @@ def test_axes_are_assessed_with_the_fitted_contrast(reported, evidence):
 def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
     spots = tuple(replace(s, experiment=None, point=None) for s in evidence.campaign.spots)
     plain = replace(evidence, classic=None, campaign=replace(evidence.campaign, spots=spots))
-    text = " ".join(Nodes(report_html(plain)).text)
+    text = words(report_html(plain))
     assert "Classic: not applicable" in text and "no complete four-point experiment" in text
     first = text.split("Contents")[0]
     assert "0.06" in first and "classic value(u)" not in first
 
 
 def test_without_limit_no_verdict_and_without_convergence_no_results(evidence, no_pictures):
-    assert "No limit was stated" in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
+    assert "No limit was stated" in words(report_html(replace(evidence, criteria=())))
     astray = structs.replace(evidence.fit.summary, converged=False, problems=("the mode was not reached",))
     broken = replace(evidence, fit=replace(evidence.fit, summary=astray))
-    text = " ".join(Nodes(report_html(broken)).text)
+    text = words(report_html(broken))
     assert "NOT CONVERGED" in text and "the mode was not reached" in text
 
 
@@ -363,9 +349,12 @@ PAYLOADS = (
 )
 
 
-@pytest.mark.parametrize("shift", range(3))
+@pytest.mark.parametrize("shift", range(2))
 def test_hostile_text_is_escaped(reported, page, shift, tmp_path, no_pictures):
-    """Every text field of campaign.toml; results stay valid because texts are outside the hash."""
+    """Every text field of campaign.toml; results stay valid because texts are outside the hash.
+
+    Shifted by one: each field gets a payload that shows without escaping, which braces alone do not.
+    """
     campaign = read_campaign(reported)
     payloads = PAYLOADS[shift:] + PAYLOADS[:shift]
     header = dict(zip(("name", "operator", "instrument", "serial", "method", "notes"), payloads, strict=False))
@@ -387,12 +376,8 @@ def test_hostile_text_is_escaped(reported, page, shift, tmp_path, no_pictures):
 
 
 def test_next_experiments_are_those_of_the_plan(reported, evidence, no_pictures):
-    path = reported / "results" / "plan.json"
-    path.write_text(json.dumps({"inputs": evidence.fit.provenance.inputs, **PLANNED}))
-    try:
+    with stored(reported, {"plan.json": {"inputs": evidence.fit.provenance.inputs, **PLANNED}}):
         planned = evidence_of(reported).planned
-    finally:
-        path.unlink()
     text = report_html(replace(evidence, planned=planned)).decode()
     for wanted in ("u(left) \u2264 2e-4", "0.00031 deg/step", "focal scale to 0.1 %", "Go on measuring"):
         assert wanted in text

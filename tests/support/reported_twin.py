@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.cli.main import run
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.report import figures
 from tvsbayes.report.document import Issue
 from tvsbayes.report.evidence import Evidence, gather
 from tvsbayes.report.page import page_html
@@ -64,6 +69,28 @@ class Nodes(HTMLParser):
         return [attributes for name, attributes in self.elements if name == tag]
 
 
+def words(page: bytes) -> str:
+    """What a reader sees of a page, in one line."""
+    return " ".join(" ".join(Nodes(page).text).split())
+
+
+def first_words(page: bytes) -> str:
+    """The same of what stands before the contents."""
+    return words(page.split(b"<nav")[0] + b"</header></body></html>")
+
+
+@contextmanager
+def stored(place: Path, documents: Mapping[str, object]) -> Iterator[None]:
+    """Documents in the results of a campaign, as long as the block lasts."""
+    for name, document in documents.items():
+        (place / "results" / name).write_text(json.dumps(document))
+    try:
+        yield
+    finally:
+        for name in documents:
+            (place / "results" / name).unlink()
+
+
 def evidence_of(place: Path) -> Evidence:
     record = read_fit(place / "results" / "fit.json")
     limits = {"range_mm": 1000.0, "limit_deg_per_step": 1e-3, "limit_mm": 1.0}
@@ -95,5 +122,8 @@ def page(evidence) -> bytes:
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    """Pictures are not what is looked at, and take seconds."""
+    """All figures are an empty one: they are not what is looked at, and take seconds."""
+    empty = Figure()
+    for name in dir(figures):
+        monkeypatch.setattr(figures, name, lambda *_, **__: empty)
     monkeypatch.setattr("tvsbayes.report.document.svg", lambda figure: b"")
