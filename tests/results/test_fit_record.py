@@ -15,14 +15,9 @@ from support.fit_documents import OLD, changed, kept, problems, schema_of
 from support.small_results import small_record, whole_summary
 
 from tvsbayes.errors import InputError
-from tvsbayes.results.convergence import (
-    Agreement,
-    Convergence,
-    Importance,
-    MonteCarloError,
-    NamedValue,
-    Reweighted,
-)
+from tvsbayes.results.comparison_record import Gap, GapTerm
+from tvsbayes.results.convergence import Agreement, Convergence, Importance, MonteCarloError, NamedValue, Reweighted
+from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 from tvsbayes.results.fit_record import FIT_FORMAT, FIT_FORMATS, read_fit
 from tvsbayes.results.records import plain
 
@@ -49,7 +44,7 @@ def test_old_documents_stay_valid_and_readable(path):
 
 
 def test_a_new_document_obeys_the_schema(tmp_path):
-    """The writer's own path, with everything that may be null; a real fit is checked in test_cli."""
+    """The writer's own path, with everything that may be null; a real fit is checked in `cli`."""
     summary = whole_summary()
     (tmp_path / "fit.json").write_text(json.dumps(small_record(summary, seed=3).as_json()))
     document = json.loads((tmp_path / "fit.json").read_text())
@@ -111,9 +106,6 @@ def test_what_a_chain_lacks_leaves_a_rough_answer_or_none():
 
 def test_what_reports_show_besides_obeys_the_schema():
     """Keys that came within version 1, as the records behind them are written; older documents lack them."""
-    from tvsbayes.results.comparison_record import Gap, GapTerm
-    from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
-
     term = GapTerm("backlash over N", -0.002, 1e-4, (-0.0022, -0.0018))
     stop = StopResidual("pan", (3, 4), -100, "", 0, (175.0, 276.5), (None, 0.3), 61.5, -0.01, 0.04)
     cause = Cause("depth", "tilt", (CauseGroup("175 to 276 mm", 12, 0.1, 0.3),), None, False)
@@ -160,7 +152,7 @@ BROKEN = [
     ("noise/chi2", -1.0),
     ("noise/stop_sd_deg/up", ...),
     ("weak_directions/0/loadings", [0.5]),
-    ("leverage", [{"move": 0}]),
+    ("weak_directions/0/text", ...),
     ("prior_sensitivity/0/factor", 0.0),
     ("excluded_spots", [1.5]),
     ("suspect_spots", [-1]),
@@ -188,8 +180,8 @@ def test_the_schema_refuses(tmp_path, path, value):
     file.write_text(json.dumps(document))
     with pytest.raises(InputError) as error:
         read_fit(file)
-    # The message names the place: the value itself, or a key inside it; entries of a list by the list's key.
-    assert error.value.column.startswith(".".join(part for part in path.split("/") if not part.isdigit()))
+    # The message names the place, entries of a list by the list's key.
+    assert error.value.column == ".".join(part for part in path.split("/") if not part.isdigit())
 
 
 @pytest.mark.parametrize("version", FIT_FORMATS)
@@ -210,35 +202,13 @@ def test_a_schema_has_only_rules_that_are_checked(version):
     assert unknown({"properties": {"a": {"items": {"minimun": 0}}}}) == {"minimun"}
 
 
-@pytest.mark.parametrize(
-    ("path", "value", "names"),
-    [
-        ("format", "tvsbayes-fit/9", "format"),
-        ("estimator", ["laplace"], "estimator"),
-        ("effective_deg_per_step/left/value", "0.06", "effective_deg_per_step.left.value"),
-        ("effective_deg_per_step/left/interval95", [1, "2"], "effective_deg_per_step.left.interval95"),
-        ("effective_deg_per_step/up", ..., "effective_deg_per_step.up"),
-        ("parameters/backlash_deg.tilt/sd", -1.0, "parameters.backlash_deg.tilt.sd"),
-        ("reference_pose_deg", [], "reference_pose_deg"),
-        ("inputs/rig", 5, "inputs.rig"),
-        ("versions/tvsbayes", ..., "versions.tvsbayes"),
-        ("seed", 1.5, "seed"),
-        ("command", "a\x00b", "command"),
-    ],
-)
-def test_damaged_documents_are_refused_by_key(tmp_path, path, value, names):
+@pytest.mark.parametrize(("path", "value", "found"), [("noise/chi2", math.nan, '"NaN"'), ("command", "a\x00b", "")])
+def test_what_no_schema_refuses_is_refused(tmp_path, path, value, found):
     file = tmp_path / "fit.json"
     file.write_text(json.dumps(changed(kept("fit-1-laplace.json"), path, value)))
     with pytest.raises(InputError) as error:
         read_fit(file)
-    assert error.value.column == names
-
-
-def test_numbers_that_are_none_are_refused(tmp_path):
-    file = tmp_path / "fit.json"
-    file.write_text(json.dumps(changed(kept("fit-1-laplace.json"), "noise/chi2", math.nan)))
-    with pytest.raises(InputError):
-        read_fit(file)
+    assert found in error.value.message and error.value.column == (None if found else path)
 
 
 def test_a_failure_without_its_test_and_foreign_figures_are_refused(tmp_path):

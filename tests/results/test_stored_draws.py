@@ -9,6 +9,7 @@ import os
 import numpy as np
 import pytest
 from msgspec import structs
+from support.commands import no_constant
 from support.small_campaign import small_campaign
 from support.small_results import small_draws, small_mode, small_record, small_summary
 
@@ -24,11 +25,7 @@ def test_results_are_two_files_with_their_provenance(tmp_path):
     paths = write_results(folder, small_record(summary, seed=5), small_draws())
     assert paths == {"draws": str(folder / "draws.npz"), "fit": str(folder / "fit.json")}
     assert sorted(path.name for path in folder.iterdir()) == ["draws.npz", "fit.json"]
-
-    def refuse(constant):
-        raise AssertionError(f"{constant} is no JSON")
-
-    document = json.loads((folder / "fit.json").read_text(), parse_constant=refuse)
+    document = json.loads((folder / "fit.json").read_text(), parse_constant=no_constant)
     assert document["format"] == "tvsbayes-fit/1"
     assert document["seed"] == 5
     assert document["inputs"] == input_hashes(small_campaign())
