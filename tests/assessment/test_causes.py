@@ -14,18 +14,17 @@ from support.drawn_quantities import drawn_quantities
 from support.linear_fit import ROWS, fit_of, linear_problem, refitted, slope_of
 from support.written_rows import move_row
 
-from tvsbayes.assessment.causes import causes_of, headline_budget
+from tvsbayes.assessment.causes import causes_of, headline_budget, headline_causes
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.metrology.budget_tables import CORRELATIONS
+from tvsbayes.results.estimates import Estimate
+from tvsbayes.statistics.least_squares import laplace_draws
 
 
 @pytest.fixture(scope="module")
 def linear_fit(mounted_rig):
-    """The linear campaign of test_comparison with headlines that are linear in its coordinates: (fit, gradient)."""
-    from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
-    from tvsbayes.statistics.least_squares import laplace_draws
-
+    """A linear campaign with headlines that are linear in its coordinates: (fit, gradient, Jacobian, load)."""
     jacobian, load = linear_problem()
     # What the rig fixes moves no spot.
     jacobian[:, [INDEX[name] for name in RIG_NAMES if mounted_rig.table.priors[name].u == 0]] = 0.0
@@ -51,9 +50,6 @@ def linear_fit(mounted_rig):
 
 
 def test_headline_causes_are_what_refitting_shows(linear_fit):
-    from tvsbayes.assessment.causes import headline_causes
-    from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
-
     fit, gradient, jacobian, load = linear_fit
     causes = headline_causes(fit)
     # Down was never moved.
@@ -79,8 +75,6 @@ def test_headline_causes_are_what_refitting_shows(linear_fit):
 
 def test_the_scatter_of_looks_has_its_share_of_their_noise(linear_fit):
     """Of unit noise the part b diag(v) b^T, b the slopes: what refitting shows of it, and pixels have the rest."""
-    from tvsbayes.assessment.causes import headline_causes
-
     fit, gradient, jacobian, load = linear_fit
     slope = np.asarray(fit.linearised.slope)
     variance = 0.3 * np.random.default_rng(13).uniform(size=slope.shape[::2]) / np.sum(slope**2, axis=1)
@@ -99,8 +93,6 @@ def test_the_scatter_of_looks_has_its_share_of_their_noise(linear_fit):
 
 
 def test_degrees_of_freedom_follow_from_how_well_the_noise_is_known(linear_fit):
-    from tvsbayes.assessment.causes import headline_causes
-
     causes = headline_causes(linear_fit[0])
     dof = dict(zip(causes.names, causes.dof.T, strict=True))
     # nu = 1/(2 var(ln s)): ln s has sd 0.05 for pixels, 0.2 for the worse of left and right (GUM eq. G.3); 2048 draws.
@@ -114,9 +106,6 @@ def test_degrees_of_freedom_follow_from_how_well_the_noise_is_known(linear_fit):
 
 
 def test_headline_budget_is_a_gum_table(linear_fit):
-    from tvsbayes.assessment.causes import headline_causes
-    from tvsbayes.results.estimates import Estimate
-
     fit, gradient, _, _ = linear_fit
     causes = headline_causes(fit)
     sd = float(np.sqrt(gradient[1] @ fit.covariance @ gradient[1]))
@@ -138,8 +127,6 @@ def test_headline_budget_is_a_gum_table(linear_fit):
 
 
 def test_half_normal_and_log_normal_priors_state_their_own_moments(linear_fit):
-    from tvsbayes.assessment.causes import headline_causes
-
     fit, *_ = linear_fit
     causes = headline_causes(fit)
     k = causes.names.index("backlash_deg.pan")

@@ -8,17 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from support.bent_rig import (
-    calibration,
-)
+from support.bent_rig import calibration
 from support.linear_fit import fit_of, linear_problem
 from support.small_campaign import seen_steps, small_campaign
 
 from tvsbayes.assessment.causes import causes_of
-from tvsbayes.assessment.fitted_calibration import (
-    calibration_of,
-    calibration_of_draws,
-)
+from tvsbayes.assessment.fitted_calibration import calibration_of, calibration_of_draws
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
 from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.instrument.campaign import input_hashes

@@ -17,6 +17,7 @@ from msgspec import structs
 from scipy import stats
 from support.dozen_spots import coordinates
 from support.drawn_residuals import drawn_residual
+from support.fit_documents import changed, kept, problems, schema_of
 from support.small_results import small_summary
 
 from tvsbayes.assessment.score_tests import (
@@ -120,6 +121,12 @@ def test_p_values_are_uniform_and_false_alarms_rare(clean):
         assert share <= stats.binom.isf(1e-4, len(tests), 0.1), name
 
 
+DEFECTS = (
+    *("the cameras moved", "the cameras drifted", "a ratio drifted", "steps were lost", "the gears"),
+    "stops depend on the step phase",
+)
+
+
 def planted(fit: JointFit, name: str) -> np.ndarray:
     """What a defect adds to the residuals, written without the package's own columns."""
     spots = ordered_spots(fit.campaign)
@@ -143,17 +150,7 @@ def planted(fit: JointFit, name: str) -> np.ndarray:
     return patterns[name]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "the cameras moved",
-        "the cameras drifted",
-        "a ratio drifted",
-        "steps were lost",
-        "the gears",
-        "stops depend on the step phase",
-    ],
-)
+@pytest.mark.parametrize("name", DEFECTS)
 def test_a_planted_defect_is_named(clean, name):
     validation = validate(with_residual(clean, drawn(clean, 5) + planted(clean, name)))
     assert not validation.passed
@@ -229,8 +226,6 @@ def test_no_reader_of_the_report_can_miss_a_failure():
 
 
 def test_the_entry_obeys_the_schema():
-    from support.fit_documents import changed, kept, problems, schema_of
-
     document = kept("fit-1-laplace.json")
     schema = schema_of(document)
     written = json.loads(json.dumps({**document, "validation": plain(FAILED)}))

@@ -76,6 +76,8 @@ def test_intervals_hold_their_value_and_match_their_sd(summary):
         if name.startswith(("extrinsics", "stereo", "degrees_per_step")):
             # Linear in Gaussian coordinates: 2 x 1.96 sd. Derived ones come from 2048 draws (3 % of an end).
             assert high - low == pytest.approx(2 * 1.96 * estimate.sd, rel=0.1), name
+        if name.startswith("backlash_deg"):
+            assert low > 0, name
 
 
 def test_intervals_of_several_ways_of_homing_are_those_of_their_sds(fitted, summary):
@@ -90,11 +92,6 @@ def test_intervals_of_several_ways_of_homing_are_those_of_their_sds(fitted, summ
     assert both[name].sd == pytest.approx(np.hypot(alone[name].sd, np.sqrt(0.24) * apart), rel=1e-6)
     assert both[name].interval95[1] > alone[name].interval95[1] + 0.7 * apart
     assert both["mirror_offset_mm"].sd == pytest.approx(alone["mirror_offset_mm"].sd, rel=1e-6)
-
-
-def test_backlash_intervals_stay_positive(summary):
-    assert summary.parameters["backlash_deg.pan"].interval95[0] > 0
-    assert summary.parameters["backlash_deg.tilt"].interval95[0] > 0
 
 
 def test_contraction_tells_data_from_prior(summary):
@@ -208,13 +205,6 @@ def test_a_draw_that_went_astray_drops_no_experiment(paper, fitted, monkeypatch)
     assert predicted.value == pytest.approx(np.nanmean(ratios[:, mine], axis=0).mean(), rel=1e-12)
 
 
-def test_the_prediction_holds_the_classic_bias(paper, summary):
-    predicted, effective = summary.classic_predicted["left"], summary.effective["left"]
-    backlash = summary.parameters["backlash_deg.pan"].value
-    # Left starts are reversals: k N - b, but for the first; the rest of the gap is the tangent of the elevation.
-    assert predicted.value - effective.value == pytest.approx(-backlash / 200, rel=0.5)
-
-
 def test_dof_counts_spots_less_what_they_determine(summary, paper):
     residuals = 3 * len(paper.spots)
     assert residuals - 60 < summary.noise.dof < residuals - 10
@@ -289,17 +279,6 @@ def test_a_prior_that_the_data_contradict_is_named(short, summary):
     contradicted = summarise(fit(replace(short, rig=replace(short.rig, priors=priors))))
     # A tight wrong prior pushes what is softer: the ratio keeps its value and others are named in its place.
     assert any("prior sds from its prior's centre" in text for text in contradicted.prior_conflicts)
-
-
-def test_json_has_the_contract_keys_and_no_nan(summary):
-    document = summary.as_json()
-    text = json.dumps(document, allow_nan=False)
-    assert json.loads(text)["estimator"] == "laplace"
-    keys = {"converged", "effective_deg_per_step", "reference_pose_deg", "parameters", "noise", "weak_directions"}
-    assert keys | {"leverage", "excluded_spots"} <= set(document)
-    entry = {"value", "sd", "interval95", "prior_sd", "contraction", "rhat", "ess_bulk", "ess_tail"}
-    assert set(document["parameters"]["backlash_deg.pan"]) == entry
-    assert document["parameters"]["backlash_deg.pan"]["rhat"] is None
 
 
 @pytest.mark.thorough

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 from support.coarse_planning import ROUNDING, with_priors
 from support.dozen_spots import dozen_plan
 
+from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.parameters import INDEX, TARGETS, Prior
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
@@ -42,10 +44,6 @@ def u_of(steps, knowledge, z=None) -> np.ndarray:
 
 def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch):
     """Same point, same looks: segments with home offsets, shared stops, half-open play (the dozen)."""
-    import jax
-
-    from tvsbayes.estimators.mode_search import Problem
-
     monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_DEPTH_SD_MM", 0.0)
     monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_TILT_SD_DEG", 0.0)
     monkeypatch.setattr("tvsbayes.twin.simulated_campaign.HOME_SD_DEG", 0.0)
@@ -145,13 +143,6 @@ def test_looks_that_miss_an_image_tell_nothing(knowledge):
     assert not information.expectation.seen[-1]
     assert information.expectation.seen[:-1].all()
     assert information.fisher == pytest.approx(information_of(steps, knowledge).fisher, rel=ROUNDING)
-
-
-def test_moves_of_a_plan_are_those_the_twin_makes_of_it(mounted_rig, knowledge):
-    log = run_plan(paper_protocol(1), mounted_rig, ("left", "up"))
-    information = information_of(paper_protocol(1), knowledge)
-    assert information.moves == tuple(log.moves)
-    assert information.look_moves == tuple(look.move for look in log.looks)
 
 
 def test_minutes_of_a_plan_by_hand(mounted_rig):

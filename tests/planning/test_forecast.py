@@ -32,8 +32,6 @@ pytestmark = pytest.mark.usefixtures("small_searches")
     [(1.0, 1.0), (1.0, 0.53), (1.0, 0.82), (1.0, 1.45), (1.0, 0.42), (1.0, 3.0), (5e-4, 2e-4), (1.0, 0.02)],
 )
 def test_the_classics_count_is_the_first_that_suffices(sd, half_width):
-    from scipy import stats
-
     def suffices(n: int) -> bool:
         return stats.t.ppf(0.975, n - 1) * sd / math.sqrt(n) <= half_width
 

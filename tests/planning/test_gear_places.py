@@ -25,6 +25,7 @@ from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.gear_places import NO_PLACES, FittedErrors, GearPlaces, regular_places, windows_of
+from tvsbayes.planning.limits import split_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.planner import baseline_of
@@ -302,8 +303,6 @@ def test_a_point_between_the_places_has_what_they_leave_open(real):
 
 
 def test_limits_name_the_transmission_error(real):
-    from tvsbayes.planning.limits import split_of
-
     known, _ = real
     steps = (
         *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1")),

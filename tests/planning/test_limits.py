@@ -125,18 +125,6 @@ def test_errors_of_the_gears_at_the_point_are_not_called_its_stop(knowledge):
     assert needed(13.1) is None
 
 
-def test_when_to_stop():
-    target, open_end = parse_target("u(left) <= 2e-4 deg/step"), Limit(1e-5, "focal scale", {}, True, None)
-    good, poor = (Batch((), 1.0, g, g, "") for g in (1e-5, 1e-8))
-    assert stop_now(1e-4, target, open_end, (good,), True).now
-    assert not stop_now(1e-4, target, open_end, (good,), False).now, "nothing was measured yet"
-    assert not stop_now(3e-4, target, open_end, (good,), True).now
-    assert stop_now(3e-4, target, open_end, (poor,), True).now
-    floor = structs.replace(open_end, floor=2.5e-4, reachable=False)
-    assert stop_now(3e-4, target, floor, (good,), True).now
-    assert "floor" in stop_now(3e-4, target, floor, (good,), False).reason
-
-
 SCALE, STEREO = INDEX["focal_scale"], PARAMETERS - 1
 
 
@@ -175,21 +163,18 @@ def target_of(limit: float) -> Target:
 
 
 def test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high(knowledge):
-    """A value that is one prior's alone goes with its u: a floor 4 / 1.02 times the target requires u / 4 * 1.02."""
+    """A value that is one prior's alone goes with its u: a floor 4 / 1.02 times the target requires u / 4 * 1.02.
+
+    What is needed is never rounded up: 0.255, 0.2578 and 0.2598 of 0.002 are 0.00051, 0.000516 and 0.0005196, of which
+    two digits that are enough are 0.00051.
+    """
     nothing, only = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({SCALE: 2.0})[None])
     limit = limit_of(knowledge, nothing, only, target_of(0.51))
     assert (limit.floor, limit.cause, limit.reachable) == (2.0, "focal scale", False)
-    # 0.255 of 0.002, stated to two digits.
-    assert limit.needed == "it suffices to know u(focal_scale) = 0.00051 instead of 0.002"
-    assert limit_of(knowledge, nothing, only, target_of(2.0)).reachable
-
-
-def test_what_is_needed_is_never_rounded_up(knowledge):
-    """0.2578 of 0.002 is 0.000516 and 0.2598 of it 0.0005196: two digits that are enough are 0.00051 for both."""
-    nothing, only = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({SCALE: 1.0})[None])
-    for share in (0.2578, 0.2598):
-        needed = limit_of(knowledge, nothing, only, target_of(share)).needed
+    for share in (0.255, 0.2578, 0.2598):
+        needed = limit_of(knowledge, nothing, only, target_of(2.0 * share)).needed
         assert needed == "it suffices to know u(focal_scale) = 0.00051 instead of 0.002"
+    assert limit_of(knowledge, nothing, only, target_of(2.0)).reachable
 
 
 def test_two_inputs_are_required_where_one_is_not_enough(knowledge):
@@ -201,20 +186,27 @@ def test_two_inputs_are_required_where_one_is_not_enough(knowledge):
     assert limit.needed == f"it suffices to know {stereo}; u(focal_scale) = 0.0013 instead of 0.002"
 
 
-@pytest.mark.parametrize(("gain_per_minute", "stop"), [(0.98e-3, True), (1.02e-3, False)])
-def test_measuring_stops_below_a_thousandth_of_the_value_a_minute(gain_per_minute, stop):
-    """The rule that is printed: less than 0.1 % of what is known now, with and without data."""
-    now, target = 3e-4, parse_target("u(left) <= 2e-4 deg/step")
-    best = Batch((), 2.0, 2 * gain_per_minute * now, gain_per_minute * now, "")
-    idle = structs.replace(best, gain_per_minute=0.0)
-    for after_data in (False, True):
-        advice = stop_now(now, target, Limit(1e-5, "focal scale", {}, True, None), (best, idle), after_data)
-        assert advice.now is stop
-        assert "less than 0.1 % a minute" in advice.rule
+OPEN = Limit(1e-5, "focal scale", {}, True, None)
+FLOOR = structs.replace(OPEN, floor=2.5e-4, reachable=False)
 
 
-@pytest.mark.parametrize(("now", "stop"), [(2e-4, True), (2.01e-4, False)])
-def test_measuring_stops_where_the_target_is_met(now, stop):
-    good = Batch((), 1.0, 0.1 * now, 0.1 * now, "")
-    target = parse_target("u(left) <= 2e-4 deg/step")
-    assert stop_now(now, target, Limit(1e-5, "focal scale", {}, True, None), (good,), True).now is stop
+@pytest.mark.parametrize(
+    ("now", "gain_per_minute", "limit", "after_data", "stop"),
+    [
+        # The target of 2e-4 is met; before any data nothing is measured yet.
+        (2e-4, 2e-5, OPEN, True, True),
+        (2e-4, 2e-5, OPEN, False, False),
+        (2.01e-4, 2e-5, OPEN, True, False),
+        # The rule that is printed: less than 0.1 % a minute of what is known now, with and without data.
+        *((3e-4, 0.98e-3 * 3e-4, OPEN, after_data, True) for after_data in (False, True)),
+        *((3e-4, 1.02e-3 * 3e-4, OPEN, after_data, False) for after_data in (False, True)),
+        # Out of reach.
+        (3e-4, 2e-5, FLOOR, True, True),
+        (3e-4, 2e-5, FLOOR, False, False),
+    ],
+)
+def test_when_to_stop(now, gain_per_minute, limit, after_data, stop):
+    batches = Batch((), 2.0, 2 * gain_per_minute, gain_per_minute, ""), Batch((), 2.0, 0.0, 0.0, "")
+    advice = stop_now(now, parse_target("u(left) <= 2e-4 deg/step"), limit, batches, after_data)
+    assert advice.now is stop and "less than 0.1 % a minute" in advice.rule
+    assert ("floor" in advice.reason) is (limit is FLOOR)

@@ -10,6 +10,7 @@ import pytest
 from support.coarse_planning import with_priors
 from support.waits import check_forward, doings
 
+from tvsbayes.assessment import weaknesses
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, SENSES
 from tvsbayes.instrument.counter_limits import CounterLimits
@@ -123,8 +124,6 @@ def test_plan_and_fit_judge_by_one_rule(mounted_rig):
     With 2 of 12 starts cleared the ratio and the backlash of both axes correlate by 0.51 to 0.56, with 4 by 0.37 to
     0.44. A fit at the very instrument of the plan, whose covariance is the plan's, judges the same numbers.
     """
-    from tvsbayes.assessment import weaknesses
-
     for plan, together in ((partly_cleared(24, 2), True), (partly_cleared(24, 4), False)):
         judged, check = judge(plan, prior_knowledge(mounted_rig)), check_plan(mounted_rig, plan)
         assert {fault.axis for fault in check.faults} == ({"pan", "tilt"} if together else set())
