@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import equinox as eqx
@@ -109,6 +110,8 @@ def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
     """
     whole = evaluate(dozen.z, dozen.space, dozen.arrays).log_likelihood
     monkeypatch.setattr(density, "BLOCK", 20)
+    # Run once: optimising it takes longer.
+    monkeypatch.setattr(jax, "jit", partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0}))
     arrays = dozen.arrays.of_spots(0, 484)
     cut = density.evaluate(dozen.z[None], no_draw(1, arrays), dozen.space, arrays).log_density[0]
     assert cut + 0.5 * dozen.z @ dozen.z == pytest.approx(whole, abs=FINE_UNIT, rel=1e-12)
