@@ -238,8 +238,14 @@ def mixed_run(mounted_rig: Rig) -> SimulatedCampaign:
 
 
 @pytest.fixture(scope="session")
-def mixed_fit(mixed_run: SimulatedCampaign):
+def mixed_waits() -> list:
+    """What its fit reports."""
+    return []
+
+
+@pytest.fixture(scope="session")
+def mixed_fit(mixed_run: SimulatedCampaign, mixed_waits: list):
     """Its fit."""
     from tvsbayes.estimators.joint_fit import fit
 
-    return fit(mixed_run.campaign)
+    return fit(mixed_run.campaign, progress=mixed_waits.append)

@@ -19,7 +19,7 @@ from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, Prior, names_of
 from tvsbayes.instrument.plan import read_plan
-from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol
+from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.model.compiled import Compiled
 from tvsbayes.statistics.chances import binomial_bounds
@@ -33,74 +33,63 @@ FAR = 5 * SD
 """A true value lies farther than this from a right estimate in 6 of 10 million cases."""
 
 
-@pytest.fixture(scope="module")
-def simulated(mounted_rig) -> SimulatedCampaign:
-    """Six repeats of every direction with |N| = 100 and 200: 96 spots."""
-    plan = four_point_protocol(repeats=6, steps=(100, 200))
-    return simulate(mounted_rig, plan, seed=21)
-
-
-@pytest.fixture(scope="module")
-def fitted(simulated):
-    waits = []
-    result = fit(simulated.campaign, progress=waits.append)
-    check_forward(waits)
-    assert doings(waits)[-3:] == [SEARCHING, NEWTON, DIAGNOSING]
-    return result
-
-
 def with_priors(campaign: Campaign, **priors: Prior) -> Campaign:
     named = {name.replace("__", "."): prior for name, prior in priors.items()}
     return replace(campaign, rig=replace(campaign.rig, priors={**campaign.rig.priors, **named}))
 
 
-def test_truth_is_found_within_its_uncertainty(simulated, fitted):
+def test_a_fit_reports_what_it_does(mixed_fit, mixed_waits):
+    check_forward(mixed_waits)
+    assert doings(mixed_waits)[-3:] == [SEARCHING, NEWTON, DIAGNOSING]
+
+
+def test_truth_is_found_within_its_uncertainty(mixed_run, mixed_fit):
     """Ratios, play, optics, the noise of pixels and stops."""
-    assert fitted.converged, fitted.problems
-    pose = tuple(np.degrees(fitted.reference_pose_rad))
-    true = simulated.truth.parameters
-    ratios = simulated.truth.effective_deg_per_step(simulated.campaign)
-    sd = fitted.draws.effective_deg_per_step.std(axis=0)
-    z = (fitted.mode.effective_deg_per_step - [ratios[d] for d in ("left", "right", "up", "down")]) / sd
+    assert mixed_fit.converged, mixed_fit.problems
+    pose = tuple(np.degrees(mixed_fit.reference_pose_rad))
+    true = mixed_run.truth.parameters
+    ratios = mixed_run.truth.effective_deg_per_step(mixed_run.campaign)
+    sd = mixed_fit.draws.effective_deg_per_step.std(axis=0)
+    z = (mixed_fit.mode.effective_deg_per_step - [ratios[d] for d in ("left", "right", "up", "down")]) / sd
     assert np.all(np.abs(z) < FAR)
     for name in ("backlash_deg.pan", "backlash_deg.tilt", "mirror_offset_mm", "extrinsics.rotation_rad.z"):
         index = INDEX[name]
-        error = fitted.mode.physical[index] - true.get(name, np.nan)
-        assert abs(error) < FAR * fitted.draws.physical[:, index].std(), name
+        error = mixed_fit.mode.physical[index] - true.get(name, np.nan)
+        assert abs(error) < FAR * mixed_fit.draws.physical[:, index].std(), name
     for name in ("pixel_scale", *names_of("stop_sd_deg")):
         index = INDEX[name]
-        spread = np.log(fitted.draws.physical[:, index]).std()
-        assert abs(np.log(fitted.mode.physical[index] / true[name])) < FAR * spread, name
+        spread = np.log(mixed_fit.draws.physical[:, index]).std()
+        assert abs(np.log(mixed_fit.mode.physical[index] / true[name])) < FAR * spread, name
     offset = effective_mirror_offset_mm(true, pose)
-    spread = fitted.draws["effective_mirror_offset_mm"].std()
-    assert abs(fitted.mode["effective_mirror_offset_mm"] - offset) < FAR * spread
+    spread = mixed_fit.draws["effective_mirror_offset_mm"].std()
+    assert abs(mixed_fit.mode["effective_mirror_offset_mm"] - offset) < FAR * spread
 
 
-def test_the_data_shrink_the_ratios_a_hundredfold(fitted):
-    prior = fitted.prior_draws.effective_deg_per_step.std(axis=0)
-    posterior = fitted.draws.effective_deg_per_step.std(axis=0)
+def test_the_data_shrink_the_ratios_a_hundredfold(mixed_fit):
+    prior = mixed_fit.prior_draws.effective_deg_per_step.std(axis=0)
+    posterior = mixed_fit.draws.effective_deg_per_step.std(axis=0)
     # The prior is 0.01 deg/step, stereo and focal scale leave 0.3 to 0.5 % of 0.06.
     assert np.all(posterior < prior / 30)
 
 
 @pytest.mark.thorough
-def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
+def test_a_far_start_is_annealed_to_the_same_mode(mixed_run, mixed_fit):
     # The nominal rig states its mounting to 0.5 rad and 100 mm; the true one stands 0.32 rad and 100 mm away.
     wide = {f"extrinsics.rotation_rad.{a}": Prior(0.0, 0.5) for a in "xyz"}
     wide |= {f"extrinsics.translation_mm.{a}": Prior(0.0, 100.0) for a in "xyz"}
-    campaign = simulated.campaign
+    campaign = mixed_run.campaign
     campaign = replace(campaign, rig=replace(campaign.rig, priors={**campaign.rig.priors, **wide}))
     far = fit(campaign)
     assert far.converged, far.problems
     sd = far.draws.effective_deg_per_step.std(axis=0)
     # The mounted prior adds information of its own, so the modes differ by less than a standard deviation.
-    difference = far.mode.effective_deg_per_step - fitted.mode.effective_deg_per_step
+    difference = far.mode.effective_deg_per_step - mixed_fit.mode.effective_deg_per_step
     assert np.all(np.abs(difference) < SD * sd)
-    assert far.chi2 == pytest.approx(fitted.chi2, rel=0.05)
+    assert far.chi2 == pytest.approx(mixed_fit.chi2, rel=0.05)
 
 
 @pytest.mark.thorough
-def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, mounted_rig, monkeypatch):
+def test_a_second_campaign_of_another_size_compiles_nothing(mixed_run, mixed_fit, mounted_rig, monkeypatch):
     """Other numbers of spots and of counters: every argument of a compiled function keeps its shape."""
     compiled, first = [], Compiled._made
 
@@ -111,31 +100,31 @@ def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, m
     monkeypatch.setattr(Compiled, "_made", counted)
     plan = grid_protocol(pan_steps=(0, 60, 120, 180), tilt_steps=(-90, -30, 30, 90))
     grid = simulate(mounted_rig, plan, seed=22).campaign
-    again = fit(replace(grid, spots=grid.spots[: len(simulated.campaign.spots) - 7]))
-    assert again.converged and again.arrays.gears.filled > fitted.arrays.gears.filled and compiled == []
+    again = fit(replace(grid, spots=grid.spots[: len(mixed_run.campaign.spots) - 7]))
+    assert again.converged and again.arrays.gears.filled > mixed_fit.arrays.gears.filled and compiled == []
 
 
 @pytest.mark.thorough
-def test_an_outlier_is_assigned_to_the_right_spot_of_its_stop(simulated, fitted):
-    spots = ordered_spots(simulated.campaign)
+def test_an_outlier_is_assigned_to_the_right_spot_of_its_stop(mixed_run, mixed_fit):
+    spots = ordered_spots(mixed_run.campaign)
     # The first of two spots taken at one stop, away from the ends of the campaign.
     first = next(a for a, b in pairwise(spots[20:]) if a.move == b.move)
     moved = replace(first, u_left_px=first.u_left_px + 4.0, u_right_px=first.u_right_px + 4.0)
-    campaign = simulated.campaign
+    campaign = mixed_run.campaign
     spoiled = tuple(moved if s.spot == first.spot else s for s in campaign.spots)
     robust = fit(replace(campaign, spots=spoiled), model=ModelChoice(robust=True))
     assert robust.converged, robust.problems
     assert robust.excluded_spots == (first.spot,)
-    sd = fitted.draws.effective_deg_per_step.std(axis=0)
-    difference = robust.mode.effective_deg_per_step - fitted.mode.effective_deg_per_step
-    # One spot less of 96 moves an estimate by a tenth of its sd, Huber weights of the clean ones by a fraction (95 %
+    sd = mixed_fit.draws.effective_deg_per_step.std(axis=0)
+    difference = robust.mode.effective_deg_per_step - mixed_fit.mode.effective_deg_per_step
+    # One spot less of 64 moves an estimate by an eighth of its sd, Huber weights of the clean ones by a fraction (95 %
     # efficiency).
     assert np.all(np.abs(difference) < 0.5 * SD * sd)
 
 
 @pytest.mark.thorough
-def test_the_plain_fit_names_the_outlier_as_suspect(simulated):
-    campaign = simulated.campaign
+def test_the_plain_fit_names_the_outlier_as_suspect(mixed_run):
+    campaign = mixed_run.campaign
     victim = ordered_spots(campaign)[30]
     moved = replace(victim, v_left_px=victim.v_left_px + 3.0)
     spoiled = tuple(moved if s.spot == victim.spot else s for s in campaign.spots)
@@ -145,11 +134,11 @@ def test_the_plain_fit_names_the_outlier_as_suspect(simulated):
 
 
 @pytest.mark.thorough
-def test_robust_on_clean_data_excludes_nothing(simulated, fitted):
-    robust = fit(simulated.campaign, model=ModelChoice(robust=True))
+def test_robust_on_clean_data_excludes_nothing(mixed_run, mixed_fit):
+    robust = fit(mixed_run.campaign, model=ModelChoice(robust=True))
     assert robust.excluded_spots == ()
-    sd = fitted.draws.effective_deg_per_step.std(axis=0)
-    difference = robust.mode.effective_deg_per_step - fitted.mode.effective_deg_per_step
+    sd = mixed_fit.draws.effective_deg_per_step.std(axis=0)
+    difference = robust.mode.effective_deg_per_step - mixed_fit.mode.effective_deg_per_step
     assert np.all(np.abs(difference) < 0.5 * SD * sd)
 
 
@@ -194,55 +183,55 @@ def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(wobbling):
     assert abs(freed.chi2 / dof - 1) < 4 * np.sqrt(2 / dof)
 
 
-def test_harmonics_need_a_period_to_be_freed(simulated):
+def test_harmonics_need_a_period_to_be_freed(mixed_run):
     with pytest.raises(InputError, match="no axis states the period") as caught:
-        fit(simulated.campaign, model=ModelChoice(harmonics=True))
+        fit(mixed_run.campaign, model=ModelChoice(harmonics=True))
     assert '"harmonic_period_deg.pan" = { value = 360.0, u = 0.0 }' in caught.value.remedy
 
 
 @pytest.mark.thorough
-def test_gears_without_play_put_it_into_the_stops(simulated, fitted):
-    result = fit(simulated.campaign, model=ModelChoice(no_backlash=True))
+def test_gears_without_play_put_it_into_the_stops(mixed_run, mixed_fit):
+    result = fit(mixed_run.campaign, model=ModelChoice(no_backlash=True))
     assert result.converged, result.problems
     for axis in ("pan", "tilt"):
         index = INDEX[f"backlash_deg.{axis}"]
         assert not result.free[index]
         assert np.all(result.draws.physical[:, index] == 0.0) and result.mode.physical[index] == 0.0
     assert np.all(np.isfinite(result.covariance)) and np.isfinite(result.chi2)
-    assert result.log_density < fitted.log_density - 10
+    assert result.log_density < mixed_fit.log_density - 10
     sds = [INDEX[name] for name in names_of("stop_sd_deg")]
-    assert np.max(result.mode.physical[sds] / fitted.mode.physical[sds]) > 2
+    assert np.max(result.mode.physical[sds] / mixed_fit.mode.physical[sds]) > 2
 
 
 @pytest.mark.thorough
-def test_a_fixed_parameter_stays_and_the_rest_follows(simulated, fitted):
-    campaign = with_priors(simulated.campaign, mirror_offset_mm=Prior(35.0, 0.0))
+def test_a_fixed_parameter_stays_and_the_rest_follows(mixed_run, mixed_fit):
+    campaign = with_priors(mixed_run.campaign, mirror_offset_mm=Prior(35.0, 0.0))
     result = fit(campaign)
     assert np.all(result.draws.physical[:, INDEX["mirror_offset_mm"]] == 35.0)
     # The translation along y takes over what the mirror offset may not say.
     y = INDEX["extrinsics.translation_mm.y"]
-    assert result.draws.physical[:, y].std() < fitted.draws.physical[:, y].std()
+    assert result.draws.physical[:, y].std() < mixed_fit.draws.physical[:, y].std()
 
 
-def test_the_mode_is_a_stationary_maximum(fitted):
+def test_the_mode_is_a_stationary_maximum(mixed_fit):
     """By differences of the density that fits descend, along the axes of the covariance."""
-    root = np.linalg.cholesky(fitted.covariance)
+    root = np.linalg.cholesky(mixed_fit.covariance)
     # Scales of repeating errors are where the density is highest with everything else integrated out.
-    free = fitted.free & ~np.isin(NAMES, GEAR_ERROR_NAMES)
+    free = mixed_fit.free & ~np.isin(NAMES, GEAR_ERROR_NAMES)
     columns = root.T[free]
 
     def density(points):
-        still = no_draw(len(points), fitted.arrays)
-        return evaluate(points, still, fitted.space, fitted.arrays).log_density
+        still = no_draw(len(points), mixed_fit.arrays)
+        return evaluate(points, still, mixed_fit.space, mixed_fit.arrays).log_density
 
-    value = density(fitted.z[None])[0]
-    assert value == pytest.approx(fitted.log_density)
+    value = density(mixed_fit.z[None])[0]
+    assert value == pytest.approx(mixed_fit.log_density)
     # Of a hundredth of an sd: third derivatives leave 1e-5 of a slope.
-    ahead, behind = (density(fitted.z + sign * 0.01 * columns) for sign in (1, -1))
+    ahead, behind = (density(mixed_fit.z + sign * 0.01 * columns) for sign in (1, -1))
     # Squared length of the remaining Newton step in sds: the fit stops at 1e-8.
     assert np.sum(((ahead - behind) / 0.02) ** 2) < 1e-6 * SD**2
     for sign in (-1, 1):
-        fallen = value - density(fitted.z + sign * 0.5 * columns[::7])
+        fallen = value - density(mixed_fit.z + sign * 0.5 * columns[::7])
         # One half sd away a Gaussian falls by 1/8; half or twice that bounds its non-Gaussian shape.
         assert np.all((fallen > 1 / 16) & (fallen < 1 / 4))
 
@@ -258,8 +247,8 @@ def test_laplace_draws_have_exactly_their_moments():
     np.testing.assert_array_equal(draws, laplace_draws(z, covariance, seed=1))
 
 
-def test_too_few_spots_are_refused_by_number(simulated):
-    campaign = replace(simulated.campaign, spots=simulated.campaign.spots[:5])
+def test_too_few_spots_are_refused_by_number(mixed_run):
+    campaign = replace(mixed_run.campaign, spots=mixed_run.campaign.spots[:5])
     with pytest.raises(NothingToEstimate, match="5 spots can be used") as caught:
         fit(campaign)
     assert caught.value.exit_code == 3
