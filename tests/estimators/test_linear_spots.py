@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.dense_spots import dense_covariance
 
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import (
@@ -61,25 +62,6 @@ def campaign(seed: int = 1, stops: int = 7, places: int = 0) -> LinearSpots:
         jacobian=rng.standard_normal((n, 4, PARAMETERS)),
         places=rng.standard_normal((n, 4, places)),
     )
-
-
-def dense_covariance(spots: LinearSpots) -> np.ndarray:
-    """C (4n, 4n): unit noise, what every state is at both looks, and what all looks have of the errors at places.
-
-    From its renewal on a state's variance grows; two looks share what the earlier one found.
-    """
-    n = len(spots.residual)
-    places = spots.places.reshape(4 * n, -1)
-    covariance = np.eye(4 * n) + places @ places.T
-    for state in range(6):
-        load, epoch = spots.load[:, :, state], np.cumsum(spots.renewed[:, state])
-        for i in range(n):
-            for j in range(n):
-                if epoch[i] == epoch[j]:
-                    before = (epoch == epoch[i]) & (np.arange(n) <= min(i, j))
-                    shared = spots.variance[before, state].sum()
-                    covariance[4 * i : 4 * i + 4, 4 * j : 4 * j + 4] += shared * np.outer(load[i], load[j])
-    return covariance
 
 
 def rows_of(part: slice) -> slice:

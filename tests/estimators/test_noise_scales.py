@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.dense_spots import dense_covariance
 
-from tests.support.dense_spots import dense_covariance
 from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.noise_scales import MarginalScales, noise_draws

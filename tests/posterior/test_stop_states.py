@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.dense_spots import dense_covariance
 from support.small_posterior import ROUNDING, small_fit
 
 from tvsbayes.estimators.linear_spots import linear_spots
@@ -72,26 +73,12 @@ def test_no_states_take_nothing():
 
 
 def test_states_of_a_campaign_give_the_covariance_of_its_filter():
-    """Columns times their variances at the mode, against the filter's six states followed spot by spot."""
+    """Columns times their variances at the mode, against the filter's six states, which make the dense covariance."""
     fitted = small_fit()[0]
     linear = linear_spots(fitted.linearised, fitted.arrays, -fitted.linearised.residual_jacobian)
     states = stop_states(fitted, linear)
-    spots = len(linear.residual)
-    variance = states.variance.sum(axis=1) + states.constant
-    total = (states.load * variance) @ states.load.T
-    expected = np.zeros((spots, 4, spots, 4))
-    covariance = np.zeros((6, 6))
-    for spot in range(spots):
-        keep = ~linear.renewed[spot]
-        covariance = covariance * np.outer(keep, keep) + np.diag(linear.variance[spot])
-        # A state that lives on is the same at later spots; what drifts has no column.
-        alive = np.ones(6, bool)
-        for later in range(spot, spots):
-            if later > spot:
-                alive &= ~linear.renewed[later]
-            shared = linear.load[spot] @ (np.diag(covariance) * alive * np.eye(6)) @ linear.load[later].T
-            expected[spot, :, later], expected[later, :, spot] = shared, shared.T
-    expected = expected.reshape(4 * spots, 4 * spots)
+    total = (states.load * (states.variance.sum(axis=1) + states.constant)) @ states.load.T
+    expected = dense_covariance(linear) - np.eye(len(total))
     assert not linear.variance[:, 2:4][~linear.renewed[:, 2:4]].any(), "a drift has no column"
     np.testing.assert_allclose(total, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
     assert np.all(np.diff([np.flatnonzero(column)[-1] // 4 for column in states.load.T]) >= 0), "in order of their ends"
