@@ -189,22 +189,6 @@ def test_a_chain_of_another_tier_is_not_resumed(fitted, long):
         stored_chain(long[1], fitted, SEED, "other")
 
 
-@pytest.mark.thorough
-def test_a_stuck_walker_is_found(fitted, long):
-    with jax.enable_x64(True):
-        start, chain = stored_chain(long[1], fitted, SEED)
-        before = diagnose(start, chain).convergence
-        walker = int(np.argmax(before.acceptance))
-        assert walker not in before.stuck_walkers
-        w, density, accepted = chain.w.copy(), chain.log_density.copy(), chain.accepted.copy()
-        w[:, walker], density[:, walker], accepted[walker] = w[0, walker], density[0, walker], 0
-        frozen = replace(chain, w=w, log_density=density, accepted=accepted)
-        after = diagnose(start, frozen).convergence
-    assert walker in after.stuck_walkers and not after.converged
-    sentence = next(m for m in after.missing if m.startswith("stuck walkers: "))
-    assert str(walker) in sentence.removeprefix("stuck walkers: ").split(", ")
-
-
 def test_a_linear_function_is_propagated(long):
     draws = long[0].by_name
     result = long[0].propagate(lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"])
