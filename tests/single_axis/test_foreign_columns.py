@@ -51,6 +51,13 @@ def test_runs_in_columns_are_joined_in_order():
     assert long_table(wide, {"value": "Forward 1 (mm)"}).table is wide
 
 
+def test_runs_in_two_units_or_without_positions_are_refused():
+    with pytest.raises(InputError, match="runs in mm, um"):
+        long_table(table(**{"p": ("1",), "Forward 1 (mm)": ("1",), "Forward 2 (um)": ("1",)}), {})
+    with pytest.raises(InputError, match="no column that is surely their position"):
+        long_table(table(p=("1",), q=("2",), Forward_1=("1",), Backward_1=("1",)), {})
+
+
 COLUMNS = {"command": "target mm", "value": "actual mm"}
 
 

@@ -132,6 +132,11 @@ def test_cells_without_meaning_are_refused_with_their_column(tmp_path, row, colu
     assert (refused.value.line, refused.value.column) == (2, column)
 
 
+def test_a_negative_uncertainty_is_refused_as_check_does(tmp_path):
+    with pytest.raises(InputError, match=r"line 2, sd: .*from 0 to"):
+        readings_of(*table(tmp_path, "steps,angle,sd", "0,1,-0.1"))
+
+
 def test_statuses_are_accepted_by_the_campaign_reader(tmp_path):
     series = readings_of(*table(tmp_path, "steps;encoder;ok", "0;0,5;1", "100;1,5;-", "200;;+ slipped"))
     assert [reading.status for reading in series.readings] == ["ok", "refused: -", "refused: + slipped"]

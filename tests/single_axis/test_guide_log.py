@@ -140,6 +140,22 @@ def test_several_runs_calibrations_and_empty_logs():
 
 
 @pytest.mark.parametrize(
+    ("old", "new", "message", "remedy"),
+    [
+        ("Dec = 40.0 deg", "Dec = Unknown", "does not state the declination", "--assume declination_deg=NUMBER"),
+        ("Pixel scale = 2.0", "Pixel scale = ?", "does not state the pixel scale", "--assume pixel_arcsec=NUMBER"),
+        (", xRate = 3.0", "", "does not state xRate", "--assume pulse_arcsec_per_s=NUMBER"),
+        ("Dec = 40.0 deg", "Dec = 89.3 deg", "a declination of 89.3 deg", "nearer to the equator"),
+    ],
+)
+def test_values_missing_in_the_log_are_asked_for(old, new, message, remedy):
+    (run,) = read_runs(night(20).replace(old, new), "log.txt")
+    with pytest.raises(InputError, match=message) as refused:
+        readings_of_run(run, "log.txt", {})
+    assert remedy in refused.value.remedy
+
+
+@pytest.mark.parametrize(
     ("log", "message"),
     [
         ("PHD2 version 2\n", "no run with frames"),
