@@ -25,17 +25,6 @@ def products(size: float) -> np.ndarray:
     return lower + lower.T
 
 
-def test_density_and_draws_of_a_turned_proposal_agree():
-    proposal = straight().turned(products(0.4)).turned(-products(0.2))
-    w = proposal.draw(100_000, np.random.RandomState(4))
-    # Any normal density that is narrower has the mass 1 under the weights.
-    mean, covariance = w.mean(axis=0), np.cov(w.T)
-    for shrink in (0.5, 0.8):
-        other = stats.multivariate_normal(mean, shrink**2 * covariance).logpdf(w)
-        weights = np.exp(other - proposal.log_density(w))
-        assert abs(weights.mean() - 1) < SIGMAS * weights.std() / np.sqrt(len(w))
-
-
 def test_turning_keeps_means_and_leaves_tabulated_coordinates_without_products_as_they_are():
     before = straight()
     cross = products(0.4)

@@ -156,11 +156,6 @@ def test_an_error_that_grows_with_the_counter_is_ratio_to_the_line_alone(line):
     assert with_error[2:] == pytest.approx(without[2:], rel=1e-12)
 
 
-def test_gears_without_errors_have_none_in_their_line(line):
-    empty, zero = (np.asarray(line.slopes(errors, SECANT)[0]) for errors in (np.zeros(0), np.zeros(8)))
-    np.testing.assert_array_equal(empty, zero)
-
-
 def test_turns_of_the_beam_are_unwrapped(line):
     """Beyond half a turn the azimuth wraps; its line does not."""
     ratio = float(line.model.transmission.ratio_rad_per_step[0])

@@ -129,7 +129,7 @@ def test_a_reversal_of_the_wrong_sign_is_reported():
     side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
     rng = np.random.default_rng(2)
     values = [0.01 * m.command + 0.1 * s + 0.003 * rng.standard_normal() for m, s in zip(moves, side, strict=True)]
-    summary = summarise_axis(fit_axis(campaign(moves, values), tier="importance"))
+    summary = summarise_axis(fit_axis(campaign(moves, values), sampled=False))
     assert summary.parameters["backlash"].value == pytest.approx(-0.2, abs=0.05)
     assert any("negative" in text for text in summary.warnings)
 
@@ -137,7 +137,7 @@ def test_a_reversal_of_the_wrong_sign_is_reported():
 @pytest.mark.parametrize("name, value", [("per_command", 0.01), ("ratio_contrast", 2e-6)])
 def test_a_constant_is_held(name, value):
     axis = drawn(2, None, **{name: AxisPrior(value, 0.0)}).campaign
-    fit = fit_axis(AxisCampaign("deg", axis.moves, axis.readings, axis.stated), tier="importance")
+    fit = fit_axis(AxisCampaign("deg", axis.moves, axis.readings, axis.stated), sampled=False)
     # Rounding of a variance that is zero.
     np.testing.assert_allclose(fit.draws[name], value, atol=1e-10)
 

@@ -13,10 +13,12 @@ PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0
 """Digits required of every parameter and of every standard error."""
 HIGHER = {"MGH09", "Thurber", "BoxBOD", "Rat42", "MGH10", "Eckerle4", "Rat43", "Bennett5"}
 """NIST's level of difficulty: where solvers fail. Every case takes a compilation."""
+LONG = {"Bennett5", "Thurber"}
+"""Of these the ones that take seconds from either start."""
 CASES = [
     pytest.param(name, start, id=f"{name}-start{start + 1}", marks=mark if name in HIGHER else pytest.mark.slow)
     for name in MODELS
-    for start, mark in enumerate((pytest.mark.thorough, ()))
+    for start, mark in enumerate((pytest.mark.thorough, pytest.mark.thorough if name in LONG else ()))
 ]
 
 
