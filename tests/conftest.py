@@ -34,7 +34,8 @@ from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 pytest_plugins = [
-    *("support.dozen_spots", "support.commands", "support.reported_twin"),
+    # The first is imported by others.
+    *("support.commands", "support.dozen_spots", "support.reported_twin"),
     *("support.coarse_planning", "support.invented_studies", "support.viewed_twin"),
 ]
 """Fixtures of one small campaign, of commands, of the report, of planning and of studies, with their helpers."""

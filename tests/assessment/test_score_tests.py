@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 from scipy import stats
+from support.commands import steps
 from support.dozen_spots import coordinates
 from support.drawn_residuals import drawn_residual
 from support.fit_documents import changed, kept, problems, schema_of
@@ -34,7 +35,6 @@ from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, NOISE_NAMES
-from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.fit_text import fit_text, validation_lines
 from tvsbayes.report.scanner_document import verdict_of
@@ -55,9 +55,9 @@ def clean(mounted_rig) -> JointFit:
     orders: list[tuple] = [("home", 0, 0)]
     for look in range(60):
         if look % 15 == 0:
-            orders.append(("place", None, None, ("d1", "d2")[look // 15 % 2]))
+            orders.append(("place", ("d1", "d2")[look // 15 % 2]))
         orders += [("move", PAN[look % 6], TILT[look % 10]), ("look",)]
-    simulated = simulate(mounted_rig, tuple(PlanStep(n, *o) for n, o in enumerate(orders)), seed=4)
+    simulated = simulate(mounted_rig, steps(*orders), seed=4)
     with jax.enable_x64(True):
         problem = Problem(simulated.campaign, simulated.campaign.rig)
         z = np.where(problem.free, coordinates(problem.space, simulated.truth), 0.0)

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from support.commands import (
     DATA,
-    DIRECTIONS,
     MOUNTED,
     PAPER_TWIN,
     assert_error,
@@ -22,6 +21,7 @@ from support.commands import (
 from tvsbayes.cli import campaign_commands
 from tvsbayes.cli.campaign_commands import _sampled
 from tvsbayes.cli.main import run
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.plan import write_plan
 

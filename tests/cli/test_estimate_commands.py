@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 import pytest
 from support.commands import (
-    DIRECTIONS,
     ESTIMATE_KEYS,
     PAPER_TWIN,
     assert_error,
@@ -23,6 +22,7 @@ from support.fit_documents import problems, shipped_schema
 from tvsbayes.estimators import joint_fit
 from tvsbayes.estimators.four_point import select_experiments
 from tvsbayes.inference import diagnosis, ensemble, importance
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.protocols import mixed_protocol

@@ -18,6 +18,7 @@ from tvsbayes.progress import Progress
 from tvsbayes.results.tiers import CHAIN
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
+MAIN = (sys.executable, "-c", "from tvsbayes.cli.main import main; main()")
 
 
 @pytest.mark.parametrize("command", ["check", "classic", "fit"])
@@ -72,9 +73,8 @@ def test_control_characters_of_a_name_do_not_reach_the_terminal(say, tmp_path):
 @pytest.mark.parametrize("arguments", [("check", "FOLDER", "--json"), ("check", "nothing here", "--json")])
 def test_a_full_disk_behind_stdout_gives_no_traceback(grid_folder, arguments):
     words = [str(grid_folder) if word == "FOLDER" else word for word in arguments]
-    command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", *words]
     with open("/dev/full", "w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run([*MAIN, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2 and "No space left" in done.stderr
     assert "Traceback" not in done.stderr
 
@@ -83,12 +83,10 @@ def test_a_full_disk_behind_stdout_gives_no_traceback(grid_folder, arguments):
 def test_names_that_stdout_cannot_show_are_escaped(tmp_path, encoding):
     """A Greek letter on a terminal of Western letters; bytes that are no UTF-8 stand for half a character."""
     name = "\u03ac" if encoding != "utf-8" or os.name != "posix" else os.fsdecode(b"caf\xe9")
-    command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", "import", tmp_path / "log.csv"]
+    command = [*MAIN, "import", tmp_path / "log.csv", "--axis", "--to", tmp_path / name, "--yes"]
     (tmp_path / "log.csv").write_text("command,value\n0,0\n1,1\n")
     environment = {**os.environ, "PYTHONIOENCODING": f"{encoding}:strict", "PYTHONUTF8": "1"}
-    done = subprocess.run(
-        [*command, "--axis", "--to", tmp_path / name, "--yes"], capture_output=True, env=environment, check=False
-    )
+    done = subprocess.run(command, capture_output=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr.decode(errors="replace")
     escaped = b"\\udce9" if name.startswith("caf") else b"\\u03ac"
     written = done.stdout.split(b"written: ")[1]
@@ -112,7 +110,7 @@ def test_a_closed_pipe_changes_no_exit_code(monkeypatch, arguments):
     """As when Ctrl-C ends the `tee` behind a run; both streams."""
     # The rest of a buffer would fail again when Python exits: exit code 120.
     monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
-    command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", *arguments]
+    command = [*MAIN, *arguments]
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(command, stdout=writer, stderr=writer, check=False)

@@ -6,8 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 
 import pytest
@@ -53,35 +52,22 @@ class Seen:
     terminal: str
 
 
-@contextmanager
-def screen() -> Iterator[tuple[int, int]]:
-    """Both ends of a pseudo-terminal."""
-    ends = os.openpty()
-    try:
-        yield ends
-    finally:
-        os.close(ends[0])
-
-
 def on_terminal(code: str, *arguments: str) -> Seen:
     """Run Python with standard error on a pseudo-terminal."""
-    with screen() as (master, slave):
-        environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "120"}
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=slave, env=environment
-        )
+    master, slave = os.openpty()
+    command = [sys.executable, "-c", code, *arguments]
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "120"}
+    shown = b""
+    with (
+        open(master, "rb", buffering=0) as terminal,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=slave, env=environment) as process,
+    ):
         os.close(slave)
-        shown = b""
-        while True:
-            try:
-                part = os.read(master, 65536)
-            except OSError:
-                # Linux: the other end is closed.
-                break
-            if not part:
-                break
-            shown += part
-        stdout, _ = process.communicate()
+        # Linux: the other end is closed.
+        with suppress(OSError):
+            while part := terminal.read(65536):
+                shown += part
+        stdout = process.stdout.read()
     return Seen(process.returncode, stdout.decode(), shown.decode())
 
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.coarse_planning import with_priors
+from support.commands import steps
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import INDEX, NAMES, Prior
-from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.planning.candidates import Positions, candidates, from_all_sides, run_up_steps
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.looks import Looks, arrange, covariance_of
@@ -87,7 +87,7 @@ def test_limits_too_narrow_for_a_run_up_are_refused_with_its_length(mounted_rig)
     with pytest.raises(InputError, match="no look has room for a run-up of") as refused:
         candidates(prior_knowledge(rig))
     assert "[positioner]" in refused.value.remedy
-    check = check_plan(rig, (PlanStep(0, "place", target="d1"), PlanStep(1, "look")))
+    check = check_plan(rig, steps(("place", "d1"), ("look",)))
     assert [f.addition for f in check.faults] == [(), ()]
     assert any("no looks can be added on this rig" in w for w in check.warnings)
 

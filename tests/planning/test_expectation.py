@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from support.coarse_planning import ROUNDING, with_priors
+from support.commands import steps
 from support.dozen_spots import dozen_plan
 
 from tvsbayes.estimators.mode_search import Problem
@@ -90,9 +91,8 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
 @pytest.mark.parametrize("moves", [256, 257])
 def test_arrays_hold_every_move_of_a_plan(mounted_rig, moves):
     """One move more than twice the smallest number of looks: a homing and two moves per look, 128 times."""
-    steps = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1")]
-    steps += [PlanStep(n, "move", n, 0) for n in range(2, moves + 1)]
-    log = run_plan([*steps, PlanStep(moves + 1, "look")], mounted_rig, ("left", "up"))
+    orders = (("home", 0, 0), ("place", "d1"), *(("move", n, 0) for n in range(2, moves + 1)), ("look",))
+    log = run_plan(steps(*orders), mounted_rig, ("left", "up"))
     arrays = design_arrays(log.moves, [moves - 1], mounted_rig, homed_from=1, aperture=False)
     assert len(log.moves) == moves and np.array_equal(arrays.moves.steps[:moves, 0], [m.pan_steps for m in log.moves])
 
@@ -148,6 +148,5 @@ def test_looks_that_miss_an_image_tell_nothing(knowledge):
 def test_minutes_of_a_plan_by_hand(mounted_rig):
     """A homing counts as a move: 2 + 60 + 2 + 3 + 3 = 70 s."""
     rig = replace(mounted_rig, costs_s={"move_s": 2.0, "look_s": 3.0, "placement_s": 60.0})
-    steps = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "move", 50, 0)]
-    steps += [PlanStep(3, "look"), PlanStep(4, "look")]
-    assert plan_minutes(rig, steps) == pytest.approx(70 / 60, rel=1e-12)
+    plan = steps(("home", 0, 0), ("place", "d1"), ("move", 50, 0), ("look",), ("look",))
+    assert plan_minutes(rig, plan) == pytest.approx(70 / 60, rel=1e-12)

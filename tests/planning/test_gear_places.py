@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.coarse_planning import ROUNDING, with_priors
+from support.commands import steps
 
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, Prior, names_of
-from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
@@ -304,15 +304,8 @@ def test_a_point_between_the_places_has_what_they_leave_open(real):
 
 def test_limits_name_the_transmission_error(real):
     known, _ = real
-    steps = (
-        *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1")),
-        *(
-            s
-            for n, (pan, tilt) in enumerate([(0, -90), (240, 90)] * 6)
-            for s in (PlanStep(n, "move", pan, tilt), PlanStep(n, "look"))
-        ),
-    )
-    information = information_of(steps, known)
+    looks = [order for pan, tilt in [(0, -90), (240, 90)] * 6 for order in (("move", pan, tilt), ("look",))]
+    information = information_of(steps(("home", 0, 0), ("place", "d1"), *looks), known)
     at = sensitivity(WORST, known.z, known.space, known.rig.table, information.pose_rad, known.gears)
     shares = split_of(known, information.fisher, None, at)
     assert "transmission error" in shares and sum(shares.values()) == pytest.approx(1)

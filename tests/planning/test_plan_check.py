@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.coarse_planning import with_priors
+from support.commands import steps
 from support.waits import check_forward, doings
 
 from tvsbayes.assessment import weaknesses
@@ -27,17 +28,14 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 
 def test_where_a_plan_stands_follows_the_twin(mounted_rig):
     """Empty counters keep an axis, homing ends left and up, and an axis that rests keeps its side."""
-    steps = (
-        *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")),
-        *(PlanStep(3, "move", 100, 40), PlanStep(4, "move", 50, None), PlanStep(5, "look")),
-    )
-    assert describe_looks(mounted_rig, steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
+    plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("move", 100, 40), ("move", 50, None), ("look",))
+    assert describe_looks(mounted_rig, plan) == "d1: (0, 0) by left, up; (50, 40) by right, up"
     looks = Looks(np.array([[50, 60]]), np.array([[1, 1]]), np.array([0]))
-    addition = appended(steps, looks, prior_knowledge(mounted_rig), np.array([30, 10]))
+    addition = appended(plan, looks, prior_knowledge(mounted_rig), np.array([30, 10]))
     # Tilt stands at 40: 20 steps up take up its play without a run-up; pan stands at its goal and needs one.
     assert [(s.action, s.pan_steps, s.tilt_steps) for s in addition[:-1]] == [("move", 20, 40), ("move", 50, 60)]
-    assert describe_looks(mounted_rig, addition, steps) == "d1: (50, 60) by left, up"
-    moves = run_plan((*steps, *addition), mounted_rig, ("left", "up")).moves
+    assert describe_looks(mounted_rig, addition, plan) == "d1: (50, 60) by left, up"
+    moves = run_plan((*plan, *addition), mounted_rig, ("left", "up")).moves
     assert [(m.pan_steps, m.tilt_steps) for m in moves] == [(0, 0), (100, 40), (50, 40), (20, 40), (50, 60)]
 
 
@@ -59,14 +57,14 @@ def test_what_the_rig_holds_fixed_has_no_contraction(mounted_rig, fixed):
 def test_the_papers_protocol_leaves_ratio_and_backlash_inseparable_with_a_remedy(mounted_rig, monkeypatch):
     # Of three levels of tilt only the middle one leaves room for a run-up.
     monkeypatch.setattr("tvsbayes.planning.candidates.TILT_LEVELS", 5)
-    steps = paper_protocol(12)
-    check = check_plan(mounted_rig, steps)
+    plan = paper_protocol(12)
+    check = check_plan(mounted_rig, plan)
     assert {fault.axis for fault in check.faults} == {"pan", "tilt"}
     for fault in check.faults:
         assert "add N = 100 or a cleared approach" in fault.text
         before = max(check.expected[direction] for direction in SENSES[fault.axis])
         assert fault.addition and fault.u_deg_per_step < 0.9 * before
-        again = check_plan(mounted_rig, (*steps, *steps_of(fault.addition, len(steps))))
+        again = check_plan(mounted_rig, (*plan, *steps_of(fault.addition, len(plan))))
         assert fault.axis not in {f.axis for f in again.faults}
     json.dumps(check.as_json(), allow_nan=False)
 
@@ -77,11 +75,8 @@ def test_a_grid_has_no_finding(mounted_rig):
 
 
 def test_one_depth_and_one_side_are_named(mounted_rig):
-    orders = [("home", 0, 0), ("place", None, None, "d1")]
-    for pan in (40, 80, 120, 160, 200):
-        orders += [("move", pan, pan // 2 - 60), ("look",)]
-    steps = tuple(PlanStep(number, *order) for number, order in enumerate(orders))
-    text = "\n".join(check_plan(mounted_rig, steps).warnings)
+    looks = [order for pan in (40, 80, 120, 160, 200) for order in (("move", pan, pan // 2 - 60), ("look",))]
+    text = "\n".join(check_plan(mounted_rig, steps(("home", 0, 0), ("place", "d1"), *looks)).warnings)
     assert "reached from one side" in text
     assert "one depth" in text and "place d2, d3" in text
 
@@ -109,7 +104,7 @@ def test_limits_of_each_axis_and_end_count_where_they_are_stated(mounted_rig):
 
 def test_a_plan_without_a_look_is_refused(mounted_rig):
     with pytest.raises(InputError, match="looks at nothing"):
-        check_plan(mounted_rig, (PlanStep(0, "home", 0, 0),))
+        check_plan(mounted_rig, steps(("home", 0, 0)))
 
 
 def partly_cleared(repeats: int, cleared: int) -> tuple[PlanStep, ...]:

@@ -22,6 +22,7 @@ from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED
 from tvsbayes.cli.main import app, run
 from tvsbayes.errors import TvsError
 from tvsbayes.instrument.parameters import RIG_PRIORS, unit_of
+from tvsbayes.model.compilation_cache import CacheState
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "data" / "docs"
@@ -160,6 +161,8 @@ QUICK = {
 @pytest.mark.parametrize("name", QUICK)
 def test_keys_of_documents_are_explained(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
+    # Two processes try it, which takes seconds: model/test_compilation_cache.py.
+    monkeypatch.setattr("tvsbayes.model.compilation_cache.cache_state", lambda: CacheState(True, "tried elsewhere"))
     run([*(str(tmp_path / "out") if word == "OUT" else word for word in QUICK[name]), "--json"])
     document = json.loads(capsys.readouterr().out)
     part = section(section(DOCUMENTS, "Of scanners"), name, 3)

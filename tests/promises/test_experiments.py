@@ -8,9 +8,11 @@ import importlib.metadata
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
+from support.package_imports import imported
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "experiments"
@@ -28,29 +30,18 @@ DRAWS = [name for name, path in MODULES.items() if "page_figure(" in path.read_t
 DEFINES = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.ClassDef, ast.Assign, ast.AnnAssign, ast.Expr, ast.If)
 
 
+@cache
 def tree_of(name: str) -> ast.Module:
     """Syntax of a module."""
     return ast.parse(MODULES[name].read_text(encoding="utf-8"))
 
 
-def imported(name: str) -> set[str]:
-    """Modules that a module imports, at the top or in functions."""
-    names = set()
-    for node in ast.walk(tree_of(name)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert not node.level, "relative imports hide what a module needs"
-            names |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return names
-
-
 @pytest.mark.parametrize("name", MODULES)
 def test_a_question_imports_only_itself_and_what_is_common(name):
     question = name.split(".")[1]
-    questions = {module.split(".")[1] for module in imported(name) if module.startswith("experiments.")}
+    questions = {module.split(".")[1] for module in imported(tree_of(name)) if module.startswith("experiments.")}
     assert questions <= {question, "common"}
-    assert not {module.split(".")[0] for module in imported(name)} & {"tests", "conftest"}
+    assert not {module.split(".")[0] for module in imported(tree_of(name))} & {"tests", "conftest"}
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -100,7 +91,7 @@ def test_commands_on_pages_are_scripts(page):
 
 def test_figures_have_one_style():
     """All but the drawing of the instrument, which is no plot."""
-    modules = {name for name in MODULES if "matplotlib.figure" in imported(name)}
+    modules = {name for name in MODULES if "matplotlib.figure" in imported(tree_of(name))}
     assert modules == {"experiments.common.figures", "experiments.inputs.draw_rig"}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import tomllib
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.inputs import make_schemas, make_twins
+from experiments.paper.table1 import paper_values
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
@@ -36,19 +36,6 @@ def twin(name: str) -> Campaign:
     return read_campaign(DATA / "twins" / name)
 
 
-def table_1() -> dict[str, tuple[float, float, int]]:
-    """Mean, sd and number of experiments by direction, as shipped."""
-    with (DATA / "reference" / "table1.csv").open(encoding="utf-8", newline="") as file:
-        return {
-            row["direction"]: (
-                float(row["mean_deg_per_step"]),
-                float(row["sd_deg_per_step"]),
-                int(row["experiments"]),
-            )
-            for row in csv.DictReader(file)
-        }
-
-
 def test_the_package_has_all_of_data_but_the_real_pictures():
     """Each folder by name: a folder missing in the list would be missing from an installed package."""
     project = tomllib.loads((DATA.parent / "pyproject.toml").read_text(encoding="utf-8"))
@@ -60,11 +47,11 @@ def test_the_package_has_all_of_data_but_the_real_pictures():
 
 def test_reference_values_are_the_papers():
     """Table 1 and the worked example as formulation 1 quotes them, with their origin."""
-    assert table_1() == {
-        "left": (0.059394, 0.000808, 24),
-        "right": (0.062023, 0.000176, 24),
-        "up": (0.068974, 0.000319, 24),
-        "down": (0.067865, 0.000173, 24),
+    assert paper_values() == {
+        "left": (24, 0.059394, 0.000808),
+        "right": (24, 0.062023, 0.000176),
+        "up": (24, 0.068974, 0.000319),
+        "down": (24, 0.067865, 0.000173),
     }
     example = tomllib.loads((DATA / "reference" / "worked_example.toml").read_text(encoding="utf-8"))
     ratio = ratio_deg_per_step(example["theta_i_deg"], example["theta_f_deg"], example["steps"])
@@ -77,7 +64,7 @@ def test_paper_twin_reproduces_table_1():
     """Each mean within one standard error of the Table's, each sd within 20 %."""
     result = classic(twin("paper_twin"))
     assert len(result.experiments) == 96 and result.skipped == ()
-    for direction, (mean, sd, n) in table_1().items():
+    for direction, (n, mean, sd) in paper_values().items():
         row = result.directions[direction]
         assert row.n == n
         assert row.mean_deg_per_step == pytest.approx(mean, abs=sd / np.sqrt(n)), direction
@@ -91,10 +78,10 @@ def test_paper_twin_has_equal_gears_and_states_its_assumptions():
     p = truth.parameters
     assert p["ratio_contrast_deg_per_step.pan"] == p["ratio_contrast_deg_per_step.tilt"] == 0.0
     assert p["degrees_per_step.left"] == p["degrees_per_step.right"]
-    table = table_1()
+    means = {direction: mean for direction, (_, mean, _) in paper_values().items()}
     for axis, cleared, reverse in (("pan", "right", "left"), ("tilt", "up", "down")):
         # Lost motion seen by classic over 200 steps; the local slope of the beam is within 15 % of 1.
-        lost_deg = 200 * (table[cleared][0] - table[reverse][0])
+        lost_deg = 200 * (means[cleared] - means[reverse])
         assert p[f"backlash_deg.{axis}"] == pytest.approx(lost_deg, rel=0.15), axis
     assert p["stop_sd_deg.left"] > 5 * p["stop_sd_deg.right"]
     assert "OUR ASSUMPTION" in truth.note and "OUR ASSUMPTION" in campaign.header["notes"]

@@ -32,9 +32,6 @@ MOUNTED = DATA / "rigs" / "mounted"
 PAPER_TWIN = DATA / "twins" / "paper_twin"
 
 
-DIRECTIONS = ("left", "right", "up", "down")
-
-
 ESTIMATE_KEYS = {"value", "sd", "interval95", "prior_sd", "contraction", "rhat", "ess_bulk", "ess_tail"}
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.commands import steps
 
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep
@@ -37,16 +38,12 @@ class Dozen:
 
 def dozen_plan() -> tuple[PlanStep, ...]:
     """Moves of one axis between looks, single steps that leave play half taken up, two rehomings."""
-    orders = (
+    return steps(
         *(("home", 0, 0), ("place", "d1"), ("look",), ("move", 60, 0), ("look",), ("move", 60, 40), ("look",)),
         *(("place", "d2"), ("look",), ("move", 60, -40), ("look",), ("move", 61, -40), ("look",)),
         *(("home", 0, 0), ("look",), ("move", 2, 0), ("look",), ("move", 2, -3), ("look",), ("move", 90, 30)),
         *(("move", 90, 50), ("look",), ("place", "d1"), ("look",)),
         *(("home", 20, 10), ("look",), ("move", 20, 12), ("look",), ("move", -30, 12), ("look",)),
-    )
-    return tuple(
-        PlanStep(number, action, target=rest[0]) if action == "place" else PlanStep(number, action, *rest)
-        for number, (action, *rest) in enumerate(orders)
     )
 
 

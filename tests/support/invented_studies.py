@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.commands import steps
 
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.studies.rows import HeadlineRow, StudyRow
@@ -22,10 +23,10 @@ def sweep(sheets: tuple[str, ...] = ("d1", "d3")) -> tuple[PlanStep, ...]:
     """24 looks from both sides of both axes."""
     orders = [("home", 0, 0)]
     for sheet in sheets:
-        orders.append(("place", None, None, sheet))
+        orders.append(("place", sheet))
         for k in range(12):
             orders += [("move", (0, 100, 200, 100)[k % 4], (-60, 0, 60, 30, -30, -45)[k % 6]), ("look",)]
-    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+    return steps(*orders)
 
 
 def invented(job: StudyJob, index: int) -> StudyRow:
