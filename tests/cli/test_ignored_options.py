@@ -56,7 +56,7 @@ def test_options_without_effect_are_refused(ask, line, message):
     assert document["error"]["message"].startswith(message) and document["error"]["remedy"]
 
 
-def test_a_unit_is_for_files_that_state_none(ask, tmp_path):
+def test_a_unit_is_for_files_that_state_none(ask):
     """Files of other programs leave the unit of T open; that of ours is stated."""
     pair = MOUNTED / "stereo.json"
     for option in (("--import-unit", "m"), ("--image-size", "1280x720")):

@@ -211,7 +211,7 @@ def test_a_decimal_comma_is_refused_with_the_point(ask, say, number):
     assert ask("report", PAPER_TWIN, "--limit-mm", "many")[1]["error"]["remedy"] == "see tvsbayes --help"
 
 
-def test_missing_packages_are_named_with_what_to_install(tmp_path):
+def test_missing_packages_are_named_with_what_to_install():
     """As after an installation without dependencies, on a robot with NumPy alone."""
     code = "import sys; sys.modules['typer'] = None; from tvsbayes.cli.main import main; main()"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

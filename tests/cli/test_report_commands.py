@@ -58,13 +58,12 @@ def test_calibrate_without_a_browser_ends_before_the_fit(ask, grid_folder, tmp_p
 @pytest.mark.parametrize("option", ["--laboratory", "--customer", "--country", "--customer-country"])
 def test_empty_names_are_refused(ask, tmp_path, option):
     code, document = ask("report", tmp_path, "--dcc", option, " ")
-    assert (
-        code == 2 and option in document["error"]["message"] and "leave the option out" in document["error"]["remedy"]
-    )
+    assert code == 2 and option in document["error"]["message"]
+    assert "leave the option out" in document["error"]["remedy"]
 
 
 @pytest.mark.thorough
-def test_it_stops_at_an_unusable_fit(ask, say, grid_campaign, tmp_path, no_page):
+def test_it_stops_at_an_unusable_fit(ask, grid_campaign, tmp_path, no_page):
     """Relative counters contradict the model everywhere."""
     moves = tuple(
         replace(m, pan_steps=m.pan_steps - before.pan_steps)

@@ -166,15 +166,14 @@ def test_points_from_a_file_keep_their_order_and_refuse_one_by_one(ask, folder, 
     [
         ("20,100,70,up,up", "approach", "pan_approach"),
         ("20,100,nan,left,up", "number", "aperture_deg"),
-        ("20,1e12,70,left,up", "range", "pan_steps"),
+        ("20,1e12,70,left,up", "number", "pan_steps"),
     ],
 )
 def test_invalid_points_are_refused_with_line_and_column(ask, folder, tmp_path, row, code, column):
     points = table_of(tmp_path / "points.csv", "20,100,70,left,up", row)
     exit_code, document = ask("locate", folder, "--points", points)
-    assert exit_code == 2
     error = document["error"]
-    assert (error["line"], error["column"]) == (3, column)
+    assert (exit_code, error["code"], error["line"], error["column"]) == (2, code, 3, column)
     assert error["remedy"] and error["allowed"]
 
 

@@ -88,7 +88,7 @@ def test_every_look_is_reached_with_a_run_up_inside_the_limits(proposal, mounted
     assert np.all(run_up >= least), "wherever the axes stood"
 
 
-def test_a_sheet_that_stands_there_costs_nothing(proposal, mounted_rig):
+def test_a_sheet_that_stands_there_costs_nothing(proposal):
     """Of equally good looks those without a placement come first: minutes say so."""
     placements = [step.target for step in proposal.steps if step.action == "place"]
     seconds = 60 * proposal.minutes

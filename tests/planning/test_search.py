@@ -91,7 +91,7 @@ def test_criteria_are_what_they_say():
     assert scores(covariance, reference, "D") == pytest.approx(math.log(7.0 / 16.0))
 
 
-def test_a_search_after_data_knows_no_home_offset(knowledge, pool, seen):
+def test_a_search_after_data_knows_no_home_offset(knowledge, seen):
     """Offsets of the new session are two columns with the variance of homing: eliminated, they leave the exact sum."""
     known = replace(knowledge, after_data=True)
     rows = seen.rows.copy()

@@ -57,7 +57,7 @@ def test_every_fault_finds_its_place_and_its_test():
         ("Core::loop", changes.Uncalled("watch"), "  watch(now);\n", ""),
     ],
 )
-def test_a_change_applies_where_its_names_are(sources, tmp_path, place, change, before, after):
+def test_a_change_applies_where_its_names_are(sources, place, change, before, after):
     path, text = change.planted(sources, place)
     whole = changes.ast.unparse(changes.ast.parse(MODULE)) + "\n" if path.suffix == ".py" else path.read_text()
     assert whole.count(before) == 1 and text == whole.replace(before, after)
@@ -76,7 +76,8 @@ def test_a_change_without_a_place_is_refused(sources, place, change, message):
         change.planted(sources, place)
 
 
-def test_a_name_of_two_definitions_is_refused(sources, tmp_path):
+@pytest.mark.usefixtures("sources")
+def test_a_name_of_two_definitions_is_refused(tmp_path):
     (tmp_path / "tvsbayes" / "axis.py").write_text("def slope(a):\n    return a\n")
     with pytest.raises(changes.NoPlace, match=r"slope stands for 2 definitions: .*axis\.slope"):
         changes.Sources(tmp_path).definition("slope")

@@ -217,7 +217,7 @@ def test_causes_and_parameters_are_called_by_words():
 
 
 @pytest.mark.thorough
-def test_no_two_reports_have_one_number(evidence, page, no_pictures):
+def test_no_two_reports_have_one_number(evidence, no_pictures):
     """Another laboratory, customer, day, limit or operator is another report; the same one has the same number."""
     day = datetime.date(2026, 1, 15)
     campaign = replace(evidence.campaign, header={**evidence.campaign.header, "operator": "A. B."})
