@@ -334,13 +334,6 @@ def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatc
     assert "NOT CONVERGED: it went astray" in log
 
 
-def test_a_report_without_a_browser_ends_at_once(ask, grid_folder, monkeypatch):
-    monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
-    monkeypatch.setattr("tvsbayes.cli.report_commands.StoredOrFitted", None)
-    code, document = ask("report", grid_folder, "--pdf")
-    assert (code, document["error"]["code"]) == (2, "no-browser")
-
-
 @pytest.mark.thorough
 def test_held_out_counters_of_a_scanner_are_predicted(ask, say, grid_folder, monkeypatch):
     """Three counters of pan; two of tilt are too few. No experiments are needed, nothing is stored."""

@@ -43,13 +43,14 @@ def test_a_campaign_becomes_a_report_in_one_go(ask, say, grid_folder, no_page):
     assert code == 0 and "removed: report.pdf, dcc.xml" in log and not any(each.exists() for each in stale)
 
 
-def test_calibrate_without_a_browser_ends_before_the_fit(ask, grid_folder, tmp_path, monkeypatch):
+@pytest.mark.parametrize("command", [("calibrate", "--no-sample"), ("report",)])
+def test_without_a_browser_nothing_is_fitted(ask, grid_folder, tmp_path, monkeypatch, command):
     """Scanner and axis; the remedy gives a page."""
     monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
     drawn(7, runs(2)).write(tmp_path / "axis")
     for folder in (grid_folder, tmp_path / "axis"):
         before = sorted(folder.rglob("*"))
-        code, document = ask("calibrate", folder, "--no-sample", "--pdf")
+        code, document = ask(*command, folder, "--pdf")
         assert (code, document["error"]["code"]) == (2, "no-browser")
         assert "leave --pdf out" in document["error"]["remedy"] and "report.html" in document["error"]["remedy"]
         assert set(document) == {"error"} and sorted(folder.rglob("*")) == before

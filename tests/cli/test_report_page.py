@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 
 from tvsbayes.cli.report_page import DRAWING, PRINTING, WrittenPage, written_page
-from tvsbayes.errors import InputError
 
 
 @pytest.fixture
@@ -44,12 +43,6 @@ def test_printing_is_a_stage_of_the_work(shown, tmp_path, pdf):
     assert path.read_bytes() == page.html == b"N1" and page.path == path
     assert page.files == {"report": str(path), **({"pdf": str(path.with_suffix(".pdf"))} if pdf else {})}
     assert page.as_json() == {"criteria": [], "number": "N1", "files": page.files}
-
-
-def test_a_missing_browser_is_refused_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
-    with pytest.raises(InputError, match="--pdf needs one of"):
-        written_page(tmp_path, None, True, {DRAWING: 1.0}, lambda job: pytest.fail("made"))
 
 
 def test_the_commands_named_for_removed_files_exist(capsys):
