@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.bench_runs import small_plan
 from support.pseudo_terminal import needs_pseudo_terminals, served
-from support.streamed_camera import StreamedCamera
+from support.streamed_camera import streamed
 from support.varying_gears import perfect_rig
 
 from tvsbayes.acquisition.bench import Vision
@@ -132,11 +132,11 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
 
     plan = [*TWO_LOOKS, PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
     with (
-        StreamedCamera(cameras_before(instrument), frames_per_s=30) as virtual,
+        streamed(cameras_before(instrument)) as address,
         served(instrument.device, 1_000_000) as port,
     ):
         table = {"driver": "serial", "port": port, "settle_s": 0.0}
-        real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
+        real = replace(small_rig, positioner=table, cameras={"source": address, "spot_sd_px": 0.08})
         lines = []
         outcome = acquire(
             real,
@@ -171,14 +171,14 @@ def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
 
     def go(resume):
         with (
-            StreamedCamera(cameras_before(instrument), frames_per_s=30) as virtual,
+            streamed(cameras_before(instrument)) as address,
             served(instrument.device, 1_000_000) as port,
         ):
             # Another name of the same line, should the system give the same one twice.
             name = tmp_path / f"tty{resume:d}"
             name.symlink_to(port)
             table = {"port": str(name), "settle_s": 0.0}
-            rig = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
+            rig = replace(small_rig, positioner=table, cameras={"source": address, "spot_sd_px": 0.08})
             terminal, vision = Terminal(lines.append, ask=lambda question: ""), Vision(failing_once)
             return acquire(
                 rig, TWO_LOOKS, tmp_path / "c", resume=resume, laser_class="3B", vision=vision, terminal=terminal

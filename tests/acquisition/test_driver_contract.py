@@ -9,7 +9,6 @@ import pytest
 from support.grbl_board import BoardLink, GrblBoard
 
 from tvsbayes.acquisition.driver_contract import camera_violations, positioner_violations
-from tvsbayes.acquisition.drivers import cameras_of, positioner_of
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.cameras.capture import CameraSettings, StereoImage
 from tvsbayes.errors import DeviceFault
@@ -37,67 +36,39 @@ def test_our_positioners_keep_every_promise(make):
     assert positioner_violations(make(), TARGETS, FORBIDDEN) == []
 
 
-def test_the_simulated_bench_keeps_every_promise(small_rig):
-    simulated = {"driver": "simulated"}
-    rig = replace(small_rig, positioner=dict(simulated), cameras={**simulated, "spot_sd_px": 0.08})
-    assert positioner_violations(positioner_of(rig), TARGETS, FORBIDDEN) == []
-    assert camera_violations(cameras_of(rig), rig.stereo.image_width, rig.stereo.image_height) == []
+def lit(report):
+    return replace(report, state=replace(report.state, laser_on=True))
 
 
-def _one_step_off(positioner):
-    move = positioner.move_to
-    positioner.move_to = lambda pan, tilt: replace(move(pan, tilt), pan_steps=pan + 1)
-
-
-def _bright_home(positioner):
-    home = positioner.home
-    positioner.home = lambda: (r := home(), replace(r, state=replace(r.state, laser_on=True)))[1]
-
-
-def _deaf_laser(positioner):
-    laser = positioner.laser
-    positioner.laser = lambda on: laser(False) if on else laser(on)
-
-
-def _lit_mover(positioner):
-    move = positioner.move_to
-    positioner.move_to = lambda pan, tilt: replace(move(pan, tilt), laser_on=(pan, tilt) == TARGETS[0])
-
-
-def _careless(positioner):
-    def laser(on):
-        return positioner.state()
-
-    positioner.laser = laser
-
-
-def _no_remedy(positioner):
-    move = positioner.move_to
-
-    def refusing(pan, tilt):
+def refusing_without_a_remedy(move):
+    def refused(pan, tilt):
         try:
             return move(pan, tilt)
         except DeviceFault:
             raise DeviceFault("limit", "no") from None
 
-    positioner.move_to = refusing
+    return refused
 
 
-def _nameless(positioner):
-    positioner.identity = {}
+BROKEN = {
+    "counters ordered": ("move_to", lambda move: lambda pan, tilt: replace(move(pan, tilt), pan_steps=pan + 1)),
+    "off in motion": ("move_to", lambda move: lambda *to: replace(move(*to), laser_on=to == TARGETS[0])),
+    "with a remedy": ("move_to", refusing_without_a_remedy),
+    "off after home": (
+        "home",
+        lambda home: lambda: (r := home(), replace(r, state=replace(r.state, laser_on=True)))[1],
+    ),
+    "laser(True)": ("laser", lambda laser: lambda on: laser(False)),
+    "before homing": ("laser", lambda laser: lambda on: laser.__self__.state()),
+    '"fw"': ("identity", lambda identity: {}),
+}
+"""The method that is another, by the word that names the promise."""
 
 
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        *((_one_step_off, "counters ordered"), (_bright_home, "off after home"), (_deaf_laser, "laser(True)")),
-        *((_careless, "before homing"), (_no_remedy, "with a remedy"), (_nameless, '"fw"')),
-        (_lit_mover, "off in motion"),
-    ],
-)
-def test_a_broken_promise_is_named(change, word):
-    positioner = serial()
-    change(positioner)
+@pytest.mark.parametrize("word", BROKEN)
+def test_a_broken_promise_is_named(word):
+    positioner, (name, changed) = serial(), BROKEN[word]
+    setattr(positioner, name, changed(getattr(positioner, name)))
     assert any(word in sentence for sentence in positioner_violations(positioner, TARGETS, FORBIDDEN))
 
 

@@ -21,13 +21,14 @@ from tvsbayes.results.records import plain
 CLASSES = {f"NX{name}" for name in ("entry", "data", "instrument", "positioner", "detector", "collection", "note")}
 
 
-@pytest.fixture
-def exported(mounted_rig, tmp_path):
+@pytest.fixture(scope="module")
+def exported(mounted_rig, tmp_path_factory):
     """A simulated run of eight looks, and its file."""
-    Run(mounted_rig, tmp_path / "c", small_plan(2)).engine.run()
-    summary = write_nexus(tmp_path / "c", tmp_path / "run.nxs")
+    place = tmp_path_factory.mktemp("exported")
+    Run(mounted_rig, place / "c", small_plan(2)).engine.run()
+    summary = write_nexus(place / "c", place / "run.nxs")
     assert plain(summary) == {"moves": 5, "looks": 8, "ok": 8, "events": summary.events, "pictures": 0}
-    return tmp_path / "c", tmp_path / "run.nxs"
+    return place / "c", place / "run.nxs"
 
 
 def every(group):

@@ -17,7 +17,7 @@ from tvsbayes.acquisition.session import begin
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.parameters import RIG_NAMES, Prior
 from tvsbayes.twin.physics import mirror_chain
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import draw_truth
@@ -60,14 +60,19 @@ def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monk
     assert np.abs(np.subtract(ours, theirs)).max() < 1e-8
 
 
-def test_a_look_lasts_from_laser_on_to_laser_off(mounted_rig):
-    """All frames of a look see one beam, the next look at the same stop another: by 0.05 deg of pan, over 200 looks."""
-    truth = draw_truth(mounted_rig, np.random.default_rng(4))
-    truth = replace(truth, parameters={**truth.parameters, "look_scatter_deg.pan": 0.05})
-    instrument = Instrument(mounted_rig, 6, truth=truth)
+def at_rest(rig, **parameters: float):
+    """An instrument of a drawn rig with some parameters stated, and its positioner, homed and moved to 0, 0."""
+    truth = draw_truth(rig, np.random.default_rng(4))
+    instrument = Instrument(rig, 6, truth=replace(truth, parameters={**truth.parameters, **parameters}))
     positioner = instrument.positioner()
     positioner.home()
     positioner.move_to(0, 0)
+    return instrument, positioner
+
+
+def test_a_look_lasts_from_laser_on_to_laser_off(mounted_rig):
+    """All frames of a look see one beam, the next look at the same stop another: by 0.05 deg of pan, over 200 looks."""
+    instrument, positioner = at_rest(mounted_rig, **{"look_scatter_deg.pan": 0.05})
     directions = []
     for _ in range(200):
         positioner.laser(True)
@@ -76,7 +81,7 @@ def test_a_look_lasts_from_laser_on_to_laser_off(mounted_rig):
         directions.append(first)
         positioner.laser(False)
     psi, beta = np.radians(instrument.state_deg().mirror_angles_deg)
-    one, two = (mirror_chain(psi + step, beta, truth.parameters)[1] for step in (0.0, 1e-6))
+    one, two = (mirror_chain(psi + step, beta, instrument.truth.parameters)[1] for step in (0.0, 1e-6))
     expected = np.radians(0.05) * np.linalg.norm(two - one) / 1e-6
     off = np.linalg.norm(np.array(directions) - np.mean(directions, axis=0), axis=1)
     # Four standard errors of an sd of 200.
@@ -85,13 +90,8 @@ def test_a_look_lasts_from_laser_on_to_laser_off(mounted_rig):
 
 def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
     """Scale x root of the hours between two motions, over 200 of them; nothing moves while a camera looks on."""
-    truth = draw_truth(mounted_rig, np.random.default_rng(4))
-    still = {name: 0.0 for name in truth.parameters if name.startswith(("stop_sd_deg", "backlash_deg"))}
-    truth = replace(truth, parameters={**truth.parameters, **still, "drift_deg_per_root_hour.pan": 0.3})
-    instrument = Instrument(mounted_rig, 6, truth=truth)
-    positioner = instrument.positioner()
-    positioner.home()
-    positioner.move_to(0, 0)
+    still = {name: 0.0 for name in RIG_NAMES if name.startswith(("stop_sd_deg", "backlash_deg"))}
+    instrument, positioner = at_rest(mounted_rig, **still, **{"drift_deg_per_root_hour.pan": 0.3})
     changes, angle_deg = [], instrument.state_deg().mirror_angles_deg[0]
     for number in range(200):
         instrument.clock.sleep(3600.0)
@@ -101,7 +101,7 @@ def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
         now_deg = instrument.state_deg().mirror_angles_deg[0]
         changes.append(now_deg - angle_deg)
         angle_deg = now_deg
-    p = truth.parameters
+    p = instrument.truth.parameters
     driven = np.where(np.arange(200) % 2, -p["degrees_per_step.right"], p["degrees_per_step.left"])
     # Four standard errors of an sd of 200.
     assert np.std(np.array(changes) - driven) == pytest.approx(0.3, rel=4 / np.sqrt(400))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 
 import numpy as np
 import pytest
 from support import streamed_camera
-from support.streamed_camera import StreamedCamera
+from support.streamed_camera import streamed
 
-from tvsbayes.cameras.capture import StereoImage, open_cameras
+from tvsbayes.cameras.capture import StereoImage, open_cameras, open_capture
 from tvsbayes.cameras.network_stream import NetworkStream
 from tvsbayes.errors import DeviceFault
 
@@ -106,8 +107,32 @@ def test_a_server_that_drops_idle_viewers_is_read_continuously(monkeypatch):
             much.set()
         return pair
 
-    with StreamedCamera(render, frames_per_s=200.0) as virtual:
-        camera = open_cameras({"source": virtual.address}, 320, 240)
+    with streamed(render, frames_per_s=200.0) as address:
+        camera = open_cameras({"source": address}, 320, 240)
         assert much.wait(WAIT_S), "the server sends as long as we read"
         assert camera.grab().left.shape == (240, 320, 3)
         camera.close()
+
+
+def test_a_stream_over_http_from_rendering_to_pictures(monkeypatch):
+    """Every frame has its number as grey level on both sides; a grab never returns one rendered before it."""
+    monkeypatch.setenv("http_proxy", "http://proxy.invalid:3128")
+    numbers, rendered = itertools.count(1), []
+
+    def render() -> StereoImage:
+        rendered.append(next(numbers))
+        return StereoImage(*(np.full((48, 64, 3), 3 * (rendered[-1] % 80) + offset, np.uint8) for offset in (0, 10)))
+
+    with streamed(render, frames_per_s=40) as address:
+        camera = open_cameras({"source": address}, 64, 48)
+        for _ in range(3):
+            before = rendered[-1]
+            image = camera.grab()
+            left, right = image.left.mean(), image.right.mean()
+            # Grey levels survive a JPEG of quality 97 within one.
+            assert right - left == pytest.approx(10, abs=1)
+            assert 1 <= (round(left / 3) - before) % 80 < 40
+            assert image.left.std() < 1
+        camera.close()
+    with pytest.raises(DeviceFault):
+        open_capture("http://127.0.0.1:9/stereo.mjpg")

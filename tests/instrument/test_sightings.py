@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from tvsbayes.instrument.mechanisms import MECHANISMS, SIGHTING_HEAD, TWO_MIRROR
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.plan import PlanBuilder
 from tvsbayes.instrument.rig import Rig, RigTable, parse_rig_table, rig_table_toml
-from tvsbayes.instrument.sightings import Sighting, tangent_frames
+from tvsbayes.instrument.sightings import tangent_frames
 from tvsbayes.report import figures as plots
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import read_truth
@@ -100,26 +102,8 @@ def test_tables_of_sightings_round_trip(key):
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        (
-            lambda s: Sighting(
-                sighting=s.sighting,
-                move=s.move,
-                azimuth_deg=-s.azimuth_deg,
-                elevation_deg=s.elevation_deg,
-                u_deg=s.u_deg,
-            ),
-            "counter-sign",
-        ),
-        (
-            lambda s: Sighting(
-                sighting=s.sighting,
-                move=s.move,
-                azimuth_deg=s.elevation_deg,
-                elevation_deg=s.azimuth_deg,
-                u_deg=s.u_deg,
-            ),
-            "exchanged",
-        ),
+        (lambda s: replace(s, azimuth_deg=-s.azimuth_deg), "counter-sign"),
+        (lambda s: replace(s, azimuth_deg=s.elevation_deg, elevation_deg=s.azimuth_deg), "exchanged"),
     ],
 )
 def test_wrong_tables_are_named(simulated, change, code):

@@ -98,79 +98,51 @@ def test_light_behind_a_motion_is_cut_as_reported():
     assert not board.laser_on
 
 
-def _unhomed(positioner, board):
-    positioner.move_to(1, 1)
-
-
-def _dark_first(positioner, board):
-    positioner.laser(True)
-
-
-def _beyond(positioner, board):
-    positioner.home()
-    positioner.move_to(0, 501)
-
-
-def _limit(positioner, board):
-    positioner.home()
-    board.limit_steps = 300
-    positioner.move_to(900, 0)
-
-
-def _no_switch(positioner, board):
-    board.home_fails = True
-    positioner.home()
-
-
-def _blocked(positioner, board):
-    positioner.home()
-    board.blocked = True
-    positioner.move_to(900, 0)
-
-
-def _silent(positioner, board):
-    positioner.home()
-    board.silent = True
-    positioner.state()
-
-
-def _reset(positioner, board):
-    positioner.home()
-    board.power_on()
-    positioner.move_to(5, 5)
-
-
-def _elsewhere(positioner, board):
-    positioner.home()
-    board.missing_steps = 1
-    positioner.move_to(100, 0)
-
-
 @pytest.mark.parametrize(
-    ("action", "code"),
+    ("homed_first", "change", "order", "code"),
     [
-        *((_unhomed, "refused-unhomed"), (_dark_first, "refused-unhomed"), (_beyond, "refused-limit")),
-        *((_limit, "alarm-1"), (_no_switch, "alarm-9"), (_blocked, "stall"), (_silent, "no-answer")),
-        *((_reset, "reset"), (_elsewhere, "position")),
+        (False, {}, ("move_to", 1, 1), "refused-unhomed"),
+        (False, {}, ("laser", True), "refused-unhomed"),
+        (False, {"home_fails": True}, ("home",), "alarm-9"),
+        (True, {}, ("move_to", 0, 501), "refused-limit"),
+        (True, {"limit_steps": 300}, ("move_to", 900, 0), "alarm-1"),
+        (True, {"blocked": True}, ("move_to", 900, 0), "stall"),
+        (True, {"missing_steps": 1}, ("move_to", 100, 0), "position"),
+        (True, {"silent": True}, ("state",), "no-answer"),
     ],
 )
-def test_faults_are_named_and_end_in_time_and_darkness(action, code):
+def test_faults_are_named_and_end_in_time_and_darkness(homed_first, change, order, code):
     board = GrblBoard()
     positioner = connected(board)
+    if homed_first:
+        positioner.home()
+    vars(board).update(change)
+    check_fault(positioner, board, order, code)
+
+
+def test_a_board_that_was_reset_has_lost_its_position():
+    board, positioner = homed()
+    board.power_on()
+    assert isinstance(check_fault(positioner, board, ("move_to", 5, 5), "reset"), PositionLost)
+
+
+def check_fault(positioner: GrblPositioner, board: GrblBoard, order: tuple, code: str) -> DeviceFault:
+    name, *arguments = order
     with pytest.raises(DeviceFault) as caught:
-        action(positioner, board)
+        getattr(positioner, name)(*arguments)
     assert caught.value.code == code and caught.value.remedy and caught.value.message.isprintable()
     assert isinstance(caught.value, PositionLost) == (code == "reset")
     assert board.clock.monotonic() < 60.0
     positioner.close()
     assert not board.laser_on and not board.lit_in_motion
+    return caught.value
 
 
 def test_an_alarm_is_left_by_homing():
-    board = GrblBoard()
-    positioner = connected(board)
+    board, positioner = homed()
+    board.limit_steps = 300
     with pytest.raises(DeviceFault, match="hard limit"):
-        _limit(positioner, board)
+        positioner.move_to(900, 0)
     with pytest.raises(DeviceFault, match="before homing"):
         positioner.move_to(0, 0)
     board.limit_steps = 10**9
