@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,19 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
+
+
+@pytest.fixture(scope="module")
+def eight_looks(mounted_rig, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("eight") / "c"
+    Run(mounted_rig, folder).engine.run()
+    return folder
+
+
+@pytest.fixture
+def finished(eight_looks, tmp_path) -> Path:
+    """A folder of its own of a run of eight looks that is done."""
+    return Path(shutil.copytree(eight_looks, tmp_path / "c"))
 
 
 def test_campaign_is_readable_after_every_look(mounted_rig, tmp_path):
@@ -75,10 +89,9 @@ def test_what_was_edited_since_is_kept_beside(mounted_rig, tmp_path):
 
 
 @pytest.mark.parametrize("kept", ["half", "created"])
-def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp_path, capsys, kept):
+def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, finished, capsys, kept):
     """Rows that only the tables have are lost looks, not edits; they are kept."""
-    folder, plan = tmp_path / "c", small_plan(2)
-    Run(mounted_rig, folder, plan).engine.run()
+    folder = finished
     before = {name: (folder / name).read_bytes() for name in ("moves.csv", "spots.csv")}
     lines = (folder / LOG).read_bytes().splitlines(keepends=True)
     (folder / LOG).write_bytes(b"".join(lines[: len(lines) // 2 if kept == "half" else 1]))
@@ -88,7 +101,7 @@ def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp
     lost = [warning for warning in document["warnings"] if "lost looks" in warning]
     assert len(lost) == 1 and f"{8 - looks} looks" in lost[0] and "-" not in lost[0].split(" looks and ")[0][-5:]
     assert not any("behind the journal" in warning for warning in document["warnings"])
-    outcome = Run(mounted_rig, folder, plan, resume=True, start=1).engine.run()
+    outcome = Run(mounted_rig, folder, resume=True, start=1).engine.run()
     assert outcome.reason == "done" and sum(s.experiment is not None for s in read_campaign(folder).spots) == 8
     assert not any("edited" in warning for warning in outcome.warnings) and not list(folder.glob("*.edited-*"))
     assert sum("lost its end" in warning for warning in outcome.warnings) == 2
@@ -96,10 +109,9 @@ def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp
     assert copies == before
 
 
-def test_tables_that_lack_a_look_of_the_journal_say_which(mounted_rig, tmp_path, capsys):
+def test_tables_that_lack_a_look_of_the_journal_say_which(finished, capsys):
     """As a killed run leaves them: `classic` and `fit` use the tables."""
-    folder = tmp_path / "c"
-    Run(mounted_rig, folder, small_plan(2)).engine.run()
+    folder = finished
     assert behind_journal(folder, read_campaign(folder)) == ""
     lines = (folder / "spots.csv").read_bytes().splitlines(keepends=True)
     (folder / "spots.csv").write_bytes(b"".join(lines[:-1]))
@@ -109,22 +121,19 @@ def test_tables_that_lack_a_look_of_the_journal_say_which(mounted_rig, tmp_path,
     assert behind_journal(folder, read_campaign(folder)) == "", "what is wrong with a journal is reported by check"
 
 
-def test_a_deleted_journal_has_a_remedy_that_leads_somewhere(mounted_rig, tmp_path):
-    folder = tmp_path / "c"
-    Run(mounted_rig, folder, small_plan(2)).engine.run()
-    (folder / LOG).unlink()
+def test_a_deleted_journal_has_a_remedy_that_leads_somewhere(mounted_rig, finished, tmp_path):
+    (finished / LOG).unlink()
     with pytest.raises(InputError) as refused:
-        acquire(mounted_rig, small_plan(2), folder, simulate=True, resume=True)
+        acquire(mounted_rig, small_plan(2), finished, simulate=True, resume=True)
     assert "backup" in refused.value.remedy and "another folder" in refused.value.remedy
     with pytest.raises(InputError) as refused:
         acquire(mounted_rig, small_plan(2), tmp_path / "new", simulate=True, resume=True)
     assert refused.value.remedy.startswith("leave --resume out")
 
 
-def test_a_repair_counts_what_follows_a_lost_event(mounted_rig, tmp_path, capsys):
+def test_a_repair_counts_what_follows_a_lost_event(finished, tmp_path, capsys):
     """A motion of the first look is lost: until the next homing the mirror angles are unknown."""
-    folder = tmp_path / "c"
-    Run(mounted_rig, folder, small_plan(2)).engine.run()
+    folder = finished
     lines = (folder / LOG).read_bytes().splitlines(keepends=True)
     lost = next(number for number, line in enumerate(lines) if b'"moved"' in line)
     later = [sum(f'"{event}"'.encode() in line for line in lines[lost + 1 :]) for event in ("moved", "looked")]

@@ -396,72 +396,61 @@ def test_missing_names_are_given_by_the_user(mounted, tmp_path):
 
 
 def mistaken(mounted: Stereo) -> dict[str, tuple[dict[str, object], str]]:
-    """Mistakes in a plain JSON, and the part of the message that names each."""
-    good = listed(mounted)
-    x, y, z = mounted.T
+    """Mistakes in a plain JSON: what its entries become, None where they are missing, and the words that name each."""
+    good, (x, y, z) = listed(mounted), mounted.T
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ mounted.R
-    turned = {"R": mounted.R.T.tolist(), "E": essential.tolist()}
-    without_t = {key: value for key, value in good.items() if key != "T"}
+    fundamental = np.linalg.solve(mounted.M2.T, essential @ np.linalg.inv(mounted.M1))
+    wide = {"D1": [0.1, 0, 0, 0], "D2": [0.1, 0, 0, 0], "distortion_model": "equidistant"}
+    others = dict.fromkeys(("M1", "D1", "M2", "D2", "image_size"))
+    named = {"master": {"K": good["M1"], "D": good["D1"]}, "slave": {"K": good["M2"], "D": good["D2"]}}
+    one = {"camera_matrix": good["M1"], "dist_coeffs": good["D1"]}
     return {
-        "R transposed": ({**good, **turned}, "R transposed, by what else the file says"),
+        "R transposed": ({"R": mounted.R.T, "E": essential}, "R transposed, by what else the file says"),
         "R of another file": (
-            {**good, **turned, "R": rotation_matrix(np.array([0, 0.3, 0])).tolist()},
+            {"R": rotation_matrix(np.array([0, 0.3, 0])), "E": essential},
             "another pose than the rest of the file says",
         ),
-        "R transposed, by F": (
-            {
-                **good,
-                "R": turned["R"],
-                "F": np.linalg.solve(mounted.M2.T, essential @ np.linalg.inv(mounted.M1)).tolist(),
-            },
-            "--key R=R.T",
-        ),
-        "two poses": ({**good, "T_right_left": np.eye(4).tolist()}, "another pose"),
-        "by columns": ({**good, "M1": mounted.M1.T.tolist()}, "--key R=R.T where it is transposed too"),
-        "three coefficients": ({**good, "D2": [0.1, 0.0, 0.2]}, "D2: found 3 numbers"),
-        "no number": ({**good, "T": [None, 0, 0]}, "T: found no list of finite numbers"),
-        "no picture's T": ({**good, "T": (mounted.T * 500).tolist()}, "--import-unit mm if it is so"),
-        "squares": ({**good, "T": (mounted.T / 25).tolist()}, "--import-unit 25 where it counts squares"),
-        "R no rotation": ({**good, "R": (2 * mounted.R).tolist()}, "misses it by"),
-        "R in degrees": ({**good, "R": [0.0, 5.0, 1.0]}, "is it in degrees?"),
-        "omnidirectional": ({**good, "camera_model": "omni"}, "the model omni"),
-        "T missing": (without_t, "no T under a name that is known"),
-        "T zero": ({**good, "T": [0, 0, 0]}, "cameras in one place"),
-        "T in metres": ({**good, "T": (mounted.T / 1000).tolist()}, "--import-unit m "),
-        "size missing": ({k: v for k, v in good.items() if k != "image_size"}, "--image-size"),
-        "size of no picture": ({**good, "image_size": [1280.5, 720]}, "whole numbers of pixels"),
-        "M with skew": ({**good, "M1": [[800, 5, 640], [0, 800, 360], [0, 0, 1]]}, "no camera matrix"),
-        "M not last row": ({**good, "M1": [[800, 0, 640], [0, 800, 360], [0, 0, 2]]}, "no camera matrix"),
-        "D missing": ({k: v for k, v in good.items() if k != "D2"}, "no D2"),
-        "unknown lens": ({**good, "distortion_model": "fov"}, "the model fov"),
-        "two left matrices": ({**good, "K1": (2 * mounted.M1).tolist()}, "another under K1"),
-        "wide fisheye": (
-            {
-                **good,
-                "D1": [0.1, 0, 0, 0],
-                "D2": [0.1, 0, 0, 0],
-                "distortion_model": "equidistant",
-                "M1": [[300, 0, 640], [0, 300, 360], [0, 0, 1]],
-            },
-            "do not rename the model",
-        ),
+        "R transposed, by F": ({"R": mounted.R.T, "F": fundamental}, "--key R=R.T"),
+        "two poses": ({"T_right_left": np.eye(4)}, "another pose"),
+        "by columns": ({"M1": mounted.M1.T}, "--key R=R.T where it is transposed too"),
+        "three coefficients": ({"D2": [0.1, 0.0, 0.2]}, "D2: found 3 numbers"),
+        "no number": ({"T": [None, 0, 0]}, "T: found no list of finite numbers"),
+        "no picture's T": ({"T": mounted.T * 500}, "--import-unit mm if it is so"),
+        "squares": ({"T": mounted.T / 25}, "--import-unit 25 where it counts squares"),
+        "R no rotation": ({"R": 2 * mounted.R}, "misses it by"),
+        "R in degrees": ({"R": [0.0, 5.0, 1.0]}, "is it in degrees?"),
+        "omnidirectional": ({"camera_model": "omni"}, "the model omni"),
+        "T missing": ({"T": None}, "no T under a name that is known"),
+        "T zero": ({"T": [0, 0, 0]}, "cameras in one place"),
+        "T in metres": ({"T": mounted.T / 1000}, "--import-unit m "),
+        "size missing": ({"image_size": None}, "--image-size"),
+        "size of no picture": ({"image_size": [1280.5, 720]}, "whole numbers of pixels"),
+        "M with skew": ({"M1": [[800, 5, 640], [0, 800, 360], [0, 0, 1]]}, "no camera matrix"),
+        "M not last row": ({"M1": [[800, 0, 640], [0, 800, 360], [0, 0, 2]]}, "no camera matrix"),
+        "D missing": ({"D2": None}, "no D2"),
+        "unknown lens": ({"distortion_model": "fov"}, "the model fov"),
+        "two left matrices": ({"K1": 2 * mounted.M1}, "another under K1"),
+        "wide fisheye": ({**wide, "M1": [[300, 0, 640], [0, 300, 360], [0, 0, 1]]}, "do not rename the model"),
         "master and slave": (
-            {
-                **{"master": {"K": good["M1"], "D": good["D1"]}, "slave": {"K": good["M2"], "D": good["D2"]}},
-                **{"R": good["R"], "T": good["T"]},
-            },
+            {**others, **named},
             "--key M1=master.K --key M2=slave.K --key D1=master.D --key D2=slave.D",
         ),
-        "one camera": ({"camera_matrix": good["M1"], "dist_coeffs": good["D1"]}, "calibration of one camera"),
-        "nothing": ({"a": 1}, "no other numbers"),
+        "one camera": ({**dict.fromkeys(good), **one}, "calibration of one camera"),
+        "nothing": ({**dict.fromkeys(good), "a": 1}, "no other numbers"),
     }
+
+
+def changed(mounted: Stereo, changes: dict[str, object]) -> dict[str, object]:
+    """The plain document with other entries, without those that are None."""
+    lists = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in changes.items()}
+    return {name: value for name, value in {**listed(mounted), **lists}.items() if value is not None}
 
 
 @pytest.mark.parametrize("kind", mistaken(read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")))
 def test_mistakes_are_refused_with_a_remedy(mounted, tmp_path, kind):
-    document, word = mistaken(mounted)[kind]
+    changes, word = mistaken(mounted)[kind]
     with pytest.raises(InputError) as caught:
-        read_json(tmp_path, document)
+        read_json(tmp_path, changed(mounted, changes))
     assert word in str(caught.value) and caught.value.remedy and "m.json" in str(caught.value)
 
 
@@ -479,24 +468,23 @@ def test_implausible_pairs_are_named_by_file_and_key(mounted, tmp_path):
 
 def test_ambiguous_conventions_are_reported(mounted, tmp_path):
     """Four coefficients that may be those of a fisheye, poses in other axes or inverted."""
-    good, (x, y, z) = listed(mounted), mounted.T
-    inverse = (-mounted.R.T @ mounted.T).tolist()
+    (x, y, z), four = mounted.T, [-0.02, 0.01, -0.005, 0.001]
     attacks = {
-        "four coefficients without the name": {"D1": [-0.02, 0.01, -0.005, 0.001], "D2": [-0.02, 0.01, -0.005, 0.001]},
+        "four coefficients without the name": {"D1": four, "D2": four},
         "in axes of another frame": {"T": [z, x, y]},
-        "are left and right swapped?": {"T": inverse, "R": mounted.R.T.tolist()},
-        "--import-unit": {"T": (mounted.T / 25.4).tolist()},
+        "are left and right swapped?": {"T": -mounted.R.T @ mounted.T, "R": mounted.R.T},
+        "--import-unit": {"T": mounted.T / 25.4},
         "is that its size?": {"image_size": [640, 360]},
-        "is R transposed?": {"R": rotation_matrix(np.array([0, -0.1, 0.02])).tolist()},
-        "transposed they diverge": {"R": rotation_matrix(np.array([0, 0.1, 0.02])).tolist()},
-        "of pictures of two sizes": {"M2": np.diag([2, 2, 1]).dot(mounted.M2).tolist()},
-        "turns by 25 deg": {"R": rotation_matrix(np.array([0.0, 0.1, 0.43])).tolist()},
+        "is R transposed?": {"R": rotation_matrix(np.array([0, -0.1, 0.02]))},
+        "transposed they diverge": {"R": rotation_matrix(np.array([0, 0.1, 0.02]))},
+        "of pictures of two sizes": {"M2": np.diag([2, 2, 1]).dot(mounted.M2)},
+        "turns by 25 deg": {"R": rotation_matrix(np.array([0.0, 0.1, 0.43]))},
         "is taken as rows, columns": {"image_size": [720, 1280]},
         "a view of": {"M1": [[4.2, 0, 640], [0, 4.2, 360], [0, 0, 1]]},
     }
-    for word, new in attacks.items():
+    for word, changes in attacks.items():
         try:
-            result = read_json(tmp_path, {**good, **new})
+            result = read_json(tmp_path, changed(mounted, changes))
             text = " ".join([*result.notes, *result.warnings])
         except InputError as error:
             text = str(error)

@@ -286,25 +286,19 @@ def test_the_table_names_every_status(found_speckled):
         assert word in text
 
 
-@pytest.mark.parametrize("kind", ["link", "damaged", "size", "folder"])
+HOSTILE = {
+    "link": lambda frame: frame.symlink_to(frame.rename(frame.parents[2] / "outside.png")),
+    "damaged": lambda frame: frame.write_bytes(frame.read_bytes()[:-20] + bytes(20)),
+    "size": lambda frame: frame.write_bytes(png_bytes(np.zeros((100, 100, 3), np.uint8))),
+    "folder": lambda frame: (frame.unlink(), frame.mkdir()),
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
 def test_hostile_frames_are_refused_and_nothing_is_written(kind, tmp_path):
     folder = Folder(tmp_path / "c", looks=2)
-    frame = folder.path / "frames" / "000010_right.png"
     before = (folder.path / "spots.csv").read_bytes()
-    if kind == "link":
-        outside = tmp_path / "outside.png"
-        outside.write_bytes(frame.read_bytes())
-        frame.unlink()
-        frame.symlink_to(outside)
-    elif kind == "damaged":
-        data = bytearray(frame.read_bytes())
-        data[len(data) // 2] ^= 1
-        frame.write_bytes(bytes(data))
-    elif kind == "size":
-        frame.write_bytes(png_bytes(np.zeros((100, 100, 3), np.uint8)))
-    else:
-        frame.unlink()
-        frame.mkdir()
+    HOSTILE[kind](folder.path / "frames" / "000010_right.png")
     for method in ("fit", "contour"):
         with pytest.raises(InputError) as caught:
             detect(read_campaign(folder.path), method)
