@@ -106,12 +106,6 @@ def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
         assert [int(row["line"]) for row in csv.DictReader(stream)] == [*range(8, 42, 7), *range(48, 72, 7)]
 
 
-def test_a_cloud_without_refused_looks_has_no_table_of_them(tmp_path):
-    rows = looks(6)
-    written = write_cloud(cloud(calibration(), [rows], {}), tmp_path / "c.ply", [])
-    assert written.refused_file is None and [path.name for path in tmp_path.iterdir()] == ["c.ply"]
-
-
 def test_the_table_of_an_earlier_cloud_goes_and_a_foreign_file_of_its_name_stays(tmp_path):
     place, table = tmp_path / "c.ply", tmp_path / "c.refused.csv"
     assert write_cloud(cloud(calibration(), [looks(20)], {}), place, []).refused == 2 and table.exists()

@@ -1,18 +1,14 @@
-"""Serial ports: opened by name alone, and the driver over a real file descriptor."""
+"""Serial ports: opened by name alone, and of two ports of one device the named one."""
 
 from __future__ import annotations
 
 import pytest
-from support.pseudo_terminal import needs_pseudo_terminals, served
 
-from tvsbayes.acquisition.simulated_instrument import SimulatedDevice, VirtualClock
+from tvsbayes.acquisition.simulated_instrument import VirtualClock
 from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner import serial_port
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.serial_port import Port, serial_opener
-
-SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 10_000}
 
 
 def test_a_ports_name_is_never_taken_as_an_address(tmp_path):
@@ -43,16 +39,3 @@ def test_of_two_ports_of_one_device_the_named_one_is_opened(monkeypatch):
     with pytest.raises(OSError, match="serial number A"):
         open_link()
     assert opened == ["/dev/ttyACM1", "/dev/ttyACM3"]
-
-
-@needs_pseudo_terminals
-def test_pyserial_on_a_pseudo_terminal():
-    """A session from connection to close; the device's time runs with its bytes."""
-    device = SimulatedDevice(VirtualClock(), Mechanics(home_steps=(-60, -40), limit_steps=900))
-    with served(device, 2_000_000) as port:
-        positioner = SerialPositioner(serial_opener(port, 115_200), SETTINGS)
-        positioner.home()
-        assert positioner.laser(True).laser_on
-        assert positioner.move_to(30, 12).pan_steps == 30
-        positioner.close()
-        assert device.mechanics.true_steps == [30, 12] and not device.mechanics.laser_on
