@@ -44,7 +44,7 @@ BESIDE = ("acquisition", "cameras", "single_axis", "statistics")
 """Packages that need little of the model: what the other process is at while one compiles it."""
 TOGETHER = {
     **{"estimators": "estimators", "posterior": "posterior", "planning": "planning", "report": "report"},
-    **{"assessment": "judgements", "comparison": "judgements"},
+    **{"assessment": "judgements", "comparison": "judgements", "view": COMPILES},
 }
 """Packages whose files share fits and compiled functions: one process takes them all. Roughly the longest first."""
 

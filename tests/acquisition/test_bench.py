@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bench_runs import small_plan
+from support.bench_runs import events, small_plan
 from support.pseudo_terminal import needs_pseudo_terminals, served
 from support.streamed_camera import streamed
 from support.varying_gears import perfect_rig
 
 from tvsbayes.acquisition.bench import Vision
-from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.observation import DetectedSpot, live_detector, twin_renderer
 from tvsbayes.acquisition.operator import Terminal
@@ -151,8 +150,8 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     assert not instrument.mechanics.laser_on and lit_in_motion and not any(lit_in_motion)
     assert verify(tmp_path / "c").frames == 12 and len(read_campaign(tmp_path / "c").spots) == 3
     assert "synthetic" not in read_campaign(tmp_path / "c").header
-    start = next(r for r in read_journal(tmp_path / "c").records if r.event == "start")
-    assert start.data["device"]["fw"] == "1.1.0" and "cameras" in start.data
+    (start,) = events(tmp_path / "c", "start")
+    assert start["device"]["fw"] == "1.1.0" and "cameras" in start
 
 
 @pytest.mark.thorough

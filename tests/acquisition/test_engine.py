@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from support.bench_runs import HEADER, Run, ctrl_c, raise_error, small_plan
+from support.bench_runs import HEADER, Run, ctrl_c, events, raise_error, small_plan
 
 from tvsbayes.acquisition.bench import SIMULATED_START
 from tvsbayes.acquisition.campaign_files import check_journal, repair_campaign
@@ -180,7 +180,7 @@ def test_resumed_after_any_look_every_look_is_there_once(mounted_rig, tmp_path, 
     on_target = {before.moves[s.move].pan_steps for s in before.spots if s.target == before.spots[-1].target}
     assert len(references) == len(on_target) and {m.segment for m in campaign.moves} == {0, 1}
     assert_looks_as_planned(campaign, plan)
-    shifts = [r.data["shift_px"] for r in read_journal(folder).records if r.event == "looked" and "shift_px" in r.data]
+    shifts = [look["shift_px"] for look in events(folder, "looked") if "shift_px" in look]
     # New stop errors and home offset of 0.1 degrees together, 900 px per rad, at 175 to 275 mm: a few px.
     assert shifts and max(shifts) < 15
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bench_runs import small_plan
+from support.bench_runs import events, small_plan
 from support.grbl_board import BoardLink, GrblBoard
 
 from tvsbayes.acquisition.bench import Bench
@@ -85,8 +85,8 @@ def test_a_run_on_a_grbl_board_that_is_reset_and_resumed(mounted_rig, tmp_path):
     looked = [(s.experiment, s.point) for s in campaign.spots if s.experiment is not None]
     assert looked == [(n, point) for n in (0, 1) for point in (1, 2, 3, 4)]
     assert {move.segment for move in campaign.moves} == {0, 1} and record.unverified == (0, 1) and record.lost == ()
-    start = next(r for r in read_journal(tmp_path / "c").records if r.event == "start")
-    assert start.data["device"]["fw"] == "Grbl 1.1h" and start.data["setup"]["positioner.port"] == "/dev/ttyUSB0"
+    start = events(tmp_path / "c", "start")[0]
+    assert start["device"]["fw"] == "Grbl 1.1h" and start["setup"]["positioner.port"] == "/dev/ttyUSB0"
 
 
 def test_a_stop_where_a_board_was_homed_has_no_known_side(mounted_rig, tmp_path):

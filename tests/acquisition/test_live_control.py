@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.bench_runs import Run, raise_error, small_plan
+from support.bench_runs import Run, events, raise_error, small_plan
 from support.live_runs import scripted_run
 
 from tvsbayes.acquisition.journal import read_journal
@@ -22,8 +22,7 @@ pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 
 def requests(folder) -> list[tuple[str, bool]]:
     """What the journal holds of requests: what, and whether the laser was on then."""
-    records = read_journal(folder).records
-    return [(r.data["what"], r.data["device"]["laser_on"]) for r in records if r.event == "asked"]
+    return [(asked["what"], asked["device"]["laser_on"]) for asked in events(folder, "asked")]
 
 
 def states(live: LiveRun) -> list[tuple[str, str]]:
@@ -122,8 +121,8 @@ def test_a_pause_without_a_page_ends_with_ctrl_c_only(mounted_rig, tmp_path):
 
     live.requests.wait = waited
     assert run.engine.run().reason == "interrupted" and live.requests.waits == 5 and run.dark()
-    events = [record.event for record in read_journal(tmp_path / "c").records]
-    assert events[events.index("asked") :] == ["asked", "stop"], "nothing moves"
+    names = [record.event for record in read_journal(tmp_path / "c").records]
+    assert names[names.index("asked") :] == ["asked", "stop"], "nothing moves"
 
 
 def test_requests_that_cannot_be_carried_out_are_reported_as_failed(mounted_rig, tmp_path):

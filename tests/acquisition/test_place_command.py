@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.bench_runs import Run, small_plan
+from support.bench_runs import Run, events, small_plan
 from support.firmware_sessions import NO_EMULATOR
 
-from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator
 from tvsbayes.acquisition.place_command import WORDS_MAX, PlaceCommand
@@ -26,10 +25,6 @@ WAITS = "import threading; print('on my way', flush=True); threading.Event().wai
 
 def program(code: str, limit_s: float = 60.0) -> PlaceCommand:
     return PlaceCommand((sys.executable, "-c", code), limit_s)
-
-
-def events(folder, name: str) -> list[dict]:
-    return [record.data for record in read_journal(folder).records if record.event == name]
 
 
 def test_every_placement_is_made_by_the_program_in_the_dark(mounted_rig, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from functools import partial
 from types import SimpleNamespace
 
 import pytest
-from support.bench_runs import RIG_FILE, Run, small_plan
+from support.bench_runs import RIG_FILE, Run, events, small_plan
 from support.fits_beside import given_rig, proposing, two_directions
 
 from tvsbayes.acquisition.journal import Journal, read_journal
@@ -35,10 +35,6 @@ def ahead(sheet: str = "d2", step: int = 5, ratio: float = 1.0, accepted: bool =
     return partial(proposing, sheet, step, ratio, accepted)
 
 
-def changes(folder, event: str = "adapted") -> list[dict]:
-    return [record.data for record in read_journal(folder).records if record.event == event]
-
-
 def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
     """Proposals at 12, 15, 18, 22 and 27 looks; 4.6e-4 is met at the last."""
     plan = small_plan(20)
@@ -46,7 +42,7 @@ def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
         run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate)
         outcome = run_.engine.run()
     assert (outcome.reason, outcome.looks) == ("target met", 27) and run_.dark() and not outcome.warnings
-    changed = changes(tmp_path / "c")
+    changed = events(tmp_path / "c", "adapted")
     assert [event["looks"] for event in changed] == [12, 15, 18, 22]
     assert changed[0]["why"] == "8 looks at d2 help most"
     looks = [step for step in changed[0]["steps"] if step["action"] == "look"]
@@ -60,8 +56,8 @@ def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
     assert after == [12, 17, 22, 15, 20, 25, 18, 23, 28, 33, 22, 27, 32, 37, 42]
     assert {spot.target for spot in campaign.spots[12:]} == {"d2"}
     records = read_journal(tmp_path / "c").records
-    events = [record.event for record in records]
-    assert events[events.index("adapted") :].count("placed") == 1
+    names = [record.event for record in records]
+    assert names[names.index("adapted") :].count("placed") == 1
     assert adapted_plan(plan, records) == run_.engine.plan
 
 
@@ -70,10 +66,10 @@ def test_the_sampled_posterior_has_the_last_word(mounted_rig, tmp_path):
     with Replanning(tmp_path / "c", ahead(ratio=1.5), 4.6e-4, 60.0, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(20), estimate=estimate).engine.run()
     assert (outcome.reason, outcome.looks) == ("target met", 40)
-    events = changes(tmp_path / "c", "confirmed")
-    assert [(event["looks"], event["reached"]) for event in events] == [(27, False), (40, True)]
-    assert events[0]["importance_u_deg_per_step"] == pytest.approx(1.5 * events[0]["laplace_u_deg_per_step"])
-    assert [event["looks"] for event in changes(tmp_path / "c")] == [12, 15, 18, 22, 27, 33]
+    confirmed = events(tmp_path / "c", "confirmed")
+    assert [(event["looks"], event["reached"]) for event in confirmed] == [(27, False), (40, True)]
+    assert confirmed[0]["importance_u_deg_per_step"] == pytest.approx(1.5 * confirmed[0]["laplace_u_deg_per_step"])
+    assert [event["looks"] for event in events(tmp_path / "c", "adapted")] == [12, 15, 18, 22, 27, 33]
     assert outcome.as_json()["estimate"]["tier"] == "importance"
     assert outcome.estimate.looks == 40 and set(outcome.estimate.deg_per_step.values()) == {0.061}
 
@@ -82,9 +78,9 @@ def test_weights_that_cannot_be_used_end_no_run(mounted_rig, tmp_path):
     minutes = plan_minutes(mounted_rig, small_plan(3)) + 2.5
     with Replanning(tmp_path / "c", ahead(accepted=False), 4.6e-4, minutes, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(3), estimate=estimate).engine.run()
-    events = changes(tmp_path / "c", "confirmed")
+    confirmed = events(tmp_path / "c", "confirmed")
     assert outcome.reason == "time over" and outcome.looks > 33 and outcome.estimate.tier == "laplace"
-    assert [event["looks"] for event in events][:2] == [27, 33] and not any(event["reached"] for event in events)
+    assert [event["looks"] for event in confirmed][:2] == [27, 33] and not any(event["reached"] for event in confirmed)
 
 
 def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
@@ -126,7 +122,7 @@ def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
 def test_a_proposal_that_the_rig_cannot_run_is_not_followed(mounted_rig, tmp_path, sheet, step):
     with Replanning(tmp_path / "c", ahead(sheet, step), 1e-9, 60.0, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate).engine.run()
-    assert (outcome.reason, outcome.looks) == ("done", 16) and not changes(tmp_path / "c")
+    assert (outcome.reason, outcome.looks) == ("done", 16) and not events(tmp_path / "c", "adapted")
     assert "proposed looks were not followed" in outcome.warnings[0]
 
 
@@ -159,9 +155,9 @@ def test_a_resumed_run_has_the_plan_of_the_interrupted_one(mounted_rig, tmp_path
         go(tmp_path / "c", stop_at=17)
     before = adapted_plan(small_plan(20), read_journal(tmp_path / "c").records)
     outcome = go(tmp_path / "c", resume=True)
-    assert outcome.reason == "target met" and len(changes(tmp_path / "c")) > 2
+    assert outcome.reason == "target met" and len(events(tmp_path / "c", "adapted")) > 2
     after = adapted_plan(small_plan(20), read_journal(tmp_path / "c").records)
-    done = changes(tmp_path / "c")[2]["row"]
+    done = events(tmp_path / "c", "adapted")[2]["row"]
     assert after[:done] == before[:done] and before != tuple(small_plan(20))
     targets = [spot.target for spot in read_campaign(tmp_path / "c").spots]
     assert len(targets) == outcome.looks and targets[17:] == ["d2"] * (outcome.looks - 17)

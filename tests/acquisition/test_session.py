@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support.bench_runs import HEADER, RIG_FILE, Run, ctrl_c, small_plan
+from support.bench_runs import HEADER, RIG_FILE, Run, ctrl_c, events, small_plan
 
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import verify
@@ -80,7 +80,7 @@ def test_a_rig_that_is_reached_or_driven_otherwise_goes_on(mounted_rig, tmp_path
     lines = setup_changes(read_journal(folder).records, changed, synthetic=True)
     assert len(lines) == 6 and all("was not stated and is" in line for line in lines), lines
     assert Run(changed, folder, plan, resume=True, start=1).engine.run().reason == "done"
-    before, after = (r.data["setup"] for r in read_journal(folder).records if r.event == "start")
+    before, after = (start["setup"] for start in events(folder, "start"))
     stated = {f"{name}.{key}": value for name, entries in setup.items() for key, value in entries.items()}
     assert stated.items() <= after.items() and not stated.keys() & before.keys()
 

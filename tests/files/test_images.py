@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -44,8 +45,6 @@ def test_a_png_round_trips_to_the_bit(tmp_path):
 
 def test_a_jpeg_is_read_without_its_orientation_tag():
     """A camera held upright tags its pictures; pixel coordinates belong to the sensor."""
-    import cv2
-
     smooth = cv2.resize(picture(), (400, 300), interpolation=cv2.INTER_CUBIC)
     data = cv2.imencode(".jpg", smooth, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
     exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
@@ -83,8 +82,6 @@ def test_other_formats_are_refused_under_any_name(data):
 
 
 def test_jpegs_of_unusual_kinds_are_refused():
-    import cv2
-
     data = cv2.imencode(".jpg", picture())[1].tobytes()
     frame = data.index(b"\xff\xc0")
     for kind in (0xC3, 0xC9, 0xCF):

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from support.small_campaign import small_stereo
@@ -20,7 +21,6 @@ ROUNDING = 16 * np.finfo(float).eps  # a dozen roundings in a product of three m
 
 
 def test_rotation_matrix_against_opencv():
-    cv2 = pytest.importorskip("cv2")
     rng = np.random.default_rng(1)
     for length in (0.0, 1e-12, 1e-5, 0.3, 2.0, np.pi - 1e-9, np.pi):
         axis = rng.normal(size=3)

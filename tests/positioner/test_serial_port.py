@@ -13,7 +13,6 @@ from tvsbayes.positioner.serial_port import Port, serial_opener
 
 def test_a_ports_name_is_never_taken_as_an_address(tmp_path):
     """With pyserial spy:// would write a file, alt:// call another class; other names end in its ValueError."""
-    pytest.importorskip("serial")
     victim = tmp_path / "victim.txt"
     for port in (f"spy:///dev/ptmx?file={victim}", "loop://?x=1", "alt://x?class=nope", "a\0b"):
         with pytest.raises(DeviceFault) as caught:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tvsbayes.acquisition.bench import SIMULATED_START, Bench
 from tvsbayes.acquisition.engine import Acquisition
+from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.observation import TwinObserver
 from tvsbayes.acquisition.operator import SimulatedOperator, StopKey
 from tvsbayes.acquisition.session import begin
@@ -104,3 +105,8 @@ def raise_error(error):
 
 def ctrl_c(_instrument) -> None:
     signal.raise_signal(signal.SIGINT)
+
+
+def events(folder, name: str) -> list[dict]:
+    """The entries of every event of a kind in a journal."""
+    return [record.data for record in read_journal(folder).records if record.event == name]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -114,8 +115,6 @@ def test_folder_without_results_shows_the_stated_rig(viewed):
 
 
 def test_results_of_other_data_are_not_used(viewed, tmp_path):
-    import shutil
-
     folder = tmp_path / "changed"
     shutil.copytree(viewed.folder, folder)
     table = (folder / "spots.csv").read_text()
