@@ -8,7 +8,8 @@ import pytest
 
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of
 from tvsbayes.cli.main import COMMANDS
-from tvsbayes.instrument.campaign_header import SCANNER, mechanism_key
+from tvsbayes.instrument.campaign_header import mechanism_key
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 
 HANDED_ON = {"out", "issue", "moves", "alone"}
 """What a command makes of its options before it hands them on."""
@@ -17,7 +18,7 @@ HANDED_ON = {"out", "issue", "moves", "alone"}
 @pytest.mark.parametrize(
     ("text", "mechanism"),
     [
-        ('format = "tvsbayes-campaign/1"\n', SCANNER),
+        ('format = "tvsbayes-campaign/1"\n', TWO_MIRROR.key),
         ('format = "tvsbayes-campaign/1"\n[rig]\nmechanism = "pan-tilt"\n', "pan-tilt"),
         ('format = "tvsbayes-axis/1"\n', "axis"),
         ("format = 3\n", "3"),

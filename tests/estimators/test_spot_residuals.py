@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.estimators.campaign_arrays import pixel_covariance
 from tvsbayes.estimators.spot_residuals import NoiseScales, Reflection, ToStates
 from tvsbayes.instrument.campaign import ordered_spots
 
@@ -109,7 +108,7 @@ def test_whitened_differences_have_the_stated_covariance(dozen):
     )
     for k, spot in enumerate(spots):
         d = difference[:4, k]
-        expected = d @ np.linalg.solve(pixel_covariance(spot), d)
+        expected = d @ np.linalg.solve(spot.pixel_covariance(), d)
         assert np.sum(whitened[:4, k] ** 2) == pytest.approx(expected, rel=1e-12)
 
 

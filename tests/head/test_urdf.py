@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.head.chain import HeadOptics
 from tvsbayes.head.urdf import HeadModel, head_joints, ratios_of
 from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.chains import HeadOptics
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import HEAD_TERMS
 

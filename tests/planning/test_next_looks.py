@@ -102,7 +102,7 @@ def test_the_posterior_confirms_on_request(begun_fit, mounted_rig, proposal, mon
 
     def sample(fit, tier):
         def propagate(quantity):
-            values = quantity(Draws(fit.draws))
+            values = quantity(Draws(fit.draws, fit.space.mechanism))
             mean, sd = values.mean(axis=0), 1.5 * values.std(axis=0)
             return SimpleNamespace(mean=mean, sd=sd, interval95=np.stack([mean - 2 * sd, mean + 2 * sd]))
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.drawn_quantities import drawn_quantities
 
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import AMPLITUDE_NAMES, INDEX, NAMES
 from tvsbayes.posterior.arviz_tree import COORDS, VARIABLES, _dataset, _variables
 
@@ -24,7 +25,7 @@ def draws():
 def test_amplitudes_of_stated_periods_have_a_dimension_of_their_own(draws, count):
     """One period or all: the labels are those of the contract names."""
     varying = AMPLITUDE_NAMES[-count:]
-    variable = _dataset(_variables(draws, set(varying), SHAPE))["harmonic_amplitude_deg"]
+    variable = _dataset(_variables(draws, set(varying), SHAPE, TWO_MIRROR))["harmonic_amplitude_deg"]
     dim = variable.dims[-1]
     assert variable.sizes == {"chain": 2, "draw": 3, dim: count}
     assert [f"harmonic_amplitude_deg.{label}" for label in variable[dim].values] == list(varying)
@@ -37,5 +38,5 @@ def test_every_variable_of_several_names_has_a_dimension_with_as_many_labels(dra
     for name, variable in VARIABLES.items():
         labels = 1 if variable.dim is None else len(COORDS[variable.dim])
         assert labels == len(variable.names), name
-    whole = _dataset(_variables(draws, {n for spec in VARIABLES.values() for n in spec.names}, SHAPE))
+    whole = _dataset(_variables(draws, {n for spec in VARIABLES.values() for n in spec.names}, SHAPE, TWO_MIRROR))
     assert set(whole.data_vars) == set(VARIABLES)

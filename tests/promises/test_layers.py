@@ -6,6 +6,8 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,7 @@ from support.package_imports import (
 )
 from support.tests_of import files_importing
 
+from tvsbayes.instrument import mechanisms
 from tvsbayes.model.compiled import sources_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,6 +51,24 @@ JAX_FREE_MODULES = (
 )
 """Free of JAX until a function that fits is called, in packages that are not."""
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
+OF_ONE_INSTRUMENT = {
+    "single_axis": "an axis",
+    "head": "a head with sightings",
+    "compensation": "tables of an axis",
+    "cli": "finds the instrument of a folder, and runs its commands",
+    "pipeline": "the same for Python: `read_campaign`, `verify`",
+    "instrument.mechanisms": "the table of instruments with two axes",
+    "instrument.chains": "its column of chains of the beam",
+    "twin.physics": "the twin's own such column",
+    "twin.simulated_axis": "the twin of an axis",
+    "report.axis_document": "the report of an axis",
+    "report.head_document": "the report of a head with sightings",
+    "view.laser_ways": "draws the mirrors of a scanner",
+}
+"""Rooms and modules that may know which instrument they serve. Others ask what the instrument has:
+images, names, rows of the table."""
+IDENTITY = {"key", "word", "terms", "sightings"}
+"""Fields of a mechanism that tell which it is."""
 LINES_MAX = 600
 """Of a module: a longer one has two subjects."""
 
@@ -75,8 +96,8 @@ def test_parser_sees_every_way_to_import():
 
 
 def test_tests_of_a_module_are_those_that_import_it():
-    files = files_importing("head.chain", "tests/head")
-    assert "tests/head/test_chain.py" in files and "tests/head/test_pointing_table.py" not in files
+    files = files_importing("head.urdf", "tests/head")
+    assert "tests/head/test_urdf.py" in files and "tests/head/test_pointing_table.py" not in files
 
 
 def test_every_module_is_in_a_listed_package():
@@ -129,12 +150,87 @@ def test_without_jax():
             assert not {name, *reachable(graph, name)} & with_jax, name
 
 
+ROWS = {name for name, value in vars(mechanisms).items() if isinstance(value, mechanisms.Mechanism)}
+"""Names of the mechanisms in code."""
+
+
+def parsed(name: str) -> ast.AST:
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
+
+@cache
+def names_of_instruments() -> set[str]:
+    """Names in code that stand for one instrument: mechanisms, kinds of looks, chains, classes of its rooms."""
+    rooms = [parsed(name) for name in MODULES if room(name) in ("single_axis", "head") or name == "instrument.chains"]
+    classes = {node.name for tree in rooms for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    return ROWS | classes | {"Optics", "Spot", "Sighting", "mechanism_key"}
+
+
+@cache
+def words_of_instruments() -> set[object]:
+    """Words for mechanisms, and names of parameters that not all of them have."""
+    kinds = mechanisms.MECHANISMS.values()
+    names = [set(kind.names) for kind in kinds]
+    return {kind.word for kind in kinds} | {kind.key for kind in kinds} | set.union(*names) - set.intersection(*names)
+
+
+def decisions(tree: ast.AST) -> Iterator[ast.AST]:
+    """Conditions, comparisons and tests of a type."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If | ast.IfExp | ast.While | ast.Assert):
+            yield node.test
+        elif isinstance(node, ast.comprehension):
+            yield from node.ifs
+        elif isinstance(node, ast.Match):
+            yield from (node.subject, *(case.pattern for case in node.cases))
+        elif isinstance(node, ast.Compare | ast.BoolOp) or isinstance(getattr(node, "op", None), ast.Not):
+            yield node
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("isinstance", "issubclass"):
+            yield node
+
+
+def decides_on_instrument(tree: ast.AST) -> set[str]:
+    """Decisions that name an instrument; a module may name the classes that it defines."""
+    names = names_of_instruments() - {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    found = set[str]()
+    for decision in decisions(tree):
+        for node in ast.walk(decision):
+            name, of = (getattr(part, "id", getattr(part, "attr", "")) for part in (node, getattr(node, "value", None)))
+            word = node.value if isinstance(node, ast.Constant) else None
+            if name in names or word in words_of_instruments() or (name in IDENTITY and of in ("mechanism", "kind")):
+                found.add(ast.unparse(decision))
+    return found
+
+
+def test_decisions_on_the_instrument_are_found():
+    """Each way to ask which instrument it is, and what may be asked."""
+    asks = ("x = 1 if rig.mechanism.sightings else 2", "if kind is HEAD: pass", "[x for x in y if isinstance(x, Spot)]")
+    asks += ('x = "azimuth_zero_deg" in values', "x = not mechanism.terms", "match look:\n case Spot(): pass")
+    assert all(decides_on_instrument(ast.parse(code)) for code in asks)
+    may = ("if rig.has_images: pass", "if not mechanism.all_round: pass", "x = CHAINS[mechanism.word]")
+    may += ("class Spot: pass\nx = isinstance(y, Spot)", "x = name in mechanism.documented")
+    assert not any(decides_on_instrument(ast.parse(code)) for code in may)
+
+
+def test_only_listed_modules_know_which_instrument_they_serve(inner):
+    """The scanner's mechanism may be imported: it is that of files which state none."""
+    listed, found = set(OF_ONE_INSTRUMENT), dict[str, set[str]]()
+    for name in MODULES:
+        tree = parsed(name)
+        imports = {other for other in inner[name] if room(other) in ("head", "single_axis")}
+        imports |= {node.name for node in ast.walk(tree) if isinstance(node, ast.alias)} & ROWS - {"TWO_MIRROR"}
+        if reasons := imports | decides_on_instrument(tree):
+            found[name] = reasons
+    assert not {name: reasons for name, reasons in found.items() if not {name, room(name)} & listed}
+    assert listed <= {*found, *map(room, found)}, "the list names what is no longer needed"
+
+
 def test_twin_shares_no_formula_with_the_estimators(inner):
     for name in MODULES:
         if room(name) == "twin":
             reached = reachable(inner, name)
             assert not {room(other) for other in reached} & BESIDE_THE_TWIN, name
-            borrowed = {"instrument.mirrors", "head.chain", "single_axis.axis_model", "single_axis.axis_rows"}
+            borrowed = {"instrument.mirrors", "instrument.chains", "single_axis.axis_model", "single_axis.axis_rows"}
             assert not reached & borrowed, name
 
 

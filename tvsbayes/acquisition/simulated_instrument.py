@@ -21,13 +21,13 @@ import numpy as np
 from tvsbayes.acquisition.journal_events import TrueAngles
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.firmware_model import DeviceModel
 from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, device_settings
 from tvsbayes.twin.gear_errors import PERFECT, SECONDS_PER_HOUR, draw_gear_errors, zero_shift_deg
-from tvsbayes.twin.head_physics import tilt_zero_deg
 from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
 from tvsbayes.twin.simulated_campaign import look_scatter_deg, placed_sheet
 from tvsbayes.twin.true_rig import Truth, draw_truth
@@ -286,7 +286,7 @@ class Instrument:
 
     def _mirror_angles_deg(self) -> tuple[float, float]:
         psi, beta = (gear.angle_deg(self.clock.now_us) for gear in self._gears)
-        return psi, beta + tilt_zero_deg(self.truth.parameters)
+        return psi, beta + self.truth.parameters[mechanism_of(self.truth.parameters).tilt_zero]
 
     def light(self) -> Light:
         """The light at this moment; changes nothing, so that a camera's thread may call it at any time.

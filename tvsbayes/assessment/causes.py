@@ -51,13 +51,6 @@ class _SplitInformation:
     groups: dict[str, list[int]]
 
 
-def _noise_of(fit: JointFit) -> str:
-    """Name the noise of single looks."""
-    if fit.space.mechanism.sightings:
-        return "noise of sightings"
-    return "pixel and aperture noise" if fit.arrays.read.any() else "pixel noise"
-
-
 def _split_information(fit: JointFit) -> _SplitInformation:
     linear = linear_spots(fit.linearised, fit.arrays, fit.linearised.by_coordinates(fit.held))
     information = stop_information(linear.spelled_out(linear.places))
@@ -70,7 +63,7 @@ def _split_information(fit: JointFit) -> _SplitInformation:
     groups = dict(fit.space.mechanism.prior_groups)
     groups |= {TRANSMISSION_ERROR: error_columns.tolist(), PLAY_VARIATION: (error_columns + places).tolist()}
     return _SplitInformation(
-        _noise_of(fit),
+        "pixel and aperture noise" if fit.arrays.read.any() else fit.space.mechanism.noise,
         noise - by_looks,
         by_looks,
         information.fisher - noise,

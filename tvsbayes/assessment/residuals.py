@@ -132,7 +132,7 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     """
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
     # A direction has no depth.
-    depth_mm = np.asarray(fit.arrays.spots.triangulated_mm)[:, 0] * (not fit.space.mechanism.sightings)
+    depth_mm = np.asarray(fit.arrays.spots.triangulated_mm)[:, 0] * fit.campaign.has_images
     left, residuals = _left_to_stops(fit), list[StopResidual]()
     for index, axis in enumerate(AXES):
         for one in _seen_rests(fit, axis, left):

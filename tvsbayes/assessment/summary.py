@@ -22,7 +22,6 @@ from tvsbayes.assessment.weaknesses import (
     sum_directions,
     weak_directions,
 )
-from tvsbayes.estimators.campaign_arrays import components
 from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, ratio_slopes, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
@@ -271,7 +270,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     moved = moved_directions(fit)
     usable = posterior if posterior is not None and posterior.converged else None
     source = _Source(fit, usable)
-    observations = float(components(fit.campaign.rig) * fit.arrays.used.sum() + fit.arrays.read.sum())
+    observations = float(fit.campaign.rig.mechanism.residuals * fit.arrays.used.sum() + fit.arrays.read.sum())
     determined = float(np.trace(fit.information.fisher @ fit.covariance))
     pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
     (a, b), (c, d) = np.asarray(source.centre.jacobian).tolist()

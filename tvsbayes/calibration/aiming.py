@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.optics import Ray, Vector, ahead, beam_components, is_head, output_deg
+from tvsbayes.calibration.optics import Ray, Vector, ahead, beam_components, output_deg
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, SIDES, bad_approach
+from tvsbayes.instrument.mechanisms import mechanism_of
 
 AIM_STEPS, AIM_RAD = 40, 1e-11
 
@@ -132,8 +133,8 @@ def mirror_angles(values: Mapping[str, float], target: Point | Direction) -> tup
         InputError: no mirror angles aim the beam there.
     """
     pan_deg = tilt_deg = 0.0
-    # A head turns all round; a scanner cannot locate points behind its baseline.
-    for _ in range(AIM_STEPS if target.ahead or (is_head(values) and target.finite) else 0):
+    # A scanner cannot locate points behind its baseline.
+    for _ in range(AIM_STEPS if target.ahead or (mechanism_of(values).all_round and target.finite) else 0):
         beam = beam_components(values, pan_deg, tilt_deg, math)
         goal, (x, y, z) = target.seen_from(beam.origin), beam.direction
         azimuth = math.remainder(goal.azimuth_deg - math.degrees(math.atan2(y, x)), 360.0)

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
-from tvsbayes.instrument.mirrors import Optics, Turn, beam_path
+from tvsbayes.instrument.chains import CHAINS
+from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_ORDERS
 
 ERROR_AT, PLAY_AT = "transmission_error_at_deg", "play_variation_at_deg"
@@ -81,12 +81,7 @@ def output_deg(
         output = output + _harmonic(values, axis, output, period_deg, m)
     if (error := values.get(f"{ERROR_AT}.{axis}")) is not None:
         output = output + error - 0.5 * side * values[f"{PLAY_AT}.{axis}"]
-    return output if axis == "pan" else output + values["elevation_zero_deg" if is_head(values) else "tilt_zero_deg"]
-
-
-def is_head(values: Values) -> bool:
-    """Whether these are the parameters of a pan-tilt head."""
-    return "azimuth_zero_deg" in values
+    return output if axis == "pan" else output + values[mechanism_of(values).tilt_zero]
 
 
 def ahead(x_mm: Number) -> bool | np.ndarray:
@@ -111,29 +106,18 @@ class Components(NamedTuple):
         return np.where(ahead(points[0]), points, complex(np.nan, np.nan) if np.iscomplexobj(points) else np.nan)
 
 
-def _optics(values: Values) -> Optics | HeadOptics:
-    """Build laser and mirrors, or the terms of a head, from parameters by name."""
-    if is_head(values):
-        return HeadOptics.of(lambda name: values[name] * (TO_RAD if "_deg" in name else 1.0))
-
-    def block(name: str) -> Number | list[Number]:
-        entries = [values[entry] * TO_RAD if name.endswith("_deg") else values[entry] for entry in BLOCKS[name]]
-        return entries if len(entries) > 1 else entries[0]
-
-    return Optics.of(block)
-
-
 def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: ModuleType = np) -> Components:
     """Compute origin and unit direction of the beam in frame T for mirror angles (formulation 3.2 and 2)."""
     psi, beta, to_t = pan_deg * TO_RAD, tilt_deg * TO_RAD, (values["pan_zero_emission_deg"] - 90.0) * TO_RAD
-    optics = _optics(values)
-    if isinstance(optics, Optics):
-        # From Q through P to T in one rotation.
-        beam, turn = beam_path(optics, psi, beta, m).rays[-1], Turn.by(psi + to_t, m)
-    else:
-        beam, turn = optics.leaving(psi, beta, m), Turn.by(to_t, m)
-    x, y, z = turn.forward(beam.origin_mm)
-    return Components((x, y + 0.5 * values["baseline_mm"], z), turn.forward(beam.direction))
+
+    def block(name: str) -> Number | list[Number]:
+        names = BLOCKS.get(name, (name,))
+        entries = [values[entry] * TO_RAD if "_deg" in name else values[entry] for entry in names]
+        return entries if len(entries) > 1 else entries[0]
+
+    beam = CHAINS[mechanism_of(values).word].of(block).leaving_turned(psi, beta, to_t, m)
+    x, y, z = beam.origin_mm
+    return Components((x, y + 0.5 * values["baseline_mm"], z), beam.direction)
 
 
 def range_components(

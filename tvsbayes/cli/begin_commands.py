@@ -49,7 +49,7 @@ def new(
     as_json: Json = False,
 ) -> None:
     """An empty campaign, explained in campaign.toml, and a rig file. With --pictures: its looks and their frames."""
-    from tvsbayes.instrument.campaign import campaign_templates, head_templates
+    from tvsbayes.instrument.campaign import campaign_templates
 
     if pictures is None:
         refuse_options("for pictures", "add --pictures FOLDER, or leave it out", pair=pair, swap=swap)
@@ -64,6 +64,8 @@ def new(
         return
     if is_head:
         refuse_options("for a scanner", "leave it out, and copy what `tvsbayes new` makes", pictures=pictures)
+        from tvsbayes.cli.head_commands import head_templates
+
         tables = "log moves and sightings" if sightings else "put stereo.json beside them, log moves and spots"
         write_new(out, head_templates(sightings), f"{tables}, then `tvsbayes check` this folder", as_json)
         return

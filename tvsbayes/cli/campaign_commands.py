@@ -192,9 +192,9 @@ def check(
     from tvsbayes.report.command_text import check_text
 
     document = _contents(path, plan_file)
-    warnings, is_sighted = document["warnings"], (path / SIGHTINGS.file).is_file()
+    warnings, has_images = document["warnings"], not (path / SIGHTINGS.file).is_file()
     summary = f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}"
-    finish(document, f"{check_text(document, is_sighted)}\n{summary}", as_json)
+    finish(document, f"{check_text(document, has_images)}\n{summary}", as_json)
 
 
 def _contents(path: Path, plan_file: Path | None) -> dict[str, Any]:

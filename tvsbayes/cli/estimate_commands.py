@@ -232,7 +232,7 @@ def _compare_pointing(data: Campaign, as_json: bool) -> None:
     import numpy as np
 
     from tvsbayes.head.pointing_model import pointing_model
-    from tvsbayes.report.result_tables import pointing_table
+    from tvsbayes.report.head_document import pointing_table
 
     model = pointing_model(data)
     with waiting() as progress:

@@ -6,6 +6,7 @@ Reads options, calls the library, prints a table or JSON; heavy imports are insi
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped, refusal, typed
+from tvsbayes.files.csv_kind import templates
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.files.foreign_table import read_foreign
@@ -32,7 +34,7 @@ from tvsbayes.head.foreign_sightings import (
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadJoints, HeadModel, head_joints, ratios_of
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import MOVES, head_templates, input_hashes, read_campaign
+from tvsbayes.instrument.campaign import MOVES, SPOTS, input_hashes, read_campaign
 from tvsbayes.instrument.campaign_header import header_values, mechanism_key
 from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, map_columns, unit_of_name
 from tvsbayes.instrument.corrections import Correction
@@ -55,6 +57,15 @@ PRIOR_FILES = ("campaign.toml", "rig.toml")
 """Files with [rig.prior]."""
 RATIO_U = 0.01
 """Relative u of a nominal ratio."""
+
+
+def head_templates(sightings: bool) -> dict[str, bytes]:
+    """The commented files of an empty campaign of a pan-tilt head, with its rig file."""
+    files = templates("head_templates", MOVES, SIGHTINGS if sightings else SPOTS)
+    # Lines that begin with #sightings or #spots apply only to heads of that kind.
+    kind, other = (b"sightings", b"spots") if sightings else (b"spots", b"sightings")
+    files = {name: re.sub(rb"(?m)^#%s .*\n" % other, b"", data) for name, data in files.items()}
+    return {name: re.sub(rb"(?m)^#%s " % kind, b"", data) for name, data in files.items()}
 
 
 def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_per_turn: float | None) -> Import:
@@ -281,7 +292,7 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
 
 def classic(folder: Path, as_json: bool) -> None:
     """Print a pointing model by least squares, without gears."""
-    from tvsbayes.report.result_tables import pointing_table
+    from tvsbayes.report.head_document import pointing_table
 
     model = pointing_model(read_campaign(folder))
     finish(model.as_json(), pointing_table(model).text(), as_json)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 GAP_DRAWS = 128
 """Number of draws: it gives the sds of terms to 6 %; each draw takes four classic estimates of every experiment."""
-OPTICS = tuple(name for name in OPTICS_NAMES if name != "mirror_offset_mm")
+OPTICS = OPTICS_NAMES[1:]
 """Parameters of the optics that are zero in the nominal rig."""
 BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
     "backlash over N",

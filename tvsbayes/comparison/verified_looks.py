@@ -15,7 +15,7 @@ import numpy as np
 
 from tvsbayes.calibration.aiming import Direction, mirror_angles
 from tvsbayes.calibration.calibration_file import stored_calibration
-from tvsbayes.calibration.optics import beam_components, is_head, output_deg
+from tvsbayes.calibration.optics import beam_components, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
 from tvsbayes.compensation.promise import bound_of, refuse_answer
@@ -36,6 +36,7 @@ from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.inference.stored_posterior import answer_of
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.stops import rests_of
@@ -43,7 +44,7 @@ from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
 from tvsbayes.results.records import stored_document
-from tvsbayes.single_axis.predicted_stops import PredictedReadings
+from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
@@ -119,9 +120,9 @@ class AimedLooks:
         values, (pan, tilt) = self.calibration.estimates, self.angles_deg(self.sides).T
         x, y, z = beam_components(values, pan, tilt).direction
         azimuth, elevation = np.degrees([np.arctan2(y, x), np.arcsin(z)])
-        if is_head(values):
+        if (mechanism := mechanism_of(values)).all_round:
             aims = [Direction(*map(float, row)) for row in zip(azimuth, elevation, strict=True)]
-            angles = np.array([mirror_angles(nominal, aim) for aim in aims]) - [0.0, nominal["elevation_zero_deg"]]
+            angles = np.array([mirror_angles(nominal, aim) for aim in aims]) - [0.0, nominal[mechanism.tilt_zero]]
             # Add the whole turns that bring the angle nearest to the axis.
             angles[:, 0] += FULL_TURN_DEG * np.round((pan - angles[:, 0]) / FULL_TURN_DEG)
         else:
@@ -265,8 +266,8 @@ def verify_looks(
         after=size_of(angles.value),
         promised95=bound_of(judgement.promised, aim, np.arange(len(aim))),
         readings=len(aimed.steps),
-        # Sightings of a head have no lengths.
-        millimetres=None if looks.rig.mechanism.sightings else _millimetres(aimed, angles, before, distance_mm, seed),
+        # Directions have no lengths.
+        millimetres=_millimetres(aimed, angles, before, distance_mm, seed) if looks.has_images else None,
         unit="deg",
         needed=None if judgement.needed is None else -(-judgement.needed // 2),
         looks=True,

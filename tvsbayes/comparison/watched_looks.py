@@ -22,7 +22,6 @@ from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.homing import homed
-from tvsbayes.instrument.mechanisms import Mechanism
 from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.model.compiled import placed
@@ -82,7 +81,7 @@ _GEARS = (
     *(_single(f"play: {axis}", f"backlash_deg.{axis}", 0.1, "deg") for axis in AXES),
 )
 CHANGES = (*_pose("cameras", "stereo"), *_pose("positioner", "extrinsics"), *_GEARS)
-"""All tested changes, with the sizes that must be detected."""
+"""Tested changes of what a stereo pair sees, with the sizes that must be detected."""
 _LEAN = tuple(f"azimuth_axis_tilt_deg.{side}" for side in ("north", "east"))
 SIGHTED_CHANGES = (
     # These sizes exceed the uncertainty of a homing.
@@ -91,12 +90,7 @@ SIGHTED_CHANGES = (
     _single("beam: not square", "beam_not_square_deg", 0.1, "deg"),
     *_GEARS,
 )
-"""Tested changes of a head with sightings."""
-
-
-def changes_of(mechanism: Mechanism) -> tuple[StatedChange, ...]:
-    """Return the tested changes of an instrument."""
-    return SIGHTED_CHANGES if mechanism.sightings else CHANGES
+"""The same of a head that says where it points."""
 
 
 def columns_of(changes: Sequence[StatedChange]) -> tuple[slice, ...]:
@@ -222,7 +216,8 @@ class WatchedLooks:
         used = np.append(fit.arrays.used, in_sight(joined)[self.first :])
         self.problem = Problem(joined, fit.table, used, np.asarray(fit.arrays.spots.weight)[: self.first])
         self.looks = int(used[self.first :].sum())
-        self.changes = changes_of(fit.space.mechanism)
+        apply = fit.space.mechanism.documented.issuperset
+        self.changes = next(each for each in (CHANGES, SIGHTED_CHANGES) if apply(n for c in each for n in c.names))
         self.dof = int(self.problem.dof[self.usable].sum())
 
     def departure(self, z: np.ndarray, *, angles: bool = False) -> Departure:

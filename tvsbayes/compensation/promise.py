@@ -27,8 +27,9 @@ from tvsbayes.single_axis.axis_density import line_weights
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
-from tvsbayes.single_axis.predicted_stops import PredictedReadings, PredictedStops, predicted_stops
+from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
 from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
+from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import Stream, random_stream
 
 NODES_FEW, NODES_MANY = 13, 41

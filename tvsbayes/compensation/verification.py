@@ -42,7 +42,8 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisStop, axis_hash
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, rows_of
-from tvsbayes.single_axis.predicted_stops import PredictedReadings, PredictedStops, log_mean, predicted_stops
+from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.statistics.predicted_readings import PredictedReadings, log_mean
 from tvsbayes.statistics.streams import Stream, random_stream
 
 SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003

@@ -16,11 +16,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.instrument.axes import APPROACH_SIGN
-from tvsbayes.instrument.campaign import Campaign, Look, Move, ordered_spots, pixels_of
+from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots, pixels_of
 from tvsbayes.instrument.conditions import kelvin, powered_on_s, warm_minutes
 from tvsbayes.instrument.places import PLACES_MAX, SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.instrument.sightings import Sighting, sighted_deg, sightings_of, tangent_frames
+from tvsbayes.instrument.sightings import sighted_deg, sightings_of, tangent_frames
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import placed
@@ -33,8 +33,6 @@ protocol has six counters."""
 SMALLEST_BUCKET = 4096
 """Spots and moves are padded to this size or the next power of two above it: smaller campaigns share compiled
 functions, and their cost follows their own rows."""
-SIGHTED = (1, 2)
-"""Columns of the pixels that hold the two angles of sightings; the first column is where ranges are eliminated."""
 NOWHERE_MM = np.array([500.0, 0.0, 0.0])
 """Point of a look that is not used: finite, and in front of the cameras."""
 
@@ -212,19 +210,6 @@ def gear_arrays(given: SeenPlaces, size: int) -> GearArrays:
     return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (given.error_share, given.play_share)))
 
 
-def pixel_covariance(spot: Look) -> np.ndarray:
-    """Return the stated covariance of (u_left, v_left, u_right, v_right), px^2; of a sighting, rad^2."""
-    if isinstance(spot, Sighting):
-        covariance = np.eye(4)
-        covariance[SIGHTED, SIGHTED] = np.radians(spot.u_deg or 1.0) ** 2
-        return covariance
-    sd = np.array([spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px], dtype=float)
-    covariance = np.diag(sd**2)
-    covariance[0, 1] = covariance[1, 0] = spot.ruv_left * sd[0] * sd[1]
-    covariance[2, 3] = covariance[3, 2] = spot.ruv_right * sd[2] * sd[3]
-    return covariance
-
-
 def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> CampaignArrays:
     """Pack a campaign for the jitted functions.
 
@@ -237,9 +222,14 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     """
     spots = ordered_spots(campaign)
     size = bucket(len(spots))
-    frames = tangent_frames(sighted_deg(sightings_of(spots))) if campaign.stereo is None else None
-    pixels = pixels_of(spots) if frames is None else np.zeros((len(spots), 4))
-    covariance = np.stack([pixel_covariance(s) for s in spots])
+    if campaign.has_images:
+        pixels, tangents = pixels_of(spots), None
+        points_mm = triangulate(campaign.stereo_pair, pixels)
+    else:
+        frames = tangent_frames(sighted_deg(sightings_of(spots)))
+        pixels, points_mm = np.zeros((len(spots), 4)), frames[:, 2]
+        tangents = padded(frames[:, :2], size, np.eye(3)[1:])
+    covariance = np.stack([s.pixel_covariance() for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     looks = [s.move for s in spots]
     priors = campaign.rig if table is None else table
@@ -247,7 +237,6 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     places = seen_places(campaign.moves, looks, priors)
     gears = gear_arrays(places if gears_vary(priors) else places.none, size)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
-    points_mm = triangulate(campaign.stereo_pair, pixels) if frames is None else frames[:, 2]
     finite = np.isfinite(points_mm).all(axis=1)
     points_mm[~finite] = NOWHERE_MM
     spot_arrays = SpotArrays(
@@ -264,35 +253,30 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
         new_segment=padded(new.new_segment, size, False, bool),
         homed=padded(new.homed, size, False, bool),
         hours=padded(new.hours, size),
-        tangents=None if frames is None else padded(frames[:, :2], size, np.eye(3)[1:]),
+        tangents=tangents,
     )
     azimuth = placed(campaign.rig.aperture_convention == "azimuth")
     moves = move_arrays(campaign.moves, powered_on_s=powered_on_s(campaign.header))
     return CampaignArrays(moves, spot_arrays, gears, azimuth, placed(np.int32(len(spots))))
 
 
-def components(rig: RigTable) -> int:
-    """Count independent residuals of a look without the aperture: four pixels less the range, or two angles."""
-    return len(SIGHTED) if rig.mechanism.sightings else 3
-
-
 def in_sight(campaign: Campaign) -> np.ndarray:
     """Mark each ordered spot that has a triangulated point; one outside the lens model's range has none."""
     spots = ordered_spots(campaign)
-    if campaign.stereo is None:
+    if not campaign.has_images:
         return np.ones(len(spots), dtype=bool)
-    return np.isfinite(triangulate(campaign.stereo, pixels_of(spots))).all(axis=1)
+    return np.isfinite(triangulate(campaign.stereo_pair, pixels_of(spots))).all(axis=1)
 
 
 def spot_constants(campaign: Campaign) -> np.ndarray:
     """Compute the constant terms of each ordered spot's log likelihood: 2 pi and its stated covariance."""
-    constants = components(campaign.rig)
+    constants = campaign.rig.mechanism.residuals
     return np.array(
         [
             -0.5
             * (
                 (constants + (s.aperture_deg is not None)) * np.log(2 * np.pi)
-                + np.linalg.slogdet(pixel_covariance(s))[1]
+                + np.linalg.slogdet(s.pixel_covariance())[1]
             )
             for s in ordered_spots(campaign)
         ]

@@ -20,7 +20,7 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
-from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.campaign import Campaign, Look, Move, ordered_spots, pixels_of
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
 from tvsbayes.results.records import Record
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
@@ -205,17 +205,15 @@ def select_experiments(campaign: Campaign) -> Selection:
     """
     moves = {move.move: move for move in campaign.moves}
     rows: dict[int, list[int]] = {}
-    # Sightings belong to no experiment.
-    spots = [spot for spot in campaign.spots if isinstance(spot, Spot)]
-    for row, spot in enumerate(spots):
+    for row, spot in enumerate(campaign.spots):
         if spot.experiment is not None:
             rows.setdefault(spot.experiment, []).append(row)
     kept: list[tuple[int, list[int], str, int]] = []
     skipped: list[SkippedExperiment] = []
     for number in sorted(rows):
         try:
-            by_point = _by_point(spots, rows[number])
-            kept.append((number, by_point, *_commanded([moves[spots[row].move] for row in by_point])))
+            by_point = _by_point(campaign.spots, rows[number])
+            kept.append((number, by_point, *_commanded([moves[campaign.spots[row].move] for row in by_point])))
         except _Unusable as reason:
             skipped.append(SkippedExperiment(number, str(reason)))
     numbers, four_rows, axes, steps = zip(*kept, strict=True) if kept else 4 * ((),)
@@ -223,7 +221,7 @@ def select_experiments(campaign: Campaign) -> Selection:
     return Selection(
         experiments=np.array(numbers, dtype=int),
         spot_rows=spot_rows,
-        pixels=pixels_of(spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
+        pixels=pixels_of(campaign.spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
         steps=np.array(steps, dtype=int),
         axis=np.array(axes, dtype="U4"),
         skipped=tuple(skipped),
@@ -237,7 +235,7 @@ def experiment_rows(campaign: Campaign, selection: Selection) -> np.ndarray:
     return np.array(rows, dtype=int).reshape(-1, 4)
 
 
-def _by_point(spots: Sequence[Spot], rows: list[int]) -> list[int]:
+def _by_point(spots: Sequence[Look], rows: list[int]) -> list[int]:
     """Find the rows of points 1 to 4 in order; raise `_Unusable` where there are not exactly four."""
     by_point: dict[int | None, list[int]] = {}
     for row in rows:

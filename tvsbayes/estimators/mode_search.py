@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from scipy import optimize, special
 
 from tvsbayes.estimators.annealed_stage import Fixed, linear_part, linearised_at, stage
-from tvsbayes.estimators.campaign_arrays import campaign_arrays, components
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import (
     Linearised,
@@ -137,7 +137,7 @@ class Problem:
     @property
     def dof(self) -> np.ndarray:
         """Count each spot's residuals: those of a look, and a reading of the aperture."""
-        return components(self.table) + np.asarray(self.arrays.spots.has_aperture)[: len(self.spots)]
+        return self.table.mechanism.residuals + np.asarray(self.arrays.spots.has_aperture)[: len(self.spots)]
 
     def compile_aside(self, executor: ThreadPoolExecutor) -> None:
         """Start the compilation for later steps in another thread, while the first stage runs."""

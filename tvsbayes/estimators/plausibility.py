@@ -132,7 +132,7 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     Returns:
         Findings, certain ones and doubts; `Finding.sentence` is printed.
     """
-    if campaign.stereo is None:
+    if not campaign.has_images:
         return sighting_findings(campaign)
     points_mm = campaign.usable_points_mm if points_mm is None else points_mm
     spots = stereo_spots(campaign.spots)
@@ -176,7 +176,7 @@ def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple
         does not test it. Empty where nothing explains the failure.
     """
     findings = [*implausible(campaign)]
-    if campaign.stereo is None:
+    if not campaign.has_images:
         return tuple(findings)
     ok = [spot for spot in stereo_spots(campaign.spots) if spot.status == "ok"]
     points_mm = campaign.usable_points_mm
@@ -273,7 +273,7 @@ def _reading_findings(ok: Sequence[Spot]) -> list[Finding]:
 
 def _metres(campaign: Campaign) -> list[str]:
     """Find lengths stated in metres where the name says mm."""
-    lengths = [name for name in campaign.rig.mechanism.documented if name == "mirror_offset_mm"]
+    lengths = campaign.rig.mechanism.documented & {"mirror_offset_mm"}
     stated = {name: campaign.rig.priors[name].value for name in lengths}
     origin = [campaign.rig.priors[name].value for name in names_of("extrinsics.translation_mm")]
     stated["extrinsics.translation_mm"] = max(origin, key=abs)
@@ -327,12 +327,12 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     refused = Counter(spot.status for spot in campaign.spots if spot.status != "ok")
     selection = select_experiments(campaign)
     stereo = campaign.stereo
-    points_mm = np.zeros((0, 3)) if stereo is None else campaign.usable_points_mm
+    points_mm = campaign.usable_points_mm if campaign.has_images else np.zeros((0, 3))
     # Causes first, then their consequences.
     findings = implausible(campaign, points_mm)
     warnings = [*(finding.sentence for finding in findings), *_incomplete(selection.skipped)]
     if not ok:
-        warnings.append(f"no {'spot' if stereo else 'sighting'} has status ok: there is nothing to estimate from")
+        warnings.append(f"no {campaign.looks_table.required[0]} has status ok: there is nothing to estimate from")
     if count := interpolated(campaign.moves):
         warnings.append(f"{count} of {len(campaign.moves)} moves have no temperature_degC: interpolated in time")
     observed = {spot.move for spot in ok}

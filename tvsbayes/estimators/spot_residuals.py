@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.estimators.campaign_arrays import SIGHTED, SpotArrays
+from tvsbayes.estimators.campaign_arrays import SpotArrays
 from tvsbayes.estimators.looks import Looks, Numbers
+from tvsbayes.instrument.sightings import SIGHTED
 from tvsbayes.model.geometry import materialise
 from tvsbayes.model.parameter_space import Model
 

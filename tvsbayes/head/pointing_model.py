@@ -12,9 +12,9 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate, refusal
-from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.chains import HeadOptics
 from tvsbayes.instrument.parameters import HEAD_TERMS
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sighted_deg, sightings_of, tangent_frames
 

@@ -165,7 +165,7 @@ class _Frames:
 
     @classmethod
     def of(cls, terms: Mapping[str, float]) -> _Frames:
-        """Build from terms in degrees: the chain of `head.chain` without flexure; x of the link is the beam."""
+        """Build from terms in degrees: the chain of `instrument.chains` without flexure; x of the link is the beam."""
         from scipy.spatial.transform import Rotation
 
         rad = {name: math.radians(value) for name, value in terms.items()}

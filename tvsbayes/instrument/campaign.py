@@ -213,6 +213,14 @@ class Spot:
     ruv_left: Annotated[float, _CORRELATION] = 0.0
     ruv_right: Annotated[float, _CORRELATION] = 0.0
 
+    def pixel_covariance(self) -> np.ndarray:
+        """The stated covariance of (u_left, v_left, u_right, v_right), px^2."""
+        sd = np.array([self.su_left_px, self.sv_left_px, self.su_right_px, self.sv_right_px], dtype=float)
+        covariance = np.diag(sd**2)
+        covariance[0, 1] = covariance[1, 0] = self.ruv_left * sd[0] * sd[1]
+        covariance[2, 3] = covariance[3, 2] = self.ruv_right * sd[2] * sd[3]
+        return covariance
+
     def renumbered(self, number: int, move: int) -> Spot:
         """The spot with another id, after another move, without experiment."""
         return replace(self, spot=number, move=move, experiment=None, point=None)
@@ -300,7 +308,7 @@ class Campaign(Shown, WithStereo):
     @property
     def looks_table(self) -> CsvKind[Any]:
         """The kind of file that holds its looks."""
-        return SIGHTINGS if self.rig.mechanism.sightings else SPOTS
+        return SPOTS if self.has_images else SIGHTINGS
 
     @property
     def title(self) -> str:
@@ -505,19 +513,6 @@ def _no_campaign(folder: Path) -> InputError:
 def campaign_templates() -> dict[str, bytes]:
     """The commented files of an empty campaign."""
     return templates("templates", MOVES, SPOTS)
-
-
-def head_templates(sightings: bool) -> dict[str, bytes]:
-    """The commented files of an empty campaign of a pan-tilt head, with its rig file."""
-    files = templates("head_templates", MOVES, SIGHTINGS if sightings else SPOTS)
-    # Lines that begin with #sightings or #spots apply only to heads of that kind.
-    prefix, other_prefix = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
-    return {
-        name: b"".join(
-            line.removeprefix(prefix) for line in data.splitlines(keepends=True) if not line.startswith(other_prefix)
-        )
-        for name, data in files.items()
-    }
 
 
 def moves_bytes(moves: Iterable[Move]) -> bytes:

@@ -9,9 +9,8 @@ from tvsbayes.errors import InputError
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml
 from tvsbayes.instrument.conditions import check_power
+from tvsbayes.instrument.mechanisms import WORDS
 
-SCANNER = "two-mirror"
-"""Mechanism of a campaign that states none."""
 _TEXT_CHARS = {
     **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
     **dict.fromkeys(("pan_joint", "tilt_joint"), 200),
@@ -78,7 +77,7 @@ def mechanism_key(folder: Path) -> str:
     rig = values.get("rig")
     mechanism = format_name
     if format_name == "campaign":
-        mechanism = str(rig.get("mechanism", SCANNER)) if isinstance(rig, dict) else SCANNER
+        mechanism = str(rig.get("mechanism", WORDS[0])) if isinstance(rig, dict) else WORDS[0]
     return f"{mechanism}-sightings" if (folder / "sightings.csv").is_file() else mechanism
 
 

@@ -6,7 +6,7 @@ the mirrors for its own terms: the gears' coordinates, and every array, are the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -30,18 +30,26 @@ class Mechanism:
     Attributes:
         key: its name in the program.
         word: its name in rig and campaign files.
-        sightings: looks are sightings; else spots seen by a stereo pair.
         terms: terms of its geometry, by the scanner's parameter whose coordinate they use.
         fixed: values of parameters that do not apply to it; documents omit them.
         own_priors: priors that replace the registry's.
+        absent: derived quantities that it lacks.
+        all_round: its axes turn all round; else the beam is aimed ahead only.
+        sightings: looks are sightings; else spots seen by a stereo pair.
+        noise: name of the noise of its looks.
+        residuals: independent residuals of a look without the aperture: four pixels less the range, or two angles.
     """
 
     key: str
     word: str
-    sightings: bool = False
     terms: Mapping[str, Parameter] = field(default_factory=dict)
     fixed: Mapping[str, float] = field(default_factory=dict)
     own_priors: Mapping[str, Prior] = field(default_factory=dict)
+    absent: tuple[str, ...] = ()
+    all_round: bool = False
+    sightings: bool = False
+    noise: str = "pixel noise"
+    residuals: int = 3
 
     def __reduce__(self) -> tuple[Callable[[str], Mechanism], tuple[str]]:
         """Copying, also to another process, returns the entry of the list: mechanisms are compared by identity."""
@@ -60,6 +68,11 @@ class Mechanism:
     def named(self, names: Iterable[str]) -> tuple[str, ...]:
         """The mechanism's names for the scanner's coordinates of these names; other names are unchanged."""
         return tuple(self.terms[name].name if name in self.terms else name for name in names)
+
+    @cached_property
+    def tilt_zero(self) -> str:
+        """Name of the zero of the tilt axis."""
+        return self.named(("tilt_zero_deg",))[0]
 
     @cached_property
     def prior_groups(self) -> dict[str, list[int]]:
@@ -103,14 +116,17 @@ _SIGHT = {
 }
 """A head with sightings has neither cameras nor lengths."""
 TWO_MIRROR = Mechanism("two-mirror", "two-mirror")
-HEAD = Mechanism("pan-tilt", "pan-tilt", terms=HEAD_TERMS, fixed=_LASER | _RECEIVER)
-SIGHTING_HEAD = Mechanism(
-    "pan-tilt-sightings",
-    "pan-tilt",
-    True,
-    HEAD_TERMS,
-    _SIGHT | _RECEIVER,
-    {"flexure_deg": Prior(0.0, 0.1)},
+HEAD = Mechanism(
+    "pan-tilt", "pan-tilt", HEAD_TERMS, _LASER | _RECEIVER, absent=("effective_mirror_offset_mm",), all_round=True
+)
+SIGHTING_HEAD = replace(
+    HEAD,
+    key="pan-tilt-sightings",
+    fixed=_SIGHT | _RECEIVER,
+    own_priors={"flexure_deg": Prior(0.0, 0.1)},
+    sightings=True,
+    noise="noise of sightings",
+    residuals=2,
 )
 MECHANISMS: dict[str, Mechanism] = {mechanism.key: mechanism for mechanism in (TWO_MIRROR, HEAD, SIGHTING_HEAD)}
 """Mechanisms by key."""
@@ -121,3 +137,14 @@ WORDS: tuple[str, ...] = tuple(dict.fromkeys(mechanism.word for mechanism in MEC
 def mechanism_by_key(key: str) -> Mechanism:
     """The entry of the list."""
     return MECHANISMS[key]
+
+
+def mechanism_named(word: object, sightings: bool) -> Mechanism | None:
+    """The entry with this word in files and this kind of looks; None where there is none."""
+    kinds = MECHANISMS.values()
+    return next((kind for kind in kinds if (kind.word, kind.sightings) == (word, sightings)), None)
+
+
+def mechanism_of(names: Container[str]) -> Mechanism:
+    """The first entry with such parameters, told by the zero of the tilt axis; without that the scanner."""
+    return next((kind for kind in MECHANISMS.values() if kind.tilt_zero in names), TWO_MIRROR)

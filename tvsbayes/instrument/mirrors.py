@@ -136,6 +136,11 @@ class Optics(NamedTuple):
         path = beam_path(self, pan_rad, tilt_rad, functions, materialise)
         return Ray(*map(path.pan.forward, path.rays[-1]))
 
+    def leaving_turned(self, pan_rad: Numbers, tilt_rad: Numbers, by_rad: Numbers, functions: ModuleType) -> Ray:
+        """The same in P turned about z, by one rotation from Q."""
+        ray = beam_path(self, pan_rad, tilt_rad, functions).rays[-1]
+        return Ray(*map(Turn.by(pan_rad + by_rad, functions).forward, ray))
+
 
 class BeamPath(NamedTuple):
     """The path of the laser beam in frame Q: the turn from Q to P, the mirrors in order, the ray after each of them."""

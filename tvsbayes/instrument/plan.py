@@ -64,8 +64,8 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def _check_actions(table: Table, values: Values, sheets: bool) -> None:
-    """Refuse an action without its columns or with another's, and a look before a placement where sheets are used."""
+def _check_actions(table: Table, values: Values, unplaced: bool) -> None:
+    """Refuse an action without its columns or with another's, and a look before a placement unless none is needed."""
     check_experiments(table, values["experiment"], values["point"], [True] * len(table))
     targets, sheet = values["target"], ""
     for row, action in enumerate(values["action"]):
@@ -79,14 +79,14 @@ def _check_actions(table: Table, values: Values, sheets: bool) -> None:
                 raise table.refuse(row, column, "action", allowed, "give each action its own columns only")
         if action == "place":
             sheet = targets[row]
-        elif action == "look" and sheets and (not sheet or targets[row] not in ("", sheet)):
+        elif action == "look" and not unplaced and (not sheet or targets[row] not in ("", sheet)):
             allowed = f"an empty cell or {sheet}, placed last" if sheet else "a place before the look"
             raise table.refuse(row, "target", "target", allowed, "place the target first")
 
 
 def parse_plan(data: bytes, file: str = PLANS.file, mechanism: Mechanism = TWO_MIRROR) -> tuple[PlanStep, ...]:
     """The checked rows of `plan.csv`; see `read_plan`."""
-    steps = PLANS.parse(data, file, partial(_check_actions, sheets=not mechanism.sightings))
+    steps = PLANS.parse(data, file, partial(_check_actions, unplaced=mechanism.sightings))
     return tuple(
         replace(step, pan_steps=step.pan_steps or 0, tilt_steps=step.tilt_steps or 0) if step.action == "home" else step
         for step in steps
@@ -203,9 +203,8 @@ def run_plan(
         InputError: a look before a target is placed, or a target that the rig does not have.
     """
     log, time_s, segment = PlanLog(), 0.0, -1
-    if rig.table.mechanism.sightings:
-        # Sightings need no sheet.
-        log.targets.append("")
+    # A target without a name needs no placement.
+    log.targets += [name for name in rig.depths_mm if not name]
     for step in plan:
         if step.action == "home" or (not log.moves and step.action in ("move", "look")):
             segment += 1

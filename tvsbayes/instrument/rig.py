@@ -16,7 +16,7 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, HOME_KEYS, LIMIT_KEYS, CounterLimits
-from tvsbayes.instrument.mechanisms import HEAD, MECHANISMS, TWO_MIRROR, WORDS, Mechanism
+from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, WORDS, Mechanism, mechanism_named
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     HARMONIC_NAMES,
@@ -107,12 +107,12 @@ class Rig(WithStereo):
     @property
     def look_sd(self) -> float:
         """Standard uncertainty of a simulated look: px of a spot's centre, rad of a sighting."""
-        return math.radians(self.sighting_sd_deg) if self.table.mechanism.sightings else self.spot_sd_px
+        return self.spot_sd_px if self.has_images else math.radians(self.sighting_sd_deg)
 
     @property
     def depths_mm(self) -> dict[str, float]:
-        """Depths of the sheets; a head with sightings has one target without a name."""
-        return {"": 1.0} if self.table.mechanism.sightings else self.sheets_mm
+        """Depths of the sheets; directions have one target, without a name."""
+        return self.sheets_mm if self.has_images else {"": 1.0}
 
     @property
     def limits(self) -> CounterLimits:
@@ -273,12 +273,12 @@ _OWN_KEYS = ("aperture_convention", "mechanism", "prior")
 
 def _stated_mechanism(table: Keys, sightings: bool) -> Mechanism:
     """The mechanism by its key in `[rig]`."""
-    word = table.word("mechanism", WORDS) if "mechanism" in table else TWO_MIRROR.word
-    if sightings and word == TWO_MIRROR.word:
+    word = table.word("mechanism", WORDS) if "mechanism" in table else WORDS[0]
+    if (mechanism := mechanism_named(word, sightings)) is None:
         remedy = 'write mechanism = "pan-tilt" into [rig]; a scanner needs stereo.json and spots.csv instead'
         allowed = "a pan-tilt head where there are sightings and no stereo pair"
         raise table.refuse("mechanism", "mechanism", allowed, remedy, f"a {word} instrument")
-    return next(kind for kind in MECHANISMS.values() if (kind.word, kind.sightings) == (word, sightings))
+    return mechanism
 
 
 def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
@@ -309,7 +309,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
             raise table.table("prior").refuse(name, "duplicate-key", "every name once", "remove one", found)
     _check_periods(table.table("prior"), prior, period_deg)
     key = "aperture_convention"
-    if key in table and mechanism is not TWO_MIRROR:
+    if key in table and "aperture_zero_deg" not in mechanism.documented:
         raise table.refuse(key, "unknown-key", "no aperture", "leave it out: a head has no receiver", f"the name {key}")
     azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
     return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg, mechanism)
@@ -327,7 +327,8 @@ def rig_table_toml(table: RigTable) -> str:
         return toml_line(name, {"value": float(prior.value), "u": float(prior.u)})
 
     kind = table.mechanism
-    own = ("aperture_convention", table.aperture_convention) if kind is TWO_MIRROR else ("mechanism", kind.word)
+    has_aperture = "aperture_zero_deg" in kind.documented
+    own = ("aperture_convention", table.aperture_convention) if has_aperture else ("mechanism", kind.word)
     stated = {name: table.harmonic_period_deg.get(axis, ()) for name, axis in _PERIOD_NAMES.items()}
     periods = [
         toml_line(name, {"value": numbers[0] if len(numbers) == 1 else numbers, "u": 0.0})
@@ -453,7 +454,7 @@ def read_rig(path: Path) -> Rig:
     tables = ("rig", "truth", "sheets", "positioner", "cameras", "costs")
     keys.only(("format", "name", "notes", "stereo", *tables))
     header = {key: keys.text_value(key, length) for key, length in (("name", 200), ("notes", 2000)) if key in keys}
-    sightings = "stereo" not in keys and keys.table("rig").values.get("mechanism") == HEAD.word
+    sightings = "stereo" not in keys and mechanism_named(keys.table("rig").values.get("mechanism"), True) is not None
     table = parse_rig_table(keys.table("rig"), sightings)
     stereo = None if sightings else read_stereo(_file_beside(keys, "stereo", path.parent), folder=path.parent)
     sheets = keys.table("sheets")

@@ -15,6 +15,8 @@ import numpy as np
 
 from tvsbayes.files.csv_kind import Column, CsvKind, filled_where_ok, follows_a_move, unique
 
+SIGHTED = (1, 2)
+"""Columns of the pixels that hold the two angles of sightings; the first column is where ranges are eliminated."""
 _WHERE_OK = filled_where_ok("give the value or a refusal reason")
 
 
@@ -46,6 +48,8 @@ class Sighting:
     status: Annotated[str, Column("`ok`, or a reason in words", chars_max=200, filled=True)] = "ok"
     target: ClassVar[str] = ""
     """Without a name: a head has no sheets."""
+    experiment: ClassVar[None] = None
+    point: ClassVar[None] = None
     aperture_deg: ClassVar[None] = None
     """A head has no receiver."""
 
@@ -53,6 +57,12 @@ class Sighting:
     def spot(self) -> int:
         """Its id, under the name used for all looks."""
         return self.sighting
+
+    def pixel_covariance(self) -> np.ndarray:
+        """The stated covariance (4, 4) of the pixels in whose columns its angles are, rad^2."""
+        covariance = np.eye(4)
+        covariance[SIGHTED, SIGHTED] = np.radians(self.u_deg or 1.0) ** 2
+        return covariance
 
     def renumbered(self, number: int, move: int) -> Sighting:
         """The sighting with another id, after another move."""

@@ -172,6 +172,11 @@ class WithStereo:
     stereo: Stereo | None
 
     @property
+    def has_images(self) -> bool:
+        """Whether its looks are spots in images; else directions."""
+        return self.stereo is not None
+
+    @property
     def stereo_pair(self) -> Stereo:
         """Its stereo pair.
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from tvsbayes.head.chain import HeadOptics
-from tvsbayes.instrument.mirrors import Optics, Ray
+from tvsbayes.instrument.chains import Chain
+from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.model.geometry import Scalar, materialise
 
@@ -242,11 +242,11 @@ def angles_at(
     return jax.lax.while_loop(lambda state: state.stretch.next <= index[-1], further, begin)
 
 
-def trace(optics: Optics | HeadOptics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
+def trace(optics: Chain, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
     """Trace the beam to where it leaves the instrument (formulation 3.2; the signs are part of the contract).
 
     Args:
-        optics: laser and mirrors, or the terms of a head.
+        optics: chain of the beam.
         pan_rad: angles psi of the pan stage.
         tilt_rad: angles beta of the tilt stage.
 
@@ -270,7 +270,7 @@ class BeamAngles(eqx.Module):
     effective_mirror_offset_mm: Scalar
 
 
-def beam_angles(optics: Optics | HeadOptics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
+def beam_angles(optics: Chain, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
     """Compute the beam's direction and its slope by the mirror angles at one pose (formulation 3.2)."""
 
     def azimuth_elevation(angles):

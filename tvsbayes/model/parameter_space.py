@@ -21,12 +21,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import special
 
-from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
+from tvsbayes.instrument.chains import CHAINS, Chain
 from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, Mechanism
-from tvsbayes.instrument.mirrors import Optics
 from tvsbayes.instrument.parameters import (
     BLOCKS,
+    COLUMNS,
     INDEX,
     KINDS,
     LOOK_SCATTER_NAMES,
@@ -73,7 +73,7 @@ class Model(eqx.Module):
     """Everything that the forward model and the likelihood need, in rad and mm."""
 
     transmission: Transmission
-    optics: Optics | HeadOptics
+    optics: Chain
     tilt_zero_rad: Scalar
     extrinsics: Extrinsics
     cameras: StereoCameras
@@ -264,7 +264,7 @@ def model_of(
     period_deg = jnp.asarray(harmonic_period_deg)
 
     def block(name: str):
-        first, *others = (INDEX[entry] for entry in BLOCKS[name])
+        first, *others = (COLUMNS[entry] for entry in BLOCKS.get(name, (name,)))
         return values[first : first + 1 + len(others)] if others else values[first]
 
     intrinsics = jnp.stack([block("stereo.left"), block("stereo.right")])
@@ -280,7 +280,7 @@ def model_of(
             ),
             zero_shift=ZeroShift(block("creep_deg"), block("creep_minutes"), block("thermal_deg_per_K")),
         ),
-        optics=HeadOptics.of(lambda name: values[mechanism.names.index(name)]) if mechanism.terms else Optics.of(block),
+        optics=CHAINS[mechanism.word].of(block),
         tilt_zero_rad=block("tilt_zero_deg"),
         extrinsics=Extrinsics(block("extrinsics.rotation_rad"), block("extrinsics.translation_mm")),
         cameras=StereoCameras(

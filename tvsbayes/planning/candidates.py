@@ -213,8 +213,7 @@ def candidates(knowledge: Knowledge) -> Candidates:
         )
     ratio = np.asarray(physical_at(knowledge.z, knowledge.space).value)[RATIO_COLUMNS]
     widest: Mapping[str, tuple[int, int]] = UNSTATED_STEPS
-    if rig.table.mechanism.sightings:
-        # Without pictures the range is that of candidates.
+    if not rig.has_images:
         reach = {axis: int(REACH_DEG / abs(r)) for axis, r in zip(AXES, ratio.tolist(), strict=True)}
         widest = {axis: (-steps, steps) for axis, steps in reach.items()}
     stated_range = counter_range(rig.limits, widest)

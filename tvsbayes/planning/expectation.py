@@ -197,7 +197,7 @@ def sheet_points(
 ) -> _SheetPoints:
     """Compute error-free looks after some of the moves, by default after each, at sheets normal to X.
 
-    Without images (head with sightings) points are directions, and all are visible.
+    Without images points are directions, and all are visible.
     """
     pan, tilt = mirror_angles(model.transmission, model.tilt_zero_rad, moves).angle_rad[look_moves].T
     ray = trace(model.optics, pan, tilt)
@@ -229,7 +229,7 @@ def expect(
         space: priors.
         arrays: moves and looks; pixels and points are not read.
         depth_mm: X of each look's sheet in frame S.
-        image_px: largest (u, v, u, v) inside the images; None for a head with sightings.
+        image_px: largest (u, v, u, v) inside the images; None without images.
         turning: derivative of (pan, tilt) by errors of the gears, see `GearPlaces.turning`.
 
     Returns:
@@ -295,7 +295,7 @@ def design_arrays(
             new_segment=padded(redraw_arrays.new_segment, size, False, bool),
             homed=padded(redraw_arrays.homed, size, False, bool),
             hours=padded(redraw_arrays.hours, size),
-            tangents=padded(np.zeros((count, 2, 3)), size) if rig.table.mechanism.sightings else None,
+            tangents=None if rig.has_images else padded(np.zeros((count, 2, 3)), size),
         ),
         no_gears(size),
         placed(rig.table.aperture_convention == "azimuth"),
@@ -304,10 +304,10 @@ def design_arrays(
 
 
 def largest_px(rig: Rig) -> np.ndarray | None:
-    """Return the largest (u, v, u, v) inside the images of a rig, shape (4,); None for a head with sightings."""
-    if rig.stereo is None:
+    """Return the largest (u, v, u, v) inside the images of a rig, shape (4,); None without images."""
+    if not rig.has_images:
         return None
-    return np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
+    return np.tile([rig.stereo_pair.image_width - 1.0, rig.stereo_pair.image_height - 1.0], 2)
 
 
 @dataclass(frozen=True)

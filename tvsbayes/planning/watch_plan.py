@@ -102,7 +102,7 @@ class Pattern:
 def _rig_of(campaign: Campaign, spots: Sequence[Look], used: np.ndarray) -> Rig:
     """Build a rig from a campaign: sheets at the depths of its spots, default costs."""
     sheets: dict[str, float] = {}
-    for name in () if campaign.rig.mechanism.sightings else dict.fromkeys(spot.target for spot in spots):
+    for name in dict.fromkeys(spot.target for spot in spots) if campaign.has_images else ():
         sheet_spots = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
         if sheet_spots:
             sheets[name] = float(np.median(triangulate(campaign.stereo_pair, pixels_of(sheet_spots))[:, 0]))

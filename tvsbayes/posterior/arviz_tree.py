@@ -19,7 +19,7 @@ import xarray as xr
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
-from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
+from tvsbayes.instrument.mechanisms import Mechanism
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     BLOCKS,
@@ -81,12 +81,12 @@ VARIABLES: dict[str, Variable] = {
 
 def variables_of(mechanism: Mechanism) -> dict[str, Variable]:
     """Return the variables of posterior.nc for a mechanism; each term of a head's geometry is one."""
-    shared = {name: spec for name, spec in VARIABLES.items() if not mechanism.terms.keys() & set(spec.names)}
+    shared = {name: spec for name, spec in VARIABLES.items() if mechanism.named(spec.names) == spec.names}
     return shared | {term.name.replace(".", "_"): Variable((term.name,)) for term in mechanism.terms.values()}
 
 
 def _variables(
-    draws: Derived, varying: set[str], shape: tuple[int, int], mechanism: Mechanism = TWO_MIRROR
+    draws: Derived, varying: set[str], shape: tuple[int, int], mechanism: Mechanism
 ) -> dict[str, xr.DataArray]:
     """Return all variables that vary, with named dimensions; fixed entries of a dimension are left out."""
     columns = Draws(draws, mechanism)
@@ -148,8 +148,8 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         stats["acceptance_rate"] = xr.DataArray(convergence.acceptance, {"chain": coords["chain"]}, ("chain",))
         lengths = {"steps": convergence.steps, "discarded": convergence.discarded, "thin": convergence.thin}
     places = {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)}
-    pixels = np.zeros((len(spots), len(PIXEL_LABELS))) if mechanism.sightings else pixels_of(spots)
-    # Sightings have angles about the direction sighted, rad, in the columns of `campaign_arrays.SIGHTED`.
+    pixels = pixels_of(spots) if fit.campaign.has_images else np.zeros((len(spots), len(PIXEL_LABELS)))
+    # Sightings have angles about the direction sighted, rad, in the columns of `sightings.SIGHTED`.
     observed = xr.DataArray(pixels, places, tuple(places), name="pixels")
     tree = xr.DataTree.from_dict(
         {

@@ -18,7 +18,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.inference.summaries import Propagated, carried, propagated, reweighted
 from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS
-from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
+from tvsbayes.instrument.mechanisms import Mechanism
 from tvsbayes.instrument.parameters import HEADLINES, INDEX
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
@@ -37,14 +37,14 @@ DERIVED_BATCH = 2049
 
 
 def derived_names(mechanism: Mechanism) -> tuple[str, ...]:
-    """Return the names of derived quantities of a mechanism; a head has no mirror offset."""
-    return tuple(name for name in DERIVED if not mechanism.terms or name != "effective_mirror_offset_mm")
+    """Return the names of derived quantities of a mechanism."""
+    return tuple(name for name in DERIVED if name not in mechanism.absent)
 
 
 class Draws(Mapping[str, np.ndarray]):
     """Posterior draws by name: every parameter, and the derived quantities `DERIVED`, each of shape (n,)."""
 
-    def __init__(self, draws: Derived, mechanism: Mechanism = TWO_MIRROR):
+    def __init__(self, draws: Derived, mechanism: Mechanism):
         self.derived = draws
         documented = (name for name in mechanism.names if name in mechanism.documented)
         self.names = (*documented, *derived_names(mechanism))

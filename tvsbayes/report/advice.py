@@ -98,13 +98,12 @@ def noise_line(summary: FitSummary) -> str | None:
     if USUAL_SCALE[0] <= scale <= USUAL_SCALE[1]:
         return None
     worse = "larger" if scale > 1 else "smaller"
-    sightings = "azimuth_zero_deg" in summary.parameters
-    stated = (
-        "sightings scatter {} times as much as u_deg of sightings.csv says"
-        if sightings
-        else ("the spots scatter {} times as much as su and sv of spots.csv say")
-    )
-    return f"{stated.format(f'{scale:.2g}')}; the fit allows for it: state {worse} ones if you know them"
+    looks, stated = "the spots", "su and sv of spots.csv say"
+    # A fit of images has parameters of cameras.
+    if "focal_scale" not in summary.parameters:
+        looks, stated = "sightings", "u_deg of sightings.csv says"
+    said = f"{looks} scatter {scale:.2g} times as much as {stated}"
+    return f"{said}; the fit allows for it: state {worse} ones if you know them"
 
 
 def assumed_stereo(stereo: Stereo | None, budgets: Sequence[BudgetTable]) -> str | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,8 +30,9 @@ from tvsbayes.report.document import (
     sentence,
     terminal,
 )
+from tvsbayes.report.drawing import DIRECTION_STYLE, drawing, legend
 from tvsbayes.report.page import digest_number, numbered
-from tvsbayes.report.position_figures import CURVE_POINTS, axis_errors, wave
+from tvsbayes.report.position_figures import banded
 from tvsbayes.report.result_tables import WAVE_COLUMNS, WAVES, percent, wave_row
 from tvsbayes.report.tables import TableView, interval_text, two_digits
 from tvsbayes.results.comparison_record import AxisHoldOut
@@ -42,7 +44,7 @@ from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
-from tvsbayes.single_axis.axis_periods import wave_samples
+from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
 from tvsbayes.single_axis.axis_record import (
     AxisResults,
     AxisSummary,
@@ -51,12 +53,18 @@ from tvsbayes.single_axis.axis_record import (
 )
 from tvsbayes.single_axis.classic_line import ClassicAxis
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
+from tvsbayes.statistics.intervals import band95
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DEVIATIONS_SHOWN = 40
 TABLE_ROWS = 60
 """Largest numbers of positions on a terminal, and on the page."""
 LIKELY = 0.5
 """Least probability of a wave for a figure."""
+CURVE_POINTS = 81
+"""Number of points of the curves of an axis' error and waves."""
 HELPLESS_SHARE = 0.95
 """Largest useful remaining share of an uncertainty after further stops."""
 MORE_HELPS = "many more stops (--minutes) help, or readings of smaller u"
@@ -310,6 +318,36 @@ def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     warning = f"these stops have little effect: u falls by {100 * (1 - share):.1f} %; {helps}"
     minutes = f"{plan.minutes:.1f} minutes in all"
     return terminal(next_table(plan, unit), minutes, warning if share > HELPLESS_SHARE else None)
+
+
+def axis_errors(fit: AxisFit, commands: np.ndarray, values: np.ndarray) -> Figure:
+    """The error at commands (t,) with its 95 % band, by values (n, t), and the stops, minus the line through them."""
+    rows = fit.rows
+    design = np.column_stack([np.ones(len(rows.value)), rows.command - fit.model.middle])
+    deviations = rows.value - design @ np.linalg.lstsq(design, rows.value, rcond=None)[0]
+    with drawing(3.2) as figure:
+        axes = figure.add_subplot()
+        banded(axes, commands, band95(values), "error by position")
+        for side, name in ((1, "forward"), (-1, "backward"), (0, "")):
+            of_side, (marker, colour) = rows.side == side, DIRECTION_STYLE[name]
+            if of_side.any():
+                label = f"stops, {name or 'side unknown'}"
+                axes.plot(rows.command[of_side], deviations[of_side], marker, color=colour, markersize=3.5, label=label)
+        axes.set(xlabel="command", ylabel=f"off the line, {fit.campaign.unit}")
+        legend(figure, 2)
+    return figure
+
+
+def wave(sample: WaveSample, unit: str) -> Figure:
+    """One wave over its mean period, with its 95 % band, given that it exists."""
+    turn = np.linspace(0.0, 1.0, CURVE_POINTS)
+    period_unit = "s" if sample.wave.clock == "seconds" else unit
+    with drawing(2.4) as figure:
+        axes = figure.add_subplot()
+        banded(axes, turn * float(np.mean(sample.period[sample.likeliest])), band95(sample.curve(turn)), "wave")
+        axes.set(xlabel=f"{period_unit}, from {sample.record.middle:.6g} on", ylabel=unit)
+        legend(figure, 2)
+    return figure
 
 
 def _wave_figures(fit: AxisFit) -> list[FigureView]:

@@ -58,22 +58,22 @@ SIGHTING_WORDS = {
     "refused": "refused sightings, by reason",
     **dict.fromkeys(("aperture_readings", "experiments"), ""),
 }
-"""Words for a head with sightings; "" omits a key."""
+"""Words for looks without images; "" omits a key."""
 UNSEEN_SHOWN = 5
 """Largest number of notes on counters without looks, for a file of points."""
 PLAN_UNIT = {"contrast": "deg/step", "backlash": "deg", "mirror_offset": "mm"}
 """Units of results in a plan, by the beginning of their names; deg/step for ratios."""
 
 
-def check_text(document: Mapping[str, Any], sightings: bool = False) -> str:
+def check_text(document: Mapping[str, Any], has_images: bool = True) -> str:
     """The text of `check` for a campaign, rig, plan, axis or journal: a table, and warnings.
 
     Args:
         document: document of `check --json`.
-        sightings: whether the campaign belongs to a head with sightings.
+        has_images: whether looks are spots in images; else sightings.
     """
     omitted = ("kind", "findings", "warnings", "faults", "expected", "contraction", "journal")
-    words = KEY_WORDS | (SIGHTING_WORDS if sightings else {})
+    words = KEY_WORDS | ({} if has_images else SIGHTING_WORDS)
     rows = [
         [words.get(key, key), _value_text(value)]
         for key, value in document.items()

@@ -22,7 +22,6 @@ from tvsbayes.results.compensation_record import (
     Compensation,
     Verification,
 )
-from tvsbayes.single_axis.axis_rows import DIRECTIONS
 
 if TYPE_CHECKING:
     from tvsbayes.comparison.verified_looks import AimPlan
@@ -161,30 +160,25 @@ def verification_text(verification: Verification) -> str:
     """A verification as text."""
     p = "< 0.0003" if verification.p < 3e-4 else f"= {verification.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in verification.worlds.items()]
-    is_axis = not verification.looks
-    caption = (
-        f"{verification.readings} readings under the table"
-        if is_axis
-        else f"{verification.readings} looks that the calibration aimed"
-    )
+    what, kind, under, remedies = "table", "readings", "under the table", REMEDIES
+    if verification.looks:
+        what, kind, under, remedies = "calibration", "looks", "that the calibration aimed", REMEDIES | SCANNER_REMEDIES
     lines: list[Part] = [
         f"{verification.verdict}: {verification.world} (p {p})",
         "",
-        TableView(caption, [f"the {'table' if is_axis else 'calibration'} was", "probability"], rows),
+        TableView(f"{verification.readings} {kind} {under}", [f"the {what} was", "probability"], rows),
         "",
         sizes_table(verification),
         _promise_text(verification),
         *verification.remarks,
     ]
     if verification.verdict == BROKEN:
-        remedies = REMEDIES if is_axis else REMEDIES | SCANNER_REMEDIES
         lines.append(f"what to do: {remedies[verification.world]}")
     elif verification.verdict == CANNOT_TELL and verification.needed is None:
         lines.append(
             "no number of such readings decides: the correction is smaller than the uncertainty of homing and fit"
         )
     elif verification.verdict == CANNOT_TELL:
-        kind = "readings" if is_axis else "looks"
         more = f"about {verification.needed} {kind} of this kind" if verification.needed else f"some more {kind}"
         lines.append(f"what to do: take {more}; `tvsbayes plan --verify FOLDER` lists the most informative")
     return terminal(*lines)
@@ -220,7 +214,7 @@ def _verdict(verification: Verification) -> str:
 
 def verify_plan_text(plan: VerifyPlan) -> str:
     """A plan of readings that verify a table, as text."""
-    rows = [[f"{command:.10g}", DIRECTIONS[side]] for command, side in plan.stops]
+    rows = [[f"{command:.10g}", "forward" if side > 0 else "backward"] for command, side in plan.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
     return terminal(table, f"to arrive on a side, come from at least {plan.run_up:.4g} commands away", _power(plan))
 

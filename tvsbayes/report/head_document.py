@@ -5,9 +5,10 @@ Only the pointing model is computed here, for comparison with the fit. deg, deg/
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from tvsbayes.head.pointing_model import pointing_model
+from tvsbayes.display import concise
+from tvsbayes.head.pointing_model import PointingModel, pointing_model
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.report.advice import LAPLACE_SHORT
@@ -16,9 +17,10 @@ from tvsbayes.report.figures import intervals
 from tvsbayes.report.fit_sections import stop_views
 from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.page import numbered
-from tvsbayes.report.parameter_words import sentence_in_words
-from tvsbayes.report.result_tables import headline_table, pointing_table
+from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
+from tvsbayes.report.result_tables import headline_table
 from tvsbayes.report.scanner_document import answer_table, measured_days, verdict_of
+from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.fit_record import FitRecord
 
 METHOD = (
@@ -29,6 +31,20 @@ METHOD = (
     "that drifts; every stop has an error of its own. Each sighting gives two residuals on the sphere.",
     "Refraction is as the table of sightings has it.",
 )
+
+
+def pointing_table(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> TableView:
+    """The terms of a head by least squares, and those of a fit, if any, with value and sd."""
+    rows = []
+    for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
+        row = [name_in_words(name), concise(value, error)]
+        if joint is not None:
+            row += [concise(*joint[name]), f"{error / joint[name][1]:.2g}" if joint[name][1] > 0 else ""]
+        rows.append(row)
+    columns = ["term", "least squares (se)", *(["joint (sd)", "se / sd"] if joint is not None else [])]
+    sizes = f"{two_digits(model.rms_deg)} deg = {two_digits(3600 * model.rms_deg)} arcsec"
+    caption = f"pointing model without gears, {len(model.residual_deg)} sightings; RMS on the sphere {sizes}"
+    return TableView(caption, columns, rows)
 
 
 def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: Sequence[str] = ()) -> Document:
@@ -48,18 +64,14 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
         warnings.append(LAPLACE_SHORT)
     validation = [] if summary.validation is None else validation_lines(summary.validation)
     stops = () if record.evidence is None else record.evidence.residuals
+    joint = {name: (estimate.value, estimate.sd) for name, estimate in summary.parameters.items()}
+    tables = [headline_table(summary), pointing_table(pointing_model(campaign), joint)]
+    noise, scale = summary.noise, summary.parameters["pixel_scale"].value
+    scatter = f"chi-square {noise.chi2:.1f} for {noise.dof:.1f} degrees of freedom; "
+    scatter += f"sightings scatter by {scale:.2f} times their stated u."
     sections = [
-        Section(
-            "Result",
-            tables=[
-                headline_table(summary),
-                pointing_table(
-                    pointing_model(campaign), {name: (e.value, e.sd) for name, e in summary.parameters.items()}
-                ),
-            ],
-            opened=True,
-        ),
-        Section("Stops", text=_noise_text(record), figures=[view for axis in AXES for view in stop_views(stops, axis)]),
+        Section("Result", tables=tables, opened=True),
+        Section("Stops", text=[scatter], figures=[view for axis in AXES for view in stop_views(stops, axis)]),
         Section(
             "What the sightings do not determine",
             items=[sentence_in_words(text) for text in weaknesses] or ["No remarks."],
@@ -86,11 +98,3 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
             issue=issue,
         )
     )
-
-
-def _noise_text(record: FitRecord) -> list[str]:
-    noise, scale = record.summary.noise, record.summary.parameters["pixel_scale"].value
-    return [
-        f"chi-square {noise.chi2:.1f} for {noise.dof:.1f} degrees of freedom; sightings scatter by {scale:.2f} times "
-        "their stated u."
-    ]

@@ -1,7 +1,4 @@
-"""Figures of errors that repeat by position: an error with its band and the stops on it, a wave over its period.
-
-Gears over their counters in deg, an axis over its commands in its unit.
-"""
+"""Figures of errors that repeat by position, of gears over their counters: an error with its band, the stops on it."""
 
 from __future__ import annotations
 
@@ -12,7 +9,6 @@ import numpy as np
 
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.report.drawing import BLACK, BLUE, DIRECTION_STYLE, ORANGE, PURPLE, SKY, drawing, legend
-from tvsbayes.statistics.intervals import band95
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,16 +16,12 @@ if TYPE_CHECKING:
 
     from tvsbayes.report.evidence import GearBand
     from tvsbayes.results.estimates import StopResidual
-    from tvsbayes.single_axis.axis_fit import AxisFit
-    from tvsbayes.single_axis.axis_periods import WaveSample
 
-CURVE_POINTS = 81
-"""Number of points of the curves of an axis' error and waves."""
 PLAY_SHOWN = 0.1
 """Least variation of the play, over that of the error, for its own panel."""
 
 
-def _banded(axes: Axes, x: np.ndarray, band: np.ndarray, name: str, light: str = SKY, dark: str = BLUE) -> None:
+def banded(axes: Axes, x: np.ndarray, band: np.ndarray, name: str, light: str = SKY, dark: str = BLUE) -> None:
     """A curve with its 95 % band; `band` has low, mean, high, shape (3, n)."""
     axes.fill_between(x, band[0], band[2], color=light, alpha=0.4, linewidth=0, label=f"{name}, 95 %")
     axes.plot(x, band[1], color=dark, linewidth=1.2, label="its mean")
@@ -43,7 +35,7 @@ def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
         curves = [(panels[0], band.error_deg, "transmission error", SKY, BLUE)]
         curves += [(panels[1], band.play_deg, "change of play", ORANGE, PURPLE)] if play else []
         for axes, drawn, name, light, dark in curves:
-            _banded(axes, band.steps, drawn, name, light, dark)
+            banded(axes, band.steps, drawn, name, light, dark)
             for side in ((band.steps[0], band.seen_steps[0]), (band.seen_steps[1], band.steps[-1])):
                 axes.axvspan(*side, color="#EEEEEE", zorder=0)
             axes.axhline(0.0, color=BLACK, linewidth=0.6)
@@ -57,40 +49,4 @@ def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
             panels[0].plot(steps, errors, marker, color=colour, markersize=3.5, rasterized=True, label=label)
         panels[-1].set_xlabel(f"{band.axis} counter, steps")
         legend(figure, 2, panels[0])
-    return figure
-
-
-def axis_errors(fit: AxisFit, commands: np.ndarray, values: np.ndarray) -> Figure:
-    """The error of an axis by position with its 95 % band, and the stops, minus the line through them.
-
-    Args:
-        fit: fit of the axis.
-        commands: shape (t,).
-        values: equally probable values of the error at the commands, in the axis' unit, shape (n, t).
-    """
-    rows = fit.rows
-    design = np.column_stack([np.ones(len(rows.value)), rows.command - fit.model.middle])
-    deviations = rows.value - design @ np.linalg.lstsq(design, rows.value, rcond=None)[0]
-    with drawing(3.2) as figure:
-        axes = figure.add_subplot()
-        _banded(axes, commands, band95(values), "error by position")
-        for side, name in ((1, "forward"), (-1, "backward"), (0, "")):
-            of_side, (marker, colour) = rows.side == side, DIRECTION_STYLE[name]
-            if of_side.any():
-                label = f"stops, {name or 'side unknown'}"
-                axes.plot(rows.command[of_side], deviations[of_side], marker, color=colour, markersize=3.5, label=label)
-        axes.set(xlabel="command", ylabel=f"off the line, {fit.campaign.unit}")
-        legend(figure, 2)
-    return figure
-
-
-def wave(sample: WaveSample, unit: str) -> Figure:
-    """One wave over its mean period, with its 95 % band, given that it exists."""
-    turn = np.linspace(0.0, 1.0, CURVE_POINTS)
-    period_unit = "s" if sample.wave.clock == "seconds" else unit
-    with drawing(2.4) as figure:
-        axes = figure.add_subplot()
-        _banded(axes, turn * float(np.mean(sample.period[sample.likeliest])), band95(sample.curve(turn)), "wave")
-        axes.set(xlabel=f"{period_unit}, from {sample.record.middle:.6g} on", ylabel=unit)
-        legend(figure, 2)
     return figure

@@ -6,7 +6,6 @@ Units are in captions and heads; numbers have two digits of their uncertainty (G
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,14 +14,10 @@ from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
 from tvsbayes.metrology.look_budget import Budget
-from tvsbayes.report.parameter_words import name_in_words, share_in_words
-from tvsbayes.report.tables import TableView, interval_text, signed, three_digits, two_digits
+from tvsbayes.report.parameter_words import share_in_words
+from tvsbayes.report.tables import TableView, interval_text, signed, three_digits
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
 from tvsbayes.results.estimates import Estimate, FitSummary, PeriodEstimate
-
-if TYPE_CHECKING:
-    from tvsbayes.head.pointing_model import PointingModel
-
 
 KEY_PARAMETERS = (
     *(quantity.name for quantity in HEADLINES if quantity.label and not quantity.ratio),
@@ -192,17 +187,3 @@ def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") ->
         for k in order[budget.share[order] >= SHARE_SHOWN]
     ]
     return TableView(caption, ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"], rows)
-
-
-def pointing_table(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> TableView:
-    """The terms of a head by least squares, and those of a fit, if any, with value and sd."""
-    rows = []
-    for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
-        row = [name_in_words(name), concise(value, error)]
-        if joint is not None:
-            row += [concise(*joint[name]), f"{error / joint[name][1]:.2g}" if joint[name][1] > 0 else ""]
-        rows.append(row)
-    columns = ["term", "least squares (se)", *(["joint (sd)", "se / sd"] if joint is not None else [])]
-    sizes = f"{two_digits(model.rms_deg)} deg = {two_digits(3600 * model.rms_deg)} arcsec"
-    caption = f"pointing model without gears, {len(model.residual_deg)} sightings; RMS on the sphere {sizes}"
-    return TableView(caption, columns, rows)

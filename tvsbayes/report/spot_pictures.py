@@ -14,7 +14,7 @@ import numpy as np
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.images import read_image
-from tvsbayes.instrument.campaign import CAMERAS, Campaign, Spot, frame_name
+from tvsbayes.instrument.campaign import CAMERAS, Campaign, Spot, frame_name, stereo_spots
 from tvsbayes.report.drawing import RED, drawing
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def spot_crops(campaign: Campaign, suspects: Sequence[int]) -> tuple[SpotCrop, .
     """Make cut-outs, of suspect spots first, then of others evenly chosen; none for missing or damaged frames."""
     if campaign.path is None or not (campaign.path / "frames").is_dir():
         return ()
-    usable = [spot for spot in campaign.spots if isinstance(spot, Spot) and spot.status == "ok"]
+    usable = [spot for spot in stereo_spots(campaign.spots) if spot.status == "ok"]
     suspected = [spot for spot in usable if spot.spot in set(suspects)][:LOOKS_SHOWN]
     others = [spot for spot in usable if spot not in suspected]
     count = min(LOOKS_SHOWN - len(suspected), len(others))

@@ -18,8 +18,9 @@ from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
-from tvsbayes.single_axis.predicted_stops import PredictedReadings, transferred_scales
+from tvsbayes.single_axis.predicted_stops import transferred_scales
 from tvsbayes.statistics.intervals import NORMAL_95, rms
+from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 

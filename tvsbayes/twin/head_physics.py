@@ -11,11 +11,6 @@ from collections.abc import Mapping
 import numpy as np
 
 
-def tilt_zero_deg(parameters: Mapping[str, float]) -> float:
-    """Return the angle of the second axis at counter 0, of a scanner or a head."""
-    return parameters["elevation_zero_deg" if "elevation_zero_deg" in parameters else "tilt_zero_deg"]
-
-
 def about(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     """Compute rotation matrices (..., 3, 3) about a unit vector, counter-clockwise seen from its end."""
     c, s = np.cos(angle_rad)[..., None, None], np.sin(angle_rad)[..., None, None]

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTION_SIGNS, FULL_TURN_DEG
+from tvsbayes.instrument.mechanisms import HEAD, TWO_MIRROR, mechanism_of
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.twin.head_physics import head_beam
@@ -113,13 +114,14 @@ def stop_errors(
 def mirror_chain(
     psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the beam for angles psi, beta of both axes: origin (..., 3) mm and direction (..., 3) in P.
+    """Compute the beam for angles psi, beta of both axes: origin (..., 3) mm and direction (..., 3) in P."""
+    return BEAMS[mechanism_of(geometry).word](psi_rad, beta_rad, geometry)
 
-    True reflections at true intersections (formulation 3.2). The laser is rotated into the pan stage Q instead of the
-    mirrors out of it. `geometry` maps parameter names to values; for a head see `head_beam`.
-    """
-    if "azimuth_zero_deg" in geometry:
-        return head_beam(psi_rad, beta_rad, geometry)
+
+def reflected_beam(
+    psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the beam of a scanner by true reflections, the laser rotated into the pan stage Q (formulation 3.2)."""
     psi, beta = np.broadcast_arrays(np.asarray(psi_rad, float), np.asarray(beta_rad, float))
     tx, ty = (np.tan(np.radians(geometry[f"laser_tilt_deg.{axis}"])) for axis in "xy")
     ox, oy = geometry["laser_offset_mm.x"], geometry["laser_offset_mm.y"]
@@ -138,6 +140,10 @@ def mirror_chain(
     radial = np.cos(beta)[..., None] * across + np.sin(beta)[..., None] * up
     point, direction = _reflect(point, direction, centre, np.sin(m2) * radial + np.cos(m2) * axis)
     return _about_z(point, psi), _about_z(direction, psi)
+
+
+BEAMS = {TWO_MIRROR.word: reflected_beam, HEAD.word: head_beam}
+"""Beams by the word of a mechanism."""
 
 
 def _about_z(vector: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

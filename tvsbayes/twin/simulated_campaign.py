@@ -19,12 +19,13 @@ from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, stereo_spots, with_pixels
 from tvsbayes.instrument.conditions import powered_on_s
+from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
 from tvsbayes.instrument.sightings import Sighting
 from tvsbayes.twin.gear_errors import PERFECT, draw_gear_errors, drift_deg, kelvin_of, zero_shift_deg
-from tvsbayes.twin.head_physics import sighted_angles, tilt_zero_deg
+from tvsbayes.twin.head_physics import sighted_angles
 from tvsbayes.twin.physics import (
     Light,
     Sheet,
@@ -151,7 +152,7 @@ def simulate(
     driven = _drive(log.moves, truth, rig.table.first_period_deg, streams, powered_on_s(full_header))
     truth = replace(driven.truth, homing_side=home_approach)
     looks: tuple[Spot | Sighting, ...]
-    if rig.stereo is None:
+    if not rig.has_images:
         light = Light(*[np.zeros((0, 3))] * 4)
         looks = _sightings(log, rig, truth, streams)
     else:
@@ -237,7 +238,7 @@ def _drive(
         resting[:, i] += zero_shift_deg(p, axis, warm_minutes, kelvin)
         sds = {"+": p[f"stop_sd_deg.{positive}"], "-": p[f"stop_sd_deg.{negative}"]}
         errors[:, i] = stop_errors(counters[:, i], first, approach, stop_draws[:, i], sds)
-    resting[:, 1] += tilt_zero_deg(p)
+    resting[:, 1] += p[mechanism_of(p).tilt_zero]
     realised = replace(
         truth,
         mirror_angles_deg=pan_and_tilt((resting + errors).tolist()),

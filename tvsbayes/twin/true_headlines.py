@@ -13,8 +13,8 @@ import numpy as np
 
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.twin.gear_errors import GearErrors
-from tvsbayes.twin.head_physics import tilt_zero_deg
 from tvsbayes.twin.physics import harmonics_deg, mirror_chain, wobble_deg
 
 SLOPE_STEP_RAD = 1e-5
@@ -74,7 +74,7 @@ def _mirror_deg(
     """Compute the mirror angle (n,) of an axis by mean ratio and transmission error alone."""
     angle_deg = parameters[f"degrees_per_step.{axis}"] * counters
     error_deg = errors[axis].error_deg(angle_deg) + wobble_deg(angle_deg, harmonics_deg(parameters, axis), period_deg)
-    return angle_deg + error_deg + (tilt_zero_deg(parameters) if axis == "tilt" else 0.0)
+    return angle_deg + error_deg + (parameters[mechanism_of(parameters).tilt_zero] if axis == "tilt" else 0.0)
 
 
 def _beam_deg(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:

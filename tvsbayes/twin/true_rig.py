@@ -101,9 +101,9 @@ class Truth(WithStereo):
 
     def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
         """Compute the effective ratios over the looks of a campaign, see `true_headlines`; None without looks."""
-        # A ratio contrast rotates a head's axes by degrees over long travel, and with a tilted axis its lines depend on
-        # the other axis' angle. For a scanner this effect is 1e-5.
-        pose_deg = self.reference_pose_deg if campaign.rig.mechanism.terms else None
+        # A ratio contrast rotates axes by degrees over long travel, and with a tilted axis the lines depend on the
+        # other axis' angle. For a scanner this effect is 1e-5.
+        pose_deg = self.reference_pose_deg if campaign.rig.mechanism.all_round else None
         return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign, pose_deg)
 
     def headlines(self, campaign: Campaign, pose_deg: Pair) -> dict[str, float] | None:
@@ -140,11 +140,10 @@ class Truth(WithStereo):
         effective = self.effective_deg_per_step(campaign)
         if effective is not None:
             document["effective_deg_per_step"] = effective
-        if self.reference_pose_deg is not None:
-            document["local_deg_per_step"] = local_deg_per_step(self.parameters, self.reference_pose_deg)
-            if not mechanism.terms:
-                offset_mm = effective_mirror_offset_mm(self.parameters, self.reference_pose_deg)
-                document["effective_mirror_offset_mm"] = offset_mm
+        if (pose_deg := self.reference_pose_deg) is not None:
+            document["local_deg_per_step"] = local_deg_per_step(self.parameters, pose_deg)
+            if "effective_mirror_offset_mm" not in mechanism.absent:
+                document["effective_mirror_offset_mm"] = effective_mirror_offset_mm(self.parameters, pose_deg)
         return document
 
     def _gear_error(self, axis: str, campaign: Campaign) -> GearErrorTable:

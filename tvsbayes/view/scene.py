@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.estimators.campaign_arrays import campaign_arrays, pixel_covariance
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import (
@@ -232,7 +232,7 @@ def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> Look
         suspect[[row_of[spot] for spot in (*fitted.fit.suspect_spots, *fitted.fit.excluded_spots)]] = True
     if used:
         point[rows] = campaign.points_mm[rows]
-        noise = scale**2 * np.stack([pixel_covariance(spot) for spot in used])
+        noise = scale**2 * np.stack([spot.pixel_covariance() for spot in used])
         covariance[rows] = point_covariance_mm2(campaign.stereo_pair, point[rows], noise)
     deviation, u = _deviations(row_of, () if fitted is None else fitted.stops)
     return LookColumns(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.calibration.optics import beam_components
-from tvsbayes.head.chain import HeadOptics
+from tvsbayes.instrument.chains import HeadOptics
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
 from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
 from tvsbayes.instrument.places import line_share, seen_places

@@ -1,4 +1,4 @@
-"""The line of sight of a head with two geared axes by exact rotations, for Python floats, NumPy and JAX.
+"""Chains of the beam by mechanism; that of a head with two geared axes by exact rotations, for floats, NumPy and JAX.
 
 Lengths in mm, angles in rad. The frame is P of `instrument.mirrors`: z up, azimuth counted from x towards y, as the pan
 counter. Two small angles tilt the azimuth axis in it; elevation axis and beam follow that axis. To first order the
@@ -18,7 +18,8 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import NamedTuple
 
-from tvsbayes.instrument.mirrors import Materialise, Numbers, Ray, Turn, Vectors, unchanged
+from tvsbayes.instrument.mechanisms import HEAD, TWO_MIRROR
+from tvsbayes.instrument.mirrors import Materialise, Numbers, Optics, Ray, Turn, Vectors, unchanged
 from tvsbayes.instrument.parameters import HEAD_TERMS
 
 LEAST_ELEVATION = 1e-3
@@ -41,11 +42,11 @@ class HeadOptics(NamedTuple):
     tangent_flexure_rad: Numbers
 
     @classmethod
-    def of(cls, value: Callable[[str], Numbers]) -> HeadOptics:
-        """Build from `value`, which returns each term by its name in mm and rad; terms of two parts become pairs."""
+    def of(cls, block: Callable[[str], Numbers]) -> HeadOptics:
+        """Build from `block`, which returns each term by its name in mm and rad; terms of two parts become pairs."""
         terms: dict[str, tuple[Numbers, ...]] = {}
         for term in list(HEAD_TERMS.values())[1:]:
-            terms[term.block] = (*terms.get(term.block, ()), value(term.name))
+            terms[term.block] = (*terms.get(term.block, ()), block(term.name))
         return cls(*(parts if len(parts) > 1 else parts[0] for parts in terms.values()))
 
     def leaving(
@@ -77,6 +78,10 @@ class HeadOptics(NamedTuple):
         sight = ahead * cos(self.beam_not_square_rad) + axis * -sin(self.beam_not_square_rad)
         return Ray(*materialise(tuple(self._leaning(azimuth.forward(v)) for v in (origin, sight))))
 
+    def leaving_turned(self, pan_rad: Numbers, tilt_rad: Numbers, by_rad: Numbers, functions: ModuleType) -> Ray:
+        """The line of sight in P turned about z."""
+        return Ray(*map(Turn.by(by_rad, functions).forward, self.leaving(pan_rad, tilt_rad, functions)))
+
     def _leaning(self, v: Vectors) -> Vectors:
         """Vectors turned about the horizontal axis that tilts z to the azimuth axis (Rodrigues)."""
         north, east = self.azimuth_axis_tilt_rad
@@ -87,3 +92,9 @@ class HeadOptics(NamedTuple):
         axis = Vectors(-east, north, 0.0)
         once = axis.cross(v)
         return v + once * sinc + axis.cross(once) * versine
+
+
+type Chain = Optics | HeadOptics
+"""What carries the beam: the laser over mirrors, or a line of sight on two axes."""
+CHAINS: dict[str, type[Optics] | type[HeadOptics]] = {TWO_MIRROR.word: Optics, HEAD.word: HeadOptics}
+"""Chains by the word of a mechanism."""
