@@ -23,8 +23,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from experiments.cameras.stereo_coverage import OPENCV_PAIRS, chi2
+from experiments.cameras.stereo_coverage import OPENCV_PAIRS
+from experiments.common.board_views import chi2
 from experiments.common.command_line import study
+from experiments.common.opencv_stereo import calibrated
 from experiments.common.rows import output
 from tvsbayes.cameras.assumed_covariance import (
     CORRELATION_FACTOR,
@@ -104,16 +106,10 @@ def drawn_bench(seed: int) -> Bench:
 
 def by_opencv(bench: Bench, way: str) -> tuple[Stereo, float]:
     """OpenCV's calibration of a bench, and its RMS."""
-    size = bench.true.image_width, bench.true.image_height
-    points = [bench.board.points_mm.astype(np.float32)] * len(bench.left)
-    sides = [[np.asarray(view, np.float32) for view in side] for side in (bench.left, bench.right)]
-    fixed = WAYS[way] & cv2.CALIB_FIX_K3
-    alone = [cv2.calibrateCamera(points, side, size, None, None, flags=fixed)[1:3] for side in sides]
-    flags = WAYS[way] | (0 if way == "fixed" else cv2.CALIB_USE_INTRINSIC_GUESS)
-    ends = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 300, 1e-10
-    rms, m1, d1, m2, d2, r, t, *_ = cv2.stereoCalibrate(
-        points, *sides, *alone[0], *alone[1], size, flags=flags, criteria=ends
-    )
+    size, lens = (bench.true.image_width, bench.true.image_height), WAYS[way] & cv2.CALIB_FIX_K3
+    flags = WAYS[way] if way == "fixed" else cv2.CALIB_USE_INTRINSIC_GUESS
+    sides = (bench.left, bench.right)
+    rms, m1, d1, m2, d2, r, t = calibrated(bench.board.points_mm, sides, size, flags, lens=lens, ends=(300, 1e-10))
     inner = [np.r_[m[[0, 1, 0, 1], [0, 1, 2, 2]], np.ravel(d)[:5]] for m, d in ((m1, d1), (m2, d2))]
     return Stereo.of_vector(np.concatenate([*inner, rotation_vector(r), np.ravel(t)]), size), float(rms)
 

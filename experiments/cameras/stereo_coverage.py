@@ -23,18 +23,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from experiments.common.board_views import (
-    BOARD,
-    CONDITIONS,
-    PITCH_U,
-    VIEWS,
-    Scene,
-    corners_of,
-    rendered_views,
-    scenes,
-    true_corners,
-)
+from experiments.common import board_views
+from experiments.common.board_views import BOARD, CONDITIONS, PITCH_U, Scene, chi2, true_corners
 from experiments.common.command_line import study
+from experiments.common.page import heading, line
 from experiments.common.rows import output
 from tvsbayes.cameras.boards import View, find_views
 from tvsbayes.cameras.stereo_calibration import calibrate_stereo
@@ -45,6 +37,7 @@ from tvsbayes.statistics.chances import BOUND
 ROWS, HALVES = output(__file__, "stereo_coverage.jsonl"), output(__file__, "stereo_halves.json")
 OPENCV_PAIRS = Path("/usr/share/doc/opencv-doc/examples/data")
 SPLITS = 20
+END = "correlation factor, median | s each, median"
 
 
 def corner_errors(views: Sequence[View], drawn: Sequence[Scene]) -> dict[str, float]:
@@ -64,21 +57,15 @@ def corner_errors(views: Sequence[View], drawn: Sequence[Scene]) -> dict[str, fl
     }
 
 
-def chi2(difference: np.ndarray, covariance: np.ndarray) -> float:
-    """d^T C^-1 d, scaled first: px, rad and mm differ by ten powers of ten."""
-    sds = np.sqrt(np.diag(covariance))
-    return float(difference / sds @ np.linalg.solve(covariance / np.outer(sds, sds), difference / sds))
-
-
-def calibrate(task: tuple[str, int], count: int = VIEWS) -> dict[str, object]:
+def calibrate(task: tuple[str, int], count: int = board_views.VIEWS) -> dict[str, object]:
     """One rig: chi-square of the true 24 parameters under the stored covariance, z of each, and the rest."""
     condition, seed = task
-    drawn = scenes(seed, condition, count)
+    drawn = board_views.scenes(seed, condition, count)
     rng = np.random.default_rng([seed, 99])
     if condition == "rendered":
-        views = rendered_views(drawn, seed)
+        views = board_views.rendered_views(drawn, seed)
     else:
-        views = [corners_of(scene, f"{k:02d}", rng) for k, scene in enumerate(drawn)]
+        views = [board_views.corners_of(scene, f"{k:02d}", rng) for k, scene in enumerate(drawn)]
     true = drawn[0].stereo
     board = replace(BOARD, pitch_u_mm=PITCH_U * BOARD.pitch_mm * (condition == "pitch"))
     try:
@@ -112,29 +99,25 @@ def halves(arguments: argparse.Namespace) -> None:
         parts = [[views.views[k] for k in order[a]] for a in (slice(0, 6), slice(6, None))]
         one, two = (calibrate_stereo(part, BOARD, size) for part in parts)
         difference = one.stereo.vector - two.stereo.vector
-        rows.append(
-            {
-                "stored": chi2(difference, one.stereo.parameter_covariance + two.stereo.parameter_covariance),
-                "independent": chi2(difference, one.covariance_independent + two.covariance_independent),
-            }
-        )
+        stored = chi2(difference, one.stereo.parameter_covariance + two.stereo.parameter_covariance)
+        plain = chi2(difference, one.covariance_independent + two.covariance_independent)
+        rows.append({"stored": stored, "independent": plain})
     whole = calibrate_stereo(views.views, BOARD, size)
     HALVES.parent.mkdir(parents=True, exist_ok=True)
     HALVES.write_text(json.dumps({"splits": rows, "factor": whole.correlation_factor, "rms_px": whole.stereo.rms_px}))
 
 
+TEXT = f"""# Is the covariance of a stereo calibration true?
+
+Written by `python -m experiments.cameras.stereo_coverage table`. chi2/24 of the true parameters should be 1;
+its bounds are those of a true covariance at 1e-4. `plain`: the same, had corners been taken as independent.
+
+{heading("corner errors | rigs | failed | mean chi2/24 | bounds | plain chi2/24 | worst z rms", "inside 95 %", END)}"""
+
+
 def table(rows: list[dict]) -> None:
     """Markdown on stdout."""
-    print("# Is the covariance of a stereo calibration true?\n")
-    print(
-        "Written by `python -m experiments.cameras.stereo_coverage table`. chi2/24 of the true parameters should be 1;"
-    )
-    print(
-        "its bounds are those of a true covariance at 1e-4. `plain`: the same, had corners been taken as independent.\n"
-    )
-    titles = ("corner errors", "rigs", "failed", "mean chi2/24", "bounds", "plain chi2/24", "worst z rms")
-    titles += ("inside 95 %", "correlation factor, median", "s each, median")
-    print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}")
+    print(TEXT)
     for condition in CONDITIONS:
         every = [row for row in rows if row["condition"] == condition]
         some = [row for row in every if "failed" not in row]
@@ -149,25 +132,21 @@ def table(rows: list[dict]) -> None:
         cells = [condition, str(n), str(len(every) - n), f"{stored.mean() / 24:.2f}", f"{low:.2f} to {high:.2f}"]
         cells += [f"{plain.mean() / 24:.2f}", f"{spread[worst]:.2f} ({STEREO_PARAMETER_NAMES[worst]})"]
         cells += [f"{100 * (np.abs(z) < 1.96).mean():.1f} %", f"{np.median(factor):.2f}", f"{np.median(seconds):.1f}"]
-        print(f"| {' | '.join(cells)} |")
+        print(line(*cells))
     some = [row for row in rows if row["condition"] == "rendered" and "failed" not in row]
     if some:
         keys = ("corner_sd_px", "corner_mean_u_px", "corner_mean_v_px", "corner_max_px")
         sd, u, v, largest = (np.array([row[key] for row in some]) for key in keys)
+        print(f"\n`rendered`: found less true corners have sd {np.median(sd):.3f} px (median of the rigs),", end=" ")
+        print(f"mean error u\n{u.mean():+.4f}, v {v.mean():+.4f} px, largest {largest.max():.2f} px;", end=" ")
         print(
-            f"\n`rendered`: found less true corners have sd {np.median(sd):.3f} px (median of the rigs), mean error u"
+            f"outlying views, all kept: {sum(row['outliers'] for row in some)} of {sum(row['views'] for row in some)}."
         )
-        print(
-            f"{u.mean():+.4f}, v {v.mean():+.4f} px, largest {largest.max():.2f} px; outlying views, all kept: ", end=""
-        )
-        print(f"{sum(row['outliers'] for row in some)} of {sum(row['views'] for row in some)}.")
     if HALVES.exists():
         pairs = json.loads(HALVES.read_text())
         stored, plain = (np.array([s[k] for s in pairs["splits"]]) / 24 for k in ("stored", "independent"))
-        words = (
-            f"OpenCV's 13 real pairs (640 x 480): rms {pairs['rms_px']:.3f} px, factor {pairs['factor']:.1f}. Split at "
-        )
-        words += f"random {len(stored)} times into 6 and 7 views, the two calibrations differ by\nchi2/24 = "
+        words = f"OpenCV's 13 real pairs (640 x 480): rms {pairs['rms_px']:.3f} px, factor {pairs['factor']:.1f}. "
+        words += f"Split at random {len(stored)} times into 6 and 7 views, the two calibrations differ by\nchi2/24 = "
         words += f"{stored.mean():.2f} on average (median {np.median(stored):.2f}) under the stored covariances, by "
         words += f"{plain.mean():.2f} (median {np.median(plain):.2f}) had corners been taken\nas independent."
         print(f"\n{words}")

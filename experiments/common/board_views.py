@@ -42,9 +42,33 @@ class Scene:
 
 
 def true_corners(scene: Scene) -> np.ndarray:
-    """Corners (corners, 4: u_left, v_left, u_right, v_right), px; NaN where not seen by both."""
-    x, y, z = (scene.board.points_mm @ rotation_matrix(scene.pose[:3]).T + scene.pose[3:]).T
-    return project(np.column_stack((z, -x, -y)), scene.stereo)
+    """Corners (corners, 4), see `seen_by_both`."""
+    return seen_by_both(scene.board.points_mm, scene.pose, scene.stereo)
+
+
+def seen_by_both(points_mm: np.ndarray, pose: np.ndarray, stereo: Stereo) -> np.ndarray:
+    """Pixels (points, 4: u_left, v_left, u_right, v_right) of a board at a pose; NaN where not seen by both."""
+    x, y, z = (points_mm @ rotation_matrix(pose[:3]).T + pose[3:]).T
+    return project(np.column_stack((z, -x, -y)), stereo)
+
+
+def poses_in_view(points_mm: np.ndarray, stereo: Stereo, count: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """Random poses (rotation vector, translation; board to left camera) wholly seen by both cameras."""
+    poses: list[np.ndarray] = []
+    while len(poses) < count:
+        rotation = rng.uniform(-0.6, 0.6, 3) * np.array([1.0, 1.0, 0.5])
+        depth = rng.uniform(240.0, 600.0)
+        middle = depth * np.array([rng.uniform(-0.6, 0.6), rng.uniform(-0.35, 0.35), 1.0]) + [42.5, 0.0, 0.0]
+        pose = np.concatenate((rotation, middle))
+        if np.isfinite(seen_by_both(points_mm, pose, stereo)).all():
+            poses.append(pose)
+    return poses
+
+
+def chi2(difference: np.ndarray, covariance: np.ndarray) -> float:
+    """d^T C^-1 d, scaled first: px, rad and mm differ by ten powers of ten."""
+    sds = np.sqrt(np.diag(covariance))
+    return float(difference / sds @ np.linalg.solve(covariance / np.outer(sds, sds), difference / sds))
 
 
 def corners_of(scene: Scene, name: str, rng: np.random.Generator) -> View:
@@ -70,26 +94,12 @@ def scenes(seed: int, condition: str, count: int = VIEWS) -> list[Scene]:
     if condition == "rendered":
         # Finders need the outer squares too: the renderer's own poses leave room for them.
         first = BOARD.points_mm[0]
-        poses = board_poses(cameras_of(stereo), board_pictures.Board(), RENDERED_VIEWS, seed)
-        return [
-            Scene(
-                stereo,
-                BOARD,
-                np.concatenate((rotation_vector(p.rotation), p.translation_mm - p.rotation @ first)),
-                condition,
-            )
-            for p in poses
-        ]
+        drawn = board_poses(cameras_of(stereo), board_pictures.Board(), RENDERED_VIEWS, seed)
+        poses = [np.concatenate((rotation_vector(p.rotation), p.translation_mm - p.rotation @ first)) for p in drawn]
+        return [Scene(stereo, BOARD, pose, condition) for pose in poses]
     pitch_mm = BOARD.pitch_mm * (1 + PITCH_U * rng.standard_normal() * (condition == "pitch"))
-    views: list[Scene] = []
-    while len(views) < count:
-        rotation = rng.uniform(-0.6, 0.6, 3) * np.array([1.0, 1.0, 0.5])
-        depth = rng.uniform(240.0, 600.0)
-        middle = depth * np.array([rng.uniform(-0.6, 0.6), rng.uniform(-0.35, 0.35), 1.0]) + [42.5, 0.0, 0.0]
-        scene = Scene(stereo, replace(BOARD, pitch_mm=pitch_mm), np.concatenate((rotation, middle)), condition)
-        if np.isfinite(true_corners(scene)).all():
-            views.append(scene)
-    return views
+    board = replace(BOARD, pitch_mm=pitch_mm)
+    return [Scene(stereo, board, pose, condition) for pose in poses_in_view(board.points_mm, stereo, count, rng)]
 
 
 def rendered_views(drawn: Sequence[Scene], seed: int) -> list[View]:

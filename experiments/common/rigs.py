@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, Spot, read_campaign
 from tvsbayes.instrument.parameters import CREEP_NAMES, LOOK_SCATTER_NAMES
 from tvsbayes.instrument.plan import PlanStep, read_plan
@@ -17,6 +19,11 @@ from tvsbayes.twin.true_rig import Truth, draw_truth, read_truth
 
 TWINS = ("paper_twin", "grid_twin")
 PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+PAPER_NOISE = {
+    **dict(zip((f"stop_sd_deg.{d}" for d in DIRECTIONS), (0.155, 0.022, 0.036, 0.008), strict=True)),
+    "pixel_scale": 1.0,
+}
+"""Of the paper twin, which give the Table's sds."""
 PAN_SWEEP = (0, 70, 140, 200, 140, 70)
 TILT_SWEEP = (-60, -20, 20, 60, 20, -20)
 TILT_STEPS = (-60, -36, -12, 12, 36, 60, 36, 12, -12, -36)
@@ -50,6 +57,14 @@ def shipped_twin(name: str) -> SimulatedCampaign:
     campaign = twin_campaign(name)
     truth = read_truth(shipped_data() / "twins" / name / "truth.json", campaign.stereo)
     return SimulatedCampaign(campaign, truth, None)
+
+
+def paper_values() -> dict[str, tuple[int, float, float]]:
+    """Number, mean and sd of the paper's Table 1 by direction, deg/step."""
+    with (shipped_data() / "reference" / "table1.csv").open() as file:
+        keys = "direction", "experiments", "mean_deg_per_step", "sd_deg_per_step"
+        rows = [[row[key] for key in keys] for row in csv.DictReader(file)]
+    return {direction: (int(count), float(mean), float(sd)) for direction, count, mean, sd in rows}
 
 
 def numbered(orders: Sequence[tuple]) -> tuple[PlanStep, ...]:

@@ -14,8 +14,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from experiments.common.board_views import poses_in_view, seen_by_both
 from experiments.common.command_line import print_only
-from experiments.common.rigs import drawn_truth
+from experiments.common.rigs import PAPER_NOISE, drawn_truth, paper_values
 from experiments.common.rows import ROOT
 from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -25,7 +26,6 @@ from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, write_stereo
 from tvsbayes.twin.gear_errors import PERFECT
-from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
 
@@ -35,13 +35,6 @@ BOARD_COLUMNS, BOARD_ROWS, BOARD_PITCH_MM = 9, 6, 25.0
 BOARD_VIEWS = 20
 CORNER_SD_PX = 0.15
 STEREO_SEED = 20250405
-TABLE_1 = {
-    "left": (0.059394, 0.000808),
-    "right": (0.062023, 0.000176),
-    "up": (0.068974, 0.000319),
-    "down": (0.067865, 0.000173),
-}
-"""Mean and sd of the paper's Table 1, deg/step; data/reference/table1.csv holds the same."""
 PAPER_TWIN_SPOT_SD_PX = 0.05
 MOUNTED_POSE = {
     "extrinsics.rotation_rad.x": 0.0,
@@ -93,9 +86,9 @@ def calibration_covariance(stereo: Stereo, rng: np.random.Generator) -> np.ndarr
     grid = np.mgrid[:BOARD_COLUMNS, :BOARD_ROWS].reshape(2, -1).T - np.array([4.0, 2.5])
     board = np.column_stack((BOARD_PITCH_MM * grid, np.zeros(len(grid))))
     information = np.zeros((24, 24))
-    for pose in _board_poses(stereo, board, rng):
-        by_stereo = _slopes(lambda v, pose=pose: _see(board, pose, stereo.with_vector(v)), stereo.vector)
-        by_pose = _slopes(lambda p: _see(board, p, stereo), pose)
+    for pose in poses_in_view(board, stereo, BOARD_VIEWS, rng):
+        by_stereo = _slopes(lambda v, pose=pose: seen_by_both(board, pose, stereo.with_vector(v)), stereo.vector)
+        by_pose = _slopes(lambda p: seen_by_both(board, p, stereo), pose)
         coupling = by_stereo.T @ by_pose
         information += by_stereo.T @ by_stereo
         information -= coupling @ np.linalg.solve(by_pose.T @ by_pose, coupling.T)
@@ -103,25 +96,6 @@ def calibration_covariance(stereo: Stereo, rng: np.random.Generator) -> np.ndarr
     scale = 1 / np.sqrt(np.diag(information))
     covariance = CORNER_SD_PX**2 * np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
     return (covariance + covariance.T) / 2
-
-
-def _board_poses(stereo: Stereo, board: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
-    """Random poses (rotation vector, translation; board to left camera) wholly seen by both cameras."""
-    poses: list[np.ndarray] = []
-    while len(poses) < BOARD_VIEWS:
-        rotation = rng.uniform(-0.6, 0.6, 3) * np.array([1.0, 1.0, 0.5])
-        depth = rng.uniform(240.0, 600.0)
-        centre = depth * np.array([rng.uniform(-0.6, 0.6), rng.uniform(-0.35, 0.35), 1.0])
-        pose = np.concatenate((rotation, centre + np.array([42.5, 0.0, 0.0])))
-        if np.isfinite(_see(board, pose, stereo)).all():
-            poses.append(pose)
-    return poses
-
-
-def _see(board: np.ndarray, pose: np.ndarray, stereo: Stereo) -> np.ndarray:
-    """All pixel coordinates (4 n,) of the board at a pose, NaN where out of view."""
-    x, y, z = (board @ rotation_matrix(pose[:3]).T + pose[3:]).T
-    return project(np.column_stack((z, -x, -y)), stereo).ravel()
 
 
 def _slopes(function, at: np.ndarray) -> np.ndarray:
@@ -132,7 +106,7 @@ def _slopes(function, at: np.ndarray) -> np.ndarray:
         ahead, behind = at.copy(), at.copy()
         ahead[i] += step
         behind[i] -= step
-        columns.append((function(ahead) - function(behind)) / (2 * step))
+        columns.append((function(ahead) - function(behind)).ravel() / (2 * step))
     return np.column_stack(columns)
 
 
@@ -206,7 +180,7 @@ def paper_twin(rig: Rig) -> SimulatedCampaign:
     for seed in range(1, 400):
         twin = matched(rig, seed)
         sds = _realised(twin)[1]
-        worst = max(abs(sds[name] / TABLE_1[name][1] - 1) for name in DIRECTIONS)
+        worst = max(abs(sds[name] / sd - 1) for name, (_, _, sd) in paper_values().items())
         if worst < 0.06 and all(spot.status == "ok" for spot in twin.campaign.spots):
             return twin
     raise RuntimeError("no seed below 400 reproduces Table 1; widen the search or change the stop errors")
@@ -215,31 +189,19 @@ def paper_twin(rig: Rig) -> SimulatedCampaign:
 def matched(rig: Rig, seed: int) -> SimulatedCampaign:
     """Twin of one seed with ratios, backlashes and pan stop sds solved; perfect gears, as the classic method has it."""
     drawn = draw_truth(rig, np.random.default_rng(seed)).with_gears()
-    p = {
-        **drawn.parameters,
-        "degrees_per_step.pan": 0.0615,
-        "degrees_per_step.tilt": 0.0630,
-        "ratio_contrast_deg_per_step.pan": 0.0,
-        "ratio_contrast_deg_per_step.tilt": 0.0,
-        "backlash_deg.pan": 0.526,
-        "backlash_deg.tilt": 0.222,
-        "stop_sd_deg.left": 0.155,
-        "stop_sd_deg.right": 0.022,
-        "stop_sd_deg.up": 0.036,
-        "stop_sd_deg.down": 0.008,
-        "pixel_scale": 1.0,
-    }
-    pairs = {"pan": ("right", "left"), "tilt": ("up", "down")}  # cleared, reversed
+    p = {**drawn.parameters, **PAPER_NOISE, "degrees_per_step.pan": 0.0615, "degrees_per_step.tilt": 0.0630}
+    p |= {"ratio_contrast_deg_per_step.pan": 0.0, "ratio_contrast_deg_per_step.tilt": 0.0}
+    p |= {"backlash_deg.pan": 0.526, "backlash_deg.tilt": 0.222}
+    pairs, paper = {"pan": ("right", "left"), "tilt": ("up", "down")}, paper_values()  # cleared, reversed
     for _ in range(12):
         twin = _twin(rig, Truth(with_derived(p), drawn.stereo, gear_errors=PERFECT), seed)
         mean, sd = _realised(twin)
         for axis, (cleared, reverse) in pairs.items():
-            p[f"backlash_deg.{axis}"] += 200 * (
-                mean[reverse] - mean[cleared] - TABLE_1[reverse][0] + TABLE_1[cleared][0]
-            )
-            p[f"degrees_per_step.{axis}"] *= TABLE_1[cleared][0] / mean[cleared]
+            lost = mean[reverse] - mean[cleared] - paper[reverse][1] + paper[cleared][1]
+            p[f"backlash_deg.{axis}"] += 200 * lost
+            p[f"degrees_per_step.{axis}"] *= paper[cleared][1] / mean[cleared]
         for name in ("left", "right"):
-            p[f"stop_sd_deg.{name}"] *= np.clip(TABLE_1[name][1] / sd[name], 0.8, 1.25)
+            p[f"stop_sd_deg.{name}"] *= np.clip(paper[name][2] / sd[name], 0.8, 1.25)
     p = {name: float(f"{value:.7g}") for name, value in p.items()}
     truth = Truth(with_derived(p), drawn.stereo, gear_errors=PERFECT, note=PAPER_TWIN_NOTE)
     return _twin(rig, truth, seed)
@@ -256,10 +218,8 @@ def _realised(twin: SimulatedCampaign) -> tuple[dict[str, float], dict[str, floa
     chosen = select_experiments(twin.campaign)
     ratios = four_point_ratios(chosen.pixels, chosen.steps, chosen.axis, twin.campaign.stereo)
     of = {name: ratios[chosen.direction == name] for name in DIRECTIONS}
-    return (
-        {name: float(np.mean(values)) for name, values in of.items()},
-        {name: float(np.std(values, ddof=1)) for name, values in of.items()},
-    )
+    sds = {name: float(np.std(values, ddof=1)) for name, values in of.items()}
+    return {name: float(np.mean(values)) for name, values in of.items()}, sds
 
 
 def grid_twin(rig: Rig) -> SimulatedCampaign:
@@ -288,7 +248,7 @@ def main() -> None:
         counts = f"{len(twin.campaign.spots)} spots, {len(twin.campaign.moves)} moves"
         print(f"{folder.relative_to(DATA.parent)}: seed {twin.campaign.header['seed']}, {counts}")
     results = classic(read_campaign(DATA / "twins" / "paper_twin")).directions
-    for direction, (mean, sd) in TABLE_1.items():
+    for direction, (_, mean, sd) in paper_values().items():
         result = results[direction]
         shown = f"mean {result.mean_deg_per_step:.6f} sd {result.sd_deg_per_step:.6f}"
         print(f"  {direction:5s} {shown} deg/step; Table 1: {mean:.6f}, {sd:.6f}")

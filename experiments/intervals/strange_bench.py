@@ -19,6 +19,7 @@ from statistics import NormalDist
 import cv2
 import numpy as np
 
+from experiments.common.opencv_stereo import calibrated
 from experiments.intervals.strange_optics import Camera, Gear, Head, Waves, turn, turned
 
 AXES = ("pan", "tilt")
@@ -411,18 +412,13 @@ def _calibrated(rng: np.random.Generator, rig: Rig, board: tuple[int, int, float
     corners = exact + rng.uniform(0.05, 0.25) * rng.standard_normal(exact.shape)
     fix_k3 = rig.left.lens[4] == 0.0
     flags = cv2.CALIB_FIX_K3 if fix_k3 else 0
-    once = points.astype(np.float32)
-    shown = [once] * len(poses)
-    pair = [[np.ascontiguousarray(view[:, part], np.float32) for view in corners] for part in (slice(2), slice(2, 4))]
     together = cv2.CALIB_FIX_INTRINSIC if rng.random() < 0.5 else cv2.CALIB_USE_INTRINSIC_GUESS
-    ends = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 100, 1e-6)
     threads = cv2.getNumThreads()
     # Sums of several threads differ from run to run, and with them where a descent ends.
     cv2.setNumThreads(1)
     try:
-        alone = [cv2.calibrateCamera(shown, one, rig.left.size, None, None, flags=flags)[1:3] for one in pair]
-        starts = (*pair, *alone[0], *alone[1], rig.left.size)
-        rms, *both = cv2.stereoCalibrate(shown, *starts, flags=flags | together, criteria=ends)[:7]
+        sides = (corners[..., :2], corners[..., 2:])
+        rms, *both = calibrated(points, sides, rig.left.size, together, lens=flags, ends=(100, 1e-6))
     finally:
         cv2.setNumThreads(threads)
     named = dict(zip(("M1", "D1", "M2", "D2", "R", "T"), both, strict=True))

@@ -19,9 +19,8 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import print_only
-from experiments.common.rigs import mounted_rig, numbered, shipped_plan, shipped_twin, twin_campaign
+from experiments.common.rigs import mounted_rig, numbered, paper_values, shipped_plan, shipped_twin, twin_campaign
 from experiments.common.rows import ROOT
-from experiments.paper.table1 import paper_values
 from tvsbayes.assessment.causes import headline_causes
 from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import fit

@@ -10,7 +10,6 @@ worked example. The same numbers come from `tvsbayes classic data/twins/paper_tw
 
 from __future__ import annotations
 
-import csv
 import tomllib
 
 import numpy as np
@@ -18,15 +17,13 @@ from scipy import stats
 
 from experiments.common.command_line import print_only
 from experiments.common.page import heading
-from experiments.common.rigs import mounted_rig, shipped_plan
+from experiments.common.rigs import mounted_rig, paper_values, shipped_plan, shipped_twin
 from tvsbayes.estimators.four_point import classic, four_point_angle_deg, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import simulate
-from tvsbayes.twin.true_rig import read_truth
 
 AGAIN = 100
 """Campaigns of the same true rig: their sd is known to 7 %."""
@@ -34,20 +31,10 @@ SPOT_SD_PX = 0.05
 """The twin's, see make_twins.py."""
 
 
-def paper_values() -> dict[str, tuple[int, float, float]]:
-    """Number, mean and sd of Table 1 by direction, deg/step."""
-    with (shipped_data() / "reference" / "table1.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    return {
-        r["direction"]: (int(r["experiments"]), float(r["mean_deg_per_step"]), float(r["sd_deg_per_step"]))
-        for r in rows
-    }
-
-
 def table(paper: dict[str, tuple[int, float, float]]) -> None:
     """Table 1 beside the twin's, and the twin again."""
-    folder = shipped_data() / "twins" / "paper_twin"
-    campaign = read_campaign(folder)
+    twin = shipped_twin("paper_twin")
+    campaign, truth = twin.campaign, twin.truth
     directions = classic(campaign).directions
     print(heading("direction | n, paper | mean | sd | n, twin | mean | sd | (mean - paper's) / u | sd / paper's"))
     for name in DIRECTIONS:
@@ -57,7 +44,6 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
         apart = (r.mean_deg_per_step - mean) / np.hypot(sd / np.sqrt(n), r.u_type_a_deg_per_step)
         twin = f"{r.n} | {r.mean_deg_per_step:.6f} | {r.sd_deg_per_step:.6f}"
         print(f"| {name} | {n} | {mean:.6f} | {sd:.6f} | {twin} | {apart:+.2f} | {r.sd_deg_per_step / sd:.2f} |")
-    truth = read_truth(folder / "truth.json", campaign.stereo)
     rig, plan = mounted_rig(), shipped_plan("paper_twin")
     means, sds = [], []
     for seed in range(AGAIN):

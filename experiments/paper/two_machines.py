@@ -12,9 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from experiments.common.rigs import mounted_rig, numbered
+from experiments.common.rigs import PAPER_NOISE, mounted_rig, numbered, paper_values
 from experiments.common.worth import searched_family
-from experiments.paper.table1 import paper_values
 from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
@@ -30,14 +29,7 @@ from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
 Kind = Literal["lost motion", "literal"]
 RIGS: tuple[Kind, Kind] = ("lost motion", "literal")
 HOME_SIDES = "right", "up"
-NOISE = {
-    "stop_sd_deg.left": 0.155,
-    "stop_sd_deg.right": 0.022,
-    "stop_sd_deg.up": 0.036,
-    "stop_sd_deg.down": 0.008,
-    "pixel_scale": 1.0,
-}
-"""Of the paper twin, which give the Table's sds."""
+NOISE = PAPER_NOISE
 SHEETS_MM = 175.0, 275.0
 STEPS, STARTS = 200, {"left": (0, 0), "right": (200, 0), "up": (100, -100), "down": (100, 100)}
 """Counters of pan and tilt at which the experiments of a direction start."""

@@ -36,9 +36,8 @@ from scipy import stats
 
 from experiments.common.command_line import study
 from experiments.common.figures import page_figure, title_and_figure
-from experiments.common.rigs import mounted_rig, unseen
+from experiments.common.rigs import mounted_rig, paper_values, unseen
 from experiments.common.rows import output
-from experiments.paper.table1 import paper_values
 from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.estimators.joint_fit import JointFit, fit

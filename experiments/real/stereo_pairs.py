@@ -19,8 +19,10 @@ import cv2
 import numpy as np
 from scipy import stats
 
+from experiments.common.board_views import chi2
 from experiments.common.command_line import parser
 from experiments.common.figures import page_figure, title_and_figure
+from experiments.common.opencv_stereo import calibrated
 from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
 from tvsbayes.errors import TvsError
@@ -56,24 +58,18 @@ def pairs_of(views: Sequence[View]) -> list[View]:
 
 def opencv_joint(views: Sequence[View], board: Board, size: tuple[int, int]) -> Joint:
     """OpenCV's calibration from the same corners."""
-    points = [board.points_mm.astype(np.float32)] * len(views)
-    sides = [[np.asarray(getattr(view, side), np.float32) for view in views] for side in ("left", "right")]
-    alone = [cv2.calibrateCamera(points, one, size, None, None)[1:3] for one in sides]
-    ends = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 300, 1e-12
-    joint = cv2.stereoCalibrate(
-        points, *sides, *alone[0], *alone[1], size, flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=ends
-    )
-    return Joint(float(joint[0]), float(np.linalg.norm(joint[6])))
+    sides = [[getattr(view, side) for view in views] for side in ("left", "right")]
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS
+    rms, *_, shift = calibrated(board.points_mm, sides, size, flags, ends=(300, 1e-12))
+    return Joint(float(rms), float(np.linalg.norm(shift)))
 
 
 def against(one: StereoCalibration, other: StereoCalibration) -> Halves:
     """The difference of two calibrations in what they state."""
     covariance = one.stereo.parameter_covariance + other.stereo.parameter_covariance
-    sds = np.sqrt(np.diag(covariance))
-    free = sds > 0
-    z = ((one.stereo.vector - other.stereo.vector) / np.where(free, sds, 1))[free]
-    correlation = (covariance / np.outer(np.where(free, sds, 1), np.where(free, sds, 1)))[np.ix_(free, free)]
-    return Halves(float(z @ np.linalg.solve(correlation, z)) / int(free.sum()), z)
+    free = np.diag(covariance) > 0
+    difference, covariance = (one.stereo.vector - other.stereo.vector)[free], covariance[np.ix_(free, free)]
+    return Halves(chi2(difference, covariance) / len(difference), difference / np.sqrt(np.diag(covariance)))
 
 
 def split(views: Sequence[View], first: Sequence[int], board: Board, size: tuple[int, int]) -> Halves:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
 
 from experiments.common.board_views import BOARD, rendered_views, scenes
 from experiments.common.clock import timed
+from experiments.common.opencv_stereo import calibrated
 from experiments.speed.benchmarks.measure import Bench, Case, Column, Work
 from tvsbayes.cameras.boards import View
 from tvsbayes.cameras.stereo_calibration import calibrate_stereo
@@ -68,22 +69,13 @@ def ours(seed: int) -> dict[str, object]:
 
 def opencv(together: bool) -> Work:
     """OpenCV's cameras one by one, then the pair, or then all parameters together."""
-    # As many steps as it needs: the default of 30 steps or 1e-6 stops in a hurry.
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-9)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS if together else cv2.CALIB_FIX_INTRINSIC
 
     def row(seed: int) -> dict[str, object]:
         drawn = rig(seed)
-        board, size = [BOARD.points_mm.astype(np.float32)] * len(drawn.views), drawn.size
-        left, right = (
-            [np.ascontiguousarray(getattr(v, s), np.float32) for v in drawn.views] for s in ("left", "right")
-        )
-
-        def work():
-            _, m1, d1, *_ = cv2.calibrateCamera(board, left, size, None, None)
-            _, m2, d2, *_ = cv2.calibrateCamera(board, right, size, None, None)
-            return cv2.stereoCalibrate(board, left, right, m1, d1, m2, d2, size, flags=flags, criteria=criteria)[:7]
-
+        sides = [[getattr(view, side) for view in drawn.views] for side in ("left", "right")]
+        # As many steps as it needs: the default of 30 steps or 1e-6 stops in a hurry.
+        work = partial(calibrated, BOARD.points_mm, sides, drawn.size, flags, ends=(200, 1e-9))
         (rms, m1, d1, m2, d2, turn, shift), cost = timed(work)
         five = [np.asarray(d, float).ravel()[:5] for d in (d1, d2)]
         stereo = replace(drawn.true, M1=m1, D1=five[0], M2=m2, D2=five[1], R=turn, T=np.asarray(shift).ravel())
