@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 
-from experiments.common.jax_density import innovations, without_padding
+from experiments.common.clock import timed
+from experiments.common.jax_density import innovations, log_density, without_padding
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.posterior import transport
@@ -118,6 +119,19 @@ def build_transport(joint: JointFit) -> Transport:
     return Transport(joint.z, index, root, tuple(stiff), np.where(earlier, shear, 0.0))
 
 
+def potential_of(joint: JointFit, path: Transport) -> tuple[Callable, Callable]:
+    """Coordinates z of sheared ones w, and minus the log density there, 0 at the mode."""
+    arrays = without_padding(joint.arrays, len(joint.campaign.moves))
+
+    def z_of(w: jax.Array) -> jax.Array:
+        return path.z_of_y(path.y_of_w(w))
+
+    def potential(w: jax.Array) -> jax.Array:
+        return joint.log_density - log_density(z_of(w), joint.space, arrays)
+
+    return z_of, potential
+
+
 @dataclass(frozen=True)
 class Run:
     """Draws (chain, draw, coordinate) and what they took; seconds are the process' CPU time: cores may be shared."""
@@ -142,11 +156,11 @@ class Setting:
     limit_s: float = np.inf
 
 
-def nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Setting, dense: bool = False) -> Run:
+def nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Setting) -> Run:
     """Sample exp(-potential) by NumPyro (the extra `bench`), all chains in step."""
     from numpyro.infer import NUTS
 
-    kernel = NUTS(potential_fn=potential, dense_mass=dense, target_accept_prob=0.8)
+    kernel = NUTS(potential_fn=potential, dense_mass=False, target_accept_prob=0.8)
     key, start = jax.random.split(jax.random.PRNGKey(setting.seed))
     started = time.process_time()
     state = kernel.init(
@@ -173,15 +187,8 @@ def nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Settin
 
     state, _, warmup_s = several(state, setting.warmup, np.inf, "warm-up")
     _, (z, diverging, leapfrogs, acceptance), sampling_s = several(state, setting.draws, setting.limit_s, "draws")
-    return Run(
-        draws=np.swapaxes(z, 0, 1),
-        divergences=int(diverging.sum()),
-        leapfrogs=float(leapfrogs.mean()),
-        acceptance=float(acceptance.mean()),
-        compile_s=compile_s,
-        warmup_s=warmup_s,
-        sampling_s=sampling_s,
-    )
+    figures = int(diverging.sum()), float(leapfrogs.mean()), float(acceptance.mean())
+    return Run(np.swapaxes(z, 0, 1), *figures, compile_s, warmup_s, sampling_s)
 
 
 def blackjax_nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Setting) -> Run:
@@ -216,24 +223,8 @@ def blackjax_nuts(potential: Callable[[jax.Array], jax.Array], size: int, settin
     standing = jax.block_until_ready(warm(keys, starts))
     warmup_s, cpu = time.process_time() - cpu, time.process_time()
     z, diverging, leapfrogs, acceptance = (np.asarray(x) for x in walk(*standing))
-    return Run(
-        draws=z,
-        divergences=int(diverging.sum()),
-        leapfrogs=float(leapfrogs.mean()),
-        acceptance=float(acceptance.mean()),
-        compile_s=compile_s,
-        warmup_s=warmup_s,
-        sampling_s=time.process_time() - cpu,
-    )
-
-
-@dataclass(frozen=True)
-class Stretched:
-    """Worst bulk effective draws of the free parameters, and seconds."""
-
-    ess: float
-    cpu_s: float
-    wall_s: float
+    figures = int(diverging.sum()), float(leapfrogs.mean()), float(acceptance.mean())
+    return Run(z, *figures, compile_s, warmup_s, time.process_time() - cpu)
 
 
 def straight(path: transport.Transport) -> transport.Transport:
@@ -242,8 +233,8 @@ def straight(path: transport.Transport) -> transport.Transport:
     return replace(path, narrow=0, bend=path.bend[:, :0, :0], **still)
 
 
-def stretch(joint: JointFit, start: np.ndarray, path: transport.Transport) -> Stretched:
-    """Emcee's default move in Laplace-whitened coordinates from draws that a map `path` has made."""
+def stretch(joint: JointFit, start: np.ndarray, path: transport.Transport) -> dict[str, float]:
+    """Emcee's default move in Laplace-whitened coordinates from draws that a map has made: worst bulk ESS, seconds."""
     plain = straight(path)
     began = plain.to_w(path.mapped(start).z)
     walkers = 2 * len(began)
@@ -251,9 +242,7 @@ def stretch(joint: JointFit, start: np.ndarray, path: transport.Transport) -> St
     began = np.concatenate([began, began + 0.1 * generator.standard_normal(began.shape)])
     sampler = emcee.EnsembleSampler(walkers, began.shape[1], Target(joint, plain), vectorize=True)
     state = emcee.State(began, random_state=np.random.RandomState(1).get_state())
-    wall, cpu = time.perf_counter(), time.process_time()
-    sampler.run_mcmc(state, STRETCH_STEPS, skip_initial_state_check=True)
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    _, cost = timed(lambda: sampler.run_mcmc(state, STRETCH_STEPS, skip_initial_state_check=True))
     kept = plain.mapped(sampler.get_chain()[STRETCH_STEPS // 4 :].reshape(-1, began.shape[1])).z
     kept = kept.reshape(-1, walkers, kept.shape[1])[..., np.flatnonzero(joint.free)].transpose(1, 0, 2)
-    return Stretched(worst_ess(kept), cpu, wall)
+    return {"ess": worst_ess(kept), **cost}

@@ -14,12 +14,12 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.common.command_line import print_only
 from experiments.common.of_tests import module_of_tests
+from experiments.common.page import table
 from tvsbayes.files.disk import shipped_data
 
 CHARS = 420
@@ -65,23 +65,6 @@ TWO_LOOKS = """step,action,pan_steps,tilt_steps,target,experiment,point
 3,move,100,0,,,
 4,look,,,,,
 """
-
-
-@dataclass(frozen=True)
-class Defect:
-    """One defect of `defects.toml`.
-
-    Attributes:
-        number: in the list of its trial.
-        what: in words.
-        command: of a shell.
-        before: what it printed, or what was seen, when the defect was found.
-    """
-
-    number: int
-    what: str
-    command: str
-    before: str
 
 
 class Scratch:
@@ -132,15 +115,12 @@ def code(text: str) -> str:
     return f"{fence}{text.replace('|', chr(92) + '|')}{fence}"
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in lines)
-
-
-def of_trial(scratch: Scratch, defects: Sequence[Defect]) -> str:
-    """The table of one trial."""
-    rows = [(str(d.number), d.what, code(d.command), cell(d.before), cell(scratch.printed(d.command))) for d in defects]
+def of_trial(scratch: Scratch, defects: Sequence[dict]) -> str:
+    """The table of one trial in `defects.toml`; `before` is what was printed or seen when the defect was found."""
+    rows = (
+        (d["number"], d["what"], code(d["command"]), cell(d["before"]), cell(scratch.printed(d["command"])))
+        for d in defects
+    )
     return table(("", "defect", "command", "before", "now"), rows)
 
 
@@ -178,8 +158,7 @@ def prepared(scratch: Scratch) -> None:
 def main() -> None:
     """Print the page."""
     print_only(__doc__)
-    read = tomllib.loads((HERE / "defects.toml").read_text(encoding="utf-8"))
-    listed = {trial: [Defect(**each) for each in defects] for trial, defects in read.items()}
+    listed = tomllib.loads((HERE / "defects.toml").read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory(prefix="tvsbayes-users-") as place:
         scratch = Scratch(Path(place))
         prepared(scratch)

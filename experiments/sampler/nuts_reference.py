@@ -2,20 +2,17 @@
 
     taskset -c 1 python -m experiments.sampler.nuts_reference paper      # 11 CPU minutes
     taskset -c 1 python -m experiments.sampler.nuts_reference grid --warmup 300 --draws 720     # 5
-    taskset -c 1 python -m experiments.sampler.nuts_reference paper --speed --chains 1 --warmup 200 --limit 90
 
-The first two write `data/reference/posterior_{paper,grid}.json`: mean, sd and quantiles of every free parameter and
+They write `data/reference/posterior_{paper,grid}.json`: mean, sd and quantiles of every free parameter and
 headline under the density of `tvsbayes.estimators.likelihood`, each with its Monte Carlo standard error. NumPyro's NUTS
 (the extra `bench`; four chains in step, diagonal mass) samples the sheared coordinates of
 `common/reference_samplers.py`: a reference shares no sampling code with `tvsbayes.posterior`, which it judges.
-`--speed` measures effective draws per second without the shear, dense mass.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -25,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 
+from experiments.common.clock import timed
 from experiments.common.command_line import parser
-from experiments.common.jax_density import log_density, without_padding
-from experiments.common.reference_samplers import AXES, Run, Setting, build_transport, nuts
+from experiments.common.reference_samplers import AXES, Run, Setting, build_transport, nuts, potential_of
 from experiments.common.rigs import twin_campaign
 from experiments.common.rows import ROOT
 from tvsbayes.estimators.joint_fit import JointFit, fit
@@ -44,6 +41,7 @@ RATIOS = ("effective_deg_per_step", "local_deg_per_step")
 OFFSET = "effective_mirror_offset_mm"
 ERRORS_SEED = 8
 """Of the errors at places, drawn for every draw of the coordinates."""
+CHAINS = 4
 QUANTILES = {"q05": 0.05, "q50": 0.50, "q95": 0.95}
 
 
@@ -87,26 +85,17 @@ class Found:
     rows: dict[str, dict[str, float]]
 
 
-def hamiltonian(joint: JointFit, setting: Setting, shear: bool = True) -> Found:
-    """NUTS of a fit's posterior, in sheared coordinates or with a dense mass instead; x64 has to be on."""
-    started = time.perf_counter()
-    transport = build_transport(joint)
-    transport_s = time.perf_counter() - started
+def hamiltonian(joint: JointFit, setting: Setting) -> Found:
+    """NUTS of a fit's posterior in sheared coordinates; x64 has to be on."""
+    transport, cost = timed(lambda: build_transport(joint))
     size = transport.index.size
-    print(f"{size} free coordinates, {len(transport.stiff)} sheared, transport {transport_s:.1f} s")
+    print(f"{size} free coordinates, {len(transport.stiff)} sheared, transport {cost['wall_s']:.1f} s")
     for w in np.random.default_rng(setting.seed).standard_normal((3, size)):
         sign, log_volume = np.linalg.slogdet(np.asarray(jax.jacfwd(transport.y_of_w)(jnp.asarray(w))))
         print(f"log |dy/dw| = {log_volume:.1e}, sign {sign:.0f}")
 
-    def z_of(w: jax.Array) -> jax.Array:
-        return transport.z_of_y(transport.y_of_w(w) if shear else w)
-
-    arrays = without_padding(joint.arrays, len(joint.campaign.moves))
-
-    def potential(w: jax.Array) -> jax.Array:
-        return joint.log_density - log_density(z_of(w), joint.space, arrays)
-
-    run = nuts(potential, size, setting, dense=not shear)
+    z_of, potential = potential_of(joint, transport)
+    run = nuts(potential, size, setting)
     return Found(run, {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()})
 
 
@@ -141,11 +130,9 @@ def write_reference(twin: str, campaign: Campaign, setting: Setting, run: Run, r
 
 
 def main() -> None:
-    """Write one reference, or measure speed."""
+    """Write one reference."""
     command = parser(__doc__)
     command.add_argument("twin", choices=("paper", "grid"))
-    command.add_argument("--speed", action="store_true", help="the same without the shear, dense mass; writes nothing")
-    command.add_argument("--chains", type=int, default=4)
     command.add_argument("--warmup", type=int, default=500)
     command.add_argument("--draws", type=int, default=1500, help="per chain")
     command.add_argument("--limit", type=float, default=np.inf, help="seconds after which drawing ends")
@@ -157,21 +144,19 @@ def main() -> None:
     use_compilation_cache()
     # What the tests ask importance sampling about; gears that repeat their errors are `agreement.py`'s.
     joint = fit(campaign, model=ModelChoice(perfect_gears=True))
-    setting = Setting(options.chains, options.warmup, options.draws, options.seed, options.limit)
-    nuts = hamiltonian(joint, setting, shear=not options.speed)
+    setting = Setting(CHAINS, options.warmup, options.draws, options.seed, options.limit)
+    nuts = hamiltonian(joint, setting)
     run, rows = nuts.run, nuts.rows
     worst = min(rows, key=lambda name: rows[name]["ess_bulk"])
     ess = rows[worst]["ess_bulk"]
     print(
-        f"| {options.twin} | {'no shear, dense mass' if options.speed else 'shear'} | "
-        f"{options.chains} x ({options.warmup} + {run.draws.shape[1]}) | {run.leapfrogs:.1f} | {run.divergences} | "
-        f"{run.compile_s:.0f} | {run.warmup_s:.0f} | {run.sampling_s:.0f} | "
+        f"| {options.twin} | {CHAINS} x ({options.warmup} + {run.draws.shape[1]}) | {run.leapfrogs:.1f} | "
+        f"{run.divergences} | {run.compile_s:.0f} | {run.warmup_s:.0f} | {run.sampling_s:.0f} | "
         f"{max(row['rhat'] for row in rows.values()):.4f} | {ess:.0f} ({worst}) | "
         f"{ess / run.sampling_s:.2f} | {ess / (run.sampling_s + run.warmup_s):.2f} | acceptance {run.acceptance:.3f}",
         flush=True,
     )
-    if not options.speed:
-        write_reference(options.twin, campaign, setting, run, rows)
+    write_reference(options.twin, campaign, setting, run, rows)
 
 
 if __name__ == "__main__":

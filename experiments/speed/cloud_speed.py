@@ -9,8 +9,7 @@ a time, which gives the law of propagation without the other calibrations and wi
 
 from __future__ import annotations
 
-import os
-import subprocess
+import shutil
 import sys
 import tempfile
 import time
@@ -19,6 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import print_only
+from experiments.common.page import heading
+from experiments.speed.benchmarks.measure import command_cost
 from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.coordinates.looks_file import LOOKS
 from tvsbayes.files.disk import shipped_data
@@ -52,32 +53,20 @@ def main() -> None:
     """Print the page."""
     print_only(__doc__)
     with tempfile.TemporaryDirectory() as folder:
-        twin, campaign = shipped_data() / "twins" / "paper_twin", Path(folder) / "campaign"
-        campaign.mkdir()
-        for name in ("campaign.toml", "stereo.json", "moves.csv", "spots.csv"):
-            (campaign / name).write_bytes((twin / name).read_bytes())
-        subprocess.run(command("fit", campaign, "--no-sample"), check=True, capture_output=True)
+        campaign = shutil.copytree(shipped_data() / "twins" / "paper_twin", Path(folder) / "campaign")
+        command_cost(command("fit", campaign, "--no-sample"))
         calibration = load_calibration(campaign)
         print("# A million points with error bars\n")
         print("Written by `python -m experiments.speed.cloud_speed`; paper twin, two cores.\n")
-        columns = "points", "file", "CPU s of the whole command", "points a CPU second", "peak memory, MB"
-        print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+        print(heading("points | file | CPU s of the whole command | points a CPU second | peak memory, MB"))
         for count in SIZES:
             looks = Path(folder) / f"looks{count}.csv"
             write_looks(looks, calibration, count)
             for ending in ("ply", "csv"):
                 out = Path(folder) / f"cloud.{ending}"
-                child = subprocess.Popen(
-                    command("locate", campaign, "--points", looks, "--cloud", out), stdout=subprocess.DEVNULL
-                )
-                _, status, used = os.wait4(child.pid, 0)
-                if status:
-                    raise SystemExit(f"locate ended with {status}")
-                cpu_s = used.ru_utime + used.ru_stime
-                print(
-                    f"| {count} | {ending} | {cpu_s:.1f} | {count / cpu_s:.0f} | {used.ru_maxrss / 1024:.0f} |",
-                    flush=True,
-                )
+                _, cost = command_cost(command("locate", campaign, "--points", looks, "--cloud", out))
+                cpu_s, rss_mib = cost["cpu_s"], cost["rss_mib"]
+                print(f"| {count} | {ending} | {cpu_s:.1f} | {count / cpu_s:.0f} | {rss_mib:.0f} |", flush=True)
                 out.unlink()
         generator = np.random.default_rng(1)
         low, high = calibration.range_steps.T

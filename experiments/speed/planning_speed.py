@@ -11,9 +11,7 @@ already. CPU seconds, the least of several runs.
 
 from __future__ import annotations
 
-import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -24,6 +22,7 @@ import numpy as np
 from experiments.common.clock import timed
 from experiments.common.command_line import print_only
 from experiments.common.rigs import mounted_rig
+from experiments.speed.benchmarks.measure import command_cost
 from tvsbayes.estimators.campaign_arrays import bucket
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
@@ -58,10 +57,7 @@ def least(work: Callable[[], object], repeats: int = REPEATS) -> float:
 
 def child_cpu(*command: str) -> float:
     """CPU seconds of a process from its start to its end."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=True, capture_output=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return command_cost(command)[1]["cpu_s"]
 
 
 def commands() -> None:

@@ -52,11 +52,8 @@ FEATURES = (
 
 def _counted(tree: Path) -> dict[str, int]:
     """Lines of Python and modules of a tree, and how many tests run by default."""
-    sources = {folder: sorted((tree / folder).rglob("*.py")) for folder in ("tvsbayes", "tests", "experiments")}
-    counted = {
-        f"lines of {name}/": sum(len(p.read_bytes().splitlines()) for p in each) for name, each in sources.items()
-    }
-    counted["modules of tvsbayes/"] = sum(path.name != "__init__.py" for path in sources["tvsbayes"])
+    counted = {f"lines of {folder}/": ledger.lines(tree / folder) for folder in ("tvsbayes", "tests", "experiments")}
+    counted["modules of tvsbayes/"] = sum(path.name != "__init__.py" for path in (tree / "tvsbayes").rglob("*.py"))
     words = (sys.executable, "-m", "pytest", "--collect-only", "-q", "-n0")
     environment = {**os.environ, "PYTHONPATH": str(tree)}
     done = subprocess.run(words, cwd=tree, env=environment, capture_output=True, text=True, check=True)

@@ -11,7 +11,6 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.clock import timed
-from experiments.common.jax_density import log_density, without_padding
 from experiments.common.reference_samplers import (
     AXES,
     Run,
@@ -19,6 +18,7 @@ from experiments.common.reference_samplers import (
     blackjax_nuts,
     build_transport,
     nuts,
+    potential_of,
     stretch,
     worst_ess,
 )
@@ -82,23 +82,14 @@ class Contenders:
     def stretched(self, _: int) -> dict[str, object]:
         """Emcee's default move."""
         run = stretch(self.joint, self.walkers, self.path)
-        rate = run.ess / run.cpu_s
-        return {"ess": run.ess, "cpu_s": run.cpu_s, "wall_s": run.wall_s, "rate": rate, "trusted_s": TRUSTED / rate}
+        return {**run, "rate": run["ess"] / run["cpu_s"], "trusted_s": TRUSTED / run["ess"] * run["cpu_s"]}
 
     def hamiltonian(self, sampler: Callable[..., Run]) -> Callable[[int], dict[str, object]]:
         """NUTS in sheared coordinates."""
 
         def turn(seed: int) -> dict[str, object]:
             route, built = timed(lambda: build_transport(self.joint))
-
-            def z_of(w):
-                return route.z_of_y(route.y_of_w(w))
-
-            arrays = without_padding(self.joint.arrays, len(self.joint.campaign.moves))
-
-            def potential(w):
-                return self.joint.log_density - log_density(z_of(w), self.joint.space, arrays)
-
+            z_of, potential = potential_of(self.joint, route)
             run = sampler(potential, route.index.size, Setting(CHAINS, WARMUP, DRAWS, seed))
             shape = run.draws.shape
             z = np.asarray(jax.jit(jax.vmap(z_of))(jnp.asarray(run.draws.reshape(-1, shape[-1]))))
