@@ -13,10 +13,12 @@ known: its spot must be found.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from msgspec import structs
 
 from experiments.common.command_line import print_only
 from experiments.common.figures import page_figure, title_and_figure
@@ -26,7 +28,6 @@ from experiments.common.worth import UNREACHED, searched_family
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.planning.assurance import Family
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge
 from tvsbayes.planning.limits import MANY_TIMES, limit_of, split_of
@@ -75,8 +76,7 @@ def session(knowledge: Knowledge, steps: Sequence[PlanStep]) -> Session:
     return Session(knowledge, information, at, at.value(covariance_of(knowledge.precision + information.fisher)))
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """A size of a campaign: minutes, u of the worst ratio (deg/step), spots."""
 
     minutes: float
@@ -84,38 +84,22 @@ class Point:
     spots: int
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Curves of u by campaign, lines of the first table, and the planned sessions by experiments."""
+def curves_of(sessions: Mapping[str, Sequence[Session]]) -> dict[str, list[Point]]:
+    """Points by campaign; the grid is taken once, twice and four times."""
 
-    curves: dict[str, list[Point]] = field(default_factory=dict)
-    rows: dict[str, str] = field(default_factory=dict)
-    planned: dict[int, Session] = field(default_factory=dict)
-
-    def add(self, name: str, one: Session, times: int = 1) -> None:
-        """A point of a curve: the session taken `times` times."""
+    def point(one: Session, times: int = 1) -> Point:
         value = one.at.value(covariance_of(one.knowledge.precision + times * one.information.fisher))
-        self.curves.setdefault(name, []).append(Point(times * one.information.minutes, value, times * one.spots))
+        return Point(times * one.information.minutes, value, times * one.spots)
+
+    curves = {name: [point(one) for one in of] for name, of in sessions.items()}
+    return curves | {"grid": [point(sessions["grid"][0], times) for times in (1, 2, 4)]}
 
 
-def compared(knowledge: Knowledge, family: Family) -> Comparison:
-    """Protocols with their repeats, and the planner's looks."""
-    result = Comparison()
-    for repeats in REPEATS:
-        for name, protocol in (("paper", paper_protocol), ("mixed", mixed_protocol)):
-            first = session(knowledge, protocol(repeats))
-            result.add(name, first)
-            result.rows[name] = first.row(name)
-    grid = session(knowledge, grid_protocol())
-    result.rows["grid"] = grid.row("grid")
-    for times in (1, 2, 4):
-        result.add("grid", grid, times)
-    for n in LADDER:
-        result.planned[n] = session(knowledge, family.arranged(n).steps)
-        result.add("planned", result.planned[n])
-    for n in (8, 16, 32, 96):
-        result.rows[f"planned {n}"] = result.planned[n].row(f"planned, {n}")
-    return result
+def rows_of(sessions: Mapping[str, Sequence[Session]]) -> list[str]:
+    """Lines of the first table: the largest of each protocol, and some of the planner's."""
+    planned = dict(zip(LADDER, sessions["planned"], strict=True))
+    whole = [sessions[name][-1].row(name) for name in ("paper", "mixed", "grid")]
+    return whole + [planned[n].row(f"planned, {n}") for n in (8, 16, 32, 96)]
 
 
 def second_session(first: Session) -> None:
@@ -131,7 +115,7 @@ def second_session(first: Session) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for label, allowed in (("more of the same range", ~away), ("with the beams a full turn away", np.ones_like(away))):
         part = replace(shown, rows=np.where(allowed[:, None, None], shown.rows, 0.0))
-        problem = DesignProblem(sharp, wide, part, replace(TARGET, limit=UNREACHED), first.at)
+        problem = DesignProblem(sharp, wide, part, structs.replace(TARGET, limit=UNREACHED), first.at)
         more = design_family(problem, Scope(largest=16))
         for n in (2, 4, 8, 16):
             after = information_of(more.arranged(n).steps, sharp)
@@ -149,23 +133,27 @@ def main() -> None:
     print_only(__doc__)
     use_compilation_cache()
     knowledge = prior_knowledge(mounted_rig())
-    result = compared(knowledge, searched_family(knowledge))
+    family = searched_family(knowledge)
+    plans = {"paper": [paper_protocol(n) for n in REPEATS], "mixed": [mixed_protocol(n) for n in REPEATS]}
+    plans |= {"grid": [grid_protocol()], "planned": [family.arranged(n).steps for n in LADDER]}
+    sessions = {name: [session(knowledge, steps) for steps in of] for name, of in plans.items()}
+    curves = curves_of(sessions)
     title, words = "Planned looks against the paper's 96 experiments", "u of the worst ratio against minutes, by plan"
     print(title_and_figure(__file__, title, FIGURE, words))
     print("Written by `python -m experiments.planning.planned_looks`; u of the worst effective ratio, 1e-4 deg/step.\n")
     print("| plan | spots | minutes | u | what it consists of | floor | what sets it |\n|---|---|---|---|---|---|---|")
-    print("\n".join(result.rows.values()))
+    print("\n".join(rows_of(sessions)))
     print("\n## To the uncertainty of a protocol\n")
     print(heading("as good as | u | spots | minutes | planned: spots | planned: minutes | times faster"))
     for name in ("paper", "mixed", "grid"):
-        one = result.curves[name][-1 if name != "grid" else 0]
-        enough = next((p for p in result.curves["planned"] if p.value <= one.value), None)
+        one = curves[name][-1 if name != "grid" else 0]
+        enough = next((p for p in curves["planned"] if p.value <= one.value), None)
         cells = "- | - | -"
         if enough is not None:
             cells = f"{enough.spots} | {enough.minutes:.1f} | {one.minutes / enough.minutes:.0f}"
         print(f"| {name} | {1e4 * one.value:.2f} | {one.spots} | {one.minutes:.1f} | {cells} |")
-    second_session(result.planned[16])
-    draw(result.curves)
+    second_session(sessions["planned"][LADDER.index(16)])
+    draw(curves)
 
 
 def draw(curves: Mapping[str, Sequence[Point]]) -> None:
@@ -175,7 +163,7 @@ def draw(curves: Mapping[str, Sequence[Point]]) -> None:
         axes = figure.subplots()
         for name, points in curves.items():
             colour, marker = looks[name]
-            minutes, u = np.array([(p.minutes, p.value) for p in points]).T
+            minutes, u, _ = np.array(points).T
             axes.loglog(minutes, u, color=colour, marker=marker, markersize=4, label=name)
             # The curves fall: below their ends is room.
             place = {"xytext": (4, -6), "textcoords": "offset points", "ha": "right", "va": "top"}
