@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from experiments.common import page
 from experiments.common.command_line import parser
 from experiments.common.printed_runs import axis_of, tables_of
 from tvsbayes.compensation.formats import Wish
@@ -38,6 +39,7 @@ COUNTS_PER_DEG = -22466.7
 """Of the encoder by the least-squares line through all stops: readings in degrees of the axis."""
 STEADY = {name: AxisPrior(0.0, 0.0) for name in ("ratio_contrast", "creep")}
 """Of gears whose teeth keep step, in a steady room."""
+END = "its zero that of the others | at its time | promised | inside"
 REVERSAL_DEG = 0.45
 """How far beyond a place the axis went before it came back to it."""
 
@@ -65,21 +67,8 @@ def linear_axis(table: Path) -> tuple[AxisCampaign, list[int]]:
         return axis_of(table), [int(row["cycle"]) for row in csv.DictReader(file)]
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """Errors of the readings of one visit, by what was taken off; and the promise of each."""
-
-    before: np.ndarray
-    constant: np.ndarray
-    means: np.ndarray
-    table: np.ndarray
-    zeroed: np.ndarray
-    followed: np.ndarray
-    promised: np.ndarray
-
-
-def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> LeftOut:
-    """One visit under the table of the others."""
+def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> tuple[np.ndarray, ...]:
+    """Errors of the readings of one visit, in the order of the page's columns, and the promise of each."""
     legs = legs_of(campaign.moves)
     at = np.array([r.move for r in campaign.readings])
     command, side = legs.command[at], legs.side[at]
@@ -96,15 +85,9 @@ def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> LeftO
     expected = np.where(side > 0, *(np.interp(command, columns[0], column) for column in columns[1:]))
     promised = np.where(side > 0, *(compensation.promise[name].error95 for name in ("forward", "backward")))
     means = [error[(command == c) & (side == s) & ~out].mean() for c, s in zip(command[out], side[out], strict=True)]
-    return LeftOut(
-        before=(error - error[~out].mean())[out],
-        constant=(error - line @ solved)[out],
-        means=error[out] - means,
-        table=(value - expected)[out],
-        zeroed=(value - expected)[out] - (value - expected)[~out].mean(),
-        followed=value[out] - _followed(results.fit, campaign, at[out]),
-        promised=promised[out],
-    )
+    left, followed = value - expected, value[out] - _followed(results.fit, campaign, at[out])
+    simple = (error - error[~out].mean())[out], (error - line @ solved)[out], error[out] - means
+    return (*simple, left[out], left[out] - left[~out].mean(), followed, promised[out])
 
 
 def _followed(fit: AxisFit, campaign: AxisCampaign, moves: np.ndarray) -> np.ndarray:
@@ -120,13 +103,19 @@ def _followed(fit: AxisFit, campaign: AxisCampaign, moves: np.ndarray) -> np.nda
 def row_of(name: str, unit: str, campaign: AxisCampaign, visits: Sequence[int]) -> str:
     """A line of the table: all visits left out in turn."""
     each = [left_out(campaign, visits, visit) for visit in sorted(set(visits))]
-    names = ("before", "constant", "means", "table", "zeroed", "followed", "promised")
-    *errors, promised = (np.concatenate([getattr(one, part) for one in each]) for part in names)
+    *errors, promised = (np.concatenate(parts) for parts in zip(*each, strict=True))
     table = errors[3]
     inside = float(np.mean(np.abs(table) <= promised))
     sizes = [f"{1000 * np.sqrt(np.mean(part**2)):.2f}" for part in errors]
     ends = [f"{1000 * np.median(promised):.2f}", f"{100 * inside:.0f} % of {len(table)}"]
-    return "| " + " | ".join([name, unit, *sizes, *ends]) + " |"
+    return page.line(name, unit, *sizes, *ends)
+
+
+TEXT = f"""# Real axes: the table of the others, applied to the visit left out
+
+By `experiments.compensation.real_visits`. RMS of the errors of readings left out; promised: 95 %, median.
+
+{page.heading("axis | unit | before | one constant play | means of others | table", END)}"""
 
 
 def main() -> None:
@@ -135,13 +124,7 @@ def main() -> None:
     cli.add_argument("axes", type=Path)
     cli.add_argument("rotary", type=Path)
     arguments = cli.parse_args()
-    print("# Real axes: the table of the others, applied to the visit left out\n")
-    print(
-        "By `experiments.compensation.real_visits`. RMS of the errors of readings left out; promised: 95 %, median.\n"
-    )
-    names = ("axis", "unit", "before", "one constant play", "means of others", "table", "its zero that of the others")
-    print("| " + " | ".join([*names, "at its time", "promised", "inside"]) + " |")
-    print("|" + "---|" * 10)
+    print(TEXT)
     for table in tables_of(arguments.axes):
         print(row_of(table.stem, "um", *linear_axis(table)), flush=True)
     rotary, visits = rotary_axis(arguments.rotary)

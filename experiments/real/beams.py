@@ -1,7 +1,6 @@
 """Are the stated uncertainties of spot centres true on pictures of real laser beams?
 
     python -m experiments.real.beams > experiments/real/beams.md
-    python -m experiments.real.beams FOLDER                                # any other pictures, PNG of 8 or 16 bits
 
 No truth is known, but a law holds: a picture taken apart into every fourth row and column gives sixteen pictures of one
 beam, whose centres must agree as they say once the shift between them is undone. z = (centre - mean) / u by picture, 30
@@ -21,13 +20,13 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.clock import timed
-from experiments.common.command_line import parser
+from experiments.common.command_line import print_only
 from experiments.common.figures import page_figure, title_and_figure
+from experiments.common.page import heading, line
 from tvsbayes.cameras.spot_fit import Centre, find_spot
 from tvsbayes.files.images import in_grey_levels, read_image
 
 BEAMS, FIGURE = Path("data/real/spots"), Path("data/docs/real_beams.png")
-TITLE = "Real laser beams"
 PARTS = 4
 """Rows and columns are taken apart by so many."""
 TURNS = 3
@@ -105,13 +104,9 @@ def row(beam: Beam) -> str:
     height, width = beam.picture.shape[:2]
     cells = [beam.name, str(bits), f"{width} x {height}", beam.whole.status]
     if beam.whole.status == "ok":
-        u, v = beam.whole.located.centre_px
-        su, sv = np.sqrt(np.diag(beam.whole.located.covariance_px2))
-        cells += [
-            f"{beam.whole.axes_px[0]:.1f}, {beam.whole.axes_px[1]:.1f}",
-            f"{u:.3f}, {v:.3f}",
-            f"{su:.4f}, {sv:.4f}",
-        ]
+        pairs = (beam.whole.axes_px, ".1f"), (beam.whole.located.centre_px, ".3f")
+        pairs += ((np.sqrt(np.diag(beam.whole.located.covariance_px2)), ".4f"),)
+        cells += [f"{u:{form}}, {v:{form}}" for (u, v), form in pairs]
     else:
         cells += ["", "", ""]
     cells.append(", ".join(f"{count} {status}" for status, count in beam.statuses.most_common()))
@@ -121,50 +116,37 @@ def row(beam: Beam) -> str:
     else:
         cells += ["", ""]
     cells.append(", ".join(f"{z:+.1f}" for z in beam.halves.ravel()))
-    return "| " + " | ".join(cells) + " |"
+    return line(*cells)
 
 
-def report(folder: Path) -> None:
-    """The page."""
-    paths = sorted(folder.glob("*.png"))
+TEXT = f"""Written by `python -m experiments.real.beams`: pictures of `{BEAMS}`. Sixteen parts: every fourth row and
+column; RMS z of their centres about their mean, with where 95 % of such numbers lie for true uncertainties;
+even against odd rows (u, v), then columns (u, v), in stated sds.
+
+{heading("beam | bits | px | whole | sds px | centre px | u px | sixteen parts | RMS z | by chance | even - odd")}"""
+
+
+def main() -> None:
+    """Print the page."""
+    print_only(__doc__)
+    paths = sorted(BEAMS.glob("*.png"))
     beams = [beam_of(path) for path in paths]
-    if folder == BEAMS:
-        draw(beams)
-        print(title_and_figure(__file__, TITLE, FIGURE, "The beams, with centre, status and RMS z"))
-    else:
-        print(f"# {TITLE}\n")
-    print(f"Written by `python -m experiments.real.beams`: pictures of `{folder}`. Sixteen parts: every fourth row and")
-    print(
-        "column; RMS z of their centres about their mean, with where 95 % of such numbers lie for true uncertainties;"
-    )
-    print("even against odd rows (u, v), then columns (u, v), in stated sds.\n")
-    titles = ["beam", "bits", "px", "whole", "sds px", "centre px", "u px", "sixteen parts", "RMS z", "by chance"]
-    print(f"| {' | '.join([*titles, 'even - odd'])} |\n|{'---|' * 11}")
+    draw(beams)
+    print(title_and_figure(__file__, "Real laser beams", FIGURE, "The beams, with centre, status and RMS z"))
+    print(TEXT)
     print("\n".join(row(beam) for beam in beams))
     every = np.concatenate([beam.z for beam in beams if beam.z.size])
     dof = every.size - 2 * sum(bool(beam.z.size) for beam in beams)
     halves = np.concatenate([beam.halves.ravel() for beam in beams])
-    print(
-        f"\nAll: RMS z {np.sqrt(np.sum(every**2) / dof):.2f} with {dof} degrees of freedom; even against odd ", end=""
-    )
-    print(f"{np.sqrt(np.mean(halves**2)):.2f} of {halves.size}.\n")
+    print(f"\nAll: RMS z {np.sqrt(np.sum(every**2) / dof):.2f} with {dof} degrees of freedom;", end=" ")
+    print(f"even against odd {np.sqrt(np.mean(halves**2)):.2f} of {halves.size}.\n")
     jobs = {
         "read": lambda: [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths],
         "found": lambda: [find_spot(read_image(path)) for path in paths],
     }
     rates = {name: len(paths) / min(timed(job)[1]["cpu_s"] for _ in range(TURNS)) for name, job in jobs.items()}
-    print(
-        f"Pictures per CPU second: {rates['found']:.0f} read, found and fitted, {rates['read']:.0f} by cv2.imread ",
-        end="",
-    )
-    print(f"alone ({rates['found'] / rates['read']:.2f}).")
-
-
-def main() -> None:
-    """Print the page of a folder of pictures."""
-    cli = parser(__doc__)
-    cli.add_argument("folder", type=Path, nargs="?", default=BEAMS)
-    report(cli.parse_args().folder)
+    print(f"Pictures per CPU second: {rates['found']:.0f} read, found and fitted,", end=" ")
+    print(f"{rates['read']:.0f} by cv2.imread alone ({rates['found'] / rates['read']:.2f}).")
 
 
 if __name__ == "__main__":

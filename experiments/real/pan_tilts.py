@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 import tempfile
 from collections import defaultdict
 from pathlib import Path
@@ -20,6 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import parser
+from experiments.common.console import quietly
+from experiments.common.page import heading
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.instrument.campaign import Campaign, Move
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
@@ -89,18 +89,10 @@ def camera(rows: np.ndarray) -> None:
 def servo(file: Path) -> None:
     """One axis as a user has it: imported, fitted, its answer."""
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place) / "axis"
-        tvsbayes = [sys.executable, "-m", "tvsbayes"]
-        subprocess.run(
-            [*tvsbayes, "import", str(file), "--axis", "--to", str(folder), "--yes"],
-            check=True,
-            stdout=subprocess.DEVNULL,
-        )
-        words = [*tvsbayes, "fit", str(folder), "--quick", "--json"]
-        document = json.loads(subprocess.run(words, check=True, capture_output=True).stdout)
-    print(
-        f"\n## `{file.name}`, {len(columns(file))} stops, all from below\n\n| quantity | value | 95 % |\n|---|---|---|"
-    )
+        folder = str(Path(place) / "axis")
+        assert quietly("import", str(file), "--axis", "--to", folder, "--yes")[0] == 0
+        document = json.loads(quietly("fit", folder, "--quick", "--json")[1])
+    print(f"\n## `{file.name}`, {len(columns(file))} stops, all from below\n\n{heading('quantity | value | 95 %')}")
     parameters = document["parameters"]
     for name in ("per_command", "backlash", "transmission_error", "stop_sd.forward"):
         one = document["per_command"]["forward"] if name == "per_command" else parameters[name]

@@ -1,16 +1,14 @@
 """What does `stereo` say of pictures that others took, beside OpenCV's joint calibration, and is its covariance true?
 
     python -m experiments.real.stereo_pairs > experiments/real/stereo_pairs.md
-    python -m experiments.real.stereo_pairs FOLDER --board 9x6 --pitch-mm 25       # any other set
 
-The shipped pairs by default, with a figure. No truth is needed: cv2.stereoCalibrate from the same corners with the same
+The shipped pairs. No truth is needed: cv2.stereoCalibrate from the same corners with the same
 coefficients, all free; halves of the pairs against each other by the covariance that both state; then the same pairs
 spoiled in known ways: left k with right k + 1, corners turned by half a turn, boards missing.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,16 +18,15 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.board_views import chi2
-from experiments.common.command_line import parser
+from experiments.common.command_line import print_only
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.opencv_stereo import calibrated
-from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
+from tvsbayes.cameras.boards import Board, View, corner_orders, find_views
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
 from tvsbayes.errors import TvsError
 from tvsbayes.report.drawing import BLACK, BLUE, RED
 
 PAIRS, FIGURE = Path("data/real/stereo/bumblebee2"), Path("data/docs/real_stereo.png")
-TITLE = "Real stereo pairs"
 SHIPPED_BASELINE_MM = 120.05
 """|T| of `stereo.yaml`, which came with the pairs: another program, other coefficients, no uncertainty."""
 SPLITS = 60
@@ -130,68 +127,42 @@ def draw(splits: Sequence[Halves], named: Halves) -> None:
         right.legend()
 
 
-def report(boards: Views, board: Board, folder: Path) -> None:
-    """The page."""
+def main() -> None:
+    """Print the page."""
+    print_only(__doc__)
+    board = Board(4, 6, 30.0)
+    boards = find_views(PAIRS, board)
     size = (boards.image_width, boards.image_height)
-    shipped = folder == PAIRS
     views = pairs_of(boards.views)
     ours, theirs = calibrate_stereo(views, board, size), opencv_joint(views, board, size)
     baseline = float(np.linalg.norm(ours.stereo.T))
-    if shipped:
-        print(
-            title_and_figure(
-                __file__, TITLE, FIGURE, "Differences of halves of the pairs in stated standard uncertainties"
-            )
-        )
-    else:
-        print(f"# {TITLE}\n")
+    words = "Differences of halves of the pairs in stated standard uncertainties"
+    print(title_and_figure(__file__, "Real stereo pairs", FIGURE, words))
+    print(f"Written by `python -m experiments.real.stereo_pairs`: {len(views)} pairs of `{PAIRS}`,", end=" ")
     print(
-        f"Written by `python -m experiments.real.stereo_pairs`: {len(views)} pairs of `{folder}`, "
-        f"{size[0]} x {size[1]} px,"
+        f"{size[0]} x {size[1]} px,\nboard {board.columns} x {board.rows}, squares of {board.pitch_mm:g} mm.", end=" "
     )
-    print(
-        f"board {board.columns} x {board.rows}, squares of {board.pitch_mm:g} mm. Found in one picture only: ", end=""
-    )
-    print(f"{len(boards.views) - len(views)}; no board: {', '.join(boards.without_board) or 'none'}.\n")
+    print(f"Found in one picture only: {len(boards.views) - len(views)};", end=" ")
+    print(f"no board: {', '.join(boards.without_board) or 'none'}.\n")
     print("| | rms px | baseline mm |\n|---|---|---|")
     print(f"| `stereo` | {ours.stereo.rms_px:.5f} | {baseline:.3f}, u {ours.baseline_sd_mm:.3f} |")
     print(f"| cv2.stereoCalibrate {cv2.__version__} | {theirs.rms_px:.5f} | {theirs.baseline_mm:.3f} |")
     print(f"| ours / theirs | {ours.stereo.rms_px / theirs.rms_px:.6f} | {baseline / theirs.baseline_mm:.6f} |\n")
-    if shipped:
-        away = (baseline - SHIPPED_BASELINE_MM) / ours.baseline_sd_mm
-        print(f"The calibration that came with them has {SHIPPED_BASELINE_MM} mm: {away:+.1f} stated sds from ours.\n")
+    away = (baseline - SHIPPED_BASELINE_MM) / ours.baseline_sd_mm
+    print(f"The calibration that came with them has {SHIPPED_BASELINE_MM} mm: {away:+.1f} stated sds from ours.\n")
     print(f"Corners of the board off a grid by {ours.board_error_mm:.3f} mm (sd of a coordinate), variances of what is")
     print(f"left {ours.correlation_factor:.1f} times those of independent corners.\n")
-    if len(views) >= 8:
-        rng = np.random.default_rng(1)
-        named = split(views, range(0, len(views), 2), board, size)
-        splits = [split(views, rng.permutation(len(views))[: len(views) // 2], board, size) for _ in range(SPLITS)]
-        chi2 = np.array([one.chi2 for one in splits])
-        z = np.concatenate([one.z for one in splits])
-        print(
-            f"Halves, chi-square per parameter: {chi2.mean():.2f} on average of {SPLITS} random splits (median ", end=""
-        )
-        print(
-            f"{np.median(chi2):.2f}, largest {chi2.max():.2f}), RMS z {np.sqrt(np.mean(z**2)):.2f}; odd against even ",
-            end="",
-        )
-        print(f"{named.chi2:.2f}.\n")
-        if shipped:
-            draw(splits, named)
+    rng, half = np.random.default_rng(1), len(views) // 2
+    named = split(views, range(0, len(views), 2), board, size)
+    splits = [split(views, rng.permutation(len(views))[:half], board, size) for _ in range(SPLITS)]
+    chi2s, z = np.array([one.chi2 for one in splits]), np.concatenate([one.z for one in splits])
+    print(f"Halves, chi-square per parameter: {chi2s.mean():.2f} on average of {SPLITS} random splits", end=" ")
+    print(f"(median {np.median(chi2s):.2f}, largest {chi2s.max():.2f}), RMS z {np.sqrt(np.mean(z**2)):.2f};", end=" ")
+    print(f"odd against even {named.chi2:.2f}.\n")
+    draw(splits, named)
     print("| pairs | rms px | baseline mm (u) | left out | put into another order |\n|---|---|---|---|---|")
     for what, changed in spoiled(views, board).items():
         print(f"| {what} {row_of(changed, board, size)}")
-
-
-def main() -> None:
-    """Print the page of a set of pairs."""
-    cli = parser(__doc__)
-    cli.add_argument("folder", type=Path, nargs="?", default=PAIRS)
-    cli.add_argument("--board", default="4x6", help="inner corners (%(default)s)")
-    cli.add_argument("--pitch-mm", type=float, default=30.0, help="side of a square (%(default)s)")
-    arguments: argparse.Namespace = cli.parse_args()
-    board = Board.named(arguments.board, arguments.pitch_mm)
-    report(find_views(arguments.folder, board), board, arguments.folder)
 
 
 if __name__ == "__main__":

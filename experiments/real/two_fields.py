@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from experiments.common.clock import timed
-from experiments.common.command_line import parser
+from experiments.common.command_line import print_only
 from experiments.real.beams import BEAMS, deviations, parts_of
 from tvsbayes.cameras.alternate_lines import shift_of_lines
 from tvsbayes.cameras.spot_fit import Centre, centre_of, fit_spot, widened, with_measured_noise
@@ -156,19 +156,14 @@ def costs() -> None:
     print(f"{1e3 * own_s:.2f} ms of them ({100 * own_s / all_s:.1f} %) for alternate lines.")
 
 
-def report() -> None:
-    """The page."""
+def main() -> None:
+    """Print the page."""
+    print_only(__doc__)
     print("# Pictures read in two fields\n")
     print(TEXT)
     real_rows()
     twin_row()
     costs()
-
-
-def main() -> None:
-    """Print the page."""
-    parser(__doc__).parse_args()
-    report()
 
 
 if __name__ == "__main__":
