@@ -13,30 +13,19 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import sys
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.command_line import act, parser
+from experiments.common.command_line import study
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.rows import append_row, output, read_rows
 from tvsbayes.cameras import contour, detection, spot_fit, spot_noise, spot_window
 from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.twin import spot_pictures
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.simulated_campaign import simulate
-from tvsbayes.twin.spot_pictures import (
-    Footprint,
-    Scene,
-    Sensor,
-    ambient_level,
-    footprint,
-    mosaic_response,
-    render_spot,
-    spot_irradiance,
-)
+from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, ambient_level, render_spot, spot_irradiance
 
-ROWS = output(__file__, "detection.jsonl")
 WIDTH, HEIGHT = 200, 160
 SIZES_PX, PEAKS_DN, AMBIENTS_DN = (1.5, 2.5, 4.0), (60.0, 180.0, 330.0, 600.0), (12.0, 60.0)
 CONTRASTS = (0.0, 0.4, 0.2, 0.6)
@@ -44,10 +33,10 @@ PICTURES = 120
 METHODS = ("fit", "contour")
 
 
-def cells():
+def tasks(_: argparse.Namespace) -> list[tuple[float, float, float, float]]:
     """Every cell of the grid: (size, peak, ambient, contrast)."""
-    for contrast, *others in itertools.product(CONTRASTS, SIZES_PX, PEAKS_DN, AMBIENTS_DN):
-        yield (*others, contrast)
+    grid = itertools.product(CONTRASTS, SIZES_PX, PEAKS_DN, AMBIENTS_DN)
+    return [(*others, contrast) for contrast, *others in grid]
 
 
 def bound_px(mark, scene, sensor) -> float:
@@ -57,7 +46,7 @@ def bound_px(mark, scene, sensor) -> float:
     values, whose slopes alone inform (for gamma speckle without other noise that is the exact information); photosites
     whose mean is clipped are left out.
     """
-    response = mosaic_response(WIDTH, HEIGHT, sensor.response).astype(float)
+    response = spot_pictures.mosaic_response(WIDTH, HEIGHT, sensor.response).astype(float)
     ambient = ambient_level(WIDTH, HEIGHT, scene.ambient_dn, scene.ambient_gradient_dn).astype(float)
     window, light = spot_irradiance(mark, WIDTH, HEIGHT)
     rows, columns = window
@@ -94,8 +83,10 @@ def flat_stereo():
     return Stereo(WIDTH, HEIGHT, matrix, none, matrix, none, turn, arm, np.zeros((24, 24)), 0.1)
 
 
-def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
+def run_cell(task: tuple[float, float, float, float]) -> dict:
     """One cell: errors, stated sds and the bound."""
+    size, peak, ambient, contrast = task
+    seed = 1000 + tasks(argparse.Namespace()).index(task)
     rng = np.random.default_rng(seed)
     scene, sensor = Scene(ambient_dn=ambient, ambient_gradient_dn=ambient / 2, speckle_contrast=contrast), Sensor()
     pictures, truth, bounds = [], [], []
@@ -154,7 +145,7 @@ def beyond_linear() -> list[tuple[float, float]]:
         sds, shifts = [], []
         for row in range(0, 384, 8):
             point, beam, normal = (a[row] for a in (twin.light.points_mm, twin.light.directions, twin.light.normals))
-            mark = footprint(camera, point, beam, normal, replace(Scene(), beam_sd_mm=radius), 0.0)
+            mark = spot_pictures.footprint(camera, point, beam, normal, replace(Scene(), beam_sd_mm=radius), 0.0)
             side = np.linalg.svd(beam[None])[2][1:]
             offsets = radius * (nodes[:, None, None] * side[0] + nodes[None, :, None] * side[1]).reshape(-1, 3)
             starts = point + offsets
@@ -224,30 +215,13 @@ def summary(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Append rows until every cell is there."""
-    there = {(r["size"], r["peak"], r["ambient"], r["contrast"]) for r in read_rows(ROWS)}
-    for number, cell in enumerate(cells()):
-        if cell not in there:
-            append_row(ROWS, run_cell(*cell, seed=1000 + number))
-            print(*cell, file=sys.stderr)
-
-
-def page(arguments: argparse.Namespace) -> None:
+def page(rows: list[dict]) -> None:
     """Print the table."""
-    rows = read_rows(ROWS)
     print(table(rows), summary(rows), sep="\n\n")
     print("\nLeft out by the twin's linear map of a spot (paper twin, left camera, largest of 48 looks):\n")
     for sd, shift in beyond_linear():
         print(f"- spot sd {sd:.1f} px: {shift:.4f} px")
 
 
-def main() -> None:
-    """Run the missing cells, or print the table."""
-    command = parser(__doc__)
-    command.add_argument("action", choices=("run", "table"))
-    act(command, run=run, table=page)
-
-
 if __name__ == "__main__":
-    main()
+    study(__file__, __doc__, run_cell, ("size", "peak", "ambient", "contrast"), tasks, page)

@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -152,9 +153,8 @@ def sightings() -> None:
     for row in rows_of(Path("measured/moves.csv")):
         sighting = rows.get(row["move"], {})
         cells = [row[name] for name in ("time_s", "pan_steps", "tilt_steps")]
-        lines.append(
-            ",".join([*cells, *(sighting.get(name, "") for name in ("azimuth_deg", "elevation_deg", "u_deg"))])
-        )
+        cells += [sighting.get(name, "") for name in ("azimuth_deg", "elevation_deg", "u_deg")]
+        lines.append(",".join(cells))
     Path("log.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
@@ -163,16 +163,8 @@ def boards() -> None:
     shutil.copytree(DATA / "real" / "stereo" / "bumblebee2", "pictures")
 
 
-@dataclass(frozen=True)
-class Command:
-    """A line on the page.
-
-    Attributes:
-        line: what follows `tvsbayes`.
-        last: how many of the last lines are shown; 0: all.
-        first: how many of the first ones; None: all.
-        quick: whether the tests run it.
-    """
+class Command(NamedTuple):
+    """What follows `tvsbayes`; how many of the last and of the first lines are shown; whether the tests run it."""
 
     line: str
     last: int = 0
@@ -182,15 +174,9 @@ class Command:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file.
+    """A kind of file: title and text of its section, commands, files by what they are copied or written from.
 
-    Attributes:
-        title: of its section.
-        text: its description.
-        commands: in their order.
-        files: by name: where it is copied from, or what writes its content.
-        lines: how many of the first file are shown.
-        before: what else is prepared.
+    `lines` of the first file are shown; `before` prepares what else is needed.
     """
 
     title: str

@@ -45,7 +45,6 @@ from tvsbayes.twin.true_rig import Truth
 
 TARGET = 3e-4
 MINUTES = 40.0
-BUCKET = 48
 ADAPTIVE, FIXED = "adapt", ("planned", "grid")
 
 
@@ -58,12 +57,7 @@ class Last:
 
 
 class Beside(Replanning):
-    """Fits in this process: the same fit and the same proposal, without starting Python for each.
-
-    Args:
-        given: as of `Replanning`.
-        last: receives every fit.
-    """
+    """Fits in this process: the same fit and the same proposal, without starting Python for each; `last` has them."""
 
     def __init__(self, *arguments: Any, last: Last, **more: Any):
         super().__init__(*arguments, **more)

@@ -20,11 +20,11 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from experiments.common.command_line import study
 from experiments.common.fits import fit_from_truth
 from experiments.common.headlines import judged
+from experiments.common.page import heading, line, share
 from experiments.common.rigs import PIXELS, mounted_rig, pixels_of, shipped_plan, unseen, with_pixels
 from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.residuals import residual_causes, stop_residuals
@@ -57,7 +57,6 @@ MEANING = {
 }
 MM_PER_DEG = 4.0
 JUDGED = (*(f"effective {direction}" for direction in DIRECTIONS), "backlash pan", "backlash tilt")
-CONFIDENCE = 0.95
 
 
 def broken_campaign(defect: str, size: float, seed: int):
@@ -136,9 +135,9 @@ def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
 def tasks(of: argparse.Namespace) -> list[tuple[str, float, int]]:
     """Turn by turn, so that an interrupted run is balanced."""
     every: list[tuple[str, float, int]] = []
-    share = -(-of.clean // of.n)
+    turn = -(-of.clean // of.n)
     for seed in range(of.n):
-        every += [("clean", 0.0, s) for s in range(seed * share, min((seed + 1) * share, of.clean))]
+        every += [("clean", 0.0, s) for s in range(seed * turn, min((seed + 1) * turn, of.clean))]
         every += [(defect, size, seed) for defect, sizes in SIZES.items() for size in sizes]
     return every
 
@@ -150,10 +149,17 @@ def rms_z(rows: list[dict], inflated: bool) -> float:
     return float(np.sqrt(np.mean(np.square(z))))
 
 
-def clopper_pearson(hits: int, count: int) -> str:
-    """Share with its 95 % bounds, in percent."""
-    low, high = stats.binomtest(hits, count).proportion_ci(CONFIDENCE, method="exact")
-    return f"{100 * hits / count:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+TEXT = """# Which model errors does a fit notice?
+
+Written by `python -m experiments.robustness.model_error table`; campaigns and defects stand in the script.
+
+## Clean campaigns
+"""
+DEFECTS_TEXT = f"""
+RMS z over the four effective ratios and both backlashes; 1 is honest. F: median factor of the campaigns \
+that failed. Named: the defect whose test had the least p.
+
+{heading("defect | size | campaigns | detected | named most often | other tests | F | RMS z | after | grouped")}"""
 
 
 def table(rows: list[dict]) -> None:
@@ -161,14 +167,10 @@ def table(rows: list[dict]) -> None:
     good = [r for r in rows if "validation" in r and r["converged"]]
     clean = [r for r in good if r["defect"] == "clean"]
     level = clean[0]["validation"]["level"]
-    print("# Which model errors does a fit notice?\n")
-    print(
-        "Written by `python -m experiments.robustness.model_error table`; campaigns and defects stand in the script.\n"
-    )
+    print(TEXT)
     failed = sum(not r["validation"]["passed"] for r in clean)
-    print("## Clean campaigns\n")
     print(
-        f"{len(clean)} campaigns: {failed} failed their validation, {clopper_pearson(failed, len(clean))}; the stated "
+        f"{len(clean)} campaigns: {failed} failed their validation, {share(failed, len(clean))}; the stated "
         f"level is {100 * level:g} %. RMS z of the ratios and backlashes {rms_z(clean, False):.2f}, after inflation "
         f"{rms_z(clean, True):.2f}. A validation takes {np.median([r['validate_s'] for r in clean]):.2f} s of CPU time."
         "\n"
@@ -177,25 +179,18 @@ def table(rows: list[dict]) -> None:
     print("| test | asked in | p below 5 % | failed |\n|---|---|---|---|")
     for name, count in names.items():
         mine = [t for r in clean for t in r["validation"]["tests"] if t["name"] == name]
-        print(
-            f"| {name} | {count} | {100 * np.mean([t['p'] < 0.05 for t in mine]):.1f} % "
-            f"| {sum(t['failed'] for t in mine)} |"
-        )
+        below = f"{100 * np.mean([t['p'] < 0.05 for t in mine]):.1f} %"
+        print(line(name, count, below, sum(t["failed"] for t in mine)))
     grouped = sum(bool(r["grouped"]) for r in clean)
     suspect = sum(r["suspects"] > 0 for r in clean)
     print(
         f"\nFor comparison, on the same campaigns: grouped residuals (`residual_causes`) called a cause suspicious in "
-        f"{clopper_pearson(grouped, len(clean))}, the gate named a spot in {clopper_pearson(suspect, len(clean))}.\n"
+        f"{share(grouped, len(clean))}, the gate named a spot in {share(suspect, len(clean))}.\n"
     )
     print("## Defects\n")
     for defect in SIZES:
         print(f"- {defect}: {MEANING[defect]}")
-    print(
-        "\nRMS z over the four effective ratios and both backlashes; 1 is honest. F: median factor of the campaigns "
-        "that failed. Named: the defect whose test had the least p.\n"
-    )
-    print("| defect | size | campaigns | detected | named most often | other tests | F | RMS z | after | grouped |")
-    print("|" + "---|" * 10)
+    print(DEFECTS_TEXT)
     for defect, sizes in SIZES.items():
         for size in sizes:
             mine = [r for r in good if r["defect"] == defect and r["size"] == size]
@@ -207,10 +202,9 @@ def table(rows: list[dict]) -> None:
             best = "; ".join(f"{name} {n}" for name, n in named.most_common(2)) or "-"
             also = "; ".join(f"{name} {n}" for name, n in others.most_common(3) if name not in best) or "-"
             factor = f"{np.median([r['validation']['inflation'] for r in alarmed]):.1f}" if alarmed else "-"
-            print(
-                f"| {defect} | {size:g} | {len(mine)} | {len(alarmed)} | {best} | {also} | {factor} "
-                f"| {rms_z(mine, False):.2f} | {rms_z(mine, True):.2f} | {sum(bool(r['grouped']) for r in mine)} |"
-            )
+            z = (f"{rms_z(mine, inflated):.2f}" for inflated in (False, True))
+            cells = (defect, f"{size:g}", len(mine), len(alarmed), best, also, factor, *z)
+            print(line(*cells, sum(bool(r["grouped"]) for r in mine)))
     bad = [r for r in rows if not ("validation" in r and r["converged"])]
     print(f"\n{len(rows)} fits, {len(bad)} not converged" + (":" if bad else "."))
     for r in bad:

@@ -16,21 +16,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
 from experiments.common.command_line import study
-from experiments.common.page import heading
+from experiments.common.page import heading, share
 from experiments.common.rigs import mounted_rig
 from tvsbayes.comparison import watched_looks
-from tvsbayes.comparison.watched_looks import (
-    CHANGES,
-    FALSE_ALARM_RATE,
-    NOISE_DRAWS,
-    StatedChange,
-    WatchedLooks,
-    null_distribution,
-    powers,
-    watch,
-)
+from tvsbayes.comparison.watched_looks import CHANGES, FALSE_ALARM_RATE, NOISE_DRAWS, StatedChange
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.noise_scales import noise_draws
@@ -40,12 +32,10 @@ from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.watch_plan import watch_plan
-from tvsbayes.statistics.chances import share_interval95
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
 FIRST_DAY = four_point_protocol(repeats=6, steps=(100, 200))
-BUCKET = 192
 SAME_DAYS, SIZES = 6, (1.0, 4.0)
 NOTHING = "nothing"
 
@@ -71,8 +61,6 @@ def changed(truth: Truth, change: StatedChange, times: float, rng: np.random.Gen
 
 def classic_alarm(first: Campaign, second: Campaign, direction: str) -> bool:
     """Whether the means of a direction differ, by Welch's t test."""
-    from scipy import stats
-
     days = [classic(campaign).experiments for campaign in (first, second)]
     ratios = [[e.deg_per_step for e in day if e.direction == direction] for day in days]
     return min(map(len, ratios)) > 1 and float(stats.ttest_ind(*ratios, equal_var=False).pvalue) <= FALSE_ALARM_RATE
@@ -98,9 +86,9 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     for number, (what, times, truth) in enumerate(changes):
         days.append(day(result, first.campaign, truth, what, times, 1000 * (seed + 1) + number, planned.steps))
     taken = simulate(rig, planned.steps, 1000 * (seed + 1), truth=first.truth).campaign
-    departure = WatchedLooks(result, taken).departure(noise.centre)
-    limit = null_distribution(departure, 0).limit
-    row["stated"] = {"1": [c.power for c in planned.changes], "4": powers(departure, limit, 0, 4.0)}
+    departure = watched_looks.WatchedLooks(result, taken).departure(noise.centre)
+    limit = watched_looks.null_distribution(departure, 0).limit
+    row["stated"] = {"1": [c.power for c in planned.changes], "4": watched_looks.powers(departure, limit, 0, 4.0)}
     row["looks"], row["needed"] = planned.looks, [c.looks_needed for c in planned.changes]
     return {**row, "homings": planned.homings, "minutes": planned.minutes, "days": days}
 
@@ -110,7 +98,7 @@ def day(
 ) -> dict[str, object]:
     """One second day, watched, and looked at the classic way with as many looks."""
     rig = mounted_rig()
-    test = watch(result, simulate(rig, steps, seed, truth=truth).campaign)
+    test = watched_looks.watch(result, simulate(rig, steps, seed, truth=truth).campaign)
     named = test.moved[0].what if test.moved else ""
     direction = "up" if what.endswith("tilt") else "left"
     # Of all four directions; only this one is compared.
@@ -118,12 +106,6 @@ def day(
     other = simulate(rig, four_point_protocol(repeats=repeats, steps=(100, 200)), seed + 500, truth=truth).campaign
     entries = {"verdict": test.verdict, "p": test.p, "p_all": test.p_all, "named": named}
     return {"what": what, "times": times, **entries, "classic": classic_alarm(first, other, direction)}
-
-
-def share(hits: int, count: int) -> str:
-    """With its 95 % interval."""
-    low, high = share_interval95(hits, count)
-    return f"{100 * hits / count:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
 
 
 def table(every: list[dict]) -> None:
@@ -134,15 +116,13 @@ def table(every: list[dict]) -> None:
     print("Written by `python -m experiments.watching.power table`.\n")
     looks, homings, minutes = (np.median([r[key] for r in rows]) for key in ("looks", "homings", "minutes"))
     print(f"{len(rows)} drawn rigs, {len(days)} second days. Plans of 10 minutes, in the median {looks:.0f} looks")
-    print(
-        f"after {homings:.0f} homings in {minutes:.1f} minutes. In brackets 95 % intervals of the counts; days of one"
-    )
-    print("rig share its first day, so that they are somewhat wider in truth.\n")
+    print(f"after {homings:.0f} homings in {minutes:.1f} minutes.", end=" ")
+    print("In brackets 95 % intervals of the counts; days of one")
+    print("rig share its first day, so that they are somewhat wider in truth.
+")
     print(heading("moved | size | MOVED, counted | stated at least | named right, of MOVED | classic"))
-    groups = [
-        (NOTHING, 0.0, "", None),
-        *((c.what, t, f"{t * c.size:g} {c.unit}", n) for n, c in enumerate(CHANGES) for t in SIZES),
-    ]
+    groups = [(NOTHING, 0.0, "", None)]
+    groups += [(c.what, t, f"{t * c.size:g} {c.unit}", n) for n, c in enumerate(CHANGES) for t in SIZES]
     for what, times, size, number in groups:
         chosen = [d for d in days if d["what"] == what and d["times"] == times]
         moved = [d for d in chosen if d["named"]]
@@ -153,8 +133,8 @@ def table(every: list[dict]) -> None:
         print(f"| {what} | {size} | {share(len(moved), len(chosen))} | {100 * stated:.1f} % | {named} | {alarms} |")
     same = [d for d in days if d["what"] == NOTHING]
     low = sum(d["p_all"] < FALSE_ALARM_RATE for d in same)
-    sentence = "All residuals together (`p_all`, a warning) fell below 1 % on"
-    print(f"\n{sentence} {share(low, len(same))} of the unchanged days.")
+    print("\nAll residuals together (`p_all`, a warning) fell below 1 % on", end=" ")
+    print(f"{share(low, len(same))} of the unchanged days.")
     print("\n| change | rigs on which some number of looks is enough | median of these numbers |")
     print("|---|---|---|")
     for number, change in enumerate(CHANGES):

@@ -41,8 +41,6 @@ OURS, FIRST_TIER = "tvsbayes", "tvsbayes, tier 1 alone"
 NUTS, BLACKJAX, STRETCH = "NumPyro NUTS, sheared", "BlackJAX NUTS, sheared", "emcee stretch move"
 TRUSTED = 400
 """Effective draws that four chains need before an interval is trusted (Vehtari et al., doi 10.1214/20-BA1221)."""
-BUCKET = 64
-"""Padded length of the campaign: ordinary fits pad to 512, for all contenders alike; here nothing is gained by it."""
 
 
 @dataclass(frozen=True)
