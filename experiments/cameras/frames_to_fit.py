@@ -29,6 +29,7 @@ from scipy import stats
 
 from experiments.common.command_line import by_seed, study
 from experiments.common.headlines import marked
+from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, pixels_of, shipped_plan, shipped_twin
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.cameras.detection import detect
@@ -86,7 +87,6 @@ def observed(source: str, seed: int) -> Observed:
 
 def one_campaign(task: tuple[str, int]) -> dict[str, object]:
     """Observe and fit; whatever fails is recorded, never dropped."""
-    # 64 looks.
     use_compilation_cache()
     source, seed = task
     looks = observed(source, seed)
@@ -94,14 +94,10 @@ def one_campaign(task: tuple[str, int]) -> dict[str, object]:
     known = known_truth(looks.truth)
     if source == "frames":
         known["pixel_scale"] = float(np.sqrt(np.mean((errors / stated) ** 2)))
-    row: dict[str, object] = {
-        "source": source,
-        "seed": seed,
-        "looks": len(looks.campaign.spots),
-        "ok": len(errors),
-        "median_sd_px": float(np.median(stated)),
+    row: dict[str, object] = {"source": source, "seed": seed, "looks": len(looks.campaign.spots), "ok": len(errors)}
+    row |= {"median_sd_px": float(np.median(stated)), "mean_px": errors.mean(0).tolist()}
+    row |= {
         "rms_px": np.sqrt((errors**2).mean(0)).tolist(),
-        "mean_px": errors.mean(0).tolist(),
         "rms_z": np.sqrt(((errors / stated) ** 2).mean(0)).tolist(),
     }
     try:
@@ -157,17 +153,8 @@ def table(every: list[dict]) -> None:
     print(
         "Difference: (frames - centroids) over the sd from frames, rms; sds: from frames over from centroids, median.\n"
     )
-    titles = [
-        "quantity",
-        "centroids: inside 95 %",
-        "rms z",
-        "frames: inside 95 %",
-        "rms z",
-        "mean z",
-        "difference",
-        "sds",
-    ]
-    print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}")
+    titles = "quantity | centroids: inside 95 % | rms z | frames: inside 95 % | rms z | mean z | difference | sds"
+    print(heading(titles))
     for name in good["frames"][both[0]]["quantities"]:
         cells, values = [name], {}
         for source in SOURCES:
@@ -179,7 +166,7 @@ def table(every: list[dict]) -> None:
         cells.append(f"{z.mean():+.2f}")
         (drawn, drawn_sd), (frame, seen_sd) = values["centroids"], values["frames"]
         cells += [f"{np.sqrt((((frame - drawn) / seen_sd) ** 2).mean()):.2f}", f"{np.median(seen_sd / drawn_sd):.2f}"]
-        print(f"| {' | '.join(cells)} |")
+        print(line(*cells))
     print("\nFound against true centres:\n\n| coordinate | rms, px | mean, px | rms z |\n|---|---|---|---|")
     for k, name in enumerate(COORDINATES):
         count = np.array([r["ok"] for r in rows["frames"]])
@@ -221,9 +208,7 @@ def report(place: Path, twin: str) -> None:
         by_hand = classic(result.campaign).directions
         summary = summarise(fit(result.campaign))
         pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
-        print(
-            "| quantity | truth | classic mean (sd) | 95 % type A | joint | 95 % | truth inside | z |\n|" + "---|" * 8
-        )
+        print(heading("quantity | truth | classic mean (sd) | 95 % type A | joint | 95 % | truth inside | z"))
         for name, value, one in compared(summary, {**known_truth(truth), **at_pose(truth, result.campaign, pose)}):
             low, high = one.interval95
             hand, hands = by_hand.get(name.removeprefix("effective ")), "| | "
@@ -237,11 +222,8 @@ def report(place: Path, twin: str) -> None:
                 continue
             inside, z = ("yes" if low <= value <= high else "NO"), (one.value - value) / one.sd
             print(f"| {name} | {value:.6f} {hands}| {one.value:.6f} | {low:.6f} to {high:.6f} | {inside} | {z:+.2f} |")
-        print(
-            f"\nconverged {summary.converged}, "
-            f"chi2 {summary.noise.chi2:.1f} of {summary.noise.dof:.1f} degrees of freedom\n",
-            flush=True,
-        )
+        chi2 = f"chi2 {summary.noise.chi2:.1f} of {summary.noise.dof:.1f} degrees of freedom\n"
+        print(f"\nconverged {summary.converged}, {chi2}", flush=True)
 
 
 def paper(arguments: argparse.Namespace) -> None:

@@ -41,6 +41,7 @@ PROTOCOLS = ("paper", "mixed", "grid")
 TITLES = {TIERS[0]: "Tier 1, importance sampling", TIERS[1]: "Tier 2, emcee"}
 ALL = HEADLINES + MEAN_RATIOS
 MAX_MINUTES = 10.0
+LAST = "effective share | least effective draws of a quantity | heaviest weight, % | fit, CPU s | sampling, CPU s"
 SMALL = {CLEAN: "60 spots, about 30 stops in every direction", FEW: "48 spots, twelve stops in every direction"}
 SMALL_HEADLINES = (
     *(f"effective_deg_per_step.{d}" for d in DIRECTIONS),
@@ -102,35 +103,27 @@ def _spread(values: Sequence[float], form: str) -> str:
     return f"{middle:{form}} ({low:{form}} to {high:{form}})"
 
 
+WORKINGS = f"""Medians with 10 % and 90 % quantiles; k, draws and weights are of importance sampling.
+
+{heading("protocol | rigs | fit converged | accepted | Pareto k | worst k of a headline | draws", LAST)}"""
+
+
 def workings(of: dict[str, list[dict]]) -> None:
     """Diagnostics and cost of the tier, by protocol."""
-    columns = ("protocol", "rigs", "fit converged", "accepted", "Pareto k", "worst k of a headline", "draws")
-    columns += (
-        "effective share",
-        "least effective draws of a quantity",
-        "heaviest weight, %",
-        "fit, CPU s",
-        "sampling, CPU s",
-    )
-    print("Medians with 10 % and 90 % quantiles; k, draws and weights are of importance sampling.\n")
-    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
+    print(WORKINGS)
     for protocol, rows in of.items():
         done = [r for r in rows if "posterior" in r]
         if not done:
             continue
         runs = [r["sampling"]["importance"] for r in done]
         accepted = sum(r["converged"] and r["sampled"] for r in rows)
-        cells = [protocol, str(len(rows)), str(sum(r["converged"] for r in rows))]
-        cells += [f"{accepted} ({100 * accepted / len(rows):.1f} %)"]
-        cells += [_spread([t["pareto_k"] for t in runs], ".2f")]
+        cells = [protocol, len(rows), sum(r["converged"] for r in rows)]
+        cells += [f"{accepted} ({100 * accepted / len(rows):.1f} %)", _spread([t["pareto_k"] for t in runs], ".2f")]
         cells += [_spread([t["worst_pareto_k"]["value"] for t in runs], ".2f")]
         cells += [_spread([t["draws"] for t in runs], ".0f"), _spread([t["effective_share"] for t in runs], ".2f")]
-        cells += [
-            _spread([min(r["sampling"][f"least_ess_{e}"]["value"] for e in ("bulk", "tail")) for r in done], ".0f")
-        ]
-        cells += [_spread([100 * t["heaviest_share"] for t in runs], ".2f")]
-        cells += [_spread([r[f"{w}_cpu_s"] for r in done], ".1f") for w in ("fit", "sample")]
-        print("| " + " | ".join(cells) + " |")
+        ends = [[r["sampling"][f"least_ess_{end}"]["value"] for r in done] for end in ("bulk", "tail")]
+        cells += [_spread(np.min(ends, axis=0), ".0f"), _spread([100 * t["heaviest_share"] for t in runs], ".2f")]
+        print(line(*cells, *(_spread([r[f"{w}_cpu_s"] for r in done], ".1f") for w in ("fit", "sample"))))
     print()
 
 
@@ -174,14 +167,19 @@ def table_small(rows: list[dict]) -> None:
         print()
 
 
+TEXT = f"""# Coverage of the sampled posterior
+
+Written by `python -m experiments.intervals.posterior_coverage table`; what is in it and how it was made
+stands in the script. {NOTE}; rig i has seed i. Gears repeat their
+errors, as the priors of the mounted rig draw them. What importance sampling refuses goes on to the chain
+in `fit`, `calibrate` and `study`. CPU seconds on two cores shared with other work; their medians are free
+of compilation.
+"""
+
+
 def table(rows: list[dict]) -> None:
     """The page."""
-    print("# Coverage of the sampled posterior\n")
-    print("Written by `python -m experiments.intervals.posterior_coverage table`; what is in it and how it was made")
-    print(f"stands in the script. {NOTE}; rig i has seed i. Gears repeat their")
-    print("errors, as the priors of the mounted rig draw them. What importance sampling refuses goes on to the chain")
-    print("in `fit`, `calibrate` and `study`. CPU seconds on two cores shared with other work; their medians are free")
-    print("of compilation.\n")
+    print(TEXT)
     for tier in TIERS:
         table_tier(tier, rows)
     table_small(read_rows(SBC_ROWS))

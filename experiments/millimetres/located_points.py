@@ -21,7 +21,7 @@ import numpy as np
 
 from experiments.common.command_line import study
 from experiments.common.headlines import marked
-from experiments.common.page import heading
+from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
@@ -125,10 +125,8 @@ def table(rows: list[dict]) -> None:
             missing = sum(v is None for v in values)
             e = np.array([v for v in values if v is not None])
             note = f" ({missing} without a point)" if missing else ""
-            quantiles = (
-                f"{np.median(e):.1f} | {np.sqrt(np.mean(e**2)):.1f} | {np.quantile(e, 0.95):.1f} | {e.max():.0f}"
-            )
-            print(f"| {kind} | {name}{note} | {quantiles} |")
+            figures = (f"{value:.1f}" for value in (np.median(e), np.sqrt(np.mean(e**2)), np.quantile(e, 0.95)))
+            print(line(kind, name + note, *figures, f"{e.max():.0f}"))
     print("\n## Within one rig\n")
     share = np.array([r["within"]["ellipsoid"] / r["within"]["points"] for r in good if r["within"]["points"]])
     axes = np.array([np.array(r["within"]["hits"]) / r["within"]["points"] for r in good if r["within"]["points"]])

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import print_only
+from experiments.common.page import line
 from experiments.common.rigs import mounted_rig, numbered, paper_values, shipped_plan, shipped_twin, twin_campaign
 from experiments.common.rows import ROOT
 from tvsbayes.assessment.causes import headline_causes
@@ -52,7 +53,7 @@ PLAIN, FOURFOLD = "the paper's 96 experiments", "the same four times over"
 
 def row(claim: str, stated: str, computed: str, verdict: str, script: str = "paper.claims") -> None:
     """A line of the table."""
-    print(f"| {claim} | {stated} | {computed} | `python -m experiments.{script}` | {verdict} |")
+    print(line(claim, stated, computed, f"`python -m experiments.{script}`", verdict))
 
 
 def first() -> None:
@@ -67,24 +68,14 @@ def first() -> None:
         ends = stats.binomtest(hits, rigs).proportion_ci(0.95)
         cells.append(f"{name} {float(type_a):.1f} % ({100 * ends.low:.1f} to {100 * ends.high:.1f})")
     low = min(float(r[1]) for r in rows) <= 7.0 <= max(float(r[1]) for r in rows)
-    text = f"{rigs} rigs: {', '.join(cells)}"
-    row(
-        "1. classic 95 % type A interval, one \\|N\\|, holds the truth",
-        "7 % of 40 rigs",
-        text,
-        "holds: nowhere near 95 %" if low else "holds in kind",
-        "intervals.laplace_coverage table",
-    )
+    text, command = f"{rigs} rigs: {', '.join(cells)}", "intervals.laplace_coverage table"
+    verdict = "holds: nowhere near 95 %" if low else "holds in kind"
+    row("1. classic 95 % type A interval, one \\|N\\|, holds the truth", "7 % of 40 rigs", text, verdict, command)
     # Median of a half-normal of scale 0.5 deg over 200 steps of 0.06 deg.
-    expected = -100 * 0.5 * stats.halfnorm.median() / 200 / 0.06
-    errors = ", ".join(f"{name} {error} %" for name, _, _, error in rows)
-    row(
-        "1. after a reversal k is off by -b/N",
-        f"median rig {expected:.1f} % for pan",
-        f"median error {errors}",
-        "holds for pan; in tilt the projection (claim 2) is larger",
-        "intervals.laplace_coverage table",
-    )
+    expected = f"median rig {-100 * 0.5 * stats.halfnorm.median() / 200 / 0.06:.1f} % for pan"
+    text = f"median error {', '.join(f'{name} {error} %' for name, _, _, error in rows)}"
+    verdict = "holds for pan; in tilt the projection (claim 2) is larger"
+    row("1. after a reversal k is off by -b/N", expected, text, verdict, command)
 
 
 def projection(azimuth_deg: float, from_deg: float, to_deg: float) -> float:
@@ -103,25 +94,17 @@ def second() -> None:
         asymmetric, symmetric = projection(azimuth, 0.0, 12.0), projection(azimuth, -6.0, 6.0)
         small = 1 / np.cos(np.radians(azimuth))
         text = f"{asymmetric:.4f} from 0 to 12 deg, {symmetric:.4f} from -6 to +6 deg, {small:.4f} for small moves"
-        good = abs(asymmetric - stated) < 1e-3
-        row(
-            f"2. a tilt at azimuth {azimuth} deg reads too large by",
-            f"{stated}",
-            text,
-            "holds, from 0 to 12 deg" if good else "does not hold",
-        )
+        verdict = "holds, from 0 to 12 deg" if abs(asymmetric - stated) < 1e-3 else "does not hold"
+        row(f"2. a tilt at azimuth {azimuth} deg reads too large by", f"{stated}", text, verdict)
     table = paper_values()
     means = {name: values[1] for name, values in table.items()}
     ratio = (means["up"] + means["down"]) / (means["left"] + means["right"])
     u = np.sqrt(sum((v[2] / v[1]) ** 2 / v[0] for v in table.values())) / 2 * ratio
     angle = np.degrees(np.arccos(1 / ratio))
     u_angle = np.degrees(u / (ratio**2 * np.sin(np.radians(angle))))
-    row(
-        "2. tilt over pan in Table 1, and the azimuth at which equal gears show it",
-        "1.127; 27.5 deg",
-        f"{ratio:.4f} +- {u:.4f} (type A); {angle:.1f} +- {u_angle:.1f} deg for small moves",
-        "holds",
-    )
+    text = f"{ratio:.4f} +- {u:.4f} (type A); {angle:.1f} +- {u_angle:.1f} deg for small moves"
+    claim = "2. tilt over pan in Table 1, and the azimuth at which equal gears show it"
+    row(claim, "1.127; 27.5 deg", text, "holds")
 
 
 def third(chosen, stereo) -> None:
@@ -146,12 +129,8 @@ def third(chosen, stereo) -> None:
         example.append(f"{moved['left']:+.2f} %")
     size = [abs(v) for v in shifts.values()]
     holds = "holds" if min(size) >= 0.25 and max(size) <= 0.55 else "common to all repeats: holds; larger than stated"
-    row(
-        "3. 0.5 % of focal length shifts k, in all repeats alike, by",
-        "0.3 to 0.5 %",
-        f"paper twin: {text}; worked example: {example[0]} with lenses without distortion, {example[1]} with these",
-        holds,
-    )
+    text = f"paper twin: {text}; worked example: {example[0]} with lenses without distortion, {example[1]} with these"
+    row("3. 0.5 % of focal length shifts k, in all repeats alike, by", "0.3 to 0.5 %", text, holds)
 
 
 def fourth() -> None:
@@ -162,12 +141,8 @@ def fourth() -> None:
     ratio = (sd["left"] / sd["right"]) ** 2
     low, high = ratio / stats.f.ppf([0.975, 0.025], n - 1, n - 1)
     p = 2 * stats.f.sf(ratio, n - 1, n - 1)
-    row(
-        "4. variance of left over right",
-        "21",
-        f"{ratio:.1f} (95 %: {low:.1f} to {high:.1f}), p of equality {p:.0e}",
-        "holds",
-    )
+    text = f"{ratio:.1f} (95 %: {low:.1f} to {high:.1f}), p of equality {p:.0e}"
+    row("4. variance of left over right", "21", text, "holds")
     truth = shipped_twin("paper_twin").truth
     still = {name: 0.0 for name in truth.parameters if name.startswith("stop_sd_deg")}
     truth = replace(truth, parameters={**truth.parameters, **still, "pixel_scale": 1.0})
@@ -299,19 +274,14 @@ def fifth(results: dict[str, dict[str, Parts]]) -> None:
         verdict = "does not hold"
     row("5. stereo and focal scale in the variance of k after 96 experiments", "about half", text, verdict)
     rest = all(b["backlash"] > 50 * (1 - b["cameras"] / 100) for b in base.values())
+    text = f"plain go and return: {base['left']['backlash']:.0f} % (left), {base['up']['backlash']:.0f} % (up) of all"
     row(
-        "5. separation of k from backlash",
-        "most of the rest",
-        f"plain go and return: {base['left']['backlash']:.0f} % (left), {base['up']['backlash']:.0f} % (up) of all",
-        "holds" if rest else "does not hold for both axes",
+        "5. separation of k from backlash", "most of the rest", text, "holds" if rest else "does not hold for both axes"
     )
     gain = {q: results[FOURFOLD][q]["u"] / base[q]["u"] for q in base}
-    row(
-        "5. repeats of one move do not help",
-        "no help",
-        f"four times as many: u times {gain['left']:.2f} (left), {gain['up']:.2f} (up); averaging would give 0.50",
-        "holds" if min(gain.values()) > 0.9 else "does not hold",
-    )
+    text = f"four times as many: u times {gain['left']:.2f} (left), {gain['up']:.2f} (up); averaging would give 0.50"
+    verdict = "holds" if min(gain.values()) > 0.9 else "does not hold"
+    row("5. repeats of one move do not help", "no help", text, verdict)
 
 
 def what_lowers(results: dict[str, dict[str, Parts]]) -> None:
@@ -322,11 +292,10 @@ def what_lowers(results: dict[str, dict[str, Parts]]) -> None:
     print("| u if backlash were known | contrast | left after 100 such campaigns |\n|" + "---|" * 10)
     for name, by_direction in results.items():
         for quantity, p in by_direction.items():
-            print(
-                f"| {name} | {p['spots']} | {quantity} | {p['u']:.2f} | {p['cameras']:.0f} % | {p['u_cameras']:.2f} ",
-                end="",
-            )
-            print(f"| {p['backlash']:.0f} % | {p['u_without']:.2f} | {p['contrast']:.0f} % | {p['floor']:.0f} % |")
+            shares = {key: f"{p[key]:.0f} %" for key in ("cameras", "backlash", "contrast", "floor")}
+            u, u_cameras, u_without = (f"{p[key]:.2f}" for key in ("u", "u_cameras", "u_without"))
+            cells = (p["spots"], quantity, u, shares["cameras"], u_cameras, shares["backlash"], u_without)
+            print(line(name, *cells, shares["contrast"], shares["floor"]))
     print("\nPan is better off than tilt in the plain protocol: its first start is the homing's, recorded as reached")
     print("from the left, the one cleared start of the campaign.")
 

@@ -1,7 +1,6 @@
 """Do importance sampling (tier 1), the chain (tier 2) and NUTS give the same posterior?
 
     python -m experiments.sampler.agreement run --cores 0     # minutes a case; resumable
-    python -m experiments.sampler.agreement run --campaigns FOLDER FOLDER --cores 0     # campaigns of your own too
     python -m experiments.sampler.agreement table > experiments/sampler/agreement.md
 
 `run` fits both twins, 60 spots of the mounted rig with both axes moved between any two (`rigs.dense_plan`), and 48
@@ -19,17 +18,17 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import jax
 import numpy as np
 
 from experiments.common.command_line import study
+from experiments.common.page import heading, line
 from experiments.common.reference_samplers import Setting
 from experiments.common.rigs import TWINS, dense_plan, mounted_rig, small_plan, twin_campaign
 from experiments.sampler.nuts_reference import hamiltonian
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.instrument.campaign import Campaign, read_campaign
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.draws import Posterior, headline_names
@@ -56,18 +55,17 @@ SETTINGS = {
     TWINS[0]: Setting(4, 400, 1200, SEED),
 }
 """Chains, warm-up and draws: two to four thousand effective draws of the worst quantity, on the paper twin 600."""
+CHAIN = "chain: steps | effective | R-hat | errors from tier 1 | converged | CPU s"
 RHAT_LIMIT = 1.01
 """Of four chains (Vehtari et al., doi 10.1214/20-BA1221)."""
 
 
 def campaign_of(case: str) -> Campaign:
-    """A twin, a drawn rig of the names above, or a folder."""
+    """A twin, or of a drawn rig."""
     if case in TWINS:
         return twin_campaign(case)
-    if case in SHEETS:
-        plan = dense_plan(SHEETS[case]) if case == DENSE else small_plan(SHEETS[case])
-        return simulate(mounted_rig(), plan, SEED).campaign
-    return read_campaign(Path(case))
+    plan = dense_plan(SHEETS[case]) if case == DENSE else small_plan(SHEETS[case])
+    return simulate(mounted_rig(), plan, SEED).campaign
 
 
 def one_case(task: tuple[str, str]) -> dict[str, object]:
@@ -146,53 +144,54 @@ def compare(one: Mapping[str, Mapping[str, float]], other: Mapping[str, Mapping[
     return " | ".join([*cells, verdict])
 
 
+TEXT = f"""# Importance sampling, the chain and NUTS
+
+Written by `python -m experiments.sampler.agreement table` after `run`.
+
+## What the tiers say of themselves
+
+`share`: effective draws by weights over draws; `effective`: of the worst statistic of the worst headline.
+Of the chain: steps of its walkers, worst bulk effective draws, worst R-hat, gap to tier 1 in errors.
+
+{heading("case | spots | Pareto k | worst of a headline | draws | share | effective | accepted | CPU s", CHAIN)}"""
+DIFFERENCES = f"""
+## Differences
+
+NUTS: four chains in step in sheared coordinates (`nuts_reference.py`), of the same model and data. Where it
+diverges it may miss a tail (Betancourt, arXiv:1701.02434, section 6.2); tier 1 and chain stand beside.
+Within: means within 0.1 sd and sds within 6 %. Undecided: beyond, but by no more than four Monte Carlo errors
+of both, so that more draws would have to tell. OUTSIDE: by more.
+
+{heading("case | chains x (warm-up + draws) | leapfrogs | divergences | largest R-hat | worst bulk ESS | CPU s")}"""
+
+
 def table(rows: list[dict]) -> None:
     """The page."""
-    print("# Importance sampling, the chain and NUTS\n")
-    print("Written by `python -m experiments.sampler.agreement table` after `run`.\n")
+    print(TEXT)
     of = {(r["case"], r["tier"]): r for r in rows}
     cases = list(dict.fromkeys(r["case"] for r in rows))
-    print("## What the tiers say of themselves\n")
-    print("`share`: effective draws by weights over draws; `effective`: of the worst statistic of the worst headline.")
-    print("Of the chain: steps of its walkers, worst bulk effective draws, worst R-hat, gap to tier 1 in errors.\n")
-    columns = ("case", "spots", "Pareto k", "worst of a headline", "draws", "share", "effective", "accepted", "CPU s")
-    columns += ("chain: steps", "effective", "R-hat", "errors from tier 1", "converged", "CPU s")
-    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     for case in cases:
         cells = [*first_cells(of.get((case, TIERS[0]))), *chain_cells(of.get((case, TIERS[1])))]
-        print(f"| {Path(case).name} | {' | '.join(cells)} |")
-    print("\n## Differences\n")
-    print(
-        "NUTS: four chains in step in sheared coordinates (`nuts_reference.py`), of the same model and data. Where it"
-    )
-    print("diverges it may miss a tail (Betancourt, arXiv:1701.02434, section 6.2); tier 1 and chain stand beside.")
-    print(
-        "Within: means within 0.1 sd and sds within 6 %. Undecided: beyond, but by no more than four Monte Carlo errors"
-    )
-    print("of both, so that more draws would have to tell. OUTSIDE: by more.\n")
-    print("| case | chains x (warm-up + draws) | leapfrogs | divergences | largest R-hat | worst bulk ESS | CPU s |")
-    print("|---|---|---|---|---|---|---|")
+        print(line(case, *cells))
+    print(DIFFERENCES)
     for case in cases:
         if row := of.get((case, NUTS)):
             how, cpu_s = SETTINGS[case], row["warmup_s"] + row["sampling_s"]
-            print(
-                f"| {case} | {how.chains} x ({how.warmup} + {how.draws}) | {row['leapfrogs']:.1f} | "
-                f"{row['divergences']} | {row['rhat']:.4f} | {row['ess']:.0f} | {cpu_s:.0f} |"
-            )
+            sizes = f"{how.chains} x ({how.warmup} + {how.draws})"
+            cells = (f"{row['leapfrogs']:.1f}", row["divergences"], f"{row['rhat']:.4f}", f"{row['ess']:.0f}")
+            print(line(case, sizes, *cells, f"{cpu_s:.0f}"))
     print()
-    columns = ("case", "of", "from", "quantities", "mean, sds", "sd, %", "in errors: median, worst", "verdict")
-    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
+    print(heading("case | of | from | quantities | mean, sds | sd, % | in errors: median, worst | verdict"))
     for case in cases:
         one, two, pooled, nuts = (of.get((case, tier)) for tier in (*TIERS, POOLED, NUTS))
         pairs = (("tier 1", one, "chain", two), ("tier 1", one, "NUTS", nuts), ("chain", two, "NUTS", nuts))
         pairs += ((POOLED, pooled, "NUTS", nuts), ("tier 1", one, POOLED, pooled), ("chain", two, POOLED, pooled))
         for name, these, other, those in pairs:
             if these and those:
-                cells = compare(these["quantities"], those["quantities"])
-                print(f"| {Path(case).name} | {name} | {other} | {cells} |")
+                print(line(case, name, other, compare(these["quantities"], those["quantities"])))
     for r in rows:
         if not r["accepted"]:
-            print(f"\n- not accepted: {Path(r['case']).name}, {r['tier']}: {'; '.join(r['missing'])}")
+            print(f"\n- not accepted: {r['case']}, {r['tier']}: {'; '.join(r['missing'])}")
 
 
 def first_cells(row: dict | None) -> list[str]:

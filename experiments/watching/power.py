@@ -118,8 +118,7 @@ def table(every: list[dict]) -> None:
     print(f"{len(rows)} drawn rigs, {len(days)} second days. Plans of 10 minutes, in the median {looks:.0f} looks")
     print(f"after {homings:.0f} homings in {minutes:.1f} minutes.", end=" ")
     print("In brackets 95 % intervals of the counts; days of one")
-    print("rig share its first day, so that they are somewhat wider in truth.
-")
+    print("rig share its first day, so that they are somewhat wider in truth.\n")
     print(heading("moved | size | MOVED, counted | stated at least | named right, of MOVED | classic"))
     groups = [(NOTHING, 0.0, "", None)]
     groups += [(c.what, t, f"{t * c.size:g} {c.unit}", n) for n, c in enumerate(CHANGES) for t in SIZES]
