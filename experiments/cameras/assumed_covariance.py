@@ -160,22 +160,21 @@ def poses(arguments: argparse.Namespace) -> None:
             print(f"{name},{view.name},{','.join(f'{value:.3f}' for value in row)}")
 
 
+def made_up(stereo: Stereo, board: Board, views: int, rms_px: float) -> dict[str, np.ndarray]:
+    """The covariances of `MADE` for a calibration from so many views."""
+    usual = Board(*USUAL_BOARD, USUAL_PITCH_MM)
+    return {
+        "all stated": calibration_covariance(stereo, board, views, rms_px, False),
+        "way unknown": calibration_covariance(stereo, board, views, rms_px),
+        "nothing stated": calibration_covariance(stereo, usual, min(views, USUAL_VIEWS), USUAL_RMS_PX),
+    }
+
+
 def real(arguments: argparse.Namespace) -> None:
     """Of each public set: sds of its own adjustment and of what is made up, and halves against each other."""
     rows = {}
     for name, (board, views, done) in sets(arguments.opencv).items():
         count, rms, size = len(views.views), done.stereo.rms_px, (views.image_width, views.image_height)
-        usual = Board(*USUAL_BOARD, USUAL_PITCH_MM)
-
-        def covariances(
-            views: int, stereo: Stereo = done.stereo, board: Board = board, rms: float = rms, usual: Board = usual
-        ) -> dict[str, np.ndarray]:
-            return {
-                "all stated": calibration_covariance(stereo, board, views, rms, False),
-                "way unknown": calibration_covariance(stereo, board, views, rms),
-                "nothing stated": calibration_covariance(stereo, usual, min(views, USUAL_VIEWS), USUAL_RMS_PX),
-            }
-
         rng, halves = np.random.default_rng(0), []
         for _ in range(SPLITS):
             order = rng.permutation(count)
@@ -186,11 +185,12 @@ def real(arguments: argparse.Namespace) -> None:
                 "independent corners": one.covariance_independent + two.covariance_independent,
                 "own": one.stereo.parameter_covariance + two.stereo.parameter_covariance,
             }
-            first, second = (covariances(len(half)) for half in halved)
+            first, second = (made_up(done.stereo, board, len(half), rms) for half in halved)
             sums |= {kind: first[kind] + second[kind] for kind in MADE}
             halves.append({kind: judged(difference, covariance) for kind, covariance in sums.items()})
         whole = {"independent corners": done.covariance_independent, "own": done.stereo.parameter_covariance}
-        sds = {kind: np.sqrt(np.diag(covariance)).tolist() for kind, covariance in (whole | covariances(count)).items()}
+        whole |= made_up(done.stereo, board, count, rms)
+        sds = {kind: np.sqrt(np.diag(covariance)).tolist() for kind, covariance in whole.items()}
         rows[name] = {"views": count, "rms_px": rms, "sd": sds, "halves": halves}
     REAL.parent.mkdir(parents=True, exist_ok=True)
     REAL.write_text(json.dumps(rows))

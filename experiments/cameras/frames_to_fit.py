@@ -52,14 +52,7 @@ COORDINATES = ("u left", "v left", "u right", "v right")
 
 @dataclass(frozen=True)
 class Observed:
-    """A simulated campaign without its truth, and the truth.
-
-    Attributes:
-        truth: of the rig.
-        campaign: with the centres of the source.
-        errors_px: found minus true centres (n, 4) of the spots that are ok, in the order of `COORDINATES`.
-        stated_px: their sds.
-    """
+    """A simulated campaign, its truth, found minus true centres (n, 4: `COORDINATES`) of good spots, their sds."""
 
     truth: Truth
     campaign: Campaign

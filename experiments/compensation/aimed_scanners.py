@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
-from experiments.common.rows import ROOT
+from experiments.common.rigs import mounted_rig
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.compensation.verification import SCENARIOS
 from tvsbayes.errors import TvsError
@@ -25,12 +25,11 @@ from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.instrument.rig import Rig, read_rig
+from tvsbayes.instrument.rig import Rig
 from tvsbayes.results.compensation_record import APPLIED, BROKEN, CANNOT_TELL, KEPT, OTHER_MACHINE, WORLDS
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
-RIG = ROOT / "data" / "rigs" / "mounted" / "rig.toml"
 RUN_UP_STEPS = 40
 SIDES = (("left", "up"), ("right", "down"), ("left", "down"), ("right", "up"))
 AIMS = tuple(
@@ -95,7 +94,7 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
 
     use_compilation_cache()
     (seed,) = task
-    began, rig = time.process_time(), read_rig(RIG)
+    began, rig = time.process_time(), mounted_rig()
     plan = four_point_protocol(repeats=4, steps=(100, 200))
     run, other = (simulate(rig, plan, each) for each in (seed, seed + 100_000))
     row: dict[str, object] = {"seed": seed}

@@ -21,8 +21,8 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
+from experiments.common.drawn_axes import fresh_moves, read, stands, up_and_down
 from experiments.common.rows import git
-from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensation_of

@@ -25,12 +25,12 @@ import numpy as np
 from msgspec import structs
 
 from experiments.common.command_line import print_only
-from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
+from experiments.common.drawn_axes import fresh_moves, read, stands, up_and_down
+from experiments.common.page import heading, line
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensation_of, file_text
 from tvsbayes.compensation.verification import verify_readings
-from tvsbayes.results.compensation_record import TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
@@ -192,18 +192,20 @@ def main() -> None:
     comp = compensation_of(results, Wish("linuxcnc"), seed=SEED)
     table = file_text(comp, before)
     play = float(results.summary.parameters["backlash"].value)
-    turned = file_text(structs.replace(comp, table=tuple(_turned(row) for row in comp.table)), before)
+    signs = [{"add_forward": -row.add_forward, "add_backward": -row.add_backward} for row in comp.table]
+    rows = tuple(structs.replace(row, **sign) for row, sign in zip(comp.table, signs, strict=True))
+    turned = file_text(structs.replace(comp, table=rows), before)
     print("# A table in LinuxCNC, applied and verified\n")
-    print(
-        "By `experiments.compensation.linuxcnc_loop`; LinuxCNC of the Debian package `linuxcnc-uspace`. The drawn axis"
-    )
+    print("By `experiments.compensation.linuxcnc_loop`; LinuxCNC of the Debian package `linuxcnc-uspace`.", end=" ")
+    print("The drawn axis")
     print(f"has a play of {loop.truth.parameters['backlash']:.3f} deg; the fit found {play:.3f} deg.\n")
     left = {side: promise.error95 for side, promise in comp.promise.items()}
     print(f"Promised: 95 % of errors at most {left['forward']:.4f} deg forward, {left['backward']:.4f} deg backward.\n")
     print(
-        "| INI file | verdict | world | its probability | p | expected without, RMS deg | read, RMS deg | worst deg |"
+        heading(
+            "INI file | verdict | world | its probability | p", "expected without, RMS deg | read, RMS deg | worst deg"
+        )
     )
-    print("|---|---|---|---|---|---|---|---|")
     twice = Correction.of(comp)
     for name, text, backlash, host in (
         ("the table", table, 0.0, None),
@@ -217,15 +219,11 @@ def main() -> None:
         check = verify_readings(results.fit, comp, loop.campaign(plan, which, text, backlash, host), seed=SEED)
         cells = [name, check.verdict, check.world, f"{check.worlds[check.world]:.3f}", f"{check.p:.2g}"]
         cells += [f"{value:.4f}" for value in (check.before.rms, check.after.rms, check.after.worst)]
-        print("| " + " | ".join(cells) + " |", flush=True)
+        print(line(*cells), flush=True)
     path = [5.0, 20.0, 10.0, -5.0, 10.0]
     same = motor_positions(path, table, play) == motor_positions(path, table)
     print("\nBeside a table LinuxCNC", "passes over `BACKLASH`:" if same else "also applies `BACKLASH`:", end=" ")
     print("`motor-pos-cmd` is the same with and without it." if same else "`motor-pos-cmd` differs.")
-
-
-def _turned(row: TableRow) -> TableRow:
-    return structs.replace(row, add_forward=-row.add_forward, add_backward=-row.add_backward)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 
 from experiments.common.command_line import print_only
 from experiments.common.console import console, quietly
-from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
+from experiments.common.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import stored_compensation
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, read_axis

@@ -26,8 +26,7 @@ from experiments.common.headlines import HEADLINES, JUDGED, MEAN_RATIOS, NOTE, S
 from experiments.common.page import heading, line
 from experiments.common.rigs import drawn_rig, shipped_plan, unseen
 from experiments.common.rows import read_rows
-from experiments.common.uniformity import DRAWS
-from experiments.intervals.sbc import CLEAN, FEW
+from experiments.intervals.sbc import CLEAN, DRAWS, FEW
 from experiments.intervals.sbc import ROWS as SBC_ROWS
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -41,9 +42,9 @@ from experiments.common.command_line import by_seed, study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import physical_of
 from experiments.common.headlines import SHRINK
+from experiments.common.page import heading, line
 from experiments.common.rigs import creeping_rig, dense_plan, small_plan, unseen
 from experiments.common.rows import output
-from experiments.common.uniformity import ALPHA, BAND_SAMPLES, DRAWS, FAULT_SIMULATIONS, Band, pit_values
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
@@ -64,12 +65,55 @@ SHEETS = ("d1", "d2")
 WIDER = 3.0
 WORSE = 1000.0
 MAX_MINUTES = 8.0
+END = "p log-likelihood | p log-posterior | quantities failing | verdict | wanted"
 CLEAN, FEW, PRIOR, CAMERA = "clean", "few stops", "prior x3", "camera dropped"
 SHRUNK, JACOBIAN = f"sd x {SHRINK}", "Jacobian dropped"
 VARIANTS = (CLEAN, FEW, PRIOR, CAMERA)
 """Simulated separately; the two other faults come with the first two."""
+DRAWS = 255
+"""Draws of a simulation among which the truth is ranked."""
+ALPHA = 0.05
+"""Of all quantities of a study together: each has to reach a p of ALPHA / number of quantities."""
+FAULT_SIMULATIONS = 50
+"""As few simulations as show a planted fault; fewer judge nothing."""
+BAND_SEED, BAND_SAMPLES, PIT_SEED = 214, 20_000, 215
 FAILURES = 0.05
 """Largest share of simulations that are not judged."""
+
+
+class Band:
+    """Simultaneous band of the ECDF of n uniforms, at k / n, k = 1 ... n - 1."""
+
+    def __init__(self, n: int):
+        self.n, self.points = n, np.arange(1, n) / n
+        counts = np.arange(n + 1)[:, None]
+        self.tail = np.minimum(stats.binom.cdf(counts, n, self.points), stats.binom.sf(counts - 1, n, self.points))
+        uniform = np.random.default_rng(BAND_SEED).uniform(size=(BAND_SAMPLES, n))
+        self.null = np.sort([self.statistic(u) for u in uniform])
+
+    def counts(self, pit: np.ndarray) -> np.ndarray:
+        """ECDF at the points, times n."""
+        return np.searchsorted(np.sort(pit), self.points, side="right")
+
+    def statistic(self, pit: np.ndarray) -> float:
+        """The smallest binomial tail probability over all points."""
+        return float(np.min(self.tail[self.counts(pit), np.arange(self.n - 1)]))
+
+    def p_value(self, pit: np.ndarray) -> float:
+        """Share of uniform samples at least as far out at their worst point, never 0."""
+        return (1 + np.searchsorted(self.null, self.statistic(pit), side="right")) / (1 + BAND_SAMPLES)
+
+    def limits(self, alpha: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest ECDF inside the band."""
+        inside = self.tail >= np.quantile(self.null, alpha)
+        return np.argmax(inside, axis=0) / self.n, (self.n - np.argmax(inside[::-1], axis=0)) / self.n
+
+
+def pit_values(rows: Sequence[dict], key: str) -> dict[str, np.ndarray]:
+    """(rank + U) / (draws + 1) by quantity; the ranks of a row stand under `key`."""
+    u = np.random.default_rng(PIT_SEED)
+    names = list(rows[0][key])
+    return {name: (np.array([r[key][name] for r in rows]) + u.uniform(size=len(rows))) / (DRAWS + 1) for name in names}
 
 
 def faulty(campaign, variant: str):
@@ -231,7 +275,7 @@ def design_row(design: Design, p: dict[str, float]) -> str:
         word = "too few to judge"
     cells = (design.title, len(design.chosen), lost, len(p), f"{limit:.1e}", f"{p[least]:.1e}, {least}")
     cells += (f"{p['log-likelihood']:.1e}", f"{p['log-posterior']:.1e}", failing)
-    return f"| {' | '.join(map(str, (*cells, word, 'passes' if design.clean else 'FAILS')))} |"
+    return line(*cells, word, "passes" if design.clean else "FAILS")
 
 
 def table(rows: list[dict]) -> None:
@@ -253,9 +297,7 @@ def table_tier(title: str, rows: list[dict], pictured: bool) -> None:
     if not parts:
         return
     print(f"## {title}\n")
-    columns = ("draws", "simulations", "not accepted", "quantities", "criterion p", "least p, of", "p log-likelihood")
-    columns += ("p log-posterior", "quantities failing", "verdict", "wanted")
-    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
+    print(heading("draws | simulations | not accepted | quantities | criterion p | least p, of", END))
     p_of = {}
     for design in parts:
         band = design.band

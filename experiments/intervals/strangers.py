@@ -36,6 +36,7 @@ from scipy import special
 
 from experiments.common.command_line import act, parser
 from experiments.common.headlines import SHRINK, marked
+from experiments.common.page import heading, line
 from experiments.common.rows import commit, read_rows, rows_of, run_rows
 from experiments.intervals.strange_bench import AXES, SIDES, Bench, Calibration, bench
 from tvsbayes.statistics.chances import BOUND, binomial_bounds, rms_bounds
@@ -163,17 +164,12 @@ def answer_of(document: dict) -> Row:
         answer = "refused"
     elif not document["converged"] and answer in ANSWERED:
         answer = "not converged"
-    return {
-        "answer": answer,
-        "tier": document.get("tier"),
-        "converged": document.get("converged"),
-        "pareto_k": importance.get("pareto_k"),
-        "draws": importance.get("draws"),
-        "effective": None if not importance else importance["effective_share"] * importance["draws"],
-        "least_ess": (importance.get("least_ess") or {}).get("value"),
-        "heaviest_share": importance.get("heaviest_share"),
-        "problems": importance.get("missing") or document.get("problems") or ([error["message"]] if error else []),
-    }
+    row = {"answer": answer, "tier": document.get("tier"), "converged": document.get("converged")}
+    row |= {key: importance.get(key) for key in ("pareto_k", "draws", "heaviest_share")}
+    row["effective"] = importance["effective_share"] * importance["draws"] if importance else None
+    row["least_ess"] = (importance.get("least_ess") or {}).get("value")
+    said = [error["message"]] if error else []
+    return row | {"problems": importance.get("missing") or document.get("problems") or said}
 
 
 def headlines_of(document: dict, truth: dict) -> dict[str, dict[str, float | None]]:
@@ -213,8 +209,7 @@ def judged(rows: Sequence[Row], name: str) -> tuple[np.ndarray, np.ndarray, np.n
 
 def coverage(rows: Sequence[Row]) -> None:
     """RMS z and coverage of every headline."""
-    columns = ("headline", "benches", "RMS z", "bounds", "95 %, %", "bounds", "median contraction")
-    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
+    print(heading("headline | benches | RMS z | bounds | 95 %, % | bounds | median contraction"))
     shrunk_out = 0
     for name in HEADLINES:
         z, held, contraction = judged(rows, name)
@@ -243,9 +238,8 @@ def classes(rows: Sequence[Row]) -> None:
     """How many were answered, how, and at what cost, by class."""
     print("Median and worst; CPU in seconds and over those of the imports. Coverage and RMS z: all headlines together,")
     print("of the benches that were answered.\n")
-    columns = ("class", "benches", "answered, %", "accepted by tier 1, %", *ANSWERS, "Pareto k", "effective draws")
-    columns += ("CPU s", "CPU / imports", "95 %, %", "RMS z")
-    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
+    counted = ("class | benches | answered, % | accepted by tier 1, %", *ANSWERS, "Pareto k | effective draws")
+    print(heading(*counted, "CPU s | CPU / imports | 95 %, % | RMS z"))
     for name, chosen in CLASSES.items():
         some = [row for row in rows if chosen(row)]
         if not some:
@@ -260,7 +254,7 @@ def classes(rows: Sequence[Row]) -> None:
         parts = [judged([row for row in some if row["answer"] in ANSWERED], headline)[:2] for headline in HEADLINES]
         z, held = (np.concatenate(part) for part in zip(*parts, strict=True))
         cells += [f"{100 * held.mean():.1f}", f"{np.sqrt(np.mean(z**2)):.2f}"] if len(z) else ["", ""]
-        print(f"| {' | '.join(cells)} |")
+        print(line(*cells))
     print()
 
 
@@ -280,9 +274,8 @@ def cost_of_unrecorded_homings(rows: Sequence[Row]) -> None:
 
 def listed(rows: Sequence[Row]) -> None:
     """Benches one by one: answer, draws, cost, and the headline furthest from its truth."""
-    columns = ("bench", "looks", "answer", "Pareto k", "effective of draws", "heaviest, %", "CPU s")
-    columns += ("furthest headline", "z", "problems")
-    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
+    titles = "bench | looks | answer | Pareto k | effective of draws | heaviest, % | CPU s | furthest headline | z"
+    print(heading(titles, "problems"))
     for row in rows:
         z = {name: (e["value"] - e["truth"]) / e["sd"] for name, e in row.get("headlines", {}).items() if e["sd"]}
         furthest = max(z, key=lambda name: abs(z[name]), default="")

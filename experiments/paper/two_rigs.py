@@ -61,12 +61,7 @@ CONTRAST_U = 0.005
 TOLD_LOG10 = 2.0
 AGAINST_LOG10 = np.log10(20)
 SPOT_SD_PX = 0.05
-QUANTITIES = (
-    "ratio_contrast_deg_per_step.pan",
-    "ratio_contrast_deg_per_step.tilt",
-    "backlash_deg.pan",
-    "backlash_deg.tilt",
-)
+QUANTITIES = tuple(f"{name}.{axis}" for name in ("ratio_contrast_deg_per_step", "backlash_deg") for axis in AXES)
 CLASSIC_SEEDS = 10
 NOTES = """\
 True contrasts of the literal rigs: about -2.6 (pan) and +1.1 (tilt) in 1e-3 deg/step, of the others 0. True backlashes
@@ -119,23 +114,16 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
         draws, entry = result.draws.physical, {"converged": bool(result.converged), "problems": list(result.problems)}
         entry["log_evidence"], entry["chi2"] = result.log_evidence, result.chi2
         entry["homing_side"] = result.homing_side
-        for axis in AXES:
-            for quantity in ("ratio_contrast_deg_per_step", "backlash_deg"):
-                column = draws[:, INDEX[f"{quantity}.{axis}"]]
-                ends = np.quantile(column, (0.025, 0.975)).tolist()
-                mode = float(result.mode.physical[INDEX[f"{quantity}.{axis}"]])
-                entry[f"{quantity}.{axis}"] = [mode, float(column.std()), *ends]
+        for quantity in QUANTITIES:
+            column, mode = draws[:, INDEX[quantity]], float(result.mode.physical[INDEX[quantity]])
+            entry[quantity] = [mode, float(column.std()), *np.quantile(column, (0.025, 0.975)).tolist()]
         if model == "both":
             entry["effective"] = effective_ratios(result)
         equal = draws[:, INDEX["degrees_per_step.tilt"]] / draws[:, INDEX["degrees_per_step.pan"]]
         entry["tilt over pan"] = [float(equal.mean()), float(equal.std())]
         row["models"][model] = entry
-    return {
-        **row,
-        "truth": {n: v for n, v in truth.parameters.items() if "step" in n},
-        "effective": truth.effective_deg_per_step(campaign),
-        "cpu_s": time.process_time() - start,
-    }
+    row |= {"truth": {n: v for n, v in truth.parameters.items() if "step" in n}}
+    return {**row, "effective": truth.effective_deg_per_step(campaign), "cpu_s": time.process_time() - start}
 
 
 def tasks(of: argparse.Namespace) -> list[tuple[str, str, int]]:
@@ -195,10 +183,8 @@ def classic_part() -> None:
             spread = np.sqrt(np.mean([v.var(ddof=1) for v in values]))
             cells.append(f"{np.mean(values):.6f}, {spread:.6f}")
         cells += [f"{np.min(ratios[kind], axis=0)[k]:.4f} to {np.max(ratios[kind], axis=0)[k]:.4f}" for kind in RIGS]
-        p = [
-            stats.ttest_ind(a, b, equal_var=False).pvalue
-            for a, b in zip(*(readings[kind, name] for kind in RIGS), strict=True)
-        ]
+        pairs = zip(*(readings[kind, name] for kind in RIGS), strict=True)
+        p = [stats.ttest_ind(a, b, equal_var=False).pvalue for a, b in pairs]
         every += p
         print(f"| {name} | {' | '.join(cells)} | {sum(x < 0.05 for x in p)} of {len(p)} |")
     hits = sum(p < 0.05 for p in every)
@@ -236,11 +222,8 @@ def table(rows: list[dict]) -> None:
             cells = [f"{sure}", f"{len(weights) - sure - misled}", f"{misled}", f"{np.sum(right < -AGAINST_LOG10)}"]
             cells.append(f"{np.median(weights):+.0f} ({min(weights):+.0f} to {max(weights):+.0f})" if weights else "-")
             both = [r["models"]["both"] for r in chosen if r["models"]["both"]["converged"]]
-            held = [
-                low <= row["effective"][d] <= high
-                for row in chosen
-                for d, (_, _, low, high) in row["models"]["both"].get("effective", {}).items()
-            ]
+            stated = [(row, row["models"]["both"].get("effective", {})) for row in chosen]
+            held = [low <= row["effective"][d] <= high for row, of in stated for d, (_, _, low, high) in of.items()]
             cells.append(f"{sum(held)} of {len(held)}")
             if both:
                 at = {n: np.median([b[n][:2] for b in both], axis=0) for n in QUANTITIES}

@@ -94,10 +94,10 @@ def one_case(task: tuple[str, str]) -> dict[str, object]:
 def by_nuts(joint: JointFit, setting: Setting) -> dict[str, object]:
     """NUTS of a posterior: its diagnostics and every quantity."""
     with jax.enable_x64(True):
-        nuts = hamiltonian(joint, setting)
-    run, rhat = nuts.run, max(row["rhat"] for row in nuts.rows.values())
+        run, rows = hamiltonian(joint, setting)
+    rhat = max(row["rhat"] for row in rows.values())
     missing = [f"R-hat {rhat:.4f}"] if rhat > RHAT_LIMIT else []
-    row = {"rhat": rhat, "ess": min(row["ess_bulk"] for row in nuts.rows.values()), "quantities": nuts.rows}
+    row = {"rhat": rhat, "ess": min(row["ess_bulk"] for row in rows.values()), "quantities": rows}
     row |= {"warmup_s": run.warmup_s, "sampling_s": run.sampling_s, "leapfrogs": run.leapfrogs}
     return row | {"divergences": run.divergences, "accepted": not missing, "missing": missing}
 

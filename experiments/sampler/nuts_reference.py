@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib.metadata import version
 
 import jax
@@ -77,16 +76,8 @@ def summary(values: np.ndarray) -> dict[str, float]:
     }
 
 
-@dataclass(frozen=True)
-class Found:
-    """A run, and the `summary` of every quantity."""
-
-    run: Run
-    rows: dict[str, dict[str, float]]
-
-
-def hamiltonian(joint: JointFit, setting: Setting) -> Found:
-    """NUTS of a fit's posterior in sheared coordinates; x64 has to be on."""
+def hamiltonian(joint: JointFit, setting: Setting) -> tuple[Run, dict[str, dict[str, float]]]:
+    """NUTS of a fit's posterior in sheared coordinates, and the `summary` of every quantity; x64 has to be on."""
     transport, cost = timed(lambda: build_transport(joint))
     size = transport.index.size
     print(f"{size} free coordinates, {len(transport.stiff)} sheared, transport {cost['wall_s']:.1f} s")
@@ -96,7 +87,7 @@ def hamiltonian(joint: JointFit, setting: Setting) -> Found:
 
     z_of, potential = potential_of(joint, transport)
     run = nuts(potential, size, setting)
-    return Found(run, {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()})
+    return run, {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()}
 
 
 def content_hash(reference: dict[str, object]) -> str:
@@ -145,8 +136,7 @@ def main() -> None:
     # What the tests ask importance sampling about; gears that repeat their errors are `agreement.py`'s.
     joint = fit(campaign, model=ModelChoice(perfect_gears=True))
     setting = Setting(CHAINS, options.warmup, options.draws, options.seed, options.limit)
-    nuts = hamiltonian(joint, setting)
-    run, rows = nuts.run, nuts.rows
+    run, rows = hamiltonian(joint, setting)
     worst = min(rows, key=lambda name: rows[name]["ess_bulk"])
     ess = rows[worst]["ess_bulk"]
     print(

@@ -118,7 +118,7 @@ def main() -> int:
             print(f"{part}: {time.perf_counter() - begun:.0f} s", flush=True)
             if done.returncode:
                 failed.append(part)
-    from experiments.speed.benchmarks.report import write
+    from experiments.speed.benchmarks.measure import write
 
     write(HERE / "README.md", list(PARTS))
     if failed:
