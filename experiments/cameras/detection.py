@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
+from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from tvsbayes.cameras import contour, detection, spot_fit, spot_noise, spot_window
 from tvsbayes.instrument.stereo_pair import Stereo
@@ -30,7 +31,7 @@ WIDTH, HEIGHT = 200, 160
 SIZES_PX, PEAKS_DN, AMBIENTS_DN = (1.5, 2.5, 4.0), (60.0, 180.0, 330.0, 600.0), (12.0, 60.0)
 CONTRASTS = (0.0, 0.4, 0.2, 0.6)
 PICTURES = 120
-METHODS = ("fit", "contour")
+METHODS, END = ("fit", "contour"), "ok | contour px | contour/bound | contour actual/stated | ok"
 
 
 def tasks(_: argparse.Namespace) -> list[tuple[float, float, float, float]]:
@@ -158,30 +159,24 @@ def beyond_linear() -> list[tuple[float, float]]:
     return result
 
 
-def table(rows: list[dict]) -> str:
-    """The answer in Markdown."""
-    out = [
-        "# Spot centres against the Cramer-Rao bound",
-        "",
-        f"`python -m experiments.cameras.detection run`, {PICTURES} pictures a cell, fixed seeds; errors are root mean "
-        "squares of u and v in px; actual/stated is the root mean square of error over stated sd. Peak in DN above "
-        "black: 330 and 600 are clipped at 251. `fit` learns the noise from the pictures of the cell, `contour` is "
-        "told the true contrast.",
-        "",
-        "| spot sd px | peak DN | ambient DN | contrast | bound px | fit px | fit/bound | fit actual/stated | ok "
-        "| contour px | contour/bound | contour actual/stated | ok |",
-        "|" + "---|" * 13,
-    ]
-    for r in sorted(rows, key=lambda r: (r["size"], r["contrast"], r["peak"], r["ambient"])):
-        line = [f"{r['size']:g}", f"{r['peak']:g}", f"{r['ambient']:g}", f"{r['contrast']:g}", f"{r['bound']:.4f}"]
-        for method in METHODS:
-            one = r[method]
-            if "rms" in one:
-                line += [f"{one['rms']:.4f}", f"{one['rms'] / r['bound']:.2f}", f"{one['ratio']:.2f}", str(one["ok"])]
-            else:
-                line += ["", "", "", str(one["ok"])]
-        out.append("| " + " | ".join(line) + " |")
-    return "\n".join(out)
+TEXT = f"""# Spot centres against the Cramer-Rao bound
+
+`python -m experiments.cameras.detection run`, {PICTURES} pictures a cell, fixed seeds; errors are root mean \
+squares of u and v in px; actual/stated is the root mean square of error over stated sd. Peak in DN above \
+black: 330 and 600 are clipped at 251. `fit` learns the noise from the pictures of the cell, `contour` is \
+told the true contrast.
+
+{heading("spot sd px | peak DN | ambient DN | contrast | bound px | fit px | fit/bound | fit actual/stated", END)}"""
+
+
+def cells_of(r: dict) -> list[str]:
+    """A cell's line of the table."""
+    cells = [f"{r[key]:g}" for key in ("size", "peak", "ambient", "contrast")] + [f"{r['bound']:.4f}"]
+    for one in (r[method] for method in METHODS):
+        known = "rms" in one
+        cells += [f"{one['rms']:.4f}", f"{one['rms'] / r['bound']:.2f}", f"{one['ratio']:.2f}"] if known else [""] * 3
+        cells.append(str(one["ok"]))
+    return cells
 
 
 def summary(rows: list[dict]) -> str:
@@ -215,13 +210,16 @@ def summary(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def page(rows: list[dict]) -> None:
+def table(rows: list[dict]) -> None:
     """Print the table."""
-    print(table(rows), summary(rows), sep="\n\n")
+    print(TEXT)
+    for row in sorted(rows, key=lambda r: (r["size"], r["contrast"], r["peak"], r["ambient"])):
+        print(line(*cells_of(row)))
+    print(f"\n{summary(rows)}")
     print("\nLeft out by the twin's linear map of a spot (paper twin, left camera, largest of 48 looks):\n")
     for sd, shift in beyond_linear():
         print(f"- spot sd {sd:.1f} px: {shift:.4f} px")
 
 
 if __name__ == "__main__":
-    study(__file__, __doc__, run_cell, ("size", "peak", "ambient", "contrast"), tasks, page)
+    study(__file__, __doc__, run_cell, ("size", "peak", "ambient", "contrast"), tasks, table)

@@ -88,16 +88,8 @@ class Scratch:
 
     def printed(self, command: str) -> str:
         """What a command prints, and its exit code where that is not 0."""
-        done = subprocess.run(
-            ["bash", "-c", command],
-            cwd=self.place,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=SECONDS,
-            check=False,
-        )
+        options = {"capture_output": True, "text": True, "errors": "replace", "timeout": SECONDS, "check": False}
+        done = subprocess.run(["bash", "-c", command], cwd=self.place, env=self.environment, **options)
         text = " / ".join(line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip())
         text = text.replace(f"{self.place}/", "").replace(str(self.place), ".")
         text = text if len(text) <= CHARS else f"{text[: CHARS // 2]} ... {text[-CHARS // 2 :]}"

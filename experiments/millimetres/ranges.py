@@ -145,10 +145,7 @@ def table(rows: list[dict]) -> None:
     twins_table(good)
     for protocol in PROTOCOLS:
         drawn_table(protocol, [r for r in rows if r["name"] == protocol])
-    if any(r["name"] in PROTOCOLS for r in good):
-        draw(good)
-    else:
-        print("\nDrawn rigs: not run yet.")
+    draw(good)
 
 
 def draw(rows) -> None:

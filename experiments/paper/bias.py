@@ -22,6 +22,7 @@ from experiments.common.command_line import study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import fit_from_truth
 from experiments.common.headlines import true_headlines
+from experiments.common.page import heading, line
 from experiments.common.rigs import drawn_truth, mounted_rig
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -70,24 +71,21 @@ def drawn_campaign(factor: str, level: float, seed: int):
 def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
     """Both estimators, or the classic one alone."""
     factor, level, seed, joint = task
-
     campaign, truth = drawn_campaign(factor, level, seed)
     row: dict[str, object] = {"factor": factor, "level": level, "seed": seed, "joint": joint}
     if not joint:
         true = truth.effective_deg_per_step(campaign)
-        return row | {
-            "classic": {
-                d: {
-                    "error": r.mean_deg_per_step / true[d] - 1,
-                    "type_a": r.interval95_type_a[0] <= true[d] <= r.interval95_type_a[1],
-                    "gum": r.interval95_gum[0] <= true[d] <= r.interval95_gum[1],
-                }
-                for d, r in classic(campaign).directions.items()
-                if r is not None
+        row["classic"] = {
+            d: {
+                "error": r.mean_deg_per_step / true[d] - 1,
+                "type_a": r.interval95_type_a[0] <= true[d] <= r.interval95_type_a[1],
+                "gum": r.interval95_gum[0] <= true[d] <= r.interval95_gum[1],
             }
+            for d, r in classic(campaign).directions.items()
+            if r is not None
         }
+        return row
     use_compilation_cache()
-
     try:
         fit = fit_from_truth(campaign, truth)
         true = true_headlines(truth, campaign, fit.reference_pose_rad)
@@ -96,11 +94,8 @@ def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
             draws, at = fit.draws.effective_deg_per_step[:, k], fit.mode.effective_deg_per_step[k]
             low, high = np.quantile(draws, [0.025, 0.975])
             t = true[f"effective {d}"]
-            row["values"][d] = {
-                "error": float(at / t - 1),
-                "inside": bool(low <= t <= high),
-                "z": float((at - t) / draws.std()),
-            }
+            z = float((at - t) / draws.std())
+            row["values"][d] = {"error": float(at / t - 1), "inside": bool(low <= t <= high), "z": z}
     except Exception as error:
         row |= {"converged": False, "problems": [repr(error)]}
     return row
@@ -132,6 +127,12 @@ def cell(rows: list[dict], axis: str, estimator: str) -> dict[str, float]:
     return figures
 
 
+HEADING = heading(
+    "level | axis | classic n | mean error, % | RMS, % | type A holds | GUM holds",
+    "joint n | mean error, % | RMS, % | 95 % holds | RMS z",
+)
+
+
 def table(rows: list[dict]) -> None:
     """Markdown and figure of everything that came out."""
     title = "Bias and coverage, one imperfection at a time"
@@ -140,11 +141,7 @@ def table(rows: list[dict]) -> None:
     shown: dict[tuple[str, str, str], list[tuple[float, dict[str, float]]]] = {}
     for factor, levels in LEVELS.items():
         print(f"## {factor}: {UNITS[factor]}\n")
-        print(
-            "| level | axis | classic n | mean error, % | RMS, % | type A holds | GUM holds "
-            "| joint n | mean error, % | RMS, % | 95 % holds | RMS z |"
-        )
-        print("|" + "---|" * 12)
+        print(HEADING)
         for level in levels:
             mine = [r for r in rows if r["factor"] == factor and r["level"] == level]
             plain = [r for r in mine if "classic" in r]
@@ -162,7 +159,7 @@ def table(rows: list[dict]) -> None:
                     texts += [f"{c[inside]:.0f} %" for inside in insides]
                     if name == "joint":
                         texts.append(f"{c['rms_z']:.2f}")
-                print("| " + " | ".join(texts) + " |")
+                print(line(*texts))
         print()
     bad = [r for r in rows if r["joint"] and not r["converged"]]
     print(f"{sum(r['joint'] for r in rows)} fits, {len(bad)} not converged" + (":" if bad else "."))

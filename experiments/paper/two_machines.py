@@ -52,15 +52,9 @@ def four_point_plan(
             orders += [("home", *start), ("place", None, None, "d1")]
             if other_side[repeat % len(other_side)]:
                 orders += [("move", *beyond), ("move", *start)]
-            orders += [
-                ("look", None, None, None, number, 1),
-                ("place", None, None, "d2"),
-                ("look", None, None, None, number, 2),
-                ("move", *end),
-                ("look", None, None, None, number, 3),
-                ("place", None, None, "d1"),
-                ("look", None, None, None, number, 4),
-            ]
+            looks = [("look", None, None, None, number, point) for point in (1, 2, 3, 4)]
+            there, back = (("place", None, None, sheet) for sheet in ("d2", "d1"))
+            orders += [looks[0], there, looks[1], ("move", *end), looks[2], back, looks[3]]
     return numbered(orders)
 
 

@@ -24,6 +24,7 @@ from scipy import stats
 
 from experiments.common.command_line import by_seed, study
 from experiments.common.headlines import SHRINK
+from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output
 from tvsbayes.instrument.parameters import TARGETS
@@ -33,7 +34,7 @@ from tvsbayes.planning.planner import plan
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds, share_interval95
 from tvsbayes.studies.rows import StudyRow
-from tvsbayes.studies.study import study_result
+from tvsbayes.studies.study import StudyResult, study_result
 from tvsbayes.studies.study_job import StudyJob, study_row
 
 ROWS, DESIGNS = output(__file__, "prediction.jsonl"), output(__file__, "designs.json")
@@ -41,7 +42,7 @@ NAMES = ("paper", "grid", "n80", "n95")
 KEYS = ("name", "index")
 SEED = 2025
 """Of the campaigns; the planner's own draws have seed 0."""
-DRAWS = 400
+DRAWS, END = 400, "bounds of the stated | verdict"
 
 
 def design_file(name: str) -> Path:
@@ -77,56 +78,51 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
     return {"name": name, **study_row(job_of(name), index).as_json()}
 
 
+def headlines_table(name: str, job: StudyJob, result: StudyResult) -> None:
+    """Errors of the headlines of a design over what was predicted and reported."""
+    low, high = rms_bounds(result.converged)
+    looks = sum(step.action == "look" for step in job.steps)
+    print(f"## {name}: {looks} spots, {result.campaigns} campaigns, {result.converged} fits converged\n")
+    titles = f"headline | RMS z, predicted sd ({low:.2f}-{high:.2f}) | RMS z, reported sd | predicted / RMS error"
+    print(heading(titles, f"95 % interval holds truth | verdict | with sd x {SHRINK}"))
+    for quantity in TARGETS:
+        h = result.headlines[quantity]
+        verdict = "within" if low <= h.rms_predicted <= high else "OUTSIDE"
+        shrunk = "fails" if not low <= h.rms_predicted / SHRINK <= high else "passes"
+        cells = (f"{value:.3f}" for value in (h.rms_predicted, h.rms_z, h.predicted_over_rms))
+        print(line(quantity, *cells, f"{100 * h.coverage['95']:.1f} %", verdict, shrunk))
+    print()
+
+
+def assurance_line(name: str, stated: dict, result: StudyResult) -> str:
+    """The counted assurance of a design beside the stated one."""
+    n, a, se = result.campaigns, stated["assurance"], stated["assurance_se"]
+    ends = share_interval95(round(result.assurance * n), n)
+    # The stated value is an estimate from draws: its error widens the bounds.
+    exact, wide = binomial_bounds(n, a), stats.norm.isf(0.5e-4) * se
+    bounds = max(0.0, exact[0] - wide), min(1.0, exact[1] + wide)
+    verdict = "within" if bounds[0] <= result.assurance <= bounds[1] else "OUTSIDE"
+    shares = (f"{100 * low:.0f}-{100 * high:.0f} %" for low, high in (ends, bounds))
+    cells = (stated["experiments"], stated["looks"], f"{stated['minutes']:.1f}", f"{100 * a:.1f} +- {100 * se:.1f} %")
+    return line(name, *cells, f"{100 * result.assurance:.1f} % of {n}", *shares, verdict)
+
+
 def table(rows: list[dict]) -> None:
     """Markdown of everything that came out."""
-    kept = json.loads(DESIGNS.read_text())
+    kept, results = json.loads(DESIGNS.read_text()), {}
     print("# Predicted and actual uncertainty of plans\n")
     print("Written by `python -m experiments.planning.prediction table`; bounds at 1e-4.\n")
     for name in NAMES:
         job = job_of(name)
         chosen = [StudyRow.from_json(r) for r in rows if r["name"] == name and r["design"] == job.key]
-        if not chosen:
-            continue
-        result = study_result(job, chosen)
-        low, high = rms_bounds(result.converged)
-        looks = sum(step.action == "look" for step in job.steps)
-        print(f"## {name}: {looks} spots, {result.campaigns} campaigns, {result.converged} fits converged\n")
-        print(
-            f"| headline | RMS z, predicted sd ({low:.2f}-{high:.2f}) | RMS z, reported sd | predicted / RMS error ",
-            end="",
-        )
-        print(f"| 95 % interval holds truth | verdict | with sd x {SHRINK} |\n|---|---|---|---|---|---|---|")
-        for quantity in TARGETS:
-            h = result.headlines[quantity]
-            verdict = "within" if low <= h.rms_predicted <= high else "OUTSIDE"
-            shrunk = "fails" if not low <= h.rms_predicted / SHRINK <= high else "passes"
-            cells = (
-                f"{h.rms_predicted:.3f} | {h.rms_z:.3f} | {h.predicted_over_rms:.3f} | {100 * h.coverage['95']:.1f} %"
-            )
-            print(f"| {quantity} | {cells} | {verdict} | {shrunk} |")
-        print()
+        if chosen:
+            results[name] = study_result(job, chosen)
+            headlines_table(name, job, results[name])
     print("## Assurance\n")
-    print(
-        "| design | experiments | spots | minutes | stated | counted | 95 % interval | bounds of the stated | verdict |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
+    print(heading("design | experiments | spots | minutes | stated | counted | 95 % interval", END))
     for name in ("n80", "n95"):
-        job, stated = job_of(name), kept[name]
-        chosen = [StudyRow.from_json(r) for r in rows if r["name"] == name and r["design"] == job.key]
-        if not chosen:
-            continue
-        result = study_result(job, chosen)
-        n, a, se = result.campaigns, stated["assurance"], stated["assurance_se"]
-        hits = round(result.assurance * n)
-        low, high = share_interval95(hits, n)
-        # The stated value is an estimate from draws: its error widens the bounds.
-        exact, wide = binomial_bounds(n, a), stats.norm.isf(0.5e-4) * se
-        bounds = max(0.0, exact[0] - wide), min(1.0, exact[1] + wide)
-        verdict = "within" if bounds[0] <= result.assurance <= bounds[1] else "OUTSIDE"
-        sizes = f"{stated['experiments']} | {stated['looks']} | {stated['minutes']:.1f}"
-        counted = f"{100 * result.assurance:.1f} % of {n} | {100 * low:.0f}-{100 * high:.0f} %"
-        share = f"{100 * a:.1f} +- {100 * se:.1f} %"
-        print(f"| {name} | {sizes} | {share} | {counted} | {100 * bounds[0]:.0f}-{100 * bounds[1]:.0f} % | {verdict} |")
+        if name in results:
+            print(assurance_line(name, kept[name], results[name]))
     failed = [r for r in rows if not r["converged"]]
     seconds = np.median([r["seconds"] for r in rows])
     print(f"\n{len(rows)} rows, median {seconds:.1f} s; {len(failed)} fits failed.")

@@ -21,6 +21,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.command_line import print_only
+from experiments.common.page import heading, line
 from experiments.common.reference_samplers import AXES
 from experiments.common.rigs import mounted_rig, numbered
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
@@ -146,17 +147,10 @@ def main() -> None:
         latent = parts["range_mm"].stop - len(free)
         linear = whitening(density, joint.z[free], joint.covariance[np.ix_(free, free)], latent)
         centre, root = (jnp.asarray(x) for x in linear)
-        kernel = NUTS(
-            potential_fn=lambda e: -density(centre + root @ e), adapt_mass_matrix=False, target_accept_prob=0.97
-        )
-        chains = MCMC(
-            kernel,
-            num_warmup=WARMUP,
-            num_samples=DRAWS,
-            num_chains=CHAINS,
-            chain_method="sequential",
-            progress_bar=False,
-        )
+        options = {"adapt_mass_matrix": False, "target_accept_prob": 0.97}
+        kernel = NUTS(potential_fn=lambda e: -density(centre + root @ e), **options)
+        counts = {"num_warmup": WARMUP, "num_samples": DRAWS, "num_chains": CHAINS}
+        chains = MCMC(kernel, **counts, chain_method="sequential", progress_bar=False)
         generator = np.random.default_rng(1)
         begin = jnp.asarray(generator.standard_normal((CHAINS, len(root))))
         chains.run(jax.random.key(2), init_params=begin, extra_fields=("diverging",))
@@ -173,19 +167,15 @@ def main() -> None:
     print(f"{sizes['z']} parameters. NUTS: {CHAINS} x {DRAWS} draws, R-hat at most {rhat.max():.4f}, least bulk ESS")
     print(f"{ess.min():.0f}, {divergences} divergences. tvsbayes: converged {posterior.converged},")
     print(f"{posterior.convergence.steps} steps.\n")
-    print(
-        "| parameter (prior-normal coordinate) | mean, sds | sd, % | "
-        + " | ".join(QUANTILES)
-        + " (Monte Carlo errors) |"
-    )
-    print("|---|---|---|---|---|---|")
+    ends = " | ".join(QUANTILES)
+    print(heading("parameter (prior-normal coordinate) | mean, sds | sd, %", f"{ends} (Monte Carlo errors)"))
     for k, index in enumerate(free):
         a, b = ours[..., k], z[..., k]
         cells = [f"{(a.mean() - b.mean()) / b.std():+.3f}", f"{100 * (a.std() / b.std() - 1):+.1f}"]
         for probability in QUANTILES.values():
             error = np.hypot(*(float(array_stats.mcse(x, method="quantile", prob=probability, **AXES)) for x in (a, b)))
             cells.append(f"{(np.quantile(a, probability) - np.quantile(b, probability)) / error:+.2f}")
-        print(f"| {NAMES[index]} | {' | '.join(cells)} |")
+        print(line(NAMES[index], *cells))
 
 
 if __name__ == "__main__":

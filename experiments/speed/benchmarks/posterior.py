@@ -94,16 +94,9 @@ class Contenders:
             figures = self.worst(z.reshape(*shape[:2], -1))
             before_s = built["cpu_s"] + run.warmup_s
             cpu_s = before_s + run.sampling_s
-            return {
-                **figures,
-                "cpu_s": cpu_s,
-                "rate": figures["ess"] / cpu_s,
-                "trusted_s": before_s + run.sampling_s * TRUSTED / figures["ess"],
-                "sampling_rate": figures["ess"] / run.sampling_s,
-                "compile_s": run.compile_s,
-                "leapfrogs": run.leapfrogs,
-                "divergences": run.divergences,
-            }
+            row = {**figures, "cpu_s": cpu_s, "rate": figures["ess"] / cpu_s, "compile_s": run.compile_s}
+            row |= {"trusted_s": before_s + run.sampling_s * TRUSTED / figures["ess"], "leapfrogs": run.leapfrogs}
+            return row | {"sampling_rate": figures["ess"] / run.sampling_s, "divergences": run.divergences}
 
         return turn
 
