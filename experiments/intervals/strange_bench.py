@@ -96,14 +96,10 @@ class Looks:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the owner of the cameras did: views of a board, and what OpenCV made of them.
+    """What the owner of the cameras did: views of a board, and what OpenCV made of them, with its RMS.
 
-    Attributes:
-        board: inner corners by row and column, side of a square in mm.
-        corners: found, of both cameras, each (views, corners, 2), px.
-        fix_k3: whether k3 was held at 0.
-        matrices: M1 D1 M2 D2 R T.
-        rms_px: as `cv2.stereoCalibrate` returns it.
+    `board`: inner corners by row and column, side of a square in mm; `corners` of both cameras, each (views, corners,
+    2), px; `fix_k3`: whether k3 was held at 0; `matrices`: M1 D1 M2 D2 R T.
     """
 
     board: tuple[int, int, float]

@@ -63,10 +63,10 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
         scatter = f"{middle:.6f} ({low:.6f} to {high:.6f})"
         type_a = middle / np.sqrt(directions[name].n)
         print(f"| {name} | {means[:, k].mean():.6f} | {spread:.6f} | {type_a:.6f} | {apart:+.1f} | {scatter} |")
+    print("\nUp and down scatter more than their u of type A says: pan stands still for all 48 of them,", end=" ")
     print(
-        "\nUp and down scatter more than their u of type A says: pan stands still for all 48 of them, so that one stop"
+        f"so that one stop\nerror of pan ({truth.parameters['stop_sd_deg.left']:.2f} deg) is common to all and turns the azimuth."
     )
-    print(f"error of pan ({truth.parameters['stop_sd_deg.left']:.2f} deg) is common to all and turns the azimuth.")
     true = truth.effective_deg_per_step(campaign)
     shown = ", ".join(f"{name} {true[name]:.5f}" for name in DIRECTIONS)
     interval = {name: directions[name].interval95_type_a for name in DIRECTIONS}
@@ -99,20 +99,23 @@ def worked_example(paper: dict[str, tuple[int, float, float]]) -> None:
     print(f"| {steps} | {chain:.8f} |")
     _, mean, sd = paper["left"]
     low, high = (chain - mean) / sd - 0.01 / steps / sd, (chain - mean) / sd + 0.01 / steps / sd
+    print(f"\nOne experiment against the Table's left: {low:+.2f} to {high:+.2f} of its sd", end=" ")
     print(
-        f"\nOne experiment against the Table's left: {low:+.2f} to {high:+.2f} of its sd (angles printed to 0.01 deg);"
+        f"(angles printed to 0.01 deg);\ntwo-sided p of a single value {2 * stats.t.sf(abs(low + high) / 2, 23):.2f}."
     )
-    print(f"two-sided p of a single value {2 * stats.t.sf(abs(low + high) / 2, 23):.2f}.")
+
+
+TEXT = """# Table 1 by the classic estimator
+
+Written by `python -m experiments.paper.table1`; deg/step. The twin was solved to give it: see the script.
+"""
 
 
 def main() -> None:
     """Print the page."""
     print_only(__doc__)
     paper = paper_values()
-    print("# Table 1 by the classic estimator\n")
-    print(
-        "Written by `python -m experiments.paper.table1`; deg/step. The twin was solved to give it: see the script.\n"
-    )
+    print(TEXT)
     table(paper)
     worked_example(paper)
 

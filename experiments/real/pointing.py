@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import act, parser
+from experiments.common.page import heading
 from experiments.common.rows import append_row, output, read_rows
 from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
 from tvsbayes.estimators.joint_fit import fit
@@ -98,21 +99,13 @@ def night(file: Path) -> dict[str, object]:
         mean = float(weights @ draws[name])
         return sign * ARCSEC * mean, ARCSEC * float(np.sqrt(weights @ (draws[name] - mean) ** 2))
 
-    return {
-        "file": file.name,
-        "stars": len(stars),
-        "least": {n: (float(v), float(e)) for n, v, e in zip(TERMS, terms, errors, strict=True)},
-        "least_rms": float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
-        "classic": {n: [s * ARCSEC * by_name[t][0], ARCSEC * by_name[t][1]] for n, (t, s) in TERMS.items()},
-        "classic_rms": ARCSEC * classic.rms_deg,
-        "joint": {n: stated(*term) for n, term in TERMS.items()},
-        "gears": {name: stated(name) for name in GEARS},
-        "weak": [weak.text for weak in weak_directions(model, moved_directions(model))],
-        "answer": posterior.convergence.answer,
-        "problems": list(model.problems),
-        "left_out": predicted(campaign),
-        "cpu_s": time.process_time() - began,
-    }
+    row = {"file": file.name, "stars": len(stars), "left_out": predicted(campaign), "problems": list(model.problems)}
+    row["least"] = {n: (float(v), float(e)) for n, v, e in zip(TERMS, terms, errors, strict=True)}
+    row["classic"] = {n: [s * ARCSEC * by_name[t][0], ARCSEC * by_name[t][1]] for n, (t, s) in TERMS.items()}
+    row |= {"least_rms": float(np.sqrt(np.mean(np.sum(left**2, axis=1)))), "classic_rms": ARCSEC * classic.rms_deg}
+    row |= {"joint": {n: stated(*term) for n, term in TERMS.items()}, "gears": {name: stated(name) for name in GEARS}}
+    row["weak"] = [weak.text for weak in weak_directions(model, moved_directions(model))]
+    return {**row, "answer": posterior.convergence.answer, "cpu_s": time.process_time() - began}
 
 
 def between(folder: Path) -> dict[str, object]:
@@ -152,9 +145,7 @@ def table(_: argparse.Namespace) -> None:
     for row in rows:
         held = row["left_out"]
         rms, (low, high) = float(np.sqrt(np.mean(np.square(held["z"])))), rms_bounds(len(held["z"]))
-        print(
-            f"\n## `{row['file']}`, {row['stars']} stars\n\n| term | least squares | exact | joint |\n|---|---|---|---|"
-        )
+        print(f"\n## `{row['file']}`, {row['stars']} stars\n\n{heading('term | least squares | exact | joint')}")
         for name in TERMS:
             cells = (f"{row[kind][name][0]:.2f} ({row[kind][name][1]:.2f})" for kind in ("least", "classic", "joint"))
             print(f"| {name} | {' | '.join(cells)} |")

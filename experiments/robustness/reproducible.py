@@ -50,6 +50,9 @@ SAMPLE_MINUTES = 0.1
 STEPS_COMPARED = 20
 TOLERANCE_SD = 1e-3
 """Of a posterior sd: a thousandth of the uncertainty changes no digit that a report prints (two digits of u)."""
+TOLERANCE_TEXT = f"""
+Tolerance: {TOLERANCE_SD:g} of a posterior sd. Levenberg-Marquardt stops at a step far below it, sums of some \
+thousand float64 terms round at 1e-13 of their size, and a report prints two digits of u."""
 PACKAGES = ("numpy", "scipy", "jax", "jaxlib", "emcee")
 
 
@@ -181,16 +184,11 @@ def table(_: argparse.Namespace) -> None:
     for name, one in runs.items():
         for engine, rows in one.get("study", {}).items():
             serial = one["study"]["serial"]
-            same = (
-                rows if isinstance(rows, str) else f"{len(rows)} rows, " + ("the same" if rows == serial else "OTHER")
-            )
-            print(f"- study, run `{name}`, engine {engine}: {same}")
+            same = f"{len(rows)} rows, {'the same' if rows == serial else 'OTHER'}"
+            print(f"- study, run `{name}`, engine {engine}: {rows if isinstance(rows, str) else same}")
     versions = {json.dumps(one["versions"], sort_keys=True) for one in runs.values()}
     print(f"\nPackages: {'; '.join(sorted(versions))}.")
-    print(
-        f"\nTolerance: {TOLERANCE_SD:g} of a posterior sd. Levenberg-Marquardt stops at a step far below it, sums of "
-        "some thousand float64 terms round at 1e-13 of their size, and a report prints two digits of u."
-    )
+    print(TOLERANCE_TEXT)
 
 
 if __name__ == "__main__":

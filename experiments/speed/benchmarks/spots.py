@@ -87,9 +87,7 @@ def photutils_centre(path: str, kind: str) -> np.ndarray:
     """Centre of the spot of a picture by photutils, px, NaN where our window finds none."""
     from photutils import centroids
 
-    function: Callable = {"com": centroids.centroid_com, "bright": centroids.centroid_com}.get(
-        kind, centroids.centroid_2dg
-    )
+    function: Callable = centroids.centroid_2dg if kind == "2dg" else centroids.centroid_com
     patch = spot_window.patch_around(cv2.imread(path))
     if isinstance(patch, str):
         return np.full(2, np.nan)

@@ -44,14 +44,8 @@ def measure(bench: Bench) -> None:
 
             with tempfile.TemporaryDirectory() as folder:
                 begun = time.perf_counter()
-                study(
-                    job,
-                    campaigns,
-                    StudyRows(Path(folder) / "rows.jsonl"),
-                    engine=name.split(",")[0],
-                    workers=workers,
-                    progress=report,
-                )
+                options = {"engine": name.split(",")[0], "workers": workers, "progress": report}
+                study(job, campaigns, StudyRows(Path(folder) / "rows.jsonl"), **options)
                 whole = time.perf_counter() - begun
             # Every worker's first campaign carries its start and the reading of compiled functions.
             steady = (campaigns - workers) / max(times[-1] - times[workers - 1], 1e-9)
