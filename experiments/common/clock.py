@@ -6,20 +6,13 @@ import time
 from collections.abc import Callable
 
 
-def seconds(work: Callable[[], object]) -> float:
-    """Wall clock of one call."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
-def shortest(work: Callable[[], object], repeats: int) -> float:
-    """Wall clock of the fastest of several calls."""
-    return min(seconds(work) for _ in range(repeats))
-
-
 def timed[Result](work: Callable[[], Result]) -> tuple[Result, dict[str, float]]:
     """What `work` returns, and its wall and CPU seconds as a row holds them."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = work()
     return result, {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
+
+
+def seconds(work: Callable[[], object], repeats: int = 1) -> float:
+    """Wall clock of the fastest of several calls."""
+    return min(timed(work)[1]["wall_s"] for _ in range(repeats))

@@ -72,27 +72,24 @@ def numbered(orders: Sequence[tuple]) -> tuple[PlanStep, ...]:
     return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
 
 
-def small_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
-    """Both axes swept there and back twice, 24 spots and moves per sheet, after one homing.
-
-    Two sheets give twelve stops in every direction.
-    """
+def swept(sheets: Sequence[str], poses: Sequence[tuple[int, int]]) -> tuple[PlanStep, ...]:
+    """A look at every pose, on each sheet, after one homing."""
     orders: list[tuple] = [("home", 0, 0)]
     for sheet in sheets:
         orders.append(("place", None, None, sheet))
-        for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP * 2] + [(CROSSING[0], t) for t in TILT_SWEEP * 2]:
-            orders += [("move", pan, tilt), ("look",)]
+        for pose in poses:
+            orders += [("move", *pose), ("look",)]
     return numbered(orders)
+
+
+def small_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
+    """Both axes swept there and back twice, 24 spots and moves per sheet: for two, twelve stops in every direction."""
+    return swept(sheets, [(p, CROSSING[1]) for p in PAN_SWEEP * 2] + [(CROSSING[0], t) for t in TILT_SWEEP * 2])
 
 
 def dense_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
     """30 spots per sheet, both axes driven between any two: every spot has new stops of both axes; 60 spots for two."""
-    orders: list[tuple] = [("home", 0, 0)]
-    for sheet in sheets:
-        orders.append(("place", None, None, sheet))
-        for look in range(30):
-            orders += [("move", PAN_SWEEP[look % len(PAN_SWEEP)], TILT_STEPS[look % len(TILT_STEPS)]), ("look",)]
-    return numbered(orders)
+    return swept(sheets, list(zip(PAN_SWEEP * 5, TILT_STEPS * 3, strict=True)))
 
 
 def creeping_rig() -> Rig:

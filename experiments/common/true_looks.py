@@ -6,6 +6,7 @@ range, and the aperture reads it. Points in mm of the frame T, readings in degre
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,23 +18,18 @@ from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.twin.gear_errors import PERFECT
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign
 from tvsbayes.twin.true_rig import Truth
 
 ELLIPSOID = stats.chi2.isf(0.05, 3)
 """d^T S^-1 d of the border of a 95 % ellipsoid."""
+RANGE_MM = 250.0, 1200.0
 ESTIMATORS = ("nominal", "classic", "joint")
 
 
 @dataclass
 class TrueLooks:
-    """Looks of one true rig.
-
-    Attributes:
-        truth: of the rig.
-        convention: of its aperture.
-        generator: of sides, stop errors and aperture noise.
-        counters, sides, points, readings: of every look, in order.
-    """
+    """Looks of one true rig and its aperture's convention: counters, sides, points, readings of each, in order."""
 
     truth: Truth
     convention: str
@@ -81,6 +77,21 @@ class TrueLooks:
             points = assumed_geometry(simple, *self.counters_steps.T).points(np.array(self.readings), azimuth)
             result[name] = points.T - self.points_mm
         return result
+
+
+def looks_around(
+    simulated: SimulatedCampaign, range_steps: np.ndarray, outside: Sequence[bool], seed: int
+) -> TrueLooks:
+    """A look for every entry: inside the counters (2, 2) of a campaign, or up to half their span beyond their ends."""
+    generator = np.random.default_rng([seed, 7])
+    looks = TrueLooks(simulated.truth, simulated.campaign.rig.aperture_convention, generator)
+    low, high = range_steps.T
+    for beyond in outside:
+        place = generator.uniform(0, 1, 2)
+        if beyond:
+            place = np.where(generator.uniform(size=2) < 0.5, -0.5 * place, 1 + 0.5 * place)
+        looks.add(np.round(low + place * (high - low)), span_mm=RANGE_MM)
+    return looks
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray, usable: np.ndarray, otherwise: float) -> np.ndarray:

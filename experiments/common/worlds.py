@@ -13,12 +13,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from experiments.common.rigs import drawn_truth
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.twin.gear_errors import AxisErrors, Waves
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
-from tvsbayes.twin.true_rig import Truth, draw_truth
+from tvsbayes.twin.true_rig import Truth
 
 World = Literal["pinion", "tooth", "step", "warm-up"]
 WORLDS: tuple[World, ...] = get_args(World)
@@ -72,8 +73,7 @@ def gear_errors_of(world: World, size_deg: float, seed: int) -> dict[str, AxisEr
 
 def truth_of(rig: Rig, world: World, size_deg: float, seed: int) -> Truth:
     """The rig that `simulate` draws from the seed, with these errors in place of any that its gears would repeat."""
-    truth = draw_truth(rig, np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
-    return truth.with_gears(gear_errors_of(world, size_deg, seed))
+    return drawn_truth(rig, seed).with_gears(gear_errors_of(world, size_deg, seed))
 
 
 def campaign_of(rig: Rig, plan: Iterable[PlanStep], world: World, size_deg: float, seed: int) -> SimulatedCampaign:

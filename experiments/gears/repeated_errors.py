@@ -24,7 +24,7 @@ from experiments.common.command_line import study
 from experiments.common.headlines import HEADLINES, JUDGED, judged, limits, verdict
 from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.true_looks import TrueLooks
+from experiments.common.true_looks import TrueLooks, looks_around
 from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
@@ -41,7 +41,7 @@ PROTOCOLS = ("paper", "mixed", "grid", "planned")
 WORLDS = (("pinion", 0.05), ("pinion", 0.1), ("pinion", 0.2), ("tooth", 0.05), ("step", 0.1), ("warm-up", 0.1))
 ROUNDS = 8
 WITHIN = 8
-RANGE_MM = 250.0, 1200.0
+OUTSIDE = [False] * WITHIN + [True] * WITHIN
 PLACES = "inside", "outside"
 MODELS = {"repeating": ModelChoice(), "perfect": ModelChoice(perfect_gears=True)}
 BESIDE = 60
@@ -53,18 +53,6 @@ def simulated_in(world: str, size_deg: float, protocol: str, seed: int) -> Simul
     if world == "priors":
         return simulate(rig, plan, seed, aperture=True)
     return campaign_of(rig, plan, world, size_deg, seed)
-
-
-def looks_at(simulated: SimulatedCampaign, range_steps: np.ndarray, seed: int) -> TrueLooks:
-    """`WITHIN` looks inside the counters of the campaign, then as many outside."""
-    looks = TrueLooks(simulated.truth, simulated.campaign.rig.aperture_convention, np.random.default_rng([seed, 7]))
-    low, high = range_steps.T
-    for k in range(2 * WITHIN):
-        place = looks.generator.uniform(0, 1, 2)
-        if k >= WITHIN:
-            place = np.where(looks.generator.uniform(size=2) < 0.5, -0.5 * place, 1 + 0.5 * place)
-        looks.add(np.round(low + place * (high - low)), span_mm=RANGE_MM)
-    return looks
 
 
 def located(calibration, looks: TrueLooks, seed: int) -> dict[str, object]:
@@ -109,7 +97,7 @@ def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
                 "least_ess": weights.least_ess.value,
                 "shift_named": any("zero" in w.text for w in weak_directions(result, moved_directions(result))),
                 "headlines": judged(posterior, simulated.truth, simulated.campaign),
-                "points": located(calibration, looks_at(simulated, calibration.range_steps, seed), seed),
+                "points": located(calibration, looks_around(simulated, calibration.range_steps, OUTSIDE, seed), seed),
                 "cpu_s": time.process_time() - start,
             }
         except Exception as error:

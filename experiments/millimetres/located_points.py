@@ -23,33 +23,17 @@ from experiments.common.command_line import study
 from experiments.common.headlines import marked
 from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
+from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, looks_around, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
-from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.location import locate
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.statistics.chances import BOUND, binomial_bounds
-from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
+from tvsbayes.twin.simulated_campaign import simulate
 
 PROTOCOL = "mixed"
-RANGE_MM = 250.0, 1200.0
 WITHIN = 20
 KINDS = "inside", "outside"
-
-
-def looks_at(simulated: SimulatedCampaign, calibration: Calibration, seed: int) -> TrueLooks:
-    """A look inside the counters of the campaign, one outside, and `WITHIN` more inside."""
-    generator = np.random.default_rng([seed, 7])
-    looks = TrueLooks(simulated.truth, simulated.campaign.rig.aperture_convention, generator)
-    low, high = calibration.range_steps.T
-    for k in range(2 + WITHIN):
-        place = generator.uniform(0, 1, 2)
-        if k == 1:
-            # Beyond one end or the other of both axes.
-            place = np.where(generator.uniform(size=2) < 0.5, -0.5 * place, 1 + 0.5 * place)
-        looks.add(np.round(low + place * (high - low)), span_mm=RANGE_MM)
-    return looks
 
 
 def one_rig(task: tuple[int]) -> dict[str, object]:
@@ -66,7 +50,9 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
         calibration = calibration_of(result, seed=seed)
     except Exception as error:
         return {**row, "problem": repr(error)}
-    looks = looks_at(simulated, calibration, seed)
+    # A look inside the counters of the campaign, one outside, and more inside.
+    outside = [k == 1 for k in range(2 + WITHIN)]
+    looks = looks_around(simulated, calibration.range_steps, outside, seed)
     counters, points = looks.counters_steps, looks.points_mm
     located = locate(calibration, counters[:, 0], counters[:, 1], looks.readings, looks.sides, seed=seed)
     error = located.xyz_mm - points

@@ -64,9 +64,8 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
         type_a = middle / np.sqrt(directions[name].n)
         print(f"| {name} | {means[:, k].mean():.6f} | {spread:.6f} | {type_a:.6f} | {apart:+.1f} | {scatter} |")
     print("\nUp and down scatter more than their u of type A says: pan stands still for all 48 of them,", end=" ")
-    print(
-        f"so that one stop\nerror of pan ({truth.parameters['stop_sd_deg.left']:.2f} deg) is common to all and turns the azimuth."
-    )
+    print(f"so that one stop\nerror of pan ({truth.parameters['stop_sd_deg.left']:.2f} deg)", end=" ")
+    print("is common to all and turns the azimuth.")
     true = truth.effective_deg_per_step(campaign)
     shown = ", ".join(f"{name} {true[name]:.5f}" for name in DIRECTIONS)
     interval = {name: directions[name].interval95_type_a for name in DIRECTIONS}

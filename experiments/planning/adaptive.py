@@ -187,7 +187,8 @@ def table(rows: list[dict]) -> None:
     for name in (ADAPTIVE, *FIXED):
         for row in rows:
             if row["plan"] == name:
-                groups.setdefault((label(name), "posterior" if "importance" in row else "Laplace"), []).append(row)
+                label = "`--adapt`" if name == ADAPTIVE else f"{name}.csv"
+                groups.setdefault((label, "posterior" if "importance" in row else "Laplace"), []).append(row)
     print("# Looks chosen while measuring, against fixed plans\n")
     print("Written by `python -m experiments.planning.adaptive table`; what was done stands in the script.\n")
     print(f"Rigs drawn anew, target u(worst) <= {TARGET:g} deg/step by the sampled posterior (importance sampling); by")
@@ -207,11 +208,6 @@ def table(rows: list[dict]) -> None:
                 word = "posterior" if tier == "importance" else "Laplace"
                 print(f"| {name} | {stop} | {word} | {' | '.join(coverage([o[tier] for o in runs]))} |")
     confirmed_part([row for row in rows if row["plan"] == ADAPTIVE])
-
-
-def label(name: str) -> str:
-    """Of a plan in the table."""
-    return "`--adapt`" if name == ADAPTIVE else f"{name}.csv"
 
 
 def coverage(rows: list[dict]) -> list[str]:

@@ -23,7 +23,7 @@ from arviz_stats.base import array_stats
 from experiments.common.command_line import print_only
 from experiments.common.page import heading, line
 from experiments.common.reference_samplers import AXES
-from experiments.common.rigs import mounted_rig, numbered
+from experiments.common.rigs import mounted_rig, swept
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import stop_variances
@@ -52,12 +52,7 @@ def dozen() -> Campaign:
     table = replace(rig.table, priors={**rig.table.priors, **held})
     truth = {**rig.truth, **held}
     rig = replace(rig, table=table, stereo=stereo, truth=truth)
-    orders = [("home", 0, 0)]
-    for sheet in ("d1", "d3"):
-        orders.append(("place", None, None, sheet))
-        for stop in STOPS:
-            orders += [("move", *stop), ("look",)]
-    return simulate(rig, numbered(orders), SEED).campaign
+    return simulate(rig, swept(("d1", "d3"), STOPS), SEED).campaign
 
 
 def explicit_density(campaign: Campaign, joint: JointFit):

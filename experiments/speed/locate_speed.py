@@ -13,12 +13,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 
-from experiments.common.clock import seconds, shortest
+from experiments.common.clock import seconds
 from experiments.common.command_line import print_only
 from experiments.common.rigs import twin_campaign
 from tvsbayes.assessment.fitted_calibration import calibration_of
@@ -92,11 +91,11 @@ def main() -> None:
         pan, tilt, reading = points(calibration, count)
         settings = settings_of(pan, tilt, reading)
         locate_linear(calibration, settings)
-        linear = shortest(lambda s=settings: locate_linear(calibration, s), 3)
+        linear = seconds(lambda s=settings: locate_linear(calibration, s), 3)
         cells = [f"{linear:.4f}", f"{60 * count / linear:.3g}"]
         if count <= 10_000:
             locate(calibration, pan, tilt, reading, draws=DRAWS)
-            drawn = shortest(
+            drawn = seconds(
                 lambda p=pan, t=tilt, b=reading: locate(calibration, p, t, b, draws=DRAWS), 1 + (count < 5000)
             )
             cells += [f"{drawn:.3f}", f"{60 * count / drawn:.3g}"]
@@ -104,7 +103,7 @@ def main() -> None:
             cells += ["-", "-"]
         print(f"| {count} | {' | '.join(cells)} |", flush=True)
     pan, tilt, reading = points(calibration, 3)
-    whole = shortest(lambda: peer(calibration, pan[0], tilt[0], reading[0]), 3)
+    whole = seconds(lambda: peer(calibration, pan[0], tilt[0], reading[0]), 3)
     means = np.array([peer(calibration, pan[0], tilt[0], reading[0], seed).mean(axis=0) for seed in range(REPEATS)])
     located = [locate(calibration, pan[0], tilt[0], reading[0], draws=DRAWS, seed=seed) for seed in range(REPEATS)]
     alone = np.array([f.xyz_mm[0] for f in located])
@@ -124,13 +123,11 @@ def main() -> None:
         shutil.copytree(campaign.path, folder)
         (folder / "results").mkdir()
         (folder / "results" / "draws.npz").write_bytes(calibration_bytes(calibration))
-        start = time.perf_counter()
-        load_calibration(folder)
-        print(f"- `load_calibration`: {1e3 * (time.perf_counter() - start):.0f} ms")
+        print(f"- `load_calibration`: {1e3 * seconds(lambda: load_calibration(folder)):.0f} ms")
         arguments = ["locate", folder, "--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 70, "--json"]
         command = [str(Path(sys.executable).parent / "tvsbayes"), *map(str, arguments)]
         subprocess.run(command, check=True, capture_output=True)
-        whole = shortest(lambda: subprocess.run(command, check=True, capture_output=True), 5)
+        whole = seconds(lambda: subprocess.run(command, check=True, capture_output=True), 5)
         print(f"- `tvsbayes locate` of one point from process start, compilation cached: {whole:.2f} s")
 
 

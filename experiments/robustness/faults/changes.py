@@ -132,6 +132,14 @@ class Change(ast.NodeTransformer):
         return f"{type(self).__name__}({', '.join(arguments)})"
 
 
+class Named(Change):
+    """A change of what goes by a name inside a definition."""
+
+    def __init__(self, name: str, expression: str):
+        super().__init__()
+        self.name, self.expression = name, expression
+
+
 class Constant(Change):
     """A constant of a module or class, or a field's default, has another value."""
 
@@ -147,12 +155,8 @@ class Constant(Change):
             place.body.insert(place.body.index(place.node) + 1, self.changed(new))
 
 
-class Argument(Change):
+class Argument(Named):
     """A function takes one of its arguments for something else."""
-
-    def __init__(self, name: str, expression: str):
-        super().__init__()
-        self.name, self.expression = name, expression
 
     def change(self, place: Definition) -> None:
         """Begin the body with an assignment."""
@@ -187,12 +191,8 @@ class Returns(Change):
         return self.changed(ast.Return(_with(self.expression, value=node.value)))
 
 
-class Local(Change):
+class Local(Named):
     """A variable or attribute has another value wherever it is assigned in a definition."""
-
-    def __init__(self, name: str, expression: str):
-        super().__init__()
-        self.name, self.expression = name, expression
 
     def _follow(self, node: ast.Assign | ast.AugAssign | ast.AnnAssign) -> ast.stmt | list[ast.stmt]:
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
@@ -204,12 +204,8 @@ class Local(Change):
     visit_Assign = visit_AugAssign = visit_AnnAssign = _follow
 
 
-class Reads(Change):
+class Reads(Named):
     """A variable, attribute or element is taken for something else wherever a definition reads it."""
-
-    def __init__(self, name: str, expression: str):
-        super().__init__()
-        self.name, self.expression = name, expression
 
     def _read(self, node: ast.Name | ast.Attribute | ast.Subscript) -> ast.expr:
         if isinstance(node.ctx, ast.Load) and ast.unparse(node) == self.name:
@@ -219,12 +215,8 @@ class Reads(Change):
     visit_Name = visit_Attribute = visit_Subscript = _read
 
 
-class Call(Change):
+class Call(Named):
     """The call of a function becomes another expression: of `value`, the call itself, `function`, `arg0`, `arg1`."""
-
-    def __init__(self, name: str, expression: str):
-        super().__init__()
-        self.name, self.expression = name, expression
 
     def visit_Call(self, node: ast.Call) -> ast.expr:
         """Every call of that name."""
@@ -235,12 +227,8 @@ class Call(Change):
         return self.changed(_with(self.expression, value=node, function=node.func, **arguments))
 
 
-class Keyword(Change):
+class Keyword(Named):
     """What is handed on under a name is something else."""
-
-    def __init__(self, name: str, expression: str):
-        super().__init__()
-        self.name, self.expression = name, expression
 
     def visit_keyword(self, node: ast.keyword) -> ast.keyword:
         """Every argument of that name."""
