@@ -162,6 +162,10 @@ def answer_of(document: dict) -> Row:
     answer = document.get("answer")
     if "estimator" not in document:
         answer = "refused"
+    elif answer is None:
+        # Releases before 0.3 state no answer.
+        posterior = document["estimator"] == "posterior"
+        answer = "accepted" if posterior else "laplace" if sampling else "not converged"
     elif not document["converged"] and answer in ANSWERED:
         answer = "not converged"
     row = {"answer": answer, "tier": document.get("tier"), "converged": document.get("converged")}
