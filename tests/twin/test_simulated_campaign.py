@@ -19,14 +19,13 @@ from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     LOOK_SCATTER_NAMES,
-    RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
 )
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.protocols import grid_protocol
-from tvsbayes.instrument.rig import Rig, RigTable
-from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, triangulate
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.stereo_pair import rotation_matrix, triangulate
 from tvsbayes.twin.physics import (
     local_deg_per_step,
     mirror_chain,
@@ -36,27 +35,16 @@ from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth, draw_truth
 
 
-def make_rig(truth_u: float | None = None) -> Rig:
-    """A small rig that looks straight ahead; `truth_u` = 0 fixes every quantity at its value."""
-    stereo = Stereo(
-        image_width=1280,
-        image_height=720,
-        M1=np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]]),
-        D1=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]),
-        M2=np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]]),
-        D2=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]),
-        R=np.eye(3),
-        T=np.array([-85.0, 0.0, 0.0]),
-        parameter_covariance=np.diag([1.0, 1.0, *[0.25] * 2, *[1e-6] * 5] * 2 + [1e-8] * 3 + [0.0] * 3),
-        rms_px=0.2,
-    )
-    priors = dict(RIG_PRIORS)
-    for axis in "xyz":
-        priors[f"extrinsics.rotation_rad.{axis}"] = Prior(0.0, 0.02)
-        priors[f"extrinsics.translation_mm.{axis}"] = Prior(-20.0 if axis == "y" else 0.0, 5.0)
-    table = RigTable(priors)
-    truth = {name: replace(p, u=p.u if truth_u is None else truth_u) for name, p in table.priors.items()}
-    return Rig(table, stereo, truth, {"d1": 175.0, "d2": 275.0, "d3": 375.0}, {}, {}, {})
+@pytest.fixture
+def rig(mounted_rig) -> Rig:
+    """True rigs are drawn from all priors, scatter of looks and creep too; moves take no time."""
+    return replace(mounted_rig, truth=mounted_rig.table.priors, costs_s={})
+
+
+@pytest.fixture
+def fixed(rig) -> Rig:
+    """A rig of which every quantity is at its value."""
+    return replace(rig, truth={name: replace(prior, u=0.0) for name, prior in rig.truth.items()})
 
 
 def small_plan() -> tuple[PlanStep, ...]:
@@ -68,12 +56,11 @@ def small_plan() -> tuple[PlanStep, ...]:
     )
 
 
-def test_stop_error_is_redrawn_though_play_absorbs_the_move():
+def test_stop_error_is_redrawn_though_play_absorbs_the_move(fixed):
     """Move 51 after 50 lies within the play of 2 deg, yet the spot moves by a new stop error."""
-    rig = make_rig(truth_u=0.0)
-    truth = draw_truth(rig, np.random.default_rng(0))
+    truth = draw_truth(fixed, np.random.default_rng(0))
     truth = replace(truth, parameters=truth.parameters | {"backlash_deg.pan": 2.0})
-    result = simulate(rig, small_plan(), 3, truth).truth
+    result = simulate(fixed, small_plan(), 3, truth).truth
     plan_moves = 7  # home, three moves, one step, home, move
     assert len(result.stop_errors_deg) == plan_moves
     pan, tilt = np.array(result.stop_errors_deg).T
@@ -83,43 +70,40 @@ def test_stop_error_is_redrawn_though_play_absorbs_the_move():
     assert psi[3] == psi[2] == psi[1] and psi[4] == pytest.approx(psi[3] + 0.06, abs=1e-12)
 
 
-def test_home_offsets():
+def test_home_offsets(rig):
     """None in the first segment; later ones N(0, HOME_SD_DEG^2)."""
     plan = steps(*[("home", 0, 0)] * 400)
-    offsets = np.array(simulate(make_rig(), plan, 1).truth.home_offsets_deg)
+    offsets = np.array(simulate(rig, plan, 1).truth.home_offsets_deg)
     assert np.array_equal(offsets[0], [0.0, 0.0])
     assert np.std(offsets[1:]) == pytest.approx(HOME_SD_DEG, rel=4 / np.sqrt(2 * 798))
 
 
-def test_homing_ends_on_the_side_that_it_states():
+def test_homing_ends_on_the_side_that_it_states(fixed):
     """Reached left or up a mirror lags by half the play, reached right or down it leads by as much."""
-    rig = make_rig(truth_u=0.0)
-    truth = draw_truth(rig, np.random.default_rng(0))
+    truth = draw_truth(fixed, np.random.default_rng(0))
     known = {f"stop_sd_deg.{d}": 0.0 for d in DIRECTION_SIGNS}
     known |= {"backlash_deg.pan": 1.0, "backlash_deg.tilt": 0.6, "tilt_zero_deg": 0.25}
     truth = replace(truth, parameters=truth.parameters | known)
     for sides, angles_deg in ((("left", "up"), (-0.5, -0.05)), (("right", "down"), (0.5, 0.55))):
-        homed = simulate(rig, steps(("home", 0, 0)), 1, truth, home_approach=sides).truth
+        homed = simulate(fixed, steps(("home", 0, 0)), 1, truth, home_approach=sides).truth
         assert homed.mirror_angles_deg[0] == pytest.approx(angles_deg, abs=1e-12)
 
 
-def test_unknown_approach_is_uniform_in_the_band():
+def test_unknown_approach_is_uniform_in_the_band(fixed):
     """Mirror angles after homing with unknown approach fill the band of width b around mid-play."""
-    rig = make_rig(truth_u=0.0)
-    truth = draw_truth(rig, np.random.default_rng(0))
+    truth = draw_truth(fixed, np.random.default_rng(0))
     quiet = {f"stop_sd_deg.{d}": 0.0 for d in DIRECTION_SIGNS}
     truth = replace(truth, parameters=truth.parameters | quiet | {"backlash_deg.pan": 1.0})
     plan = steps(*[("home", 0, 0)] * 500)
-    result = simulate(rig, plan, 2, truth, home_approach=("unknown", "up")).truth
+    result = simulate(fixed, plan, 2, truth, home_approach=("unknown", "up")).truth
     start = np.array(result.mirror_angles_deg)[:, 0] - np.array(result.home_offsets_deg)[:, 0]
     assert start.min() >= -0.5 and start.max() <= 0.5
     # Uniform: variance b^2/12; relative sd of the sample sd is sqrt(0.2/n) = 2 %.
     assert np.std(start) == pytest.approx(1 / np.sqrt(12), rel=4 * 0.02)
 
 
-def test_truth_is_drawn_around_the_stated_values_never_at_them():
+def test_truth_is_drawn_around_the_stated_values_never_at_them(rig):
     """Every quantity with u > 0 and every free stereo parameter differs from its value; u = 0 stays."""
-    rig = make_rig()
     truth = draw_truth(rig, np.random.default_rng(7))
     for name, prior in rig.truth.items():
         assert (truth.parameters[name] == prior.value) == (prior.u == 0), name
@@ -136,9 +120,9 @@ def test_truth_is_drawn_around_the_stated_values_never_at_them():
     assert p["degrees_per_step.up"] + p["degrees_per_step.down"] == pytest.approx(2 * p["degrees_per_step.tilt"])
 
 
-def test_draws_follow_their_distributions():
+def test_draws_follow_their_distributions(rig):
     """600 rigs: means and sds of each kind of distribution, and of fx, within four standard errors."""
-    rig, rng, n = make_rig(), np.random.default_rng(11), 600
+    rng, n = np.random.default_rng(11), 600
     truths = [draw_truth(rig, rng) for _ in range(n)]
     four_se = 4 / np.sqrt(n)
     backlash = np.array([t.parameters["backlash_deg.pan"] for t in truths])
@@ -149,12 +133,12 @@ def test_draws_follow_their_distributions():
     focal = np.array([t.parameters["focal_scale"] for t in truths])
     assert np.mean(focal) == pytest.approx(1.0, abs=0.002 * four_se)
     fx = np.array([t.stereo.vector[0] for t in truths])
-    assert np.mean(fx) == pytest.approx(800.0, abs=four_se) and np.std(fx) == pytest.approx(1.0, rel=four_se)
+    value, sd = rig.stereo.vector[0], np.sqrt(rig.stereo.parameter_covariance[0, 0])
+    assert np.mean(fx) == pytest.approx(value, abs=four_se * sd) and np.std(fx) == pytest.approx(sd, rel=four_se)
 
 
-def test_truth_round_trip():
+def test_truth_round_trip(rig):
     """truth.json returns the same truth, with the effective values it implies."""
-    rig = make_rig()
     run = simulate(rig, small_plan(), 4)
     truth = run.truth
     document = json.loads(json.dumps(truth.as_json(run.campaign), allow_nan=False))
@@ -168,9 +152,9 @@ def test_truth_round_trip():
     assert again.effective_deg_per_step(run.campaign) == pytest.approx(document["effective_deg_per_step"], rel=1e-12)
 
 
-def test_transmission_error_leaves_every_other_draw_as_it_was():
+def test_transmission_error_leaves_every_other_draw_as_it_was(rig):
     """The same rig, stop errors, sheets and noise, whose mirrors stand off by the error of the wheel."""
-    rig, plan = make_rig(), small_plan()
+    plan = small_plan()
     rig = replace(rig, truth={**rig.truth, **{name: replace(rig.truth[name], u=0.0) for name in GEAR_ERROR_NAMES}})
     names = [name for name in HARMONIC_NAMES if ".tilt." in name]
     wobbling = replace(
@@ -191,17 +175,17 @@ def test_transmission_error_leaves_every_other_draw_as_it_was():
     assert not shift[:, 0].any()
 
 
-def test_looks_scatter_also_where_an_axis_stands():
+def test_looks_scatter_also_where_an_axis_stands(fixed):
     """Of one beam looked at 400 times, by 0.05 deg of pan alone, then of tilt; nothing else changes."""
-    rig, count = make_rig(truth_u=0.0), 400
+    count = 400
     plan = steps(("home", 0, 0), ("place", "d2"), *[("look",)] * count)
-    still = draw_truth(rig, np.random.default_rng(0))
-    without = simulate(rig, plan, 5, still)
+    still = draw_truth(fixed, np.random.default_rng(0))
+    without = simulate(fixed, plan, 5, still)
     p, (psi, beta) = still.parameters, np.radians(without.truth.mirror_angles_deg[0])
     ahead = [mirror_chain(psi + a, beta + b, p)[1] for a, b in ((0.0, 0.0), (1e-6, 0.0), (0.0, 1e-6))]
     for axis, by_angle in zip(("pan", "tilt"), (ahead[1] - ahead[0], ahead[2] - ahead[0]), strict=True):
         shaking = replace(still, parameters={**p, f"look_scatter_deg.{axis}": 0.05})
-        shaken = simulate(rig, plan, 5, shaking)
+        shaken = simulate(fixed, plan, 5, shaking)
         assert shaken.truth.mirror_angles_deg == without.truth.mirror_angles_deg
         sideways = np.linalg.norm(shaken.light.directions - without.light.directions, axis=1)
         expected = np.radians(0.05) * np.linalg.norm(by_angle) / 1e-6
@@ -210,9 +194,8 @@ def test_looks_scatter_also_where_an_axis_stands():
         assert len(np.unique(sideways)) == count
 
 
-def test_scatter_of_looks_leaves_the_drawn_rig_as_it_was():
+def test_scatter_of_looks_leaves_the_drawn_rig_as_it_was(rig):
     """Rigs of a seed are the same rigs, whatever their looks do; a truth.json without it has none."""
-    rig = make_rig()
     steady = replace(rig, truth={**rig.truth, **dict.fromkeys(LOOK_SCATTER_NAMES, Prior(0.0, 0.0, "half-normal"))})
     both = []
     for one in (rig, steady):
@@ -228,33 +211,31 @@ def test_scatter_of_looks_leaves_the_drawn_rig_as_it_was():
     assert [read.parameters[name] for name in LOOK_SCATTER_NAMES] == [0.0, 0.0]
 
 
-def test_true_transmission_error_needs_its_period():
-    rig = make_rig()
+def test_true_transmission_error_needs_its_period(rig):
     truth = draw_truth(rig, np.random.default_rng(1))
     wobbling = replace(truth, parameters={**truth.parameters, "harmonic_deg.pan.1.sin": 0.1})
     with pytest.raises(InputError, match=r"harmonic_deg\.pan\.1\.sin has no period"):
         simulate(rig, small_plan(), 8, wobbling)
 
 
-def test_streams_are_independent():
+def test_streams_are_independent(fixed):
     """Aperture readings change no pixel; a truth given changes no other draw; nor does the spot noise."""
-    rig, plan = make_rig(truth_u=0.0), small_plan()
-    rig = replace(rig, stereo=replace(rig.stereo, parameter_covariance=np.zeros((24, 24))))
-    without, with_readings = simulate(rig, plan, 8), simulate(rig, plan, 8, aperture=True)
+    plan = small_plan()
+    fixed = replace(fixed, stereo=replace(fixed.stereo, parameter_covariance=np.zeros((24, 24))))
+    without, with_readings = simulate(fixed, plan, 8), simulate(fixed, plan, 8, aperture=True)
     stripped = tuple(replace(spot, aperture_deg=None) for spot in with_readings.campaign.spots)
     assert stripped == without.campaign.spots
     assert all(spot.aperture_deg is not None for spot in with_readings.campaign.spots if spot.status == "ok")
-    truth = draw_truth(rig, np.random.default_rng(1))
-    assert simulate(rig, plan, 8, truth).campaign.spots == without.campaign.spots, "u = 0: any draw is the same rig"
-    noisier = simulate(rig, plan, 8, truth, spot_sd_px=0.16)
+    truth = draw_truth(fixed, np.random.default_rng(1))
+    assert simulate(fixed, plan, 8, truth).campaign.spots == without.campaign.spots, "u = 0: any draw is the same rig"
+    noisier = simulate(fixed, plan, 8, truth, spot_sd_px=0.16)
     assert noisier.truth.stop_errors_deg == without.truth.stop_errors_deg
 
 
-def test_spots_lie_on_beam_and_sheet():
+def test_spots_lie_on_beam_and_sheet(fixed):
     """Without noise, triangulated spots lie on the beam and within five sds of the nominal sheet."""
-    rig = make_rig(truth_u=0.0)
-    quiet = draw_truth(rig, np.random.default_rng(0))
-    simulated = simulate(rig, small_plan(), 5, quiet, spot_sd_px=1e-9)
+    quiet = draw_truth(fixed, np.random.default_rng(0))
+    simulated = simulate(fixed, small_plan(), 5, quiet, spot_sd_px=1e-9)
     truth, p = simulated.truth, simulated.truth.parameters
     rotation = rotation_matrix(np.array([p[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
     translation = np.array([p[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
@@ -268,24 +249,23 @@ def test_spots_lie_on_beam_and_sheet():
         # 1e-9 px times a depth gain of 2 mm/px, times 50.
         assert np.linalg.norm(np.cross(point - origin, direction)) < 1e-7
         # Depth sd 1 mm and 0.5 deg over 150 mm off axis: 1.9 mm together.
-        assert abs(point[0] - rig.sheets_mm[spot.target]) < 5 * 1.9
+        assert abs(point[0] - fixed.sheets_mm[spot.target]) < 5 * 1.9
 
 
 @pytest.mark.parametrize("convention", ["in-plane", "azimuth"])
-def test_aperture_reads_the_spot_with_its_zero(convention: str):
+def test_aperture_reads_the_spot_with_its_zero(fixed, convention: str):
     """Read B = angle of the spot in T, seen from (0, -a/2, 0), plus zero, plus noise of the stated sd."""
-    rig = make_rig(truth_u=0.0)
-    rig = replace(rig, table=replace(rig.table, aperture_convention=convention))
+    fixed = replace(fixed, table=replace(fixed.table, aperture_convention=convention))
     changed = {
         "aperture_zero_deg": 1.5,
         "baseline_mm": 201.0,
         "pan_zero_emission_deg": 92.0,
         "aperture_sd_deg": 0.02,
     }
-    truth = draw_truth(rig, np.random.default_rng(0))
+    truth = draw_truth(fixed, np.random.default_rng(0))
     truth = replace(truth, parameters=truth.parameters | changed)
     plan = grid_protocol(("d1", "d2"), pan_steps=(-60, 0, 60), tilt_steps=(-60, 0, 60))
-    simulated = simulate(rig, plan, 5, truth, spot_sd_px=1e-9, aperture=True)
+    simulated = simulate(fixed, plan, 5, truth, spot_sd_px=1e-9, aperture=True)
     p, spots = simulated.truth.parameters, simulated.campaign.spots
     pixels = np.array([[s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px] for s in spots])
     points_S = triangulate(truth.stereo, pixels, p["focal_scale"])
@@ -303,46 +283,42 @@ def test_aperture_reads_the_spot_with_its_zero(convention: str):
     assert np.std(error, ddof=1) == pytest.approx(0.02, rel=4 * 0.12)
 
 
-def test_every_placement_is_a_new_one():
+def test_every_placement_is_a_new_one(fixed):
     """The same target placed twice is not at the same depth."""
-    rig = make_rig(truth_u=0.0)
     plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("look",), ("place", "d1"), ("look",))
-    spots = simulate(rig, plan, 6, spot_sd_px=1e-9).campaign.spots
+    spots = simulate(fixed, plan, 6, spot_sd_px=1e-9).campaign.spots
     disparity = [spot.u_left_px - spot.u_right_px for spot in spots]
     # 1 mm of depth at 175 mm is f B / Z^2 = 2.2 px of disparity; noise is 1e-9 px.
     assert abs(disparity[0] - disparity[1]) < 1e-7 and abs(disparity[2] - disparity[0]) > 0.01
 
 
-def test_pixel_noise_is_stated_sd_times_pixel_scale():
+def test_pixel_noise_is_stated_sd_times_pixel_scale(fixed):
     """400 looks at one resting spot: the spread in each coordinate, in four standard errors."""
-    rig = make_rig(truth_u=0.0)
-    truth = draw_truth(rig, np.random.default_rng(0))
+    truth = draw_truth(fixed, np.random.default_rng(0))
     truth = replace(truth, parameters=truth.parameters | {"pixel_scale": 1.7})
     plan = steps(("home", 0, 0), ("place", "d1"), *[("look",)] * 400)
-    campaign = simulate(rig, plan, 6, truth, spot_sd_px=0.1).campaign
+    campaign = simulate(fixed, plan, 6, truth, spot_sd_px=0.1).campaign
     u = np.array([[s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px] for s in campaign.spots])
     assert np.std(u, axis=0, ddof=1) == pytest.approx(0.17, rel=4 / np.sqrt(800))
     assert campaign.spots[0].su_left_px == 0.1
 
 
-def test_a_spot_out_of_view_is_undetected():
+def test_a_spot_out_of_view_is_undetected(fixed):
     """Outside an image, behind a camera or beyond the lens: empty pixels, no reading, undetected."""
-    rig = make_rig(truth_u=0.0)
     there = (order for pan in (800, 2500, 0) for order in (("move", pan, 0), ("look",)))
     plan = steps(("home", 0, 0), ("place", "d1"), *there)
-    spots = simulate(rig, plan, 1, aperture=True).campaign.spots
+    spots = simulate(fixed, plan, 1, aperture=True).campaign.spots
     assert [spot.status for spot in spots] == ["undetected", "undetected", "ok"]
     assert spots[0].u_left_px is spots[0].su_right_px is spots[1].aperture_deg is None
     points = np.array([[-175.0, 0.0, 0.0], [175.0, 0.0, 0.0], [175.0, -500.0, 0.0]])
-    assert np.isfinite(project(points, rig.stereo)).all(axis=1).tolist() == [False, True, False]
-    folding = replace(rig.stereo, D1=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]), D2=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
+    assert np.isfinite(project(points, fixed.stereo)).all(axis=1).tolist() == [False, True, False]
+    folding = replace(fixed.stereo, D1=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]), D2=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
     # r = 1.4 is beyond the turn at 0.82, where the polynomial leads back to r = 0.03.
     assert np.isnan(project(np.array([[100.0, -140.0, 0.0]]), folding)).all()
 
 
-def test_plan_errors_teach():
+def test_plan_errors_teach(rig):
     """An unknown sheet and a look without a sheet are refused with a remedy."""
-    rig = make_rig()
     with pytest.raises(InputError, match="d9") as caught:
         simulate(rig, steps(("home", 0, 0), ("place", "d9")), 1)
     assert caught.value.allowed == "d1, d2, d3"
@@ -350,9 +326,9 @@ def test_plan_errors_teach():
         simulate(rig, steps(("home", 0, 0), ("look",)), 1)
 
 
-def test_time_advances_by_the_rigs_costs():
+def test_time_advances_by_the_rigs_costs(rig):
     """time_s is the sum of the costs of what came before."""
-    rig = replace(make_rig(), costs_s={"placement_s": 11.0, "move_s": 2.0, "look_s": 3.0})
+    rig = replace(rig, costs_s={"placement_s": 11.0, "move_s": 2.0, "look_s": 3.0})
     times = [move.time_s for move in simulate(rig, small_plan(), 1).campaign.moves]
     # home place look | move look | move look look | move look place | move look | home look | move
     assert times == [0.0, 16.0, 21.0, 29.0, 45.0, 50.0, 55.0]
@@ -362,9 +338,9 @@ ROUNDING_DEG = 1e-12
 """Sums and differences of angles of some degrees."""
 
 
-def test_zeros_creep_from_switching_on_and_shift_with_the_temperature():
+def test_zeros_creep_from_switching_on_and_shift_with_the_temperature(fixed):
     """Angles of every move, homings between them, against c (1 - exp(-t / tau)) + k (T - T at the first move)."""
-    rig, plan = make_rig(truth_u=0.0), PlanBuilder()
+    plan = PlanBuilder()
     plan.home(0, 0)
     plan.place("d2")
     for turn in range(6):
@@ -372,12 +348,12 @@ def test_zeros_creep_from_switching_on_and_shift_with_the_temperature():
         plan.look()
         if turn == 3:
             plan.home(0, 0)
-    still = draw_truth(rig, np.random.default_rng(0))
+    still = draw_truth(fixed, np.random.default_rng(0))
     shifts = {"creep_deg.pan": 0.1, "creep_deg.tilt": -0.03, "creep_minutes": 5.0, "thermal_deg_per_K.pan": 0.02}
     moving = replace(still, parameters={**still.parameters, **shifts})
     created = datetime.datetime(2026, 1, 15, 10, tzinfo=datetime.UTC)
     early = {"created": created, "powered_on": created - datetime.timedelta(minutes=3)}
-    costly = replace(rig, costs_s={"move_s": 60.0, "look_s": 1.0})
+    costly = replace(fixed, costs_s={"move_s": 60.0, "look_s": 1.0})
 
     def angles(truth, header=None, temperature=None):
         run = simulate(costly, plan.steps, 5, truth, header=header, temperature_degC=temperature)
