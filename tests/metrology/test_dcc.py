@@ -100,28 +100,28 @@ def test_ratios_stand_with_expanded_uncertainty_and_backlash_with_its_own():
     assert texts(backlash, ".//si:unit") == [r"\degree"]
 
 
-def test_a_skewed_quantity_gets_an_interval_and_an_unmoved_one_no_number():
-    case = certified().with_play(0.02, 0.02, (0.001, 0.08))
+@pytest.mark.parametrize(
+    ("play", "interval"),
+    [
+        ((0.02, 0.02, (0.001, 0.08)), ["0.020", "0.001", "0.080", "0.95", "normal"]),
+        # Of a heavy tail the 95 % interval may be shorter than u on either side; D-SI takes k >= 1 only.
+        ((0.5, 0.2, (0.4, 0.6)), ["0.20", "0.40", "0.60", "0.95", "normal"]),
+    ],
+)
+def test_a_quantity_of_skewed_or_heavy_tails_gets_an_interval(play, interval):
+    root = certified().with_play(*play).root()
+    assert structure_problems(root) == []
+    (box,) = root.findall(".//si:coverageIntervalMU", {"si": "https://ptb.de/si"})
+    assert [child.text for child in box] == interval
+
+
+def test_a_fixed_quantity_has_no_uncertainty_and_an_unmoved_axis_no_number():
+    case = certified().with_play(0.0, 0.0, (0.0, 0.0))
     root = case.with_summary(effective={**case.fit.summary.effective, "up": None, "down": None}).root()
     assert structure_problems(root) == []
-    (box,) = root.findall(".//si:coverageIntervalMU", {"si": "https://ptb.de/si"})
-    assert [child.text for child in box] == ["0.020", "0.001", "0.080", "0.95", "normal"]
+    assert "0.0" in texts(root, ".//si:value")
     # Up, down and the backlash of their axis.
     assert len(texts(root, ".//dcc:noQuantity/dcc:content")) == 3
-
-
-def test_no_coverage_factor_below_one_is_written():
-    """Of a heavy tail the 95 % interval may be shorter than u on either side; D-SI takes k >= 1 only."""
-    root = certified().with_play(0.5, 0.2, (0.4, 0.6)).root()
-    assert structure_problems(root) == []
-    (box,) = root.findall(".//si:coverageIntervalMU", {"si": "https://ptb.de/si"})
-    assert [child.text for child in box] == ["0.20", "0.40", "0.60", "0.95", "normal"]
-
-
-def test_a_fixed_quantity_has_no_uncertainty():
-    root = certified().with_play(0.0, 0.0, (0.0, 0.0)).root()
-    assert structure_problems(root) == []
-    assert "0.0" in texts(root, ".//si:value")
 
 
 def declared(root: ET.Element) -> dict[str, tuple[str, str | None]]:

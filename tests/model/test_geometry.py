@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tvsbayes.instrument.mirrors import Vectors
 from tvsbayes.model.geometry import (
     NEAREST_MM,
     StereoCameras,
     project,
     rotation_matrix,
-    transform,
 )
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -93,13 +91,6 @@ def test_second_derivative_at_zero_is_the_known_one(compiled):
         for j in range(3):
             expected = (np.outer(unit[i], unit[j]) + np.outer(unit[j], unit[i])) / 2 - (i == j) * unit
             np.testing.assert_allclose(second[:, :, i, j], expected, atol=ROUNDING)
-
-
-def test_matrix_times_vectors():
-    rng = np.random.default_rng(3)
-    matrix, vectors = rng.standard_normal((3, 3)), rng.standard_normal((3, 5, 7))
-    product = transform(jnp.asarray(matrix), Vectors.of(jnp.asarray(vectors))).stacked()
-    np.testing.assert_allclose(product, np.einsum("ij,jab->iab", matrix, vectors), atol=10 * ROUNDING)
 
 
 def cameras(focal_scale: float = 1.0) -> StereoCameras:
