@@ -16,19 +16,22 @@ ROUNDING = 1e-13
 """Of a few dozen operations on numbers of order ten."""
 
 
-@jax.jit
+def numbers(rows) -> tuple:
+    """Components (k, n) as the library takes them."""
+    return tuple(jnp.asarray(row) for row in rows)
+
+
 def reflected(direction, *vectors):
     """The first component of the reflected direction, and reflected vectors."""
-    reflection = Reflection.of(tuple(direction))
-    return reflection.first, *(jnp.stack(reflection.of_many(tuple(v))) for v in vectors)
+    reflection = Reflection.of(numbers(direction))
+    return reflection.first, *(jnp.stack(reflection.of_many(numbers(v))) for v in vectors)
 
 
-@jax.jit
 def turned(by_pan, by_tilt, residual, variance=None):
     """(states, by_pan, by_tilt and residual in their components, residual in place)."""
-    states = ToStates.of(tuple(by_pan), tuple(by_tilt), variance)
-    components = (jnp.stack(states.of_many(tuple(v))) for v in (by_pan, by_tilt, residual))
-    return states, *components, jnp.stack(states.in_place(tuple(residual)))
+    states = ToStates.of(numbers(by_pan), numbers(by_tilt), variance)
+    components = (jnp.stack(states.of_many(numbers(v))) for v in (by_pan, by_tilt, residual))
+    return states, *components, jnp.stack(states.in_place(numbers(residual)))
 
 
 def drawn(components: int, seed: int) -> np.ndarray:
@@ -73,7 +76,7 @@ def test_looks_that_scatter_have_unit_noise_in_both_components():
     """Squares are the quadratic form of 1 + slopes diag(variances) slopes^T, whose log determinant is stated."""
     by_pan, by_tilt, residual = drawn(4, 5), drawn(4, 6), drawn(4, 7)
     variance = np.random.default_rng(12).exponential(3.0, (40, 2))
-    states, pan, tilt, *both = turned(by_pan, by_tilt, residual, variance)
+    states, pan, tilt, *both = turned(by_pan, by_tilt, residual, jnp.asarray(variance))
     check_loads(states, pan, tilt)
     for k in range(40):
         slopes = np.stack([by_pan[:, k], by_tilt[:, k]], axis=1)
@@ -87,10 +90,8 @@ def test_looks_that_scatter_have_unit_noise_in_both_components():
 
 def test_without_scatter_nothing_changes():
     """Bit for bit."""
-    drawn_ones = [jnp.asarray(drawn(4, seed)) for seed in (5, 6, 7)]
-    # Of compiled functions the last bit is the compiler's.
-    with jax.disable_jit():
-        plain, still = turned(*drawn_ones), turned(*drawn_ones, jnp.zeros((40, 2)))
+    drawn_ones = [drawn(4, seed) for seed in (5, 6, 7)]
+    plain, still = turned(*drawn_ones), turned(*drawn_ones, jnp.zeros((40, 2)))
     for one, two in zip(plain[1:], still[1:], strict=True):
         np.testing.assert_array_equal(two, one)
     np.testing.assert_array_equal(still[-1], drawn_ones[-1])
@@ -103,9 +104,7 @@ def test_whitened_differences_have_the_stated_covariance(dozen):
     difference = np.zeros((5, len(dozen.arrays.spots.valid)))
     difference[:4, : len(spots)] = np.random.default_rng(8).standard_normal((4, len(spots)))
     unit = jnp.ones(difference.shape[1])
-    whitened = np.stack(
-        NoiseScales(unit, unit).whitened(jax.tree.map(jnp.asarray, tuple(difference)), dozen.arrays.spots)
-    )
+    whitened = np.stack(NoiseScales(unit, unit).whitened(numbers(difference), dozen.arrays.spots))
     for k, spot in enumerate(spots):
         d = difference[:4, k]
         expected = d @ np.linalg.solve(spot.pixel_covariance(), d)

@@ -249,6 +249,10 @@ def test_every_name_drives_its_field_and_nothing_else():
             np.testing.assert_allclose(change, expected, atol=1e-13, err_msg=f"{name} -> {field}")
 
 
+modelled = jax.jit(lambda space: space.model(jnp.zeros(len(NAMES))))
+"""At the middle of all priors, compiled once."""
+
+
 @pytest.mark.parametrize(
     ("stated", "period_deg", "on_wheel"),
     [
@@ -259,10 +263,10 @@ def test_every_name_drives_its_field_and_nothing_else():
 )
 def test_a_full_turn_is_the_wheels_period_and_less_the_pinions(stated, period_deg, on_wheel):
     space = parameter_space(RigTable(harmonic_period_deg=stated), small_stereo())
-    harmonics = space.model(jnp.zeros(len(NAMES))).transmission.harmonics
+    model = modelled(jax.tree.map(jnp.asarray, space))
+    harmonics, periods = model.transmission.harmonics, model.gears.period_rad
     np.testing.assert_allclose(harmonics.period_rad, np.radians(period_deg), rtol=1e-15)
     # Those of amplitudes: as many as are stated, in their order.
-    periods = space.model(jnp.zeros(len(NAMES))).gears.period_rad
     for axis, name in enumerate(("pan", "tilt")):
         degrees = stated.get(name, ())
         np.testing.assert_allclose(periods[axis, : len(degrees)], np.radians(degrees), rtol=1e-15)

@@ -149,6 +149,12 @@ def fitted(monkeypatch) -> JointFit:
     return small_fit()[0]
 
 
+@pytest.fixture
+def proposed(monkeypatch) -> None:
+    """The first proposal is that of the shared run: it is not looked for again."""
+    monkeypatch.setattr(Target, "first_proposal", lambda target: small_run().pool.proposals[0])
+
+
 def test_a_campaign_is_sampled_in_few_rounds_and_accepted(fitted, posterior):
     judged = posterior.convergence.importance
     assert judged.accepted and judged.missing == () and posterior.tier == "importance"
@@ -166,6 +172,7 @@ def test_a_campaign_is_sampled_in_few_rounds_and_accepted(fitted, posterior):
     np.testing.assert_allclose(posterior.log_density[0, :64], again, atol=1e-6)
 
 
+@pytest.mark.usefixtures("proposed")
 def test_the_same_seed_gives_the_same_draws(fitted, monkeypatch):
     monkeypatch.setattr(importance, "ROUND", 512)
     one, again = (importance_run(fitted, SEED, rounds_max=2) for _ in range(2))
@@ -237,6 +244,7 @@ def test_a_proposal_that_is_too_narrow_is_fitted_again(too_narrow, posterior, be
     assert abs(one.mean - two.mean) < SIGMAS * np.hypot(one.mcse_mean, two.mcse_mean)
 
 
+@pytest.mark.usefixtures("proposed")
 def test_a_heavy_tail_is_answered_by_another_proposal(fitted, begun, monkeypatch):
     """More draws hardly change its index. With a limit that no weights meet: 3 rounds and 3 more, then 6 and 6."""
     monkeypatch.setattr(importance, "K_MAX", -1.0)
