@@ -103,7 +103,7 @@ def one_axis(task: tuple[int]) -> dict[str, object]:
                 which = [r.move for r in fresh.readings]
                 u = np.full(len(which), READ_U)
                 mean, covariance = predicted_stops(results.fit, applied.moved(fresh.moves), which, u).pooled()
-                off = predicted_stops(results.fit, fresh.moves, which, u).pooled()[0] - mean
+                off = predicted_stops(results.fit, fresh.moves, which, u).pooled().mean - mean
                 verdicts["distance"] = float(np.sqrt(off @ np.linalg.solve(covariance, off)))  # type: ignore[assignment]
         row[name] |= {"verify": verdicts}  # type: ignore[operator]
     return {**row, "seconds": time.perf_counter() - began}

@@ -97,7 +97,7 @@ def _followed(fit: AxisFit, campaign: AxisCampaign, moves: np.ndarray) -> np.nda
     )
     drawn = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
     w = transferred_scales(fit.model, drawn, model, np.random.default_rng(1))
-    return model.left_out(w, np.flatnonzero(np.isin(model.rows.move, moves)))[0].mean(axis=0)
+    return model.left_out(w, np.flatnonzero(np.isin(model.rows.move, moves))).mean.mean(axis=0)
 
 
 def row_of(name: str, unit: str, campaign: AxisCampaign, visits: Sequence[int]) -> str:

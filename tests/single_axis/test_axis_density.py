@@ -44,7 +44,8 @@ def test_draws_of_the_line_have_its_moments_given_the_scales():
     model = model_of(drawn(5, random_moves(5)).campaign)
     w = np.random.default_rng(2).standard_normal((6, len(model.coordinates.names)))
     functionals = headline_functionals(model, w)
-    mean, sd = model.linear(w).of(functionals)
+    linear = model.linear(w)
+    mean, sd = linear.mean_of(functionals), linear.sd_of(functionals)
     posterior = model.posterior(w, functionals)
     # Other right-hand sides in the same solution change the order of sums.
     np.testing.assert_allclose(posterior.log_density, model.log_density(w), atol=1e-8)

@@ -25,7 +25,7 @@ def dense(model, w):
     sampled = model.play_is_sampled
     play = play_places(rows, np.array([at["backlash"] if sampled else 0.0]))
     anchor, side, share, path = play.anchor[0], play.side[0], play.share[0], play.path[0]
-    slope = rows.line[1]
+    slope = rows.line.slope
     x = abs(slope) * rows.command
     same = x[:, None] == x
     k = matern52(x[:, None] - x, at["transmission_error_length"]) + JITTER * same
@@ -51,7 +51,7 @@ def dense(model, w):
     if "creep" in model.shifts:
         warmed = 1 - np.exp(-rows.time_s / 60 / at["creep_minutes"])
         total += model.priors["creep"].u ** 2 * np.outer(warmed, warmed)
-    residual = rows.value - rows.line[0] - slope * model.middle - model.priors["per_command"].value * g
+    residual = rows.value - rows.line.offset - slope * model.middle - model.priors["per_command"].value * g
     residual = residual - 0.5 * contrast.value * path
     return total, residual - (0.5 * side * at["backlash"] if sampled else 0.0)
 
@@ -73,7 +73,8 @@ def test_rows_left_out_are_the_conditional_of_the_dense_gaussian():
     model = model_of(a_campaign(2))
     w = np.zeros((1, len(model.coordinates.names)))
     left = np.array([3, 11, 12, 30])
-    mean, covariance = model.left_out(w, left)
+    predicted = model.left_out(w, left)
+    mean, covariance = predicted.mean, predicted.covariance
     total, residual = dense(model, w)
     others = np.setdiff1d(np.arange(len(residual)), left)
     gain = np.linalg.solve(total[np.ix_(others, others)], total[np.ix_(others, left)]).T
@@ -89,7 +90,7 @@ def test_places_without_rows_are_predicted_from_places_with_rows():
     plain, model = model_of(a_campaign()), model_of(a_campaign(), commands)
     w = 0.4 * np.random.default_rng(4).standard_normal((3, len(model.coordinates.names)))
     line, wider_line = plain.linear(w), model.linear(w)
-    count, slope = len(plain.places.command), abs(plain.rows.line[1])
+    count, slope = len(plain.places.command), abs(plain.rows.line.slope)
     assert len(model.informed) == plain.columns < model.columns == plain.columns + 2 * len(commands)
     both = np.concatenate((plain.places.command, commands))
     for k, length in enumerate(model.coordinates.values(w)["transmission_error_length"]):
@@ -100,7 +101,8 @@ def test_places_without_rows_are_predicted_from_places_with_rows():
         mean = by @ line.mean[k, block]
         left = prior[count:, count:] - by @ prior[:count, count:]
         sd = np.sqrt(np.diag(left + by @ line.covariance[k, block, block] @ by.T))
-        values, spread = wider_line.of(model.functional(commands))
+        functionals = model.functional(commands)
+        values, spread = wider_line.mean_of(functionals), wider_line.sd_of(functionals)
         # The nearest places make the prior's matrix nearly singular: its condition is 1 over the jitter at most.
         np.testing.assert_allclose(values[k], mean, atol=1e-6 * sd.max())
         np.testing.assert_allclose(spread[k], sd, rtol=1e-6)

@@ -26,11 +26,11 @@ def test_play_is_the_clip_of_the_definition():
         places = play_places(rows, np.array([backlash]))
         y, q = 0.0, 0.0
         for k, move in enumerate(moves):
-            q = rows.line[1] * move.command
+            q = rows.line.slope * move.command
             if move.approach:
                 y = q - 0.5 * backlash
             y = min(max(y, q - 0.5 * backlash), q + 0.5 * backlash)
-            anchored = rows.line[1] * places.anchor[0, k] + 0.5 * backlash * places.side[0, k]
+            anchored = rows.line.slope * places.anchor[0, k] + 0.5 * backlash * places.side[0, k]
             # Sums of a few numbers of size 20.
             assert anchored == pytest.approx(y, abs=1e-12)
             assert q + 0.5 * backlash * places.share[0, k] == pytest.approx(y, abs=1e-12)
@@ -49,7 +49,7 @@ def test_play_of_many_backlashes_is_that_of_each_with_its_anchor(k):
         for name in ("anchor", "path", "side", "share", "spread"):
             np.testing.assert_array_equal(getattr(places, name)[row], getattr(alone, name)[0], err_msg=name)
         for at, move in enumerate(moves):
-            stood, q = y, rows.line[1] * move.command
+            stood, q = y, rows.line.slope * move.command
             sign = 0.5 * np.sign(k) * backlash
             y = q - sign if move.approach else min(max(y, q - 0.5 * backlash), q + 0.5 * backlash)
             last = at if move.approach or y != stood else last

@@ -49,7 +49,7 @@ def test_runs_are_deviations_from_the_line_by_position_and_side():
     left_out = np.zeros(len(rows.value), dtype=bool)
     left_out[np.flatnonzero((rows.command == 500.0) & (rows.side > 0))[0]] = True
     rows = rows.without(left_out)
-    off = rows.value - (rows.line[0] + rows.line[1] * rows.command)
+    off = rows.value - (rows.line.offset + rows.line.slope * rows.command)
     deviations = position_runs(rows)
     assert deviations.position.tolist() == [0.0, 500.0, 1400.0]
     assert deviations.forward.shape == deviations.backward.shape == (3, 3)

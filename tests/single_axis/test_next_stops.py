@@ -39,7 +39,8 @@ def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
 @pytest.mark.parametrize("target", ["per_command", "effective_per_command", "backlash"])
 def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
     """The u given the scales is smaller because means differ between draws. Places between the rows change neither."""
-    mean, sd = fitted.linear.of(headline_functionals(fitted.model, fitted.w)[[HEADLINE_DRAWS.index(target)]])
+    functionals = headline_functionals(fitted.model, fitted.w)[[HEADLINE_DRAWS.index(target)]]
+    mean, sd = fitted.linear.mean_of(functionals), fitted.linear.sd_of(functionals)
     u_fit = np.sqrt(np.mean(sd**2))
     plan = plan_next(fitted, target, count=1)
     assert plan.u_now == pytest.approx(np.hypot(u_fit, mean.std()), rel=1e-6)
@@ -101,7 +102,7 @@ def test_a_stop_to_be_read_moves_neither_line_nor_reversal(turned, direction):
     more = rows_of(_with_stop(turned, rows, AxisStop(via, 45.0, direction), 60.0))
     assert len(more.value) == len(rows.value) + 1
     # Least squares of a point on the line, by another factorisation.
-    np.testing.assert_allclose([*more.line, reversal_of(more)[0]], [*rows.line, reversal_of(rows)[0]], atol=1e-9)
+    np.testing.assert_allclose([*more.line, reversal_of(more).value], [*rows.line, reversal_of(rows).value], atol=1e-9)
 
 
 def test_simulated_axes_round_trip_and_repeat_by_seed(tmp_path):

@@ -120,7 +120,7 @@ def test_a_drive_is_the_dense_gaussian():
         total += at["reading_scale"] ** 2 * np.eye(len(t)) + (1e-7 * rows.travel) ** 2 * np.eye(len(t))
         g = rows.command - model.middle
         total += rows.travel**2 + model.priors["per_command"].u ** 2 * np.outer(g, g)
-        total += (1e-4 * rows.line[1]) ** 2 * np.outer(rows.path, rows.path) / 4
+        total += (1e-4 * rows.line.slope) ** 2 * np.outer(rows.path, rows.path) / 4
         total += model.priors["backlash"].u ** 2 / 4
         warmed = 1 - np.exp(-t / 60 / at["creep_minutes"])
         total += model.priors["creep"].u ** 2 * np.outer(warmed, warmed)
@@ -130,7 +130,7 @@ def test_a_drive_is_the_dense_gaussian():
         along = (t - 0.5 * (t[0] + t[-1])) / (0.5 * np.ptp(t))
         changed = (WANDER * wave.scale[k]) ** 2 * np.outer(along, along)
         total += changed * np.cos(2 * np.pi * (t[:, None] - t) / PERIOD)
-        residual = rows.value - rows.line[0] - rows.line[1] * model.middle - g
+        residual = rows.value - rows.line.offset - rows.line.slope * model.middle - g
         _, log_det = np.linalg.slogdet(2 * np.pi * total)
         wanted = -0.5 * (log_det + residual @ np.linalg.solve(total, residual))
         # 40 rows of condition 1e10: the two solutions differ by rounding.

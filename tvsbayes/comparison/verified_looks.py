@@ -257,7 +257,7 @@ def verify_looks(
     travel = float(np.max(np.ptp(aimed.ratios * aimed.steps, axis=0)))
     trial = Trial(at, angles.value, aim, _other(aimed), travel, np.zeros((len(aim), len(aim))), angles.noise)
     judgement = judged(trial, seed)
-    before = judgement.without.pooled()[0]
+    before = judgement.without.pooled().mean
     return Verification(
         verdict=judgement.verdict,
         p=judgement.p,

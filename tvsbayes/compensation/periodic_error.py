@@ -43,7 +43,7 @@ def known_waves(fit: AxisFit) -> list[WaveSample]:
 def commands_of(rows: AxisRows, sample: WaveSample) -> float:
     """Compute the mean period of a wave in commands."""
     period = float(np.mean(sample.period[sample.likeliest]))
-    return period * abs(rows.rate or 0.0) if sample.wave.clock == "seconds" else period / abs(rows.line[1])
+    return period * abs(rows.rate or 0.0) if sample.wave.clock == "seconds" else period / abs(rows.line.slope)
 
 
 def strongest_period(rows: AxisRows, waves: Sequence[WaveSample]) -> float:

@@ -335,7 +335,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         job.at(0.5)
         before, _ = _run(fit, tried, max(far, run_up), since, None, u, seed)
         tried_aim = nominal * tried[run.index]
-        offset = _offset(at, nominal) if form.holds == "table" else float((after.pooled()[0] - tried_aim).mean())
+        offset = _offset(at, nominal) if form.holds == "table" else float((after.pooled().mean - tried_aim).mean())
         promise = _promise(after, before, run, offset + tried_aim, u, form.zero_free)
     table = _table(at, shaped.correction)
     return Compensation(

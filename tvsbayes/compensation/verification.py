@@ -135,7 +135,7 @@ def _log_densities(trial: Trial) -> dict[str, float]:
     """Compute the log density of the readings by hypothesis."""
     promised = trial.at(1.0, 1.0)
     mean, covariance = promised.pooled()
-    play_matters = _distance(trial.at(1.0, 0.0).pooled()[0] - mean, covariance + trial.shift) > SEPARATE
+    play_matters = _distance(trial.at(1.0, 0.0).pooled().mean - mean, covariance + trial.shift) > SEPARATE
     log_densities = {}
     for world, factors in SCENARIOS.items():
         possible = [f for f in factors if f[0] == f[1] or play_matters]
@@ -156,7 +156,7 @@ def judged(trial: Trial, seed: int) -> Judged:
     verdict = _verdict(worlds, p)
     needed: int | None = 0
     if verdict == CANNOT_TELL:
-        needed = needed_readings(promised, promised.pooled()[0] - without.pooled()[0], trial.noise)
+        needed = needed_readings(promised, promised.pooled().mean - without.pooled().mean, trial.noise)
     return Judged(verdict, p, worlds, needed, promised, without)
 
 
@@ -193,7 +193,7 @@ def needed_readings(promised: PredictedReadings, off: np.ndarray, noise: np.ndar
         off: deviation of the other hypothesis at these stops, shape (r,).
         noise: variances of the noise drawn at each visit, shape (r,).
     """
-    _, covariance = promised.pooled()
+    covariance = promised.pooled().covariance
     kept = covariance - np.diag(0.999 * np.minimum(noise, np.diag(covariance)))
     for times in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
         if _distance(off, kept + np.diag(noise) / times) >= IDENTIFIED:
@@ -276,7 +276,7 @@ def verify_readings(
         verdict=judgement.verdict,
         p=judgement.p,
         worlds=judgement.worlds,
-        before=size_of(judgement.without.pooled()[0] - aim, made.zero_free),
+        before=size_of(judgement.without.pooled().mean - aim, made.zero_free),
         after=size_of(fresh.value - aim, made.zero_free),
         promised95=bound_of(judgement.promised, aim, stops, made.zero_free),
         readings=len(fresh.value),
@@ -460,8 +460,8 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
     mean, covariance = promised.pooled()
     shift = _shift(made, fit.rows.travel, len(mean))
     noise = np.minimum(_visit_noise(promised, run.side, u), 0.999 * np.diag(covariance))
-    off = [at(0.0, 0.0).pooled()[0] - mean]
-    play = at(1.0, 0.0).pooled()[0] - mean
+    off = [at(0.0, 0.0).pooled().mean - mean]
+    play = at(1.0, 0.0).pooled().mean - mean
     if _distance(play, covariance + shift) > SEPARATE:
         off.append(play)
     if not np.any(off[0]):

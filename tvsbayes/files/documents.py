@@ -15,6 +15,7 @@ import re
 import tomllib
 from collections.abc import Iterable
 from functools import partial
+from typing import NamedTuple
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, other_format, refusal, shown
 from tvsbayes.files.disk import decode
@@ -34,6 +35,13 @@ _TOML_STRING_OR_COMMENT = re.compile(
 )
 _TOKEN = re.compile(rf"{_TOML_STRING_OR_COMMENT.pattern}|[\[\]{{}}=:,.\n]|[^\s\[\]{{}}=:,.\"'#]++", re.DOTALL)
 """Tokens by which keys are located: strings and comments, marks, and the words between them."""
+
+
+class StatedValue(NamedTuple):
+    """A quantity as the user states it, with its standard uncertainty."""
+
+    value: float
+    u: float
 
 
 def _refusal(file: str, code: str, found: str, allowed: str, remedy: str, line: int | None = None) -> InputError:
@@ -210,14 +218,14 @@ class Keys:
             raise self.refuse(key, "table", "a table", f"write it as [{path}] with keys below")
         return Keys(value, self.file, self.text, (*self.path, key))
 
-    def quantity(self, key: str, low: float, high: float, u_max: float) -> tuple[float, float]:
+    def quantity(self, key: str, low: float, high: float, u_max: float) -> StatedValue:
         """`{ value, u }` with value in [low, high] and standard uncertainty u in [0, u_max]."""
         allowed = "{ value = number, u = standard uncertainty }, both and nothing else"
         value = self._get(key, allowed)
         if not isinstance(value, dict) or set(value) != {"value", "u"}:
             raise self.refuse(key, "quantity", allowed, "u = 0 states that the value is exact")
         entry = self.table(key)
-        return entry.number("value", low, high), entry.number("u", 0.0, u_max)
+        return StatedValue(entry.number("value", low, high), entry.number("u", 0.0, u_max))
 
 
 def parse_toml(data: bytes, file: str) -> Keys:

@@ -37,8 +37,7 @@ def _header_value(keys: Keys, key: str) -> object:
     if key in _TEXT_CHARS:
         return keys.text_value(key, _TEXT_CHARS[key])
     if key in _QUANTITIES:
-        value, u = keys.quantity(key, *_QUANTITIES[key])
-        return {"value": value, "u": u}
+        return keys.quantity(key, *_QUANTITIES[key])._asdict()
     if key == "synthetic":
         return keys.flag(key)
     if key == "seed":

@@ -239,8 +239,8 @@ def _parse_priors(entries: Mapping[str, tuple[Keys, str]]) -> dict[str, Prior]:
         if parameter.prior.distribution == "half-normal" and isinstance(stated, dict) and stated.get("value", 0) != 0:
             remedy = "write value = 0: it is the size of something that has no sign, a half-normal whose scale is u"
             raise keys.table(key).refuse("value", "number", "exactly 0", remedy)
-        value, u = keys.quantity(key, parameter.low, parameter.high, parameter.u_max)
-        priors[name] = Prior(value, u, parameter.prior.distribution)
+        expected = keys.quantity(key, parameter.low, parameter.high, parameter.u_max)
+        priors[name] = Prior(expected.value, expected.u, parameter.prior.distribution)
     return priors
 
 

@@ -8,17 +8,10 @@ from __future__ import annotations
 import datetime
 from dataclasses import dataclass
 
+from tvsbayes.files.documents import StatedValue
 from tvsbayes.instrument.campaign import Campaign
 
 NOT_STATED = "not stated"
-
-
-@dataclass(frozen=True)
-class StatedValue:
-    """A quantity as the user states it, with its standard uncertainty."""
-
-    value: float
-    u: float
 
 
 @dataclass(frozen=True)

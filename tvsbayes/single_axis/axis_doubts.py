@@ -105,7 +105,7 @@ def _odd_ratio(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     prior = campaign.stated.get("per_command")
     if prior is None:
         return []
-    slope = rows.line[1]
+    slope = rows.line.slope
     error = axis_priors(campaign.stated, rows.travel, slope)["transmission_error"]
     by_position = LINE_SLOPE * max(error.u, error.value) / float(np.ptp(rows.command))
     u_line = float(np.sqrt(fit_line(rows).covariance[1, 1]))
@@ -135,7 +135,7 @@ def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
         centre = float(np.median(values))
         if len(readings) == 2:
             # Both are at the same distance from their median.
-            design = [1.0, rows.legs.command[move] - rows.command.mean(), -0.5 * np.sign(rows.line[1]) * side[move]]
+            design = [1.0, rows.legs.command[move] - rows.command.mean(), -0.5 * np.sign(rows.line.slope) * side[move]]
             centre = float(np.dot(design, line.solution))
         k = int(np.argmax(np.abs(values - centre)))
         others = np.delete(values, k)
@@ -184,7 +184,7 @@ def _robust_line(rows: AxisRows) -> _RobustLine:
         near, far = of_side[: len(of_side) - half], of_side[half:]
         spacing = rows.command[far] - rows.command[near]
         slopes += ((rows.value[far] - rows.value[near])[spacing > 0] / spacing[spacing > 0]).tolist()
-    deviations = rows.value - float(np.median(slopes or [rows.line[1]])) * rows.command
+    deviations = rows.value - float(np.median(slopes or [rows.line.slope])) * rows.command
     reversals = []
     for segment in np.unique(rows.segment):
         sides = [(rows.segment == segment) & (rows.side == side) for side in (-1, 0, 1)]
@@ -206,7 +206,7 @@ def _wild_stops(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     line = _robust_line(rows)
     typical = float(np.median(np.abs(line.deviations))) / 0.6745
     wild = np.abs(line.deviations) > max(WILD_STOP * typical, WILD_SHARE * rows.travel)
-    leg = np.abs(rows.legs.step[rows.move] * rows.line[1])
+    leg = np.abs(rows.legs.step[rows.move] * rows.line.slope)
     reading = {r.move: r.reading for r in campaign.readings if r.status == "ok"}
     return [
         f"reading {reading[int(rows.move[k])]} (move {rows.move[k]}, command {rows.command[k]:.10g}) lies "

@@ -247,7 +247,7 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
 def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:
     """All default priors of an axis."""
     u = float(np.sqrt(fit_line(rows).covariance[1, 1]))
-    return axis_priors({}, rows.travel, rows.line[1], u)
+    return axis_priors({}, rows.travel, rows.line.slope, u)
 
 
 def fit_axis(

@@ -55,20 +55,27 @@ def _repeat_sd(model: AxisModel) -> float:
     return max(float(np.sqrt(squares / freedom)) if freedom else 0.0, 1e-4 * rows.travel)
 
 
-def _start(model: AxisModel, stop_sd: float) -> tuple[np.ndarray, np.ndarray]:
-    """Start coordinates for stops with scatter `stop_sd`, and their expected widths, each (d,)."""
+def _widths(model: AxisModel) -> np.ndarray:
+    """Expected widths (d,) of the coordinates."""
     names = model.coordinates.names
-    w, width = np.zeros(len(names)), np.ones(len(names))
+    width = np.ones(len(names))
+    if "backlash" in names:
+        width[names.index("backlash")] = min(max(reversal_of(model.rows).u / model.priors["backlash"].u, 1e-9), 1.0)
+    return width
+
+
+def _start(model: AxisModel, stop_sd: float) -> np.ndarray:
+    """Start coordinates (d,) for stops with scatter `stop_sd`."""
+    names = model.coordinates.names
+    w = np.zeros(len(names))
     for k, name in enumerate(names):
         if name == "backlash":
-            reversal, error = reversal_of(model.rows)
-            w[k] = model.coordinates.coordinate(name, reversal)
-            width[k] = min(max(error / model.priors[name].u, 1e-9), 1.0)
+            w[k] = model.coordinates.coordinate(name, reversal_of(model.rows).value)
         elif name.startswith("wave_"):
             w[k] = start_coordinate(model.coordinates.waves[int(name.split(".")[1]) - 1], name)
         elif name.startswith("stop_sd"):
             w[k] = np.clip(model.coordinates.coordinate(name, stop_sd), -4.0, 4.0)
-    return w, width
+    return w
 
 
 def _gradients(model: AxisModel, w: np.ndarray, width: np.ndarray, step: float) -> np.ndarray:
@@ -101,20 +108,20 @@ def find_mode(model: AxisModel, guess: Mapping[str, float] | None = None) -> Axi
         model: the model.
         guess: start coordinates by name, from a model with fewer waves.
     """
-    start, width = _start(model, _repeat_sd(model))
-    start = np.array([(guess or {}).get(name, w) for name, w in zip(model.coordinates.names, start, strict=True)])
-    best = _search(model, start, width)
+    start = _start(model, _repeat_sd(model))
+    known = np.array([(guess or {}).get(name, w) for name, w in zip(model.coordinates.names, start, strict=True)])
+    best = _search(model, known)
     if best.missing and len(best.w):
-        bounded = _search(model, *_start(model, _repeat_sd(model)), bounded=True)
+        bounded = _search(model, start, bounded=True)
         if not bounded.missing:
             return bounded
-        restarted = _search(model, *_start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
+        restarted = _search(model, _start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
         best = max(best, restarted, key=lambda mode: (not mode.missing, mode.log_density))
     return best
 
 
-def _search(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: bool = False) -> AxisMode:
-    """The mode found by a search from coordinates (d,) with expected widths (d,).
+def _search(model: AxisModel, start: np.ndarray, bounded: bool = False) -> AxisMode:
+    """The mode found by a search from coordinates (d,).
 
     A `bounded` search stays within `BOUND` of the priors' centres: a long step over a steep density ends far outside.
     """
@@ -123,6 +130,7 @@ def _search(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: boo
     if not len(start):
         alone = float(model.log_density(start[None])[0])
         return AxisMode(start, np.zeros((0, 0)), alone, _missing(alone))
+    width = _widths(model)
 
     def value(v: np.ndarray) -> float:
         density = float(model.log_density((start + width * v)[None])[0])

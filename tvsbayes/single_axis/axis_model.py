@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.single_axis.axis_parameters import AxisCoordinates, AxisPrior
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_are_long, play_places, reversal_of
-from tvsbayes.single_axis.filter_of_rows import averaged_variance, whitened
+from tvsbayes.single_axis.filter_of_rows import Whitened, averaged_variance, whitened
 from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
 from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
@@ -48,22 +49,24 @@ class LinearPosterior:
     mean: np.ndarray
     covariance: np.ndarray
 
-    def of(self, functionals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n, t) and sd (n, t) of functionals (t, columns), or of (n, t, columns), one for each draw."""
+    def mean_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Means (n, t) of functionals (t, columns), or of (n, t, columns), one for each draw."""
+        return np.einsum("ni,nti->nt", self.mean, functionals) if functionals.ndim == 3 else self.mean @ functionals.T
+
+    def sd_of(self, functionals: np.ndarray) -> np.ndarray:
+        """Standard deviations (n, t) of functionals as in `mean_of`."""
         if functionals.ndim == 3:
-            product = functionals @ self.covariance
-            variance = np.einsum("nti,nti->nt", product, functionals)
-            return np.einsum("ni,nti->nt", self.mean, functionals), np.sqrt(np.maximum(variance, 0.0))
-        variance = np.einsum("ti,nij,tj->nt", functionals, self.covariance, functionals, optimize=True)
-        return self.mean @ functionals.T, np.sqrt(np.maximum(variance, 0.0))
+            variance = np.einsum("nti,nti->nt", functionals @ self.covariance, functionals)
+        else:
+            variance = np.einsum("ti,nij,tj->nt", functionals, self.covariance, functionals, optimize=True)
+        return np.sqrt(np.maximum(variance, 0.0))
 
     def drawn(self, functionals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw functionals (t, columns) or (n, t, columns) once for each of the n, shape (n, t)."""
         covariance = functionals @ self.covariance @ np.swapaxes(functionals, -1, -2)
         values, vectors = np.linalg.eigh(covariance)
         normal = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0.0))
-        mean = np.einsum("ni,nti->nt", self.mean, functionals) if functionals.ndim == 3 else self.mean @ functionals.T
-        return mean + np.einsum("nij,nj->ni", vectors, normal)
+        return self.mean_of(functionals) + np.einsum("nij,nj->ni", vectors, normal)
 
 
 @dataclass(frozen=True)
@@ -230,12 +233,13 @@ class AxisModel:
     @cached_property
     def _unknown_spread(self) -> np.ndarray:
         """Half of the distance (1, rows) between the possible sides of a stop, by the line's reversal."""
-        reversal, error = reversal_of(self.rows)
-        return play_places(self.rows, np.array([max(abs(reversal), min(error, self.rows.travel))])).spread
+        reversal = reversal_of(self.rows)
+        play = max(abs(reversal.value), min(reversal.u, self.rows.travel))
+        return play_places(self.rows, np.array([play])).spread
 
     def clock(self, wave: Wave, command: np.ndarray, time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
         """Position, time or reading in which a wave is periodic, for commands, times and readings, each (t,)."""
-        clocks = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
+        clocks = {"position": abs(self.rows.line.slope) * command, "seconds": time_s, "encoder": value}
         return clocks[wave.clock]
 
     def clock_of_rows(self, wave: Wave) -> np.ndarray:
@@ -249,7 +253,7 @@ class AxisModel:
     def wave_columns(self, wave: Wave, period: np.ndarray) -> np.ndarray:
         """Columns (n, rows, `COLUMNS`) of a wave at periods (n,), averaged as the rows are."""
         rows = self.rows
-        speed = 1.0 if wave.clock == "seconds" else abs(rows.line[1] * (rows.rate or 0.0))
+        speed = 1.0 if wave.clock == "seconds" else abs(rows.line.slope * (rows.rate or 0.0))
         return wave_columns(self.clock_of_rows(wave), period, self.record(wave), rows.width_s * speed)
 
     def _shifts_of_rows(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -275,7 +279,7 @@ class AxisModel:
         blocks = len(backlash) if differ else 1
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
         filled = np.zeros((blocks, len(rows.move), width))
-        level = rows.line[0] + rows.line[1] * self.middle
+        level = rows.line.offset + rows.line.slope * self.middle
         anchor = play.anchor - self.middle
         filled[:, :, 0] = rows.value - level - self.priors["per_command"].value * anchor
         filled[:, :, 0] -= 0.5 * self.priors["ratio_contrast"].value * play.path
@@ -296,19 +300,22 @@ class AxisModel:
             columns[..., self.columns :] = extra
         return filled
 
-    def _scatter(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Variances of stop errors (in motion: of seeing) and of readings, each (n, rows)."""
+    def _stop_variance(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Variances of stop errors (in motion: of seeing), shape (n, rows)."""
         rows = self.rows
-        reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
         if rows.in_motion:
             seeing = (values["seeing_scale"] * rows.reading_u) ** 2
-            return seeing[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None]), reading
+            return seeing[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None])
         forward = 0.5 * (1.0 + rows.side)
         stop = np.outer(values["stop_sd.forward"] ** 2, forward)
-        stop += np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
-        if not self.places.exact:
-            reading += self._between_nodes(values)[:, None]
-        return stop, reading
+        return stop + np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
+
+    def _reading_variance(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Variances of readings, shape (n, rows)."""
+        rows = self.rows
+        reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
+        exact = rows.in_motion or self.places.exact
+        return reading if exact else reading + self._between_nodes(values)[:, None]
 
     def _carry(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Share of the previous row's stop error (in motion: seeing) in each row: shape (n or 1, rows)."""
@@ -324,7 +331,7 @@ class AxisModel:
 
     def _between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Variance (n,) of both processes midway between nodes, as lost by cubic interpolation."""
-        spacing = abs(self.rows.line[1]) * (self.places.command[1] - self.places.command[0])
+        spacing = abs(self.rows.line.slope) * (self.places.command[1] - self.places.command[0])
         length = values["transmission_error_length"]
         weight = np.array([1.0, -0.0625, 0.5625, 0.5625, -0.0625])
         positions = np.array([1.5, 0.0, 1.0, 2.0, 3.0]) * spacing
@@ -357,7 +364,7 @@ class AxisModel:
         for k, scale in enumerate(scales):
             sd[:, self.of_wave(k)] = np.outer(scale, SHARES)
         factor = sd[:, None] * np.eye(self.columns)
-        distance = abs(self.rows.line[1]) * (self.places.command[:, None] - self.places.command)
+        distance = abs(self.rows.line.slope) * (self.places.command[:, None] - self.places.command)
         length = values["transmission_error_length"][:, None, None]
         covariance = matern52(distance[None], length) + JITTER * np.eye(len(distance))
         if reorder:
@@ -383,25 +390,29 @@ class AxisModel:
             columns = self._columns(w[part], values, extra)
             if informed:
                 columns = columns[:, :, np.concatenate(([0], 1 + self.informed))]
-            white, log_scatter = self._whitened(values, columns)
+            white = self._whitened(values, columns)
             scales = [draws.scale for draws in self.coordinates.wave_draws(w[part])]
-            products = np.swapaxes(white, 1, 2) @ white
+            products = np.swapaxes(white.columns, 1, 2) @ white.columns
             spread = rows_log_density(self.rows, values["reading_scale"])
-            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values, scales, informed))
+            yield part, _Block(products, white.log_scatter - 2 * spread, self._factor(values, scales, informed))
 
-    def white(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened readings and columns (rows, 1 + columns) at one draw w (1, d), and the factor of their prior."""
+    def white(self, w: np.ndarray) -> np.ndarray:
+        """Whitened readings and columns (rows, 1 + columns) at one draw w (1, d)."""
         values = self.coordinates.values(w)
+        return self._whitened(values, self._columns(w, values, None)).columns[0]
+
+    def prior_factor(self, w: np.ndarray) -> np.ndarray:
+        """Factor of the prior covariance of the columns (columns, columns) at one draw w (1, d)."""
         scales = [draws.scale for draws in self.coordinates.wave_draws(w)]
-        return self._whitened(values, self._columns(w, values, None))[0][0], self._factor(values, scales, False)[0]
+        return self._factor(self.coordinates.values(w), scales, False)[0]
 
     def whitened_extra(self, w: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Further columns (rows, c), whitened as the model's columns at one draw w (1, d)."""
-        return self._whitened(self.coordinates.values(w), columns[None])[0][0]
+        return self._whitened(self.coordinates.values(w), columns[None]).columns[0]
 
-    def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        stop, reading = self._scatter(values)
-        return whitened(columns, self.rows, values["drift_per_root_hour"] ** 2, stop, reading, self._carry(values))
+    def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> Whitened:
+        drift, stop = values["drift_per_root_hour"] ** 2, self._stop_variance(values)
+        return whitened(columns, self.rows, drift, stop, self._reading_variance(values), self._carry(values))
 
     def log_likelihood(self, w: np.ndarray) -> np.ndarray:
         """Log density of the readings at coordinates (n, d), shape (n,)."""
@@ -412,12 +423,13 @@ class AxisModel:
         rows, count = len(self.rows.move), len(functionals)
         log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), count)), np.empty((len(w), count, count))
         for part, block in self._blocks(w):
-            information, right_side = _information(block, 0)
-            root, scaled, scale = _equilibrated(information)
-            sides = np.concatenate([right_side[:, None], functionals @ block.factor], axis=1) / scale[:, None]
-            solved = np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
+            normal = _normal_equations(block, 0)
+            scaled = _scaled(normal.information)
+            sides = np.concatenate([normal.right_side[:, None], functionals @ block.factor], axis=1)
+            sides = sides / scaled.scale[:, None]
+            solved = np.linalg.solve(scaled.matrix, np.swapaxes(sides, 1, 2))
             products = sides @ solved
-            log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
+            log_det = 2 * np.sum(np.log(np.diagonal(scaled.root, axis1=1, axis2=2)) + np.log(scaled.scale), axis=1)
             residual = block.products[:, 0, 0] - products[:, 0, 0]
             log_density[part] = -0.5 * (block.log_scatter + log_det + residual + rows * np.log(2 * np.pi))
             mean[part], covariance[part] = products[:, 0, 1:], products[:, 1:, 1:]
@@ -428,7 +440,7 @@ class AxisModel:
     def _prior_means(self, w: np.ndarray) -> np.ndarray:
         """Prior means of the columns, (n, columns)."""
         means = np.zeros((len(w), self.columns))
-        means[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
+        means[:, OFFSET] = self.rows.line.offset + self.rows.line.slope * self.middle
         means[:, SLOPE] = self.priors["per_command"].value
         means[:, CONTRAST] = self.priors["ratio_contrast"].value
         means[:, BACKLASH] = self.coordinates.values(w)["backlash"]
@@ -475,10 +487,10 @@ class AxisModel:
         # Places without influence on rows have no information: only the matrix of the others is inverted.
         for part, block in self._blocks(w, informed=len(others) > 0):
             reduced = replace(block, factor=block.factor[:, informed[:, None], informed]) if len(others) else block
-            information, right_side = _information(reduced, 0)
-            inverse = _inverse(information)
+            normal = _normal_equations(reduced, 0)
+            inverse = _inverse(normal.information)
             loading = block.factor[:, :, informed] if len(others) else block.factor
-            means[part] = np.einsum("nij,njk,nk->ni", loading, inverse, right_side, optimize=True)
+            means[part] = np.einsum("nij,njk,nk->ni", loading, inverse, normal.right_side, optimize=True)
             covariances[part] = loading @ inverse @ np.swapaxes(loading, 1, 2)
             for group in (others[: len(others) // 2], others[len(others) // 2 :]):
                 # Columns of the error by position, then of the play, which are independent in the prior.
@@ -486,7 +498,7 @@ class AxisModel:
                 covariances[part, group[:, None], group] += factor @ np.swapaxes(factor, 1, 2)
         return LinearPosterior(means + self._prior_means(w), covariances)
 
-    def left_out(self, w: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def left_out(self, w: np.ndarray, rows: np.ndarray) -> LinearPosterior:
         """Prediction of some rows by all others, given the scales.
 
         Each left-out row gets an additional unknown with a flat prior, so that it has no influence; the unknown is the
@@ -497,18 +509,18 @@ class AxisModel:
             rows: numbers of the rows left out.
 
         Returns:
-            Means (n, rows) and covariances (n, rows, rows) of their readings, including noise and stop errors.
+            Their readings in place of columns, including noise and stop errors.
         """
         extra = np.zeros((len(self.rows.move), len(rows)))
         extra[rows, np.arange(len(rows))] = 1.0
         means, covariances = np.empty((len(w), len(rows))), np.empty((len(w), len(rows), len(rows)))
         for part, block in self._blocks(w, extra):
-            information, right_side = _information(block, len(rows))
-            inverse = _inverse(information)
-            expected = np.einsum("nij,nj->ni", inverse, right_side)
+            normal = _normal_equations(block, len(rows))
+            inverse = _inverse(normal.information)
+            expected = np.einsum("nij,nj->ni", inverse, normal.right_side)
             means[part] = self.rows.value[rows] - expected[:, self.columns :]
             covariances[part] = inverse[:, self.columns :, self.columns :]
-        return means, covariances
+        return LinearPosterior(means, covariances)
 
     def line_terms(self, **factors: float) -> np.ndarray:
         """A functional (columns,) of `offset`, `per_command`, `ratio_contrast`, `backlash` by their factors."""
@@ -558,8 +570,15 @@ def _creeps(rows: AxisRows) -> bool:
 _LINE_COLUMNS = {"offset": OFFSET, "per_command": SLOPE, "ratio_contrast": CONTRAST, "backlash": BACKLASH}
 
 
-def _information(block: _Block, flat: int) -> tuple[np.ndarray, np.ndarray]:
-    """Information (n, c, c) and right-hand side (n, c) of the columns in units of their prior, then of flat ones."""
+class _NormalEquations(NamedTuple):
+    """Information (n, c, c) and right-hand side (n, c)."""
+
+    information: np.ndarray
+    right_side: np.ndarray
+
+
+def _normal_equations(block: _Block, flat: int) -> _NormalEquations:
+    """Normal equations of the columns in units of their prior, then of `flat` ones."""
     products, columns = block.products, block.factor.shape[1]
     factor = block.factor
     if flat:
@@ -570,20 +589,27 @@ def _information(block: _Block, flat: int) -> tuple[np.ndarray, np.ndarray]:
     transposed = np.swapaxes(factor, 1, 2)
     information = transposed @ products[:, 1:, 1:] @ factor
     information[:, range(columns), range(columns)] += 1.0
-    return information, np.einsum("nij,nj->ni", transposed, products[:, 1:, 0])
+    return _NormalEquations(information, np.einsum("nij,nj->ni", transposed, products[:, 1:, 0]))
 
 
-def _equilibrated(information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cholesky factor of the matrix scaled to a unit diagonal, that matrix, and the scale (n, c)."""
+class _Scaled(NamedTuple):
+    """A matrix scaled to a unit diagonal, its Cholesky factor, both (n, c, c), and the scale (n, c)."""
+
+    matrix: np.ndarray
+    root: np.ndarray
+    scale: np.ndarray
+
+
+def _scaled(information: np.ndarray) -> _Scaled:
     scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
     scaled = information / (scale[:, :, None] * scale[:, None, :])
-    return np.linalg.cholesky(scaled), scaled, scale
+    return _Scaled(scaled, np.linalg.cholesky(scaled), scale)
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:
     """Inverse of the matrix, by its scaled one."""
-    _, scaled, scale = _equilibrated(information)
-    return np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    scaled = _scaled(information)
+    return np.linalg.inv(scaled.matrix) / (scaled.scale[:, :, None] * scaled.scale[:, None, :])
 
 
 def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:

@@ -111,7 +111,7 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
         functionals = np.concatenate([np.zeros((COLUMNS, model.columns)), model.line_terms(per_command=1.0)[None]])
         functionals[:COLUMNS, model.of_wave(k)] = np.eye(COLUMNS)
         draws = linear.drawn(functionals, rng)
-        coefficients, ratio = draws[:, :COLUMNS], draws[:, COLUMNS] / fit.rows.line[1]
+        coefficients, ratio = draws[:, :COLUMNS], draws[:, COLUMNS] / fit.rows.line.slope
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
         # Positions in the model follow the line's ratio; the true ratio scales them.
         true_period = period * ratio if wave.clock == "position" else period

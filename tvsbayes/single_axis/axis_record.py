@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta, field, structs
@@ -152,26 +152,29 @@ def axis_fit_schema() -> dict[str, Any]:
     return schema_of(AxisSummary, Provenance, format={"const": AXIS_FIT_FORMAT}, inputs=AxisInputs)
 
 
-def _estimate(
-    draws: np.ndarray, prior: float | None, diagnosis: tuple[float | None, float | None, float | None]
-) -> Estimate:
+class _Diagnosis(NamedTuple):
+    """Diagnosis of a sampler, as in `Estimate`; None where none ran."""
+
+    rhat: float | None = None
+    ess_bulk: float | None = None
+    ess_tail: float | None = None
+
+
+def _estimate(draws: np.ndarray, prior: float | None, diagnosis: _Diagnosis) -> Estimate:
     sd = float(draws.std())
     contraction = None if not prior else float(max(1 - (sd / prior) ** 2, -1.0))
-    return Estimate(float(draws.mean()), sd, interval95(draws), prior, contraction, *diagnosis)
+    return Estimate(float(draws.mean()), sd, interval95(draws), prior, contraction, **diagnosis._asdict())
 
 
-def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, float | None]]:
-    """R-hat, bulk and tail effective draws by quantity; "" has the worst values, used for other quantities."""
+def _diagnoses(fit: AxisFit) -> dict[str, _Diagnosis]:
+    """Diagnosis by quantity; "" has the worst values, used for other quantities."""
     if fit.sample is None or fit.answer == "laplace":
-        return {"": (None, None, None)}
+        return {"": _Diagnosis()}
     state = fit.sample.convergence
-    by_name = {name: (state.rhat.get(name), state.ess_bulk[name], state.ess_tail[name]) for name in state.ess_bulk}
-    lowest = (
-        max(state.rhat.values(), default=None),
-        min(state.ess_bulk.values()),
-        min(state.ess_tail.values()),
-    )
-    return {**by_name, "": lowest}
+    bulk, tail = state.ess_bulk, state.ess_tail
+    by_name = {name: _Diagnosis(state.rhat.get(name), bulk[name], tail[name]) for name in bulk}
+    worst = _Diagnosis(max(state.rhat.values(), default=None), min(bulk.values()), min(tail.values()))
+    return {**by_name, "": worst}
 
 
 def _prior_sds(fit: AxisFit) -> dict[str, float]:
@@ -233,7 +236,7 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
     )
 
 
-def _effective_backlash(fit: AxisFit, diagnosis: tuple[float | None, float | None, float | None]) -> Estimate | None:
+def _effective_backlash(fit: AxisFit, diagnosis: _Diagnosis) -> Estimate | None:
     """Estimate the mean of the play over the positions read; None for a drive, or with stops from one side alone."""
     rows, model = fit.rows, fit.model
     if rows.in_motion or not rows.both_sides:
@@ -295,8 +298,13 @@ def deviation_strata(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
     from scipy.special import ndtri
 
     normal = ndtri((np.arange(STRATA) + 0.5) / STRATA)[:, None]
-    laws = [part.linear.of(deviation_functionals(part, commands)) for part in _curve_parts(fit)]
-    return np.concatenate([(mean[:, None] + normal * u[:, None]).reshape(-1, len(commands)) for mean, u in laws])
+
+    def of_part(part: AxisFit) -> np.ndarray:
+        functionals = deviation_functionals(part, commands)
+        mean, sd = part.linear.mean_of(functionals), part.linear.sd_of(functionals)
+        return (mean[:, None] + normal * sd[:, None]).reshape(-1, len(commands))
+
+    return np.concatenate([of_part(part) for part in _curve_parts(fit)])
 
 
 def _curve_parts(fit: AxisFit) -> Iterator[AxisFit]:

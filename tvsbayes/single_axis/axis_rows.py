@@ -10,12 +10,14 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, listed
 from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
+from tvsbayes.statistics.intervals import Uncertain
 
 SIDES = {"forward": 1, "backward": -1, "unknown": 0}
 DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}
@@ -47,6 +49,13 @@ class Legs:
     segment: np.ndarray
 
 
+class Line(NamedTuple):
+    """The line of positions over commands: `offset`, unit, is that at command 0; `slope` is in unit per command."""
+
+    offset: float
+    slope: float
+
+
 @dataclass(frozen=True)
 class AxisRows:
     """Moves with readings; arrays (rows,).
@@ -63,7 +72,7 @@ class AxisRows:
         variance: variance of that mean by the stated u, unit^2; 0 where no u is known.
         within: sum of squares of the readings about their mean, in units of their u.
         count: readings in the mean.
-        line: offset and unit per command of the least-squares line with a reversal.
+        line: the least-squares line with a reversal.
         time_s: time on the clock of moves.csv.
         warm_s: time since the machine was switched on, or since the first move where that is unknown.
         kelvin: temperature minus that of the first move; None where none was recorded.
@@ -85,7 +94,7 @@ class AxisRows:
     variance: np.ndarray
     within: np.ndarray
     count: np.ndarray
-    line: tuple[float, float]
+    line: Line
     time_s: np.ndarray
     warm_s: np.ndarray
     kelvin: np.ndarray | None
@@ -101,7 +110,7 @@ class AxisRows:
     @property
     def travel(self) -> float:
         """Range of the positions read, unit."""
-        return float(np.ptp(self.command)) * abs(self.line[1])
+        return float(np.ptp(self.command)) * abs(self.line.slope)
 
     @property
     def positions(self) -> np.ndarray:
@@ -145,8 +154,18 @@ def legs_of(moves: Sequence[AxisMove]) -> Legs:
     return Legs(command, step, first, side, segment)
 
 
-def _means(used: Sequence[Reading]) -> dict[int, tuple[float, float, float, int]]:
-    """Mean, variance, scatter within and number of the readings of every move.
+@dataclass(frozen=True)
+class _Mean:
+    """The readings of one move; fields as in `AxisRows`."""
+
+    value: float
+    variance: float
+    within: float
+    count: int
+
+
+def _means(used: Sequence[Reading]) -> dict[int, _Mean]:
+    """Means of the readings of every move.
 
     Without a stated u, it comes from repeated readings of one move; without these it is unknown, 0.
     """
@@ -165,9 +184,9 @@ def _means(used: Sequence[Reading]) -> dict[int, tuple[float, float, float, int]
         if np.all(u > 0):
             weight = 1 / u**2
             mean = float(weight @ values / weight.sum())
-            means[move] = mean, float(1 / weight.sum()), float(weight @ (values - mean) ** 2), len(of_move)
+            means[move] = _Mean(mean, float(1 / weight.sum()), float(weight @ (values - mean) ** 2), len(of_move))
         else:
-            means[move] = float(values.mean()), 0.0, 0.0, len(of_move)
+            means[move] = _Mean(float(values.mean()), 0.0, 0.0, len(of_move))
     return means
 
 
@@ -248,13 +267,16 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
             file="readings.csv",
             remedy="thin them out, or give readings at one standstill one move: they are averaged exactly",
         )
-    value, variance, within, count = (np.array(column) for column in zip(*(means[m] for m in moves), strict=True))
+    read = {
+        name: np.array([getattr(means[m], name) for m in moves]) for name in ("value", "variance", "within", "count")
+    }
+    value = read["value"]
     command = legs.command[moves]
     _check_turns(campaign, command, value, moves)
     design = np.column_stack([np.ones(len(command)), command - command.mean(), legs.side[moves]])
-    line = np.linalg.lstsq(design, value, rcond=None)[0]
+    level, slope, _ = np.linalg.lstsq(design, value, rcond=None)[0]
     remedy = "check the columns move and value, and that the reading follows this axis"
-    _check_motion(line[1], command, value, remedy)
+    _check_motion(slope, command, value, remedy)
     times_s = np.array([m.time_s for m in campaign.moves])
     stated_u = [r.u for r in used if r.u > 0]
     rows = AxisRows(
@@ -266,12 +288,9 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         segment=legs.segment[moves],
         hours=_hours(times_s / HOUR_S, legs, moves),
         path=_path(legs)[moves],
-        redrawn=_redrawn(legs, moves) | (variance == 0),
-        value=value,
-        variance=variance,
-        within=within,
-        count=count,
-        line=(float(line[0] - line[1] * command.mean()), float(line[1])),
+        redrawn=_redrawn(legs, moves) | (read["variance"] == 0),
+        **read,
+        line=Line(float(level - slope * command.mean()), float(slope)),
         time_s=times_s[moves],
         warm_s=times_s[moves] - warm_from(campaign),
         kelvin=_kelvin(campaign, times_s[moves]),
@@ -344,7 +363,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
     starts_s = np.array([by_move["time_s"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
     gaps = np.where(first, rows_time - starts_s, np.r_[0.0, np.diff(rows_time)])
     design = np.column_stack([np.ones(len(rows_command)), rows_command - rows_command.mean()])
-    line = np.linalg.lstsq(design, rows_value, rcond=None)[0]
+    level, per_command = np.linalg.lstsq(design, rows_value, rcond=None)[0]
     starts_command = np.array([by_move["command"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
     return AxisRows(
         unit=campaign.unit,
@@ -360,7 +379,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
         variance=1.0 / weight_sum,
         within=np.zeros(len(count)),
         count=count,
-        line=(float(line[0] - line[1] * rows_command.mean()), float(line[1])),
+        line=Line(float(level - per_command * rows_command.mean()), float(per_command)),
         time_s=rows_time,
         warm_s=rows_time - warm_from(campaign),
         kelvin=_kelvin(campaign, rows_time),
@@ -472,7 +491,7 @@ class _PlayEnd:
 
 def _places_in_motion(rows: AxisRows) -> PlayPlaces:
     """Positions of a drive that never reverses: the play is taken up on one side."""
-    side = (-float(np.sign(rows.line[1])) * rows.side)[None].astype(float)
+    side = (-float(np.sign(rows.line.slope)) * rows.side)[None].astype(float)
     return PlayPlaces(rows.command[None], rows.path[None], side, side, np.zeros_like(side))
 
 
@@ -483,7 +502,7 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
     """
     if rows.in_motion:
         return _places_in_motion(rows)
-    legs, slope = rows.legs, rows.line[1]
+    legs, slope = rows.legs, rows.line.slope
     motion = legs.step * slope
     shortest = np.min(np.abs(motion[motion != 0]), initial=np.inf)
     if np.all(backlash < shortest) and not np.any(legs.first & (legs.side == 0)):
@@ -491,7 +510,7 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
         backlash = backlash[:1]
     half = 0.5 * np.maximum(backlash, 0.0)
     n, count, slope_sign = len(half), len(rows.move), float(np.sign(slope))
-    arrays = [np.empty((n, count)) for _ in range(5)]
+    places = PlayPlaces(*(np.empty((n, count)) for _ in range(5)))
     path = _path(legs)
     ends: list[_PlayEnd] = []
     row = 0
@@ -505,43 +524,43 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
                 end.follow(command, travelled, slope, half)
         if row < count and rows.move[row] == move:
             low, high = ends[0], ends[-1]
-            places = low.place(slope, half), high.place(slope, half)
-            offset = 0.5 * (places[0] + places[1]) - slope * command
+            lowest, highest = low.place(slope, half), high.place(slope, half)
+            offset = 0.5 * (lowest + highest) - slope * command
             middle_side = 0.5 * (low.side + high.side)
-            arrays[0][:, row] = 0.5 * (low.anchor + high.anchor)
-            arrays[1][:, row] = 0.5 * (low.path + high.path)
-            arrays[2][:, row] = middle_side
-            arrays[3][:, row] = np.where(half > 0, offset / np.where(half > 0, half, 1.0), middle_side)
-            arrays[4][:, row] = 0.5 * (places[1] - places[0])
+            places.anchor[:, row] = 0.5 * (low.anchor + high.anchor)
+            places.path[:, row] = 0.5 * (low.path + high.path)
+            places.side[:, row] = middle_side
+            places.share[:, row] = np.where(half > 0, offset / np.where(half > 0, half, 1.0), middle_side)
+            places.spread[:, row] = 0.5 * (highest - lowest)
             row += 1
-    return PlayPlaces(*arrays)
+    return places
 
 
 def line_design(rows: AxisRows) -> np.ndarray:
     """Columns of offset (at the mean command), unit per command and backlash, shape (rows, 3)."""
-    sign = np.sign(rows.line[1])
+    sign = np.sign(rows.line.slope)
     return np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * sign * rows.side])
 
 
-def reversal_of(rows: AxisRows) -> tuple[float, float]:
+def reversal_of(rows: AxisRows) -> Uncertain[float]:
     """Backlash of the least-squares line with one reversal, unit, and its standard error: infinite if undetermined."""
     design = line_design(rows)
     solved, _, rank, _ = np.linalg.lstsq(design, rows.value, rcond=None)
     if rank < 3:
-        return 0.0, np.inf
+        return Uncertain(0.0, np.inf)
     scatter = float(np.sqrt(np.sum((rows.value - design @ solved) ** 2) / max(len(rows.value) - 3, 1)))
-    return float(solved[2]), scatter * float(np.sqrt(np.linalg.inv(design.T @ design)[2, 2]))
+    return Uncertain(float(solved[2]), scatter * float(np.sqrt(np.linalg.inv(design.T @ design)[2, 2])))
 
 
 def legs_are_long(rows: AxisRows) -> bool:
     """Whether every leg certainly takes up the play, so that the backlash is linear as well."""
-    reversal, error = reversal_of(rows)
-    motion = np.abs(rows.legs.step * rows.line[1])
+    reversal = reversal_of(rows)
+    motion = np.abs(rows.legs.step * rows.line.slope)
     shortest = np.min(motion[motion > 0], initial=np.inf)
     if np.all(rows.side >= 0) or np.all(rows.side <= 0):
         # With approaches from one side only, the backlash stays at its prior, and the offset absorbs it.
         return True
-    return bool(shortest > LONG_LEGS * abs(reversal) + LONG_ERRORS * error)
+    return bool(shortest > LONG_LEGS * abs(reversal.value) + LONG_ERRORS * reversal.u)
 
 
 LINE_ROUNDS, LINE_PLAYS, LINE_PLAY_MAX = 3, 61, 0.5
@@ -550,17 +569,17 @@ LINE_ROUNDS, LINE_PLAYS, LINE_PLAY_MAX = 3, 61, 0.5
 
 def _line_with_play(rows: AxisRows) -> AxisRows:
     """The rows with a least-squares line that includes the play; its slope decides which legs are lost."""
-    slope = rows.line[1]
+    slope = rows.line.slope
     for _ in range(LINE_ROUNDS):
         play = play_places(rows, np.linspace(0.0, LINE_PLAY_MAX * rows.travel, LINE_PLAYS))
-        best = None
+        least, line = np.inf, rows.line
         for anchor, side in zip(play.anchor, play.side, strict=True):
             design = np.column_stack([np.ones(len(anchor)), anchor, side])
             solved = np.linalg.lstsq(design, rows.value, rcond=None)[0]
             sum_of_squares = float(np.sum((rows.value - design @ solved) ** 2))
-            if best is None or sum_of_squares < best[0]:
-                best = sum_of_squares, solved
-        if best is None or not 0.5 < best[1][1] / slope < 2.0:
+            if sum_of_squares < least:
+                least, line = sum_of_squares, Line(*solved[:2].tolist())
+        if not 0.5 < line.slope / slope < 2.0:
             break
-        rows = replace(rows, line=(float(best[1][0]), float(best[1][1])))
+        rows = replace(rows, line=line)
     return rows

@@ -99,7 +99,7 @@ class PositionRuns:
 
 def position_runs(rows: AxisRows) -> PositionRuns:
     """The runs for ISO 230-2."""
-    deviations = rows.value - rows.command * rows.line[1] - rows.line[0]
+    deviations = rows.value - rows.command * rows.line.slope - rows.line.offset
     by_side = [[deviations[(rows.command == p) & (rows.side == side)] for p in rows.positions] for side in (1, -1)]
     complete = [k for k in range(len(rows.positions)) if min(len(by_side[0][k]), len(by_side[1][k])) >= RUNS_MIN]
     tables = []

@@ -5,7 +5,7 @@ Two states, many draws at once; times in hours, variances in the square of the r
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,16 @@ def averaged_variance(duration: np.ndarray) -> np.ndarray:
     return np.where(duration > 1e-3, 2 / ratio * (1 + np.expm1(-ratio) / ratio), 1.0 - duration / 3)
 
 
+class Whitened(NamedTuple):
+    """Innovations of columns over their sd (n, rows, c), and the log-determinant of the scatter (n,)."""
+
+    columns: np.ndarray
+    log_scatter: np.ndarray
+
+
 def whitened(
     columns: np.ndarray, rows: AxisRows, drift: np.ndarray, stop: np.ndarray, reading: np.ndarray, carry: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Whitened:
     """Columns in units of the scatter of drift, stop errors and readings, decorrelated: innovations of the filter.
 
     Args:
@@ -31,9 +38,6 @@ def whitened(
         reading: variances of readings, shape (n, rows).
         carry: share of the previous row's stop error or seeing in each row; 0 where it is new, 1 where it is unchanged;
             shape (n or 1, rows).
-
-    Returns:
-        Innovations over their sd (n, rows, c), and the log-determinant of the scatter (n,).
     """
     n, count, width = len(drift), columns.shape[1], columns.shape[2]
     new_segment = np.append(False, rows.segment[1:] != rows.segment[:-1]).tolist()
@@ -83,7 +87,7 @@ def whitened(
             held += gain_held[k] * innovation
         white[k] = innovation
         zero = zero + gain_zero[k] * innovation
-    return np.swapaxes(white / np.sqrt(variance), 0, 1), np.log(variance[..., 0]).sum(axis=0)
+    return Whitened(np.swapaxes(white / np.sqrt(variance), 0, 1), np.log(variance[..., 0]).sum(axis=0))
 
 
 def _by_row(of_draws: np.ndarray, count: int) -> list[Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
@@ -30,17 +31,24 @@ and scatter by more than the second share of their own span about a line."""
 _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
 
 
-def run_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, tuple[int, int]]:
-    """Columns with one run each, by name: its number and direction; empty where the table has none."""
-    runs: dict[str, tuple[int, int]] = {}
+class Run(NamedTuple):
+    """A run of a table: its number, and its side, 1 forward or -1 backward."""
+
+    number: int
+    side: int
+
+
+def run_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, Run]:
+    """Columns with one run each, by name; empty where the table has none."""
+    runs: dict[str, Run] = {}
     for name, cells in columns.items():
         words = words_of(name.translate(_ARROWS))
         sides = [side for side, spellings in DIRECTIONS.items() if spellings.intersection(words)]
         numbers = [int(word) for word in words if word.isdigit()]
         first = next((cell for cell in cells if cell), "")
         if len(sides) == 1 and len(numbers) < 2 and NUMBER.fullmatch(first):
-            runs[name] = (numbers[0] if numbers else 1, sides[0])
-    has_both = {side for _, side in runs.values()} == {-1, 1}
+            runs[name] = Run(numbers[0] if numbers else 1, sides[0])
+    has_both = {run.side for run in runs.values()} == {-1, 1}
     return runs if (has_both or len(runs) > 1) and len(set(runs.values())) == len(runs) else {}
 
 
@@ -85,19 +93,19 @@ def long_table(table: ForeignTable, stated: Mapping[str, str]) -> LongTable:
     positions = [float(cell) for cell in table.columns[position]]
     rising = sorted(range(len(positions)), key=positions.__getitem__)
     rows = [
-        (row, name, side)
-        for name, (_, side) in sorted(runs.items(), key=lambda item: (item[1][0], -item[1][1]))
-        for row in (rising if side > 0 else rising[::-1])
+        (row, name)
+        for name in sorted(runs, key=lambda name: (runs[name].number, -runs[name].side))
+        for row in (rising if runs[name].side > 0 else rising[::-1])
     ]
     unit = next(iter(units))
     columns: dict[str, Sequence[object]] = {
-        position: [table.columns[position][row] for row, _, _ in rows],
-        "direction": ["forward" if side > 0 else "backward" for _, _, side in rows],
-        "reading" + f" ({unit})" * (unit is not None): [table.columns[name][row] for row, name, _ in rows],
-        "cycle": [str(runs[name][0]) for _, name, _ in rows],
+        position: [table.columns[position][row] for row, _ in rows],
+        "direction": ["forward" if runs[name].side > 0 else "backward" for _, name in rows],
+        "reading" + f" ({unit})" * (unit is not None): [table.columns[name][row] for row, name in rows],
+        "cycle": [str(runs[name].number) for _, name in rows],
     }
     sentence = f"runs: {len(runs)} columns ({listed}), read one after the other; forward runs rise, backward runs fall"
-    by_rows = table_of(table.file, table.kind, columns, [table.lines[row] for row, _, _ in rows])
+    by_rows = table_of(table.file, table.kind, columns, [table.lines[row] for row, _ in rows])
     return LongTable(by_rows, {**stated, "command": position}, [sentence])
 
 
@@ -115,7 +123,7 @@ def deviation_columns(table: ForeignTable, columns: Mapping[str, str]) -> dict[s
         words = set(words_of(name))
         if name in names or not words & (SPREAD | DEVIATION | {"fehler"}):
             continue
-        scale = _scale(name, columns["value"])
+        scale = scale_between(name, columns["value"])
         numbers = _numbers(cells)
         rows = [k for k, cell in enumerate(numbers) if cell is not None and None not in (command[k], value[k])]
         for sign, text in ((1.0, f"{names[0]} - {names[1]}"), (-1.0, f"{names[1]} - {names[0]}"), (0.0, "")):
@@ -143,7 +151,7 @@ def _half_digit(cell: str) -> float:
     return 0.5000001 * 10.0**-decimals + 1e-12
 
 
-def _scale(name: str, other_name: str) -> float:
+def scale_between(name: str, other_name: str) -> float:
     """Units of one column in a unit of another, by their names; 1 where these do not state them."""
     unit, other = unit_of_name(name, READING_UNITS), unit_of_name(other_name, READING_UNITS)
     for units in (LENGTHS_MM, DEGREES):
@@ -162,7 +170,7 @@ def refuse_small(table: ForeignTable, columns: Mapping[str, str]) -> None:
     units = [unit_of_name(name, READING_UNITS) for name in names]
     comparable = any(units[0] in points and units[1] in points for points in (LENGTHS_MM, DEGREES))
     pairs = zip(*(_numbers(table.columns[name]) for name in names), strict=True)
-    points = [(c, v * _scale(names[0], names[1])) for c, v in pairs if c is not None and v is not None]
+    points = [(c, v * scale_between(names[0], names[1])) for c, v in pairs if c is not None and v is not None]
     if not comparable or len(points) < 4:
         return
     commands, values = zip(*points, strict=True)
@@ -185,11 +193,3 @@ def refuse_small(table: ForeignTable, columns: Mapping[str, str]) -> None:
             allowed="positions",
             remedy=f"add --deviations, or --column value={escaped(names[1])}",
         )
-
-
-def positions_of_deviations(
-    columns: Mapping[str, str], commands: Sequence[float], deviations: Sequence[float | None]
-) -> tuple[list[float | None], float]:
-    """Positions in the unit of the commands, and the factor from the unit of the deviations."""
-    factor = _scale(columns["command"], columns["value"])
-    return [None if d is None else c + factor * d for c, d in zip(commands, deviations, strict=True)], factor

@@ -27,6 +27,7 @@ from tvsbayes.instrument.column_names import (
 )
 from tvsbayes.instrument.foreign_cells import (
     FieldCells,
+    PlainColumn,
     homings_of,
     left_out,
     plain_column,
@@ -37,7 +38,7 @@ from tvsbayes.instrument.foreign_cells import (
 )
 from tvsbayes.single_axis.axis_campaign import AXIS_MOVES, READINGS, TURNS, Approach, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import turn_jumps
-from tvsbayes.single_axis.foreign_columns import positions_of_deviations
+from tvsbayes.single_axis.foreign_columns import scale_between
 
 TURN_TOLERANCE = 0.1
 """Largest deviation of a jump from whole turns by play and errors of gears, turns."""
@@ -169,14 +170,16 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
         InputError: a cell is not a value of its field, or the table has no row.
     """
     table.require_rows()
-    assumed: list[str] = []
-    table, unit = _plain(table, columns, assumed)
+    plain = _plain_columns(table, columns)
+    table = replace(table, columns={**table.columns, **{columns[f]: column.cells for f, column in plain.items()}})
+    assumed, unit = [column.remark for column in plain.values() if column.remark], plain["value"].unit
     cells = FieldCells(table, columns)
     commands, values, stated_u = (cells.read(_COLUMNS[name]) for name in ("command", "value", "u"))
     if not deviations and len(set(values)) > 2 and values == commands:
         assumed.append("value: equals the command in every row: what was read, or the command again?")
     if deviations:
-        values, factor = positions_of_deviations(columns, commands, values)
+        factor = scale_between(columns["command"], columns["value"])
+        values = [None if d is None else c + factor * d for c, d in zip(commands, values, strict=True)]
         stated_u, unit = [factor * u for u in stated_u], unit_of_name(columns["command"], READING_UNITS) or unit
         assumed.append("value: the command plus the deviation, because --deviations says so")
     if "u" in columns and (coverage := _coverage_of(columns["u"])) is not None:
@@ -206,16 +209,10 @@ def _coverage_of(name: str) -> float | None:
     return COVERAGE_USUAL if {"expanded", "erweiterte", "expandida", "elargie"}.intersection(words_of(name)) else None
 
 
-def _plain(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) -> tuple[ForeignTable, str | None]:
-    """Convert a table to plain numbers for commands, readings and their u; also return the readings' unit."""
-    units: dict[str, str | None] = {}
-    plain_columns = dict(table.columns)
-    for field in ("command", "value", "u"):
-        if field in columns:
-            column = plain_column(columns[field], table.columns[columns[field]])
-            plain_columns[columns[field]], units[field] = column.cells, column.unit
-            assumed += [column.remark] * bool(column.remark)
-    return replace(table, columns=plain_columns), units.get("value")
+def _plain_columns(table: ForeignTable, columns: Mapping[str, str]) -> dict[str, PlainColumn]:
+    """Commands, readings and their u as plain numbers, by field."""
+    names = {field: columns[field] for field in ("command", "value", "u") if field in columns}
+    return {field: plain_column(name, table.columns[name]) for field, name in names.items()}
 
 
 class _Stops:

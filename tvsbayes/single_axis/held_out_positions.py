@@ -19,7 +19,7 @@ from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.predicted_stops import transferred_scales
-from tvsbayes.statistics.intervals import NORMAL_95, rms
+from tvsbayes.statistics.intervals import NORMAL_95, Uncertain, rms
 from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
@@ -37,13 +37,13 @@ def _mean_weights(rows: AxisRows, members: np.ndarray) -> np.ndarray:
     return rows.count[members] / rows.count[members].sum()
 
 
-def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> tuple[float, float]:
-    """Mean of rows `members` from offset, scale and play fitted to the other rows, and its u."""
+def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> Uncertain[float]:
+    """Mean of rows `members` from offset, scale and play fitted to the other rows."""
     line = fit_line(rows, ~left_out)
     weights = _mean_weights(rows, members)
     design_row = weights @ line_design(rows)[members]
     variance = float(design_row @ line.covariance @ design_row + line.scatter**2 * weights @ weights)
-    return float(design_row @ line.solution), float(np.sqrt(variance))
+    return Uncertain(float(design_row @ line.solution), float(np.sqrt(variance)))
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,8 @@ def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Predictio
     None where the weights are unreliable. Leave-one-out by importance sampling (Vehtari, Gelman and Gabry, Stat.
     Comput. 27 (2017) 1413), with whole positions left out.
     """
-    stops = PredictedReadings(*model.left_out(w, rows))
+    predicted = model.left_out(w, rows)
+    stops = PredictedReadings(predicted.mean, predicted.covariance)
     smoothed = smoothed_weights(-stops.log_densities(model.rows.value[rows]))
     if not smoothed.pareto_k < K_MAX or effective_draws(smoothed.weights) < EFFECTIVE_MIN:
         return None
@@ -74,7 +75,8 @@ def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> _Prediction:
     rng = random_stream(seed, AxisStream.HELD_OUT)
     sample = _equal_draws(reduced, DRAWS, seed, rng)
     w = transferred_scales(reduced, sample.w, model, rng)
-    return _Prediction(*PredictedReadings(*model.left_out(w, np.flatnonzero(left_out))).pooled(), sample.fault)
+    predicted = model.left_out(w, np.flatnonzero(left_out))
+    return _Prediction(*PredictedReadings(predicted.mean, predicted.covariance).pooled(), sample.fault)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
@@ -164,7 +166,7 @@ def _scores(rows: AxisRows, position: float, prediction: _Prediction) -> list[He
         predicted = float(weights @ mean[of_side])
         u = float(np.sqrt(weights @ covariance[np.ix_(of_side, of_side)] @ weights))
         z = (rows.value[members] - mean[of_side]) / np.sqrt(np.diag(covariance)[of_side])
-        classic_mean, classic_u = classic_prediction(rows, left_out, members)
+        classic = classic_prediction(rows, left_out, members)
         predictions.append(
             HeldOutReadings(
                 position=float(position),
@@ -175,8 +177,8 @@ def _scores(rows: AxisRows, position: float, prediction: _Prediction) -> list[He
                 u=u,
                 rows=len(members),
                 inside=int(np.sum(np.abs(z) <= NORMAL_95)),
-                classic_predicted=classic_mean,
-                classic_u=classic_u,
+                classic_predicted=classic.value,
+                classic_u=classic.u,
                 end=position in (rows.positions[0], rows.positions[-1]),
             )
         )

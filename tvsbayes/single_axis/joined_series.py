@@ -13,6 +13,7 @@ import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -101,9 +102,9 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
         start = start or date_time
         by_name.setdefault(match["name"], []).append(((date_time - start).total_seconds(), float(match["value"])))
     series = {name: _series(rows) for name, rows in by_name.items() if rows}
-    command, value = _pair(series, file, stated)
+    names = _series_names(series, file, stated)
     kind = f"EPICS camonitor, {len(by_name)} series, {left_out} lines without a number left out"
-    return _joined(series, command, value, file, kind)
+    return _joined(series, names["command"], names["value"], file, kind)
 
 
 def _series(rows: Sequence[tuple[float, float]]) -> Series:
@@ -114,8 +115,8 @@ def _series(rows: Sequence[tuple[float, float]]) -> Series:
     return Series(times[is_last], np.array([row[1] for _, row in ordered])[is_last])
 
 
-def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> tuple[str, str]:
-    """Names of the command and of the reading: as stated, else by words in their names.
+def _series_names(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> dict[str, str]:
+    """Names of the series of `command` and `value`: as stated, else by words in their names.
 
     Raises:
         InputError: the names do not determine the pair.
@@ -140,7 +141,7 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
         found, allowed = f"series that change: {listed}", "one that is commanded and one that is read"
         remedy = "say which: --column command=NAME --column value=NAME"
         raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
-    return names["command"], names["value"]
+    return names
 
 
 def _joined(series: Mapping[str, Series], command: str, value: str, file: str, kind: str) -> ForeignTable:
@@ -180,8 +181,15 @@ INTERVAL_MAX_S = 2.0
 """Longest time between two values of an axis in motion: a command logged once per move is valid until the next."""
 
 
-def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
-    """Commands at times between the first and the last of a series, and the number of interpolated ones.
+class CommandsInTime(NamedTuple):
+    """Commands at times (n,), and the number of interpolated ones."""
+
+    commands: np.ndarray
+    interpolated: int
+
+
+def command_at(commands: Series, times_s: np.ndarray) -> CommandsInTime:
+    """Commands at times between the first and the last of a series.
 
     Args:
         commands: commands logged at changes.
@@ -194,7 +202,7 @@ def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
     fraction = np.where(gap > 0, (times_s - commands.times_s[k]) / np.where(gap > 0, gap, 1.0), 0.0)
     moving = (gap <= min(STANDSTILL_INTERVALS * typical, INTERVAL_MAX_S)) & (fraction * gap > EQUAL_S)
     rise = commands.values[after] - commands.values[k]
-    return commands.values[k] + np.where(moving, fraction * rise, 0.0), int(moving.sum())
+    return CommandsInTime(commands.values[k] + np.where(moving, fraction * rise, 0.0), int(moving.sum()))
 
 
 def _saved_angles(data: bytes) -> tuple[str, list[float]] | None:
@@ -235,7 +243,7 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
         columns: dict[str, Sequence[object]] = {"full steps": range(len(numbers)), "angle (deg)": angles}
         return table_of(file, kind, columns, range(1, len(numbers) + 1))
     angles_s: list[tuple[float, float]] = []
-    steps: list[tuple[np.ndarray, np.ndarray]] = []
+    steps: list[Series] = []
     names: dict[str, None] = {}
     for message in _messages(data, file):
         kind_of, _, name = str(message.get("q", "")).partition(":")
@@ -252,7 +260,7 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
         found, allowed = f"series {', '.join(map(escaped, names)) or 'none'}", "one angle:NAME and one stepq:NAME"
         remedy = "log one sensor and its stepper with data_logger.py; or name it in a table of your own"
         raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
-    times, positions = (np.concatenate(part) for part in zip(*steps, strict=True))
+    times, positions = (np.concatenate([getattr(s, name) for s in steps]) for name in ("times_s", "values"))
     order = np.argsort(times, kind="stable")
     readings, counters = _series(angles_s), Series(times[order], positions[order])
     # Steps are instantaneous commands and are not interpolated.
@@ -285,8 +293,8 @@ def _messages(data: bytes, file: str) -> Iterator[dict]:
             yield message
 
 
-def _steps(params: Mapping[str, object], file: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times and counter after every step of one message of a stepper's queue."""
+def _steps(params: Mapping[str, object], file: str) -> Series:
+    """Counter after every step of one message of a stepper's queue."""
     try:
         first_s, last_s = float(params["first_step_time"]), float(params["last_step_time"])  # type: ignore[arg-type]
         first_clock, last_clock = int(params["first_clock"]), int(params["last_clock"])  # type: ignore[call-overload]
@@ -306,5 +314,6 @@ def _steps(params: Mapping[str, object], file: str) -> tuple[np.ndarray, np.ndar
         signs.append(np.full(len(k), 1 if count > 0 else -1))
         clock = int(clocks[-1][-1]) if len(k) else clock
     if not clocks:
-        return np.empty(0), np.empty(0)
-    return first_s + (np.concatenate(clocks) - first_clock) * per_clock_s, position + np.cumsum(np.concatenate(signs))
+        return Series(np.empty(0), np.empty(0))
+    times_s = first_s + (np.concatenate(clocks) - first_clock) * per_clock_s
+    return Series(times_s, position + np.cumsum(np.concatenate(signs)))

@@ -120,8 +120,8 @@ def _with_stop(campaign: AxisCampaign, rows: AxisRows, stop: AxisStop, seconds: 
     moves, last = list(campaign.moves), campaign.moves[-1]
     for command in (stop.command,) if stop.via is None else (stop.via, stop.command):
         moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
-    offset, slope = rows.line
-    value = offset + slope * stop.command - 0.5 * float(np.sign(slope)) * SIDES[stop.direction] * reversal_of(rows)[0]
+    line, play = rows.line, reversal_of(rows).value
+    value = line.offset + line.slope * stop.command - 0.5 * float(np.sign(line.slope)) * SIDES[stop.direction] * play
     u = float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
     number = max(r.reading for r in campaign.readings) + 1
     reading = Reading(number, len(moves) - 1, value, u)
@@ -148,8 +148,9 @@ def _variance(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndar
     rows = replace(rows_of(campaign), line=fit.rows.line)
     model = AxisModel.of(rows, fit.model.priors, places, fit.model.coordinates.waves)
     model = replace(model, coordinates=fit.model.coordinates)
-    mean, sd = model.linear(fit.w).of(_functionals(replace(fit, model=model), target, places))
-    return _Variance(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
+    linear, functionals = model.linear(fit.w), _functionals(replace(fit, model=model), target, places)
+    between = np.var(linear.mean_of(functionals), axis=0)
+    return _Variance(float(np.mean(linear.sd_of(functionals) ** 2)), float(np.mean(between)))
 
 
 def _with_linear_play(fit: AxisFit) -> AxisFit:

@@ -73,7 +73,7 @@ class _WhitenedModel:
 
 
 def _whitened_model(model: AxisModel, w: np.ndarray) -> _WhitenedModel:
-    white, factor = model.white(w)
+    white, factor = model.white(w), model.prior_factor(w)
     base = np.column_stack([white[:, :1], white[:, 1:] @ factor])
     information = base[:, 1:].T @ base[:, 1:] + np.eye(factor.shape[1])
     return _WhitenedModel(model, w, base, np.linalg.inv(information), base[:, 1:].T @ base[:, 0])
@@ -211,8 +211,8 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: WavePerio
     encoder = [] if periods.encoder is None else [_stated_wave("encoder", periods.encoder, unit, rows, priors)]
     known = [Wave.fixed(wave.clock, wave.peak, unit) for wave in (*stated, *encoder)]
     start: dict[str, float] = {}
-    unknown, peaks = _inferred(rows, priors, known, unknown, start)
-    all_waves = [*known[: len(stated)], *peaks, *known[len(stated) :]]
+    unknown = _inferred(rows, priors, known, unknown, start)
+    all_waves = [*known[: len(stated)], *map(_at_peak, unknown), *known[len(stated) :]]
     model = AxisModel.of(rows, priors, None, all_waves)
     mode, names, results = find_mode(model, start).w, model.coordinates.names, []
     for k, wave in enumerate([*stated, *unknown, *encoder]):
@@ -222,39 +222,40 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: WavePerio
     return tuple(results)
 
 
+def _at_peak(wave: Wave) -> Wave:
+    """A wave that was searched, fixed at its peak."""
+    return replace(Wave.fixed(wave.clock, wave.peak, wave.unit), absent=wave.absent)
+
+
 def _inferred(
     rows: AxisRows,
     priors: Mapping[str, AxisPrior],
     known: Sequence[Wave],
     waves: Sequence[Wave],
     start: dict[str, float],
-) -> tuple[list[Wave], list[Wave]]:
-    """Find the waves of unknown period, also fixed at their peaks: one after the other, the strongest evidence first.
+) -> list[Wave]:
+    """Find the waves of unknown period, one after the other, the strongest evidence first.
 
     Every range gets the stated number of waves, and further ones while the evidence for another exceeds `FURTHER`: a
     gear train may have unexpected stronger periods. `start` has the coordinates of the last mode by name.
     """
-    inferred: list[Wave] = []
-    peaks: list[Wave] = []
+    found: list[Wave] = []
 
     def strongest(ranges: Sequence[Wave]) -> _SearchResult:
+        peaks = [_at_peak(wave) for wave in found]
         model = AxisModel.of(rows, priors, None, [*known, *peaks])
         mode = find_mode(model, start).w
         start.update(zip(model.coordinates.names, mode.tolist(), strict=True))
         state = _whitened_model(model, mode[None])
         return max((_search(state, wave, peaks) for wave in ranges), key=lambda result: result.log_evidence)
 
-    def take(best: _SearchResult) -> None:
-        inferred.append(next(wave for wave in waves if (wave.low, wave.high) == (best.wave.low, best.wave.high)))
-        peaks.append(replace(Wave.fixed(best.wave.clock, best.wave.peak, best.wave.unit), absent=best.wave.absent))
-
     different = list({(wave.low, wave.high): wave for wave in waves}.values())
-    while different and len(inferred) < WAVES_MAX and (best := strongest(different)).log_evidence > FURTHER:
-        take(best)
+    while different and len(found) < WAVES_MAX and (best := strongest(different)).log_evidence > FURTHER:
+        found.append(best.wave)
     for wave in different:
-        while inferred.count(wave) < waves.count(wave):
-            take(strongest([wave]))
-    return inferred, peaks
+        while sum((one.low, one.high) == (wave.low, wave.high) for one in found) < waves.count(wave):
+            found.append(strongest([wave]).wave)
+    return found
 
 
 RATIO_SDS = 3.0
@@ -270,7 +271,7 @@ def _stated_wave(clock: Clock, period: float, unit: float, rows: AxisRows, prior
     """
     if clock != "position":
         return replace(Wave.fixed(clock, period, unit), known=period)
-    ratio, prior = abs(rows.line[1]), priors["per_command"]
+    ratio, prior = abs(rows.line.slope), priors["per_command"]
     error = max(priors["transmission_error"].u, priors["transmission_error"].value)
     relative_sd = float(np.hypot(np.sqrt(fit_line(rows).covariance[1, 1]) / ratio, ERROR_SLOPE * error / rows.travel))
     middle = period

@@ -45,9 +45,9 @@ def transferred_scales(source: AxisModel, draws: np.ndarray, target: AxisModel, 
         if name in source.coordinates.names:
             w[:, column] = draws[:, source.coordinates.names.index(name)]
         elif name == "backlash":
-            values, sd = source.linear(draws).of(source.line_terms(backlash=1.0)[None])
-            prior = target.priors[name]
-            w[:, column] = (values[:, 0] + sd[:, 0] * rng.standard_normal(len(draws)) - prior.value) / prior.u
+            linear, backlash, prior = source.linear(draws), source.line_terms(backlash=1.0)[None], target.priors[name]
+            values, sd = linear.mean_of(backlash)[:, 0], linear.sd_of(backlash)[:, 0]
+            w[:, column] = (values + sd * rng.standard_normal(len(draws)) - prior.value) / prior.u
     return w
 
 
@@ -93,13 +93,14 @@ def predicted_stops(
         for move in moves
     ]
     # The value of a left-out row is arbitrary; a value on the line leaves all that depends on the line unchanged.
-    offset, slope = fit.rows.line
+    line = fit.rows.line
     readings = [
-        Reading(number + k, count + m, offset + slope * moves[m].command, float(u[k])) for k, m in enumerate(read)
+        Reading(number + k, count + m, line.offset + line.slope * moves[m].command, float(u[k]))
+        for k, m in enumerate(read)
     ]
     extended = replace(known, moves=(*known.moves, *joined), readings=(*known.readings, *readings))
-    rows = replace(rows_of(extended), line=fit.rows.line)
+    rows = replace(rows_of(extended), line=line)
     model = AxisModel.of(rows, fit.model.priors, None, fit.model.coordinates.waves)
     w = transferred_scales(fit.model, _spread_draws(fit), model, rng)
-    mean, covariance = model.left_out(w, np.flatnonzero(rows.move >= count))
-    return PredictedStops(mean, covariance, model.coordinates.values(w))
+    stops = model.left_out(w, np.flatnonzero(rows.move >= count))
+    return PredictedStops(stops.mean, stops.covariance, model.coordinates.values(w))

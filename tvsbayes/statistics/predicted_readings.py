@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+
+
+class Pooled(NamedTuple):
+    """Mean (r,) and covariance (r, r) of readings."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -15,12 +23,13 @@ class PredictedReadings:
     mean: np.ndarray
     covariance: np.ndarray
 
-    def pooled(self, weights: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (r,) and covariance (r, r) of the mixture with weights (n,) of sum 1; None: equal weights."""
+    def pooled(self, weights: np.ndarray | None = None) -> Pooled:
+        """Moments of the mixture with weights (n,) of sum 1; None: equal weights."""
         weights = np.full(len(self.mean), 1 / len(self.mean)) if weights is None else weights
         mean = weights @ self.mean
         deviations = self.mean - mean
-        return mean, np.tensordot(weights, self.covariance, 1) + (weights[:, None] * deviations).T @ deviations
+        covariance = np.tensordot(weights, self.covariance, 1) + (weights[:, None] * deviations).T @ deviations
+        return Pooled(mean, covariance)
 
     def drawn(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Readings (count, r) drawn from the mixture, the same number from each draw."""
