@@ -24,7 +24,7 @@ from tvsbayes.planning.search import (
     Scope,
     Search,
     scores,
-    search_rows,
+    search_precision,
     smallest_design,
 )
 from tvsbayes.planning.target import parse_target, sensitivity
@@ -97,7 +97,7 @@ def test_a_search_after_data_knows_no_home_offset(knowledge, seen):
     rows = seen.rows.copy()
     rows[..., CONTRAST_COLUMNS] = 0
     shown, picks = replace(seen, rows=rows), np.arange(6)
-    wide, precision = search_rows(shown, known)
+    wide, precision = shown.rows, search_precision(known)
     whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[:PARAMETERS, :PARAMETERS]
     exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, True)
     contrasts = np.isin(np.arange(PARAMETERS), CONTRAST_COLUMNS)

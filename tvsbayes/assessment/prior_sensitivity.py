@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.assessment.weaknesses import headline_gradients
+from tvsbayes.assessment.weaknesses import headline_gradients, judged_headlines
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.parameters import HEADLINES, KINDS, NAMES
 from tvsbayes.model.parameter_space import half_normal
@@ -79,6 +79,8 @@ class SampledHeadlines:
     weights: np.ndarray
     half: np.ndarray
     """Coordinates whose quantity is half-normal a priori, shape (d,)."""
+    labels: tuple[str, ...] = ()
+    """Labels of the headlines."""
 
     @property
     def normal(self) -> NormalModel:
@@ -103,15 +105,15 @@ class SampledHeadlines:
         return Change((mean - centre) / sd, np.sqrt(weights.weights @ (self.values - mean) ** 2) / sd)
 
 
-def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> tuple[list[str], SampledHeadlines]:
-    """Return judged headlines of a posterior's draws, with their labels."""
+def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> SampledHeadlines:
+    """Return judged headlines of a posterior's draws."""
     draws, rows = posterior.joined, np.flatnonzero(fit.free)
     columns = {of.label: draws[of.name] for of in HEADLINES if of.judged and of.applies(moved)}
     columns = {name: values for name, values in columns.items() if np.ptp(values) > 1e-12 * np.max(np.abs(values))}
     half = np.zeros(len(NAMES), dtype=bool)
     half[: len(fit.space.kind)] = np.asarray(fit.space.kind) == KINDS.index("half-normal")
-    values = np.stack(list(columns.values()), axis=1)
-    return list(columns), SampledHeadlines(posterior.joined_z[:, rows], values, posterior.weights.ravel(), half[rows])
+    values, weights = np.stack(list(columns.values()), axis=1), posterior.weights.ravel()
+    return SampledHeadlines(posterior.joined_z[:, rows], values, weights, half[rows], tuple(columns))
 
 
 def prior_sensitivity(
@@ -131,14 +133,15 @@ def prior_sensitivity(
     rows = np.flatnonzero(fit.free)
     sampled = None
     if posterior is None:
-        quantities, gradient = headline_gradients(fit, moved)
+        headlines = judged_headlines(fit, moved)
+        quantities, gradient = tuple(headlines), headline_gradients(fit, headlines)
         covariance = fit.covariance[np.ix_(rows, rows)]
         gradient = gradient[:, rows]
         sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, covariance, gradient))
         normal = NormalModel(fit.z[rows], np.linalg.inv(covariance), gradient, sd)
     else:
-        quantities, sampled = sampled_headlines(fit, moved, posterior)
-        normal = sampled.normal
+        sampled = sampled_headlines(fit, moved, posterior)
+        quantities, normal = sampled.labels, sampled.normal
     names = np.array(fit.names)[rows]
     groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
     groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))

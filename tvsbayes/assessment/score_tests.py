@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tvsbayes.assessment.residuals import CAUSE_BINS, STEP_PHASES
-from tvsbayes.assessment.weaknesses import headline_gradients, moved_directions
+from tvsbayes.assessment.weaknesses import headline_gradients, judged_headlines, moved_directions
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
@@ -246,7 +246,7 @@ def _common(fit: JointFit, defects: Sequence[_Defect]) -> _Common:
     followed = inverse @ cross
     whole = np.diag(information.fisher)[p:]
     scale = 1 / np.sqrt(np.where(whole > 0, whole, 1.0))
-    _, gradient = headline_gradients(fit, moved_directions(fit))
+    gradient = headline_gradients(fit, judged_headlines(fit, moved_directions(fit)))
     sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient))
     scores = _Scores(
         score=(score[p:] - followed.T @ own_score) * scale,

@@ -5,6 +5,8 @@ Directions and gradients are in the coordinates, each in sds of its prior, of th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit, with_places
@@ -196,8 +198,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
     return tuple(directions)
 
 
-def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.ndarray]:
-    """Return labels of judged headlines, and d(quantity)/d(coordinates), shape (q, p)."""
+def judged_headlines(fit: JointFit, moved: set[str]) -> dict[str, np.ndarray]:
+    """Return the Laplace draws (draws,) of judged headlines, by label."""
     # Parameters in coordinates, where a backlash is Gaussian.
     quantities = {
         of.label: fit.draws_z[:, INDEX[of.name]] if of.name in INDEX else fit.draws[of.name]
@@ -205,8 +207,12 @@ def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.nd
         if of.judged and of.applies(moved)
     }
     # Quantities fixed by the priors scatter by rounding only and are left out.
-    quantities = {name: v for name, v in quantities.items() if np.ptp(v) > 1e-12 * np.max(np.abs(v))}
-    return list(quantities), gradients(fit, np.stack(list(quantities.values()), axis=1))
+    return {name: v for name, v in quantities.items() if np.ptp(v) > 1e-12 * np.max(np.abs(v))}
+
+
+def headline_gradients(fit: JointFit, headlines: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return d(quantity)/d(coordinates), shape (q, p), of `judged_headlines`."""
+    return gradients(fit, np.stack(list(headlines.values()), axis=1))
 
 
 def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
@@ -229,7 +235,8 @@ def whole_gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
 
 def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
     """Find stops without which a headline's sd would more than double."""
-    quantities, gradients = headline_gradients(fit, moved)
+    quantities = judged_headlines(fit, moved)
+    gradients = headline_gradients(fit, quantities)
     sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance, gradients))
     ordered = ordered_spots(fit.campaign)
     entries = []

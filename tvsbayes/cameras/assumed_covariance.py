@@ -114,8 +114,8 @@ def with_assumed_covariance(stereo: Stereo, stated: Provenance, of_file: Provena
     fixed = of_file.fixed_intrinsics if stated.fixed_intrinsics is None else stated.fixed_intrinsics
     words.append(_ADJUSTED[fixed])
     covariance = calibration_covariance(stereo, board, views, rms_px, fixed)
-    for name, group, sds in _stated_sds(stereo, stated):
-        covariance = with_marginal(covariance, group, sds)
+    for name, sds in _stated_sds(stereo, stated).items():
+        covariance = with_marginal(covariance, GROUPS[name], sds)
         words.append(f"u of {name} (stated)")
     origin = ", ".join(words)
     return replace(stereo, parameter_covariance=covariance, rms_px=rms_px, assumed=True, assumed_from=origin)
@@ -167,19 +167,16 @@ def with_marginal(covariance: np.ndarray, group: list[int], sds: np.ndarray) -> 
     return (result + result.T) / 2
 
 
-def _stated_sds(stereo: Stereo, stated: Provenance) -> list[tuple[str, list[int], np.ndarray]]:
-    """Name, parameters and sds of each group with a stated uncertainty."""
+def _stated_sds(stereo: Stereo, stated: Provenance) -> dict[str, np.ndarray]:
+    """The sds of each group of `GROUPS` with a stated uncertainty."""
     focal = np.abs(stereo.vector[GROUPS["focal length"]])
-    sds = []
-    for name, value, unit in (
+    units = (
         ("focal length", stated.u_focal_percent, focal / 100),
         ("principal point", stated.u_principal_px, np.ones(4)),
         ("rotation", stated.u_rotation_mrad, np.full(3, 1e-3)),
         ("translation", stated.u_baseline_mm, np.ones(3)),
-    ):
-        if value is not None:
-            sds.append((name, GROUPS[name], value * unit))
-    return sds
+    )
+    return {name: value * unit for name, value, unit in units if value is not None}
 
 
 def _one_view_covariance(stereo: Stereo, board: Board, fixed_intrinsics: bool | None) -> np.ndarray:

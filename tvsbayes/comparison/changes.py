@@ -14,7 +14,7 @@ import numpy as np
 from tvsbayes.comparison.gap import camera_influence
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import TARGETS, unit_of
-from tvsbayes.instrument.stereo_pair import stereo_parameters
+from tvsbayes.instrument.stereo_pair import stereo_covariance, stereo_parameters
 from tvsbayes.results.comparison_record import Change, Comparison
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
     from scipy import special
 
     pose = first.reference_pose_rad
-    cameras = [stereo_parameters(fit.campaign.stereo) for fit in (first, second)]
-    shared = all(np.array_equal(ours, theirs) for ours, theirs in zip(*cameras, strict=True))
+    ours, theirs = first.campaign.stereo, second.campaign.stereo
+    shared = all(np.array_equal(part(ours), part(theirs)) for part in (stereo_parameters, stereo_covariance))
     before, after = _draws_at(first, pose), _draws_at(second, pose)
     limit = -float(special.ndtri(0.5 * (1 - 0.95 ** (1 / len(COMPARED)))))
     variance = before[1:].var(axis=0, ddof=1) + after[1:].var(axis=0, ddof=1)

@@ -171,10 +171,12 @@ def _inverse(information: np.ndarray) -> np.ndarray:
     return (vectors / values) @ vectors.T
 
 
-def _test(score: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, int]:
-    """Compute chi-squares of scores (..., q) and their degrees of freedom."""
+def _log_chances(score: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Compute log p of chi-squares of scores (..., q); 0 where the information has no direction."""
     values, vectors = _directions(information)
-    return np.sum((score @ vectors) ** 2 / values, axis=-1), len(values)
+    if not len(values):
+        return np.zeros(score.shape[:-1])
+    return log_chance(np.sum((score @ vectors) ** 2 / values, axis=-1), len(values))
 
 
 @dataclass(frozen=True)
@@ -286,8 +288,8 @@ def log_chances(departures: DrawnDepartures, known: list[slice]) -> np.ndarray:
     for departure in departures.drawn:
         left, logs = departure.given(known), [log_chance(departure.chi2, departure.dof)]
         for rows in departure.columns:
-            chi2, dof = _test(left.score[rows], left.information[rows, rows])
-            logs.append(np.zeros(()) if rows in known or not dof else log_chance(chi2, dof))
+            own = _log_chances(left.score[rows], left.information[rows, rows])
+            logs.append(np.zeros(()) if rows in known else own)
         chances.append(np.array(logs))
     with np.errstate(divide="ignore"):
         weights = np.log(departures.weights)
@@ -320,12 +322,8 @@ def null_distribution(departure: Departure, seed: int) -> NullDistribution:
     values, vectors = np.linalg.eigh(departure.information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     scores = generator.standard_normal((NULL_DRAWS, len(root))) @ root.T
-    logs = [np.zeros(NULL_DRAWS)]
-    for rows in departure.columns:
-        chi2, dof = _test(scores[:, rows], departure.information[rows, rows])
-        if dof:
-            logs.append(log_chance(chi2, dof))
-    return NullDistribution(np.sort(np.min(logs, axis=0)), len(departure.changes))
+    own = [_log_chances(scores[:, rows], departure.information[rows, rows]) for rows in departure.columns]
+    return NullDistribution(np.sort(np.min([np.zeros(NULL_DRAWS), *own], axis=0)), len(departure.changes))
 
 
 def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) -> list[float]:
@@ -344,7 +342,8 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
     generator, shares = np.random.default_rng(seed), []
     for change, rows in zip(departure.changes, departure.columns, strict=True):
         block = departure.information[rows, rows]
-        dof = len(_directions(block)[0])
+        values, _ = _directions(block)
+        dof = len(values)
         if not dof:
             shares.append(0.0)
             continue

@@ -58,8 +58,8 @@ class _Expected:
 
 def _expected(fit: AxisFit, commands: np.ndarray, run_up: float, since: Since, seed: int) -> _Expected:
     """Predict readings at the table's commands, without the noise of a reading."""
-    stops, run = _run(fit, commands, run_up, since, None, 0.0, seed)
-    mean, covariance = stops.pooled()
+    run = since.cycles(commands, run_up)
+    mean, covariance = _predicted(fit, run, None, 0.0, seed).pooled()
     order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
     u = np.sqrt(np.diag(covariance))
     return _Expected(commands, np.array([mean[o] for o in order]), np.array([u[o] for o in order]), fit.rows.both_sides)
@@ -87,13 +87,10 @@ class Since:
         return cycles(commands, run_up, self.hours, max(1, min(round(self.travel / once), RUNS_MAX)))
 
 
-def _run(
-    fit: AxisFit, commands: np.ndarray, run_up: float, since: Since, applied: Correction | None, u: float, seed: int
-) -> tuple[PredictedStops, Cycles]:
+def _predicted(fit: AxisFit, run: Cycles, applied: Correction | None, u: float, seed: int) -> PredictedStops:
     """Predict runs up and down, under a correction."""
-    run = since.cycles(commands, run_up)
     moves = run.moves if applied is None else applied.moved(run.moves)
-    return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
+    return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed)
 
 
 def refuse_answer(answer: str, remedy: str = "run `tvsbayes fit` again, without --no-sample or --quick") -> None:
@@ -331,9 +328,10 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         u = reading_u(campaign)
         # Commands between the lines of the table are tested too.
         tried = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
-        after, run = _run(fit, tried, max(far, run_up), since, shaped.correction, u, seed)
+        run = since.cycles(tried, max(far, run_up))
+        after = _predicted(fit, run, shaped.correction, u, seed)
         job.at(0.5)
-        before, _ = _run(fit, tried, max(far, run_up), since, None, u, seed)
+        before = _predicted(fit, run, None, u, seed)
         tried_aim = nominal * tried[run.index]
         offset = _offset(at, nominal) if form.holds == "table" else float((after.pooled().mean - tried_aim).mean())
         promise = _promise(after, before, run, offset + tried_aim, u, form.zero_free)

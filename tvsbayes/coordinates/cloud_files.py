@@ -128,15 +128,16 @@ def cloud_place(path: Path, looks: Path | None = None) -> Path:
         found, allowed = escaped(path.suffix or path.name), " or ".join(FORMATS)
         message = f"--cloud {shown}: the ending {found} names no format"
         raise InputError("usage", message, found=found, allowed=allowed, remedy=f"name a file {allowed}")
-    if looks is not None and any(one.exists() and looks.exists() and one.samefile(looks) for one in _written(path)):
+    written = path, _refused_table(path)
+    if looks is not None and any(one.exists() and looks.exists() and one.samefile(looks) for one in written):
         message = f"--cloud {shown} would replace {escaped(str(looks), 200)}, which the looks are read from"
         raise InputError("usage", message, found=shown, allowed="another file", remedy="name another cloud")
     return path
 
 
-def _written(path: Path) -> tuple[Path, Path]:
-    """Return the paths of the cloud and of the table of looks without a point."""
-    return path, path.with_name(f"{path.stem}.refused.csv")
+def _refused_table(path: Path) -> Path:
+    """Return the path of the table of looks without a point, beside that of the cloud."""
+    return path.with_name(f"{path.stem}.refused.csv")
 
 
 def _removed_if_ours(table: Path) -> None:
@@ -173,7 +174,7 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
         kept.seek(0)
         stream.write(body.header(names, points))
         shutil.copyfileobj(kept, stream)
-    table = _written(path)[1]
+    table = _refused_table(path)
     if refused:
         with written_whole(table) as stream:
             stream.write(csv_bytes(REFUSED_COLUMNS, refused))

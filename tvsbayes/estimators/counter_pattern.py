@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -99,11 +100,18 @@ class _Followed:
         return self.share > FOLLOWED
 
 
-def _rest(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Compute coefficients, residuals and rank of a design."""
+class _LeastSquares(NamedTuple):
+    """Coefficients, residuals and rank of a design."""
+
+    coefficients: np.ndarray
+    residuals: np.ndarray
+    rank: int
+
+
+def _solved(design: np.ndarray, values: np.ndarray) -> _LeastSquares:
     scale = np.maximum(np.abs(design).max(axis=0), 1e-12)
     solution, _, rank, _ = np.linalg.lstsq(design / scale, values, rcond=1e-9)
-    return (solution.T / scale).T, values - (design / scale) @ solution, int(rank)
+    return _LeastSquares((solution.T / scale).T, values - (design / scale) @ solution, int(rank))
 
 
 def _columns(nearness: np.ndarray, *counters: np.ndarray) -> np.ndarray:
@@ -116,9 +124,8 @@ def _followed(pattern: _Seen, axis: Axis, steps: np.ndarray, other: np.ndarray) 
     """Fit a line in the counter, given another counter."""
     base = _columns(pattern.nearness, other)
     full = np.column_stack((base, steps, steps * pattern.nearness))
-    _, before, _ = _rest(base, pattern.angles_deg[axis])
-    solution, after, rank = _rest(full, pattern.angles_deg[axis])
-    _, rest, _ = _rest(base, steps)
+    before, rest = _solved(base, pattern.angles_deg[axis]).residuals, _solved(base, steps).residuals
+    solution, after, rank = _solved(full, pattern.angles_deg[axis])
     motion = float(before @ before)
     return _Followed(
         share=1 - float(after @ after) / motion if motion > 0 else 0.0,
@@ -287,7 +294,7 @@ def _row_finding(seen: _Seen) -> Finding | None:
 
     def left(steps: np.ndarray) -> np.ndarray:
         """Compute the variance of both motions that counters (n, 2) leave unexplained, deg^2."""
-        return np.mean(_rest(_columns(nearness, *steps.T), motion_deg)[1] ** 2, axis=0)
+        return np.mean(_solved(_columns(nearness, *steps.T), motion_deg).residuals ** 2, axis=0)
 
     def beside(lag: int, begin: int) -> np.ndarray:
         moved = at + lag * (np.arange(len(at)) >= begin)

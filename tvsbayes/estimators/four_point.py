@@ -208,22 +208,24 @@ def select_experiments(campaign: Campaign) -> Selection:
     for row, spot in enumerate(campaign.spots):
         if spot.experiment is not None:
             rows.setdefault(spot.experiment, []).append(row)
-    kept: list[tuple[int, list[int], str, int]] = []
+    kept: dict[int, list[int]] = {}
+    moved: list[tuple[int, int]] = []
     skipped: list[SkippedExperiment] = []
     for number in sorted(rows):
         try:
             by_point = _by_point(campaign.spots, rows[number])
-            kept.append((number, by_point, *_commanded([moves[campaign.spots[row].move] for row in by_point])))
+            moved.append(_moved([moves[campaign.spots[row].move] for row in by_point]))
+            kept[number] = by_point
         except _Unusable as reason:
             skipped.append(SkippedExperiment(number, str(reason)))
-    numbers, four_rows, axes, steps = zip(*kept, strict=True) if kept else 4 * ((),)
-    spot_rows = np.array(four_rows, dtype=int).reshape(-1, 4)
+    spot_rows = np.array(list(kept.values()), dtype=int).reshape(-1, 4)
+    pan, tilt = np.array(moved, dtype=int).reshape(-1, 2).T
     return Selection(
-        experiments=np.array(numbers, dtype=int),
+        experiments=np.array(list(kept), dtype=int),
         spot_rows=spot_rows,
         pixels=pixels_of(campaign.spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
-        steps=np.array(steps, dtype=int),
-        axis=np.array(axes, dtype="U4"),
+        steps=pan + tilt,
+        axis=np.where(pan != 0, "pan", "tilt"),
         skipped=tuple(skipped),
     )
 
@@ -254,8 +256,8 @@ def _by_point(spots: Sequence[Look], rows: list[int]) -> list[int]:
     return ordered
 
 
-def _commanded(at: list[Move]) -> tuple[str, int]:
-    """Find the moved axis and signed N of the moves of points 1 to 4; raise `_Unusable` where there is none."""
+def _moved(at: list[Move]) -> tuple[int, int]:
+    """Signed N of (pan, tilt) between points 2 and 3 of 4, 0 for one axis; raise `_Unusable` for other moves."""
     one, two, three, four = ((m.segment, m.pan_steps, m.tilt_steps) for m in at)
     if len({m.segment for m in at}) > 1:
         raise _Unusable("the positioner was homed within the experiment")
@@ -268,7 +270,7 @@ def _commanded(at: list[Move]) -> tuple[str, int]:
         raise _Unusable(f"both axes moved between points 2 and 3 (pan {pan:+d}, tilt {tilt:+d} steps)")
     if not pan and not tilt:
         raise _Unusable("no axis moved between points 2 and 3")
-    return ("pan", pan) if pan else ("tilt", tilt)
+    return pan, tilt
 
 
 def classic(campaign: Campaign) -> ClassicResult:

@@ -169,21 +169,20 @@ class Problem:
         volume = self.log_volume(z)
         steps = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)]) * NOISE_STEP
 
-        def about(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        def about(values: np.ndarray) -> list[np.ndarray]:
+            """Evaluate the function to minimise at noise scales (s,), then one step ahead and one behind in each."""
             points = np.repeat(z[None], len(steps), axis=0)
             points[:, self.noise] = values + steps
-            value = self.negative_log_density(points) - volume(points)
-            centre, ahead, behind = np.split(value, [1, 1 + count])
-            curvature = (ahead + behind - 2 * centre) / NOISE_STEP**2
-            return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP), curvature
+            return np.split(self.negative_log_density(points) - volume(points), [1, 1 + count])
 
         # Scaled by the curvature of the density at the start, a quasi-Newton method has a suitable first step.
-        curvature = about(z[self.noise])[2]
+        centre, ahead, behind = about(z[self.noise])
+        curvature = (ahead + behind - 2 * centre) / NOISE_STEP**2
         unit = 1 / np.sqrt(np.where(np.isfinite(curvature), np.clip(curvature, 1.0, None), 1.0))
 
         def value_and_slope(values: np.ndarray) -> tuple[float, np.ndarray]:
-            value, slope, _ = about(values * unit)
-            return value, slope * unit
+            centre, ahead, behind = about(values * unit)
+            return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP) * unit
 
         # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
         bounds = list(zip(-8.0 / unit, 8.0 / unit, strict=True))

@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -353,7 +353,7 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
     base = first * turn
     offsets_m = 1e-3 * after["elevation_axis_offset_mm"], 1e-3 * after["beam_offset_mm.y"], head.height_m
     place = new.stage.apply(offsets_m)
-    edits: list[tuple[int, int, bytes]] = []
+    edits: list[_Edit] = []
     edits += _origin(head.urdf, pan, first, pan.shift_m)
     edits += _origin(head.urdf, tilt, base.inv() * link, turn.inv().apply(first.inv().apply(place) - shift))
     # The joint keeps its sense of counting.
@@ -362,19 +362,20 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
         edits += _element(head.urdf, tilt, "axis", {"xyz": axis})
     for name, value in reductions.items():
         if (tag := head.urdf.reduction(head.names[name])) is not None:
-            edits.append((tag.text_begin, tag.text_begin + len(tag.text.encode()), f"{value:.12g}".encode()))
+            end = tag.text_begin + len(tag.text.encode())
+            edits.append(_Edit(tag.text_begin, end, f"{value:.12g}".encode()))
     data = head.urdf.data
     edits += [
-        (tag.begin, re.compile(rb"\s*").match(data, tag.end).end(), b"")  # type: ignore[union-attr]
+        _Edit(tag.begin, re.compile(rb"\s*").match(data, tag.end).end(), b"")  # type: ignore[union-attr]
         for name, tag in head.urdf.listed(PROPERTY).items()
         if name.startswith("head_")
     ]
     root = data[head.urdf.root.begin : head.urdf.root.end]
     if b"xmlns:xacro" not in root:
         root = root[:-1] + b' xmlns:xacro="http://www.ros.org/wiki/xacro">'
-    edits.append((head.urdf.root.begin, head.urdf.root.end, root + b"\n" + block.rstrip().encode()))
-    for begin, end, written in sorted(edits, reverse=True):
-        data = data[:begin] + written + data[end:]
+    edits.append(_Edit(head.urdf.root.begin, head.urdf.root.end, root + b"\n" + block.rstrip().encode()))
+    for edit in sorted(edits, reverse=True):
+        data = data[: edit.begin] + edit.text + data[edit.end :]
     return data
 
 
@@ -389,17 +390,25 @@ def _attribute(text: bytes, name: str, values: np.ndarray) -> bytes:
     return text[:end].rstrip() + b" " + name.encode() + b'="' + words + b'"' + text[end:]
 
 
-def _element(urdf: Urdf, joint: _Tag, name: str, values: Mapping[str, np.ndarray]) -> list[tuple[int, int, bytes]]:
+class _Edit(NamedTuple):
+    """A text that replaces the bytes from `begin` to `end` of a file."""
+
+    begin: int
+    end: int
+    text: bytes
+
+
+def _element(urdf: Urdf, joint: _Tag, name: str, values: Mapping[str, np.ndarray]) -> list[_Edit]:
     """An element of a joint with new numbers; inserted where the joint has none."""
     tag = joint.first(name)
     begin, end = (joint.end, joint.end) if tag is None else (tag.begin, tag.end)
     text = f"\n    <{name}/>".encode() if tag is None else urdf.data[begin:end]
     for attribute, numbers in values.items():
         text = _attribute(text, attribute, numbers)
-    return [(begin, end, text)] if values else []
+    return [_Edit(begin, end, text)] if values else []
 
 
-def _origin(urdf: Urdf, joint: _Tag, turn: Rotation, shift_m: np.ndarray) -> list[tuple[int, int, bytes]]:
+def _origin(urdf: Urdf, joint: _Tag, turn: Rotation, shift_m: np.ndarray) -> list[_Edit]:
     """Edits of a joint's origin."""
     values: dict[str, np.ndarray] = {}
     if np.max(np.abs(shift_m - joint.shift_m)) > SAME:

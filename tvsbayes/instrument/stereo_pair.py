@@ -195,13 +195,16 @@ def no_stereo_pair() -> InputError:
     return refusal("no-stereo", file="sightings.csv", found=found, allowed=allowed, remedy=remedy)
 
 
-def stereo_parameters(stereo: Stereo | None) -> tuple[np.ndarray, np.ndarray]:
-    """The 24 parameters and their covariance (24, 24); of no pair those of an ideal one, exactly known."""
-    if stereo is None:
-        ideal = np.zeros(24)
-        ideal[[0, 1, 9, 10]] = 1.0
-        return ideal, np.zeros((24, 24))
-    return stereo.vector, np.asarray(stereo.parameter_covariance, float)
+def stereo_parameters(stereo: Stereo | None) -> np.ndarray:
+    """The 24 parameters; of no pair those of an ideal one."""
+    ideal = np.zeros(24)
+    ideal[[0, 1, 9, 10]] = 1.0
+    return ideal if stereo is None else stereo.vector
+
+
+def stereo_covariance(stereo: Stereo | None) -> np.ndarray:
+    """The covariance (24, 24) of the 24 parameters; an ideal pair is exactly known."""
+    return np.zeros((24, 24)) if stereo is None else np.asarray(stereo.parameter_covariance, float)
 
 
 def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ from tvsbayes.instrument.parameters import (
     RIG_NAMES,
 )
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.instrument.stereo_pair import Stereo, stereo_parameters
+from tvsbayes.instrument.stereo_pair import Stereo, stereo_covariance, stereo_parameters
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import GearScales
 from tvsbayes.model.geometry import Scalar, StereoCameras, Vector, materialise
@@ -317,7 +317,7 @@ def model_of(
 def parameter_space(table: RigTable, stereo: Stereo | None) -> ParameterSpace:
     """Build the arrays of the priors of `[rig]` and of the stereo calibration."""
     priors = [table.priors[name] for name in table.mechanism.rig_names]
-    cameras, covariance = stereo_parameters(stereo)
+    cameras, covariance = stereo_parameters(stereo), stereo_covariance(stereo)
     scale = np.sqrt(np.diag(covariance))
     # Standard deviations span 1e-5 (rad) to 1 (px): the root is that of the correlation matrix. Zero rows (fixed
     # parameters) stay zero.

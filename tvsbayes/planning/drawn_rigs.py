@@ -54,7 +54,7 @@ def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments
     space = knowledge.space
     names = knowledge.rig.table.mechanism.rig_names
     truth_values = np.array([[truth.parameters[name] for name in names] for truth in truths]).reshape(-1, len(names))
-    cameras = np.array([stereo_parameters(truth.stereo)[0] for truth in truths]).reshape(len(truth_values), -1)
+    cameras = np.array([stereo_parameters(truth.stereo) for truth in truths]).reshape(len(truth_values), -1)
     # A half-normal with u = 0 is 0 for any value.
     value = np.where(np.asarray(space.u) > 0, np.asarray(space.value), truth_values)
     return Instruments.at(coordinates_of(space, np.concatenate([truth_values, cameras], axis=1)), value, space)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
 
 from tvsbayes.errors import TvsError
-from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experiments
+from tvsbayes.estimators.four_point import DirectionResult, classic, ratio_slopes, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, RIG_NAMES, names_of
@@ -167,13 +168,14 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
     if forecast is None or not target.of_ratios:
         return None
     half_width = target.limit * NORMAL_95 / target.factor
-    measured = None if campaign is None else _measured_sds(campaign)
+    measured = {} if campaign is None else _measured(campaign)
     answers = []
     for index in target.indices:
         direction = DIRECTIONS[index]
         low, sd, high = np.quantile(forecast.sd[:, index], [0.025, 0.5, 0.975])
-        if measured is not None and measured.get(direction) is not None:
-            sd, n = measured[direction]
+        result = measured.get(direction)
+        if result is not None and result.sd_deg_per_step is not None:
+            sd, n = result.sd_deg_per_step, result.n
             low, high = (sd * math.sqrt((n - 1) / special.chdtri(n - 1, p)) for p in (0.025, 0.975))
         error = np.quantile(forecast.error[:, index], [0.5, 0.025, 0.975])
         counts = [classic_count(float(s), half_width) for s in (low, sd, high)]
@@ -188,19 +190,18 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
                 stereo_u=float(forecast.stereo_u[index]),
                 systematic=float(error[0]),
                 systematic_interval95=(float(error[1]), float(error[2])),
-                from_data=measured is not None and measured.get(direction) is not None,
+                from_data=result is not None and result.sd_deg_per_step is not None,
             )
         )
     return max(answers, key=lambda a: a.experiments)
 
 
-def _measured_sds(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
-    """Return sd s and n of each direction of a campaign with complete experiments."""
+def _measured(campaign: Campaign) -> Mapping[str, DirectionResult | None]:
+    """Return the classic results by direction; empty without complete experiments."""
     try:
-        results = classic(campaign).directions
+        return classic(campaign).directions
     except TvsError:
-        return None
-    return {d: (r.sd_deg_per_step, r.n) for d, r in results.items() if r is not None and r.sd_deg_per_step is not None}
+        return {}
 
 
 def value_of_classic(forecast: ClassicForecast | None, target: Target, experiments: int) -> float | None:

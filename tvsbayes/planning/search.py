@@ -187,17 +187,17 @@ CONTRAST_PRECISION = 1e8
 """Precision of the contrasts during a search: their information depends on the path, which is not yet known."""
 
 
-def search_rows(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and precision with known contrasts; after data home offsets are two more columns."""
+def search_precision(knowledge: Knowledge) -> np.ndarray:
+    """Return the precision with known contrasts; after data home offsets are two more columns."""
     precision = knowledge.precision.copy()
     precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += CONTRAST_PRECISION
     if not knowledge.after_data:
-        return seen.rows[..., :-2], precision
+        return precision
     size = len(precision)
     full = np.zeros((size + 2, size + 2))
     full[:size, :size] = precision
     full[range(size, size + 2), range(size, size + 2)] = 1 / HOME_VARIANCE_RAD2
-    return seen.rows, full
+    return full
 
 
 @dataclass(frozen=True)
@@ -274,11 +274,12 @@ class DesignProblem:
 
     def search(self, sensitivity_sought: Sensitivity | None = None, criterion: str = "c") -> Search:
         """Build a search among the looks, for the target or for other quantities; contrasts count as known."""
-        rows, precision = search_rows(self.seen, self.knowledge)
+        # The last two columns of rows are those of home offsets.
+        rows = self.seen.rows if self.knowledge.after_data else self.seen.rows[..., :-2]
         aim = self.at_centre if sensitivity_sought is None else sensitivity_sought
         gradient = np.zeros((len(aim.gradient), rows.shape[2]))
         gradient[:, : self.knowledge.size] = aim.gradient
-        return Search(rows, precision, gradient, aim.own_variance, criterion)
+        return Search(rows, search_precision(self.knowledge), gradient, aim.own_variance, criterion)
 
     def information(self, picks: np.ndarray, design: LookPlan, taken: np.ndarray | None = None) -> np.ndarray:
         """Compute the information of the looks `picks` (k,) of a design, or of those `taken` (indices in `picks`)."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.errors import listed
-from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, select_experiments
+from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, Selection, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import Campaign, stereo_spots
 from tvsbayes.report.drawing import (
@@ -59,15 +59,13 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, int]:
-    """Points 1 to 4 (4, 3) of a complete experiment, its axis and N."""
-    selection = select_experiments(campaign)
+def _row_of(selection: Selection, experiment: int) -> int:
+    """The row of a complete experiment."""
     rows = np.flatnonzero(selection.experiments == experiment)
     if not len(rows):
         known = listed(selection.experiments.tolist(), 10)
         raise ValueError(f"experiment {experiment} is not complete; complete are {known or 'none'}")
-    row = rows[0]
-    return campaign.points_mm[selection.spot_rows[row]], str(selection.axis[row]), int(selection.steps[row])
+    return int(rows[0])
 
 
 def trajectories(campaign: Campaign, experiment: int) -> Figure:
@@ -76,7 +74,9 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
     Raises:
         ValueError: the experiment is not complete.
     """
-    points, axis, steps = _experiment(campaign, experiment)
+    selection = select_experiments(campaign)
+    row = _row_of(selection, experiment)
+    points, axis, steps = campaign.points_mm[selection.spot_rows[row]], selection.axis[row], selection.steps[row]
     coordinate = 1 if axis == "pan" else 2
     before, after = points[[0, 1]], points[[3, 2]]
     with drawing(3.6) as figure:
@@ -107,7 +107,8 @@ def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
     if experiment is None:
         points = campaign.usable_points_mm
     else:
-        points = _experiment(campaign, experiment)[0]
+        selection = select_experiments(campaign)
+        points = campaign.points_mm[selection.spot_rows[_row_of(selection, experiment)]]
     with drawing(4.0) as figure:
         axes = figure.add_subplot(projection="3d")
         axes.scatter(*points.T, s=12 if experiment is None else 40, color=BLUE, depthshade=False, rasterized=True)

@@ -11,11 +11,11 @@ import inspect
 import math
 import re
 from abc import ABCMeta
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -120,15 +120,17 @@ def _array_schema(kind: type) -> dict[str, object]:
     return {"type": ["number", "array"]}
 
 
-def _meanings(docstring: str) -> tuple[str, dict[str, str]]:
-    """A docstring's description of the class, and of each field by its section "Attributes"."""
-    text, _, attributes = docstring.partition("\n\nAttributes:\n")
+_ATTRIBUTES = "\n\nAttributes:\n"
+
+
+def _meanings(docstring: str) -> dict[str, str]:
+    """The description of each field by a docstring's section "Attributes"."""
     meanings = {}
-    for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
+    for entry in re.split(r"\n(?! )", inspect.cleandoc(docstring.partition(_ATTRIBUTES)[2])):
         names, _, meaning = entry.partition(": ")
         # Python's None is JSON's null.
         meanings.update(dict.fromkeys(names.split(", "), re.sub(r"\bNone\b", "null", " ".join(meaning.split()))))
-    return " ".join(text.split()), meanings
+    return meanings
 
 
 def _records() -> dict[str, type[Record]]:
@@ -156,12 +158,13 @@ def _alike(schema: Any) -> Any:
 
 def _described(component: dict[str, Any], kind: type[Record] | None) -> dict[str, Any]:
     """A schema completed by the declaration's descriptions and constraints; `kind` is None for a dataclass."""
-    text, meanings = _meanings(component.get("description", ""))
+    text = component.get("description", "")
     keys = {} if kind is None else {field.name: field.encode_name for field in msgspec.structs.fields(kind)}
-    for name, meaning in meanings.items():
+    for name, meaning in _meanings(text).items():
         if (key := keys.get(name, name)) in component["properties"]:
             component["properties"][key] |= {"description": meaning}
     always = () if kind is None else kind.always
+    text = " ".join(text.partition(_ATTRIBUTES)[0].split())
     return component | {"description": text, "required": [*component["required"], *always]}
 
 
@@ -202,8 +205,15 @@ def _validator(schema: Mapping[str, Any]) -> Draft202012Validator:
     return Draft202012Validator(schema)
 
 
-def _schema_problem(values: object, schema: Mapping[str, Any]) -> tuple[list[str | int], str] | None:
-    """The place that most likely violates the schema, as keys and list indices, and the allowed values."""
+class _Problem(NamedTuple):
+    """A place in a document, as keys and list indices, and what is allowed there."""
+
+    place: Sequence[str | int]
+    allowed: str
+
+
+def _schema_problem(values: object, schema: Mapping[str, Any]) -> _Problem | None:
+    """The place that most likely violates the schema."""
     from jsonschema.exceptions import best_match
 
     error = best_match(islice(_validator(schema).iter_errors(values), SCHEMA_PROBLEMS))
@@ -215,28 +225,28 @@ def _schema_problem(values: object, schema: Mapping[str, Any]) -> tuple[list[str
         place.append(error.instance)
     match error.validator:
         case "required":
-            return [*place, next(name for name in rule if name not in error.instance)], "this key"
+            return _Problem([*place, next(name for name in rule if name not in error.instance)], "this key")
         case "additionalProperties":
             known = error.schema.get("properties", {})
-            return [*place, next(name for name in error.instance if name not in known)], "no such key"
+            return _Problem([*place, next(name for name in error.instance if name not in known)], "no such key")
         case "type":
-            return place, rule if isinstance(rule, str) else " or ".join(rule)
+            return _Problem(place, rule if isinstance(rule, str) else " or ".join(rule))
         case "const":
-            return place, shown(rule)
+            return _Problem(place, shown(rule))
         case "enum":
-            return place, " or ".join(map(shown, rule))
+            return _Problem(place, " or ".join(map(shown, rule)))
         case other:
-            return place, f"{other} {shown(rule)}"
+            return _Problem(place, f"{other} {shown(rule)}")
 
 
-def _unfit_value(value: object, place: tuple[str, ...] = ()) -> tuple[tuple[str, ...], str] | None:
-    """The place of a text that cannot be printed or of a number that is not finite, and the allowed values."""
+def _unfit_value(value: object, place: tuple[str, ...] = ()) -> _Problem | None:
+    """The place of a text that cannot be printed or of a number that is not finite."""
     if isinstance(value, str):
         if len(value) > TEXT_CHARS_MAX or not all(c.isprintable() or c in "\n\t" for c in value):
-            return place, "printable text"
+            return _Problem(place, "printable text")
     elif isinstance(value, float):
         if not math.isfinite(value):
-            return place, "a finite number"
+            return _Problem(place, "a finite number")
     elif isinstance(value, dict):
         return next(filter(None, (_unfit_value(inner, (*place, key)) for key, inner in value.items())), None)
     elif isinstance(value, list):

@@ -424,12 +424,13 @@ class AxisModel:
         log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), count)), np.empty((len(w), count, count))
         for part, block in self._blocks(w):
             normal = _normal_equations(block, 0)
-            scaled = _scaled(normal.information)
-            sides = np.concatenate([normal.right_side[:, None], functionals @ block.factor], axis=1)
-            sides = sides / scaled.scale[:, None]
-            solved = np.linalg.solve(scaled.matrix, np.swapaxes(sides, 1, 2))
+            scale = _scale(normal.information)
+            scaled = normal.information / (scale[:, :, None] * scale[:, None, :])
+            root = np.linalg.cholesky(scaled)
+            sides = np.concatenate([normal.right_side[:, None], functionals @ block.factor], axis=1) / scale[:, None]
+            solved = np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
             products = sides @ solved
-            log_det = 2 * np.sum(np.log(np.diagonal(scaled.root, axis1=1, axis2=2)) + np.log(scaled.scale), axis=1)
+            log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
             residual = block.products[:, 0, 0] - products[:, 0, 0]
             log_density[part] = -0.5 * (block.log_scatter + log_det + residual + rows * np.log(2 * np.pi))
             mean[part], covariance[part] = products[:, 0, 1:], products[:, 1:, 1:]
@@ -592,24 +593,18 @@ def _normal_equations(block: _Block, flat: int) -> _NormalEquations:
     return _NormalEquations(information, np.einsum("nij,nj->ni", transposed, products[:, 1:, 0]))
 
 
-class _Scaled(NamedTuple):
-    """A matrix scaled to a unit diagonal, its Cholesky factor, both (n, c, c), and the scale (n, c)."""
-
-    matrix: np.ndarray
-    root: np.ndarray
-    scale: np.ndarray
-
-
-def _scaled(information: np.ndarray) -> _Scaled:
-    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
-    scaled = information / (scale[:, :, None] * scale[:, None, :])
-    return _Scaled(scaled, np.linalg.cholesky(scaled), scale)
+def _scale(information: np.ndarray) -> np.ndarray:
+    """Root of the diagonal, shape (n, c)."""
+    return np.sqrt(np.diagonal(information, axis1=1, axis2=2))
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:
     """Inverse of the matrix, by its scaled one."""
-    scaled = _scaled(information)
-    return np.linalg.inv(scaled.matrix) / (scaled.scale[:, :, None] * scaled.scale[:, None, :])
+    scale = _scale(information)
+    scales = scale[:, :, None] * scale[:, None, :]
+    # Fails where rounding made the matrix indefinite.
+    np.linalg.cholesky(information / scales)
+    return np.linalg.inv(information / scales) / scales
 
 
 def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:

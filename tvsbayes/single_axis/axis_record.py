@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta, field, structs
@@ -152,28 +152,20 @@ def axis_fit_schema() -> dict[str, Any]:
     return schema_of(AxisSummary, Provenance, format={"const": AXIS_FIT_FORMAT}, inputs=AxisInputs)
 
 
-class _Diagnosis(NamedTuple):
-    """Diagnosis of a sampler, as in `Estimate`; None where none ran."""
-
-    rhat: float | None = None
-    ess_bulk: float | None = None
-    ess_tail: float | None = None
-
-
-def _estimate(draws: np.ndarray, prior: float | None, diagnosis: _Diagnosis) -> Estimate:
+def _estimate(draws: np.ndarray, prior: float | None, diagnosis: Mapping[str, float | None]) -> Estimate:
     sd = float(draws.std())
     contraction = None if not prior else float(max(1 - (sd / prior) ** 2, -1.0))
-    return Estimate(float(draws.mean()), sd, interval95(draws), prior, contraction, **diagnosis._asdict())
+    return Estimate(float(draws.mean()), sd, interval95(draws), prior, contraction, **diagnosis)
 
 
-def _diagnoses(fit: AxisFit) -> dict[str, _Diagnosis]:
-    """Diagnosis by quantity; "" has the worst values, used for other quantities."""
+def _diagnoses(fit: AxisFit) -> dict[str, dict[str, float | None]]:
+    """Diagnosis by quantity, as fields of `Estimate`; "" has the worst values, used for other quantities."""
     if fit.sample is None or fit.answer == "laplace":
-        return {"": _Diagnosis()}
+        return {"": {}}
     state = fit.sample.convergence
-    bulk, tail = state.ess_bulk, state.ess_tail
-    by_name = {name: _Diagnosis(state.rhat.get(name), bulk[name], tail[name]) for name in bulk}
-    worst = _Diagnosis(max(state.rhat.values(), default=None), min(bulk.values()), min(tail.values()))
+    rhat, bulk, tail = state.rhat, state.ess_bulk, state.ess_tail
+    by_name = {n: {"rhat": rhat.get(n), "ess_bulk": bulk[n], "ess_tail": tail[n]} for n in bulk}
+    worst = {"rhat": max(rhat.values(), default=None), "ess_bulk": min(bulk.values()), "ess_tail": min(tail.values())}
     return {**by_name, "": worst}
 
 
@@ -236,7 +228,7 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
     )
 
 
-def _effective_backlash(fit: AxisFit, diagnosis: _Diagnosis) -> Estimate | None:
+def _effective_backlash(fit: AxisFit, diagnosis: Mapping[str, float | None]) -> Estimate | None:
     """Estimate the mean of the play over the positions read; None for a drive, or with stops from one side alone."""
     rows, model = fit.rows, fit.model
     if rows.in_motion or not rows.both_sides:

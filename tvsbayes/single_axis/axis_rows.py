@@ -154,18 +154,8 @@ def legs_of(moves: Sequence[AxisMove]) -> Legs:
     return Legs(command, step, first, side, segment)
 
 
-@dataclass(frozen=True)
-class _Mean:
-    """The readings of one move; fields as in `AxisRows`."""
-
-    value: float
-    variance: float
-    within: float
-    count: int
-
-
-def _means(used: Sequence[Reading]) -> dict[int, _Mean]:
-    """Means of the readings of every move.
+def _means(used: Sequence[Reading]) -> dict[int, dict[str, float]]:
+    """Means of the readings of every move, by the fields of `AxisRows`.
 
     Without a stated u, it comes from repeated readings of one move; without these it is unknown, 0.
     """
@@ -184,9 +174,10 @@ def _means(used: Sequence[Reading]) -> dict[int, _Mean]:
         if np.all(u > 0):
             weight = 1 / u**2
             mean = float(weight @ values / weight.sum())
-            means[move] = _Mean(mean, float(1 / weight.sum()), float(weight @ (values - mean) ** 2), len(of_move))
+            means[move] = {"value": mean, "variance": float(1 / weight.sum())}
+            means[move] |= {"within": float(weight @ (values - mean) ** 2), "count": len(of_move)}
         else:
-            means[move] = _Mean(float(values.mean()), 0.0, 0.0, len(of_move))
+            means[move] = {"value": float(values.mean()), "variance": 0.0, "within": 0.0, "count": len(of_move)}
     return means
 
 
@@ -267,9 +258,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
             file="readings.csv",
             remedy="thin them out, or give readings at one standstill one move: they are averaged exactly",
         )
-    read = {
-        name: np.array([getattr(means[m], name) for m in moves]) for name in ("value", "variance", "within", "count")
-    }
+    read = {name: np.array([means[m][name] for m in moves]) for name in ("value", "variance", "within", "count")}
     value = read["value"]
     command = legs.command[moves]
     _check_turns(campaign, command, value, moves)

@@ -28,7 +28,7 @@ from tvsbayes.instrument.parameters import (
     Prior,
 )
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, stereo_parameters
+from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, stereo_covariance, stereo_parameters
 from tvsbayes.twin.gear_errors import PERFECT, AxisErrors, GearErrors, Tabulated, draw_gear_errors
 from tvsbayes.twin.physics import effective_mirror_offset_mm, local_deg_per_step
 from tvsbayes.twin.true_headlines import effective_deg_per_step
@@ -238,7 +238,7 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
     parameters = drawn((n for n in rig_names if n not in late), rng)
     # By eigenvectors, since fixed parameters give a semi-definite covariance, for which Cholesky fails.
-    cameras, covariance = stereo_parameters(rig.stereo)
+    cameras, covariance = stereo_parameters(rig.stereo), stereo_covariance(rig.stereo)
     variances, vectors = np.linalg.eigh(covariance)
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))
     # Last, so that rigs without transmission error do not depend on these draws.
