@@ -10,6 +10,7 @@ import re
 import shlex
 from collections.abc import Iterable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 
 class TvsError(Exception):
@@ -54,6 +55,13 @@ class TvsError(Exception):
         # Pickle passes positional arguments alone; a worker process of a pool must return the complete error.
         named = ("file", "line", "column", "found", "allowed", "remedy")
         return partial(type(self), **{name: getattr(self, name) for name in named}), (self.code, self.message)
+
+
+class Reason(NamedTuple):
+    """Why something is refused, and what to do about it, in words."""
+
+    reason: str
+    remedy: str
 
 
 class InputError(TvsError):

@@ -265,7 +265,7 @@ def panel_positioner(axes: Axes) -> None:
     label(axes, seen_obliquely([0, 0, -62]), (22, -10), text, POSITIONER, ha="left", va="top")
     label(axes, seen_obliquely([0, 0, 104]), (0, 4), "pan axis", va="bottom")
     tilts = np.radians(np.linspace(1, raised_deg - 1, 30))
-    lifts = second + 84 * mirror_chain(0.0, tilts, geometry)[1]
+    lifts = second + 84 * mirror_chain(0.0, tilts, geometry).direction
     curved(axes, seen_obliquely(lifts), POSITIONER)
     label(axes, seen_obliquely(lifts[-1]), (-4, 22), "tilt $\\beta$ > 0: up,\ncounter grows", POSITIONER, va="bottom")
     label(axes, seen_obliquely([0, 0, 0]), (-21, -10), "mirror 1", ha="right")

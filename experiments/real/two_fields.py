@@ -8,6 +8,8 @@ purpose. Pictures of the twin, which read all rows at once: how many are widened
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -15,7 +17,7 @@ from experiments.common.clock import timed
 from experiments.common.command_line import print_only
 from experiments.real.beams import BEAMS, deviations, parts_of
 from tvsbayes.cameras.alternate_lines import shift_of_lines
-from tvsbayes.cameras.spot_fit import Centre, centre_of, fit_spot, widened, with_measured_noise
+from tvsbayes.cameras.spot_fit import Centre, centre_of, fit_spot, measured_noise, widened
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.cameras.spot_window import Patch, patch_around
 from tvsbayes.files.images import in_grey_levels, read_image
@@ -36,7 +38,8 @@ def bare(picture: np.ndarray, noise: SpotNoise | None = None) -> Centre:
     """The centre without what alternate lines add; by its own noise where none is given."""
     patch: Patch | str = patch_around(in_grey_levels(picture))
     if noise is None and not isinstance(patch, str):
-        patch, noise = with_measured_noise(patch)
+        measured = measured_noise(patch)
+        patch, noise = replace(patch, background_variance=measured.background_dn2), measured.noise
     return centre_of(patch, noise or SpotNoise())
 
 

@@ -81,7 +81,7 @@ def test_a_look_lasts_from_laser_on_to_laser_off(mounted_rig):
         directions.append(first)
         positioner.laser(False)
     psi, beta = np.radians(instrument.state_deg().mirror_angles_deg)
-    one, two = (mirror_chain(psi + step, beta, instrument.truth.parameters)[1] for step in (0.0, 1e-6))
+    one, two = (mirror_chain(psi + step, beta, instrument.truth.parameters).direction for step in (0.0, 1e-6))
     expected = np.radians(0.05) * np.linalg.norm(two - one) / 1e-6
     off = np.linalg.norm(np.array(directions) - np.mean(directions, axis=0), axis=1)
     # Four standard errors of an sd of 200.

@@ -145,7 +145,7 @@ def test_mirrored_corner_orders_are_corrected(monkeypatch):
         return original(grey, board).reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
 
     monkeypatch.setattr(boards, "_find_classic", mirrored)
-    np.testing.assert_array_equal(boards.find_corners(grey, BOARD)[0], straight)
+    np.testing.assert_array_equal(boards.find_corners(grey, BOARD).px, straight)
 
 
 def test_colours_decide_for_an_inverted_camera(tmp_path):
@@ -290,4 +290,4 @@ def test_the_size_of_a_board_is_searched_in_a_smaller_copy(greys, monkeypatch):
     ],
 )
 def test_pictures_without_a_board(picture, reason):
-    assert reason in why_no_board([picture], 9, 6)[0]
+    assert reason in why_no_board([picture], 9, 6).reason

@@ -58,7 +58,7 @@ def test_a_run_on_a_bent_rig_is_the_twins(period_deg):
                 np.array(counters), homed, zeros + start, zeros, ratio, play, harmonics, period_deg
             )
         psi, beta = np.radians(angles["pan"]), np.radians(angles["tilt"] + rig["tilt_zero_deg"])
-        beam = mirror_chain(psi, beta, rig)[1]
+        beam = mirror_chain(psi, beta, rig).direction
         angle = np.degrees(np.arctan2(beam[:, 1], beam[:, 0]) if name == "pan" else np.arcsin(beam[:, 2]))
         deviation = angle - 0.06 * np.array(path)
         runs = deviation[1:].reshape(2, 12)

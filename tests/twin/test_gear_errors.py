@@ -234,7 +234,7 @@ def test_the_headline_is_the_line_through_the_looks(mounted_rig):
     many = simulate(mounted_rig, sweep((20, 40, 60, 80, 100, 120)), 1, truth).campaign
     counters = np.array([0.0, 20, 40, 60, 80, 100, 120])
     tilt_deg = p["degrees_per_step.tilt"] * counters.mean() / 2 + p["tilt_zero_deg"]
-    direction = mirror_chain(np.radians(p["degrees_per_step.pan"] * counters), np.radians(tilt_deg), p)[1]
+    direction = mirror_chain(np.radians(p["degrees_per_step.pan"] * counters), np.radians(tilt_deg), p).direction
     line = np.polyfit(counters, np.degrees(np.arctan2(direction[:, 1], direction[:, 0])), 1)[0]
     slopes = effective_deg_per_step(p, PERFECT, many)
     assert (slopes["left"] + slopes["right"]) / 2 == pytest.approx(line, rel=1e-9)

@@ -61,8 +61,8 @@ def test_nominal_chain_is_a_periscope():
     origin, direction = mirror_chain(0.0, 0.0, NOMINAL)
     assert origin == pytest.approx([0.0, -30.0, 0.0], abs=1e-12)
     assert direction == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
-    left = mirror_chain(0.1, 0.0, NOMINAL)[1]
-    up = mirror_chain(0.0, 0.1, NOMINAL)[1]
+    left = mirror_chain(0.1, 0.0, NOMINAL).direction
+    up = mirror_chain(0.0, 0.1, NOMINAL).direction
     assert left == pytest.approx([np.cos(0.1), np.sin(0.1), 0.0], abs=1e-12)
     assert up == pytest.approx([np.cos(0.1), 0.0, np.sin(0.1)], abs=1e-12)
 

@@ -182,7 +182,7 @@ def test_looks_scatter_also_where_an_axis_stands(fixed):
     still = draw_truth(fixed, np.random.default_rng(0))
     without = simulate(fixed, plan, 5, still)
     p, (psi, beta) = still.parameters, np.radians(without.truth.mirror_angles_deg[0])
-    ahead = [mirror_chain(psi + a, beta + b, p)[1] for a, b in ((0.0, 0.0), (1e-6, 0.0), (0.0, 1e-6))]
+    ahead = [mirror_chain(psi + a, beta + b, p).direction for a, b in ((0.0, 0.0), (1e-6, 0.0), (0.0, 1e-6))]
     for axis, by_angle in zip(("pan", "tilt"), (ahead[1] - ahead[0], ahead[2] - ahead[0]), strict=True):
         shaking = replace(still, parameters={**p, f"look_scatter_deg.{axis}": 0.05})
         shaken = simulate(fixed, plan, 5, shaking)

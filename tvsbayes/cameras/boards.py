@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ from tvsbayes.cameras.marker_boards import (
     Markers,
     fitted_markers,
     marker_board_corners,
-    most_markers,
+    marker_counts,
     spread,
 )
 from tvsbayes.cameras.picture_pairs import (
@@ -38,7 +38,7 @@ from tvsbayes.cameras.picture_pairs import (
     natural_order,
     read_folder,
 )
-from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
+from tvsbayes.errors import InputError, NothingToEstimate, Reason, all_of, escaped, refusal
 from tvsbayes.files.images import in_grey_levels, read_image
 from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.stereo_pair import same_shape, scaled_px
@@ -194,7 +194,14 @@ class Views:
     right_image_size: Size | None = None
 
 
-def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> tuple[np.ndarray, bool] | None:
+class Corners(NamedTuple):
+    """Inner corners (corners, 2), px, in right-handed order (the sense of the image's x, y), and by which finder."""
+
+    px: np.ndarray
+    by_fallback: bool
+
+
+def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> Corners | None:
     """Inner corners of a board in one picture.
 
     `classic` is findChessboardCorners refined by cornerSubPix, `sector` findChessboardCornersSB (Duda and Frese
@@ -206,12 +213,11 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
         finder: the finder tried first.
 
     Returns:
-        Corners (corners, 2), px, in right-handed order (the sense of the image's x, y), and whether the fallback found
-        them; None where neither did.
+        The corners; None where neither finds them.
     """
     if board.markers is not None:
         marker_corners = marker_board_corners(grey, board.markers)
-        return None if marker_corners is None else (marker_corners, False)
+        return None if marker_corners is None else Corners(marker_corners, False)
     for method in (finder, "sector" if finder == "classic" else "classic"):
         corners = _find_classic(grey, board) if method == "classic" else _find_sector(grey, board)
         if corners is None or not np.isfinite(corners).all():
@@ -221,7 +227,7 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
         # Every picture shows the front of the board, so the order has the same sense in all pictures.
         if along[0] * across[1] - along[1] * across[0] < 0:
             grid = grid[:, ::-1]
-        return grid.reshape(-1, 2), method != finder
+        return Corners(grid.reshape(-1, 2), method != finder)
     return None
 
 
@@ -290,21 +296,18 @@ class _Detected:
     by_fallback: bool
 
 
-def _same_order(left: _Detected, right: _Detected, board: Board) -> tuple[np.ndarray, bool]:
-    """Right corners in the order of the left ones, and whether they were reordered.
+def _turn_of_right(left: _Detected, right: _Detected, board: Board) -> int:
+    """Number in `corner_orders` of the order in which right corners are those of the left ones; 0 is unchanged.
 
     The colours decide where a turned board looks different (one of columns and rows odd, one even). Otherwise the
     relative rotation of the cameras is assumed to be less than half of the board's symmetry angle.
     """
-    if board.markers is not None:
-        return right.corners, False
     grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in corner_orders(board)]
     candidates = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
     grid = left.corners.reshape(board.rows, board.columns, 2)
     along = (grid[:, -1] - grid[:, 0]).mean(0)
     rows_px = [(candidate[:, -1] - candidate[:, 0]).mean(0) for candidate in grids]
-    best = max(candidates, key=lambda k: float(along @ rows_px[k]) / max(float(np.linalg.norm(rows_px[k])), 1e-12))
-    return grids[best].reshape(-1, 2), best != 0
+    return max(candidates, key=lambda k: float(along @ rows_px[k]) / max(float(np.linalg.norm(rows_px[k])), 1e-12))
 
 
 def find_views(
@@ -364,8 +367,9 @@ def find_views(
         left, right = (boards[name].get(side) for side in CAMERAS)
         corners = None if right is None else right.corners
         if left is not None and right is not None:
-            corners, turned = _same_order(left, right, board)
-            reordered += [name] * turned
+            turn = _turn_of_right(left, right, board)
+            corners = right.corners[corner_orders(board)[turn]]
+            reordered += [name] * (turn != 0)
         corners = None if corners is None else scaled_px(corners, usual["right"], usual["left"])
         views.append(View(name, None if left is None else left.corners, corners))
     unpaired = [n for (view, side), n in names.items() if (view, CAMERAS[side == "left"]) not in names]
@@ -400,7 +404,7 @@ def _no_board_error(sample: Sequence[Picture], pictures: PictureFolder, board: B
     reason, remedy = why_no_board(greys, board.columns, board.rows)
     if board.markers is None:
         shown = spread(greys)
-        name, markers = most_markers(shown)
+        name, markers = marker_counts(shown).most_common(1)[0]
         if markers >= MARKERS_MIN * len(shown):
             reason += f"; {markers} markers of {name.partition('_')[0]} are seen, as on a ChArUco board"
             remedy = f"--charuco COLUMNSxROWS --dictionary {name} in place of --board, counting squares"
@@ -505,8 +509,8 @@ def inner_corners(grey: np.ndarray) -> tuple[int, int] | None:
     return int(columns), int(rows)
 
 
-def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> tuple[str, str]:
-    """A reason why pictures do not show the board, and a remedy.
+def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> Reason:
+    """Why pictures do not show the board.
 
     Args:
         pictures: a sample of one camera's pictures.
@@ -523,26 +527,26 @@ def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> tup
             and 2 * count <= boards.total()
             and all(a <= stated[0] and b <= stated[1] for a, b in boards)
         ):
-            return (
+            return Reason(
                 f"parts of a board are seen, {listed} inner corners of {stated[0]}x{stated[1]}: partly outside?",
                 "hold the whole board into both pictures; or is it smaller: count where four squares meet",
             )
         remedy = f"--board {long}x{short}? count where four squares meet, not the squares"
-        return f"{long}x{short} inner corners are seen in {count} of {len(pictures)} pictures", remedy
+        return Reason(f"{long}x{short} inner corners are seen in {count} of {len(pictures)} pictures", remedy)
     levels = [float(grey.mean()) for grey in pictures]
     if float(np.median(levels)) < DARK_DN:
         remedy = "more light, or a longer exposure"
-        return f"the pictures are dark, mean grey level {np.median(levels):.0f} of 255", remedy
+        return Reason(f"the pictures are dark, mean grey level {np.median(levels):.0f} of 255", remedy)
     clipped = [float((grey >= 254).mean()) for grey in pictures]
     if float(np.median(levels)) > BRIGHT_DN or float(np.median(clipped)) > CLIPPED_SHARE:
         remedy = "less light, or a shorter exposure"
-        return f"the pictures are overexposed, {100 * np.median(clipped):.0f} % of the pixels are white", remedy
+        return Reason(f"the pictures are overexposed, {100 * np.median(clipped):.0f} % of the pixels are white", remedy)
     if float(np.median([_sharpness(grey) for grey in pictures])) < BLURRED_SHARE:
-        return "the pictures are blurred: no edge is in focus", "focus, and hold the board still"
+        return Reason("the pictures are blurred: no edge is in focus", "focus, and hold the board still")
     remedy = (
         "check --board (inner corners, one less than squares), sharpness and light; a ruled or printed white margin "
     )
-    return "no checkerboard of any size is seen", remedy + "around the board helps"
+    return Reason("no checkerboard of any size is seen", remedy + "around the board helps")
 
 
 def _sharpness(grey: np.ndarray) -> float:

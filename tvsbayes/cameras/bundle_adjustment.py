@@ -235,7 +235,7 @@ def bundle_adjustment(
     root = np.zeros((24, 24))
     root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
     arrays = replace(arrays, root=placed(root))
-    end, again = _lowest(_descended(zero, arrays), arrays, free, dof)
+    *_, end, again = _descents(_descended(zero, arrays), arrays, free, dof)
     noise_sd = end.noise_sd(dof)
     jacobian, residuals = end.jacobian[kept][:, free], end.residuals[kept]
     _check_minimum(jacobian, residuals, (again.z - end.z)[free], noise_sd)
@@ -309,15 +309,15 @@ class _End:
         return math.sqrt(float(self.residuals @ self.residuals) / dof)
 
 
-def _lowest(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> tuple[_End, _End]:
-    """The lowest end point, and that of the last repetition from a start near it."""
-    again = _repeated(end, arrays, free, dof)
+def _descents(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> list[_End]:
+    """A first end point, and those of repetitions from starts near the end before, up to one that is not lower."""
+    ends = [end, _repeated(end, arrays, free, dof)]
     for _ in range(RESTARTS_MAX):
-        if not again.noise_sd(dof) < (1 - LOWER_SHARE) * end.noise_sd(dof):
+        if not ends[-1].noise_sd(dof) < (1 - LOWER_SHARE) * ends[-2].noise_sd(dof):
             break
-        # The returned end is always repeated: compared with itself it would seem confirmed.
-        end, again = again, _repeated(again, arrays, free, dof)
-    return end, again
+        # The last end but one is always repeated: compared with itself it would seem confirmed.
+        ends.append(_repeated(ends[-1], arrays, free, dof))
+    return ends
 
 
 def _repeated(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> _End:

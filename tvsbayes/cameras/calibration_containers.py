@@ -63,7 +63,7 @@ def read_container(data: bytes, file: str) -> list[Keys]:
             except (MemoryError, RecursionError, struct.error, IndexError, AttributeError, OverflowError) as e:
                 raise container_error(file, None, "a damaged file", "write it again with its program") from e
             return [Keys(_plain_values(values, file), file, "")]
-    text, _ = text_of(data, file, _FORMATS_TEXT, _TEXT_REMEDY)
+    text = text_of(data, file, _FORMATS_TEXT, _TEXT_REMEDY).text
     try:
         printed = printed_values(text)
     except ValueError as error:

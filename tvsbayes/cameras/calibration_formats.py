@@ -189,10 +189,10 @@ class _Reader:
         left, right = (self._distortion(side, matrices[side], sizes[side]) for side in (0, 1))
         scaled = matrices[1] * np.array([[size[0] / sizes[1][0]] * 2 + [1.0]] * 2 + [[1.0] * 3])
         scaled[:2, 2] = scaled_px(matrices[1][:2, 2], sizes[1], size)
-        rotation, translation = self._extrinsics()
-        translation = translation * self._unit(float(np.linalg.norm(translation)))
+        pose = self._pose()
+        translation = pose.translation * self._unit(float(np.linalg.norm(pose.translation)))
         inner = matrices[0], left, scaled, right
-        bare = Stereo(*size, *inner, rotation, translation, np.zeros((24, 24)), 0.0, assumed=True)
+        bare = Stereo(*size, *inner, pose.rotation, translation, np.zeros((24, 24)), 0.0, assumed=True)
         bare = replace(bare, right_image_size=self.right_size)
         return parse_stereo(stereo_bytes(bare), "the imported calibration")
 
@@ -359,7 +359,7 @@ class _Reader:
         file = self.fields.files[0].file
         raise refusal("missing-key", file=file, found="no image size", allowed="image_width", remedy=remedy)
 
-    def _extrinsics(self) -> tuple[np.ndarray, np.ndarray]:
+    def _pose(self) -> _Pose:
         """R and T of x_right = R x_left + T, T in the file's unit: the first pose, checked against all others."""
         poses = list(self._poses())
         if not poses:
@@ -390,7 +390,7 @@ class _Reader:
                 raise first.turn.refuse("rotation", allowed, remedy, found_here)
         if not checks and first.plain and "R" not in self.fields.stated:
             self._check_direction(first)
-        return first.rotation, first.translation
+        return first
 
     def _poses(self) -> Iterator[_Pose]:
         """All poses of the right camera in the files."""

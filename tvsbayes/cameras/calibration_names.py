@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,9 +99,16 @@ _IGNORED_TABLES = {"roi", "region_of_interest", "header"}
 MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "model", "lensmodel", "distortiontype")
 
 
-def _table() -> dict[str, list[tuple[str, str]]]:
-    """Field and side by name; the side is "" where the name states none."""
-    fields: dict[str, list[tuple[str, str]]] = {}
+class Meaning(NamedTuple):
+    """A field, and the side that a name states for it, "" where it states none."""
+
+    field: str
+    side: str
+
+
+def _table() -> dict[str, list[Meaning]]:
+    """Meanings by name."""
+    fields: dict[str, list[Meaning]] = {}
     for field, (_, words) in FIELDS.items():
         names = {(f"{mark}{word}", "") for word in words.split() for mark in _MARKS}
         if field in CAMERA_FIELDS:
@@ -111,7 +118,7 @@ def _table() -> dict[str, list[tuple[str, str]]]:
                         names |= {(f"{mark}{side}{word}", side), (f"{side}{mark}{word}", side)}
                         names |= {(f"{word}{mark}{side}", side), (f"{mark}{word}{side}", side)}
         for name, side in names:
-            fields.setdefault(name, []).append((field, side))
+            fields.setdefault(name, []).append(Meaning(field, side))
     return fields
 
 
@@ -227,8 +234,8 @@ def _letters(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str]]:
-    """Possible fields and sides of an entry, by the longest part of its path that is a known name.
+def meanings(entry: Entry, *, of_any_count: bool = False) -> list[Meaning]:
+    """Possible meanings of an entry, by the longest part of its path that is a known name.
 
     Args:
         entry: an entry of a file.
@@ -239,11 +246,11 @@ def meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str
         return []
     for count in range(min(4, len(parts)), 0, -1):
         known = _NAMES.get(_letters("".join(parts[-count:])), ())
-        matches = [match for match in known if of_any_count or entry.numbers.size in FIELDS[match[0]][0]]
+        matches = [match for match in known if of_any_count or entry.numbers.size in FIELDS[match.field][0]]
         if matches:
             # A name without a side may be in the table of one camera.
             side = next((s for part in reversed(parts[:-count]) if (s := _side_of(part))), "")
-            return [(field, stated or (side if field in CAMERA_FIELDS else "")) for field, stated in matches]
+            return [one if one.side or one.field not in CAMERA_FIELDS else Meaning(one.field, side) for one in matches]
     return []
 
 
@@ -273,10 +280,10 @@ class Fields:
         self.pair: dict[str, Entry] = {}
         self.cameras: tuple[dict[str, Entry], dict[str, Entry]] = ({}, {})
         self.twice: dict[str, tuple[Entry, Entry]] = {}
-        readings = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
+        readings = [(entry, meaning) for entry in self.entries for meaning in meanings(entry)]
         # Entries without a side come last: they fill the gaps of a camera.
-        readings.sort(key=lambda reading: not reading[2])
-        numbers = {side for _, _, side in readings if side.isdigit()}
+        readings.sort(key=lambda reading: not reading[1].side)
+        numbers = {meaning.side for _, meaning in readings if meaning.side.isdigit()}
         offset = 0 if "0" in numbers or not numbers else 1
         # Files of one camera each have entries without a side: the first file is the left one, unless names state it.
         camera_files = [k for k in range(len(files)) if self._has_camera(readings, k)]
@@ -284,7 +291,7 @@ class Fields:
         if one_camera_each and [_side_in_name(files[k].file) for k in camera_files] == [1, 0]:
             camera_files.reverse()
         self.by_file = one_camera_each
-        for entry, field, side in readings:
+        for entry, (field, side) in readings:
             if field in PROVENANCE_FIELDS:
                 if not any(map(_side_of, entry.keys.path)):
                     self.pair.setdefault(field, entry)
@@ -311,9 +318,9 @@ class Fields:
                 self.cameras[int(field[-1]) - 1][field[:-1]] = entry
 
     @staticmethod
-    def _has_camera(readings: Sequence[tuple[Entry, str, str]], file: int) -> bool:
+    def _has_camera(readings: Sequence[tuple[Entry, Meaning]], file: int) -> bool:
         """Whether a file contains a camera matrix without a side."""
-        return any(e.file == file and field in ("M", "fx") and not side for e, field, side in readings)
+        return any(e.file == file and of.field in ("M", "fx") and not of.side for e, of in readings)
 
     def _add(self, table: dict[str, Entry], field: str, name: str, entry: Entry) -> None:
         previous = table.get(field)
@@ -362,7 +369,7 @@ class Fields:
             )
         fields = {field.rstrip("12") for field in fields_missing}
         for entry in self.entries:
-            names = {field for field, _ in meanings(entry, of_any_count=True)} & fields
+            names = {meaning.field for meaning in meanings(entry, of_any_count=True)} & fields
             if names and entry.numbers.size != 1 and not meanings(entry):
                 counts = FIELDS[min(names)][0]
                 return entry.refuse(

@@ -28,7 +28,7 @@ import numpy as np
 from tvsbayes.cameras.alternate_lines import AlternateLines
 from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, rectified_pair
 from tvsbayes.cameras.picture_pairs import SUFFIXES
-from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, widened, with_measured_noise
+from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, measured_noise, skewness, widened
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
 from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal, typed
@@ -482,7 +482,7 @@ def _estimated_noise(patches: Sequence[Patch], speckle_contrast: float | None) -
     # Wide spots are first fitted without speckle, whose weights would overrate the wings, which are not Gaussian.
     wide = bool(patches) and speckle_contrast is None and all(patch.wide for patch in patches)
     if wide and len(patches) < SHAPE_SPOTS_MIN:
-        return mean_noise([with_measured_noise(patch)[1] for patch in patches])
+        return mean_noise([measured_noise(patch).noise for patch in patches])
     noise = SpotNoise(speckle_contrast=0.0 if wide else _contrast(speckle_contrast))
     for _ in range(LEARNING_ROUNDS):
         fits = [(fitted, patch) for patch in patches if (fitted := fit_spot(patch, noise)) is not None]

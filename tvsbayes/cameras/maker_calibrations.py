@@ -205,8 +205,8 @@ def _depthai(document: Values, keys: Keys, size: Size | None) -> MakersPair:
     if not all(socket in cameras for socket in sockets) or sockets[0] == sockets[1]:
         # CAM_B and CAM_C are used where the rectification was never stored.
         sockets = [1, 2]
-    poses = [_chain_pose(cameras, socket) for socket in sockets if socket in cameras] + [None, None]
-    if poses[0] is None or poses[1] is None or poses[0][0] != poses[1][0]:
+    chains = [chain for s in sockets if s in cameras and (chain := _chain_pose(cameras, s)) is not None]
+    if len(chains) < 2 or len({end for end, _ in chains}) > 1:
         raise refusal(
             "missing-key",
             file=keys.file,
@@ -214,7 +214,8 @@ def _depthai(document: Values, keys: Keys, size: Size | None) -> MakersPair:
             allowed="two cameras, and a chain of toCameraSocket between them",
             remedy="take it from the device again: dai.CalibrationHandler.eepromToJsonFile()",
         )
-    pose = np.linalg.inv(poses[1][1]) @ poses[0][1]
+    (_, left), (_, right) = chains
+    pose = np.linalg.inv(right) @ left
     values: Values = {"R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
     for side, socket in zip(("left", "right"), sockets, strict=True):
         camera = cameras[socket]

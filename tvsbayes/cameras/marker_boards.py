@@ -6,8 +6,10 @@ integer at a pixel's centre, row by row, NaN where unseen. No JAX.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -85,8 +87,15 @@ def _markers(grey: np.ndarray, dictionary: str) -> _Detected:
     return _Detected(np.array(corners, float).reshape(-1, 4, 2), np.ravel(numbers))
 
 
-def _plane_fit(detected: _Detected, board: cv2.aruco.CharucoBoard) -> tuple[float, float] | None:
-    """Rms deviation of markers' centres from those of a board, and the markers' side, in squares; None for too few."""
+class _PlaneFit(NamedTuple):
+    """Rms deviation of markers' centres from those of a board, and the markers' side, in squares."""
+
+    rms: float
+    side: float
+
+
+def _plane_fit(detected: _Detected, board: cv2.aruco.CharucoBoard) -> _PlaneFit | None:
+    """The fit of the markers of a picture to those of a board; None for too few."""
     places = np.array([np.asarray(four, float)[:, :2] for four in board.getObjPoints()])
     on_board = detected.numbers < len(places)
     if on_board.sum() < MARKERS_MIN:
@@ -100,7 +109,7 @@ def _plane_fit(detected: _Detected, board: cv2.aruco.CharucoBoard) -> tuple[floa
     back, flat = (np.reshape(part_squares, (-1, 2)) for part_squares in parts)
     rms = float(np.sqrt(np.mean(np.sum((back - centres) ** 2, axis=1))))
     sides = np.linalg.norm(flat.reshape(-1, 4, 2) - np.roll(flat.reshape(-1, 4, 2), 1, axis=1), axis=2)
-    return rms, float(np.median(sides))
+    return _PlaneFit(rms, float(np.median(sides)))
 
 
 def fitted_markers(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
@@ -118,13 +127,13 @@ def fitted_markers(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
     for legacy in (markers.legacy, not markers.legacy):
         board = replace(markers, legacy=legacy).board()
         fits[legacy] = [fit for markers_seen in detected if (fit := _plane_fit(markers_seen, board)) is not None]
-    best = min(fits, key=lambda legacy: np.median([fit[0] for fit in fits[legacy]] or [np.inf]))
+    best = min(fits, key=lambda legacy: np.median([fit.rms for fit in fits[legacy]] or [np.inf]))
     if not fits[best]:
         _refuse_other_markers(spread(pictures), markers)
         return replace(markers, share=markers.share or SHARE_DEFAULT)
-    if np.median([fit[0] for fit in fits[best]]) > MISFIT_SQUARES:
+    if np.median([fit.rms for fit in fits[best]]) > MISFIT_SQUARES:
         raise _other_board(detected, markers)
-    share = markers.share or float(np.clip(np.median([fit[1] for fit in fits[best]]), 0.2, 0.98))
+    share = markers.share or float(np.clip(np.median([fit.side for fit in fits[best]]), 0.2, 0.98))
     return replace(markers, legacy=best, share=share)
 
 
@@ -136,7 +145,7 @@ def _other_board(detected: Sequence[_Detected], markers: Markers) -> NothingToEs
         rows = -(-2 * (1 + max(int(markers_seen.numbers.max(initial=0)) for markers_seen in detected)) // columns)
         for legacy in (False, True):
             board = replace(markers, legacy=legacy).board((columns, max(3, rows + rows % 2)))
-            fits = [fit[0] for markers_seen in detected if (fit := _plane_fit(markers_seen, board)) is not None]
+            fits = [fit.rms for markers_seen in detected if (fit := _plane_fit(markers_seen, board)) is not None]
             misfits[columns] = min(misfits.get(columns, np.inf), float(np.median(fits)) if fits else np.inf)
     best = min(misfits, key=lambda columns: misfits[columns])
     remedy = "count squares, columns x rows, with the first marker at the upper left"
@@ -156,15 +165,14 @@ def spread[T](pictures: Sequence[T], count: int = SAMPLE_PICTURES) -> list[T]:
     return [pictures[round(place)] for place in places]
 
 
-def most_markers(pictures: Sequence[np.ndarray]) -> tuple[str, int]:
-    """The dictionary with the most markers in the pictures, or the first with enough in all, and their number."""
-    counted: dict[str, int] = {}
+def marker_counts(pictures: Sequence[np.ndarray]) -> Counter[str]:
+    """Numbers of markers in the pictures by dictionary, up to the first dictionary with enough in all."""
+    counted: Counter[str] = Counter()
     for name in WIDEST_DICTIONARIES:
         counted[name] = sum(len(_markers(grey, name).numbers) for grey in pictures)
         if counted[name] >= MARKERS_MIN * len(pictures):
-            return name, counted[name]
-    name = max(counted, key=lambda key: counted[key])
-    return name, counted[name]
+            break
+    return counted
 
 
 def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> None:
@@ -173,7 +181,7 @@ def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> N
     False detections are common for dictionaries with few bits.
     """
     matching = sum(len(_markers(grey, markers.dictionary).numbers) for grey in pictures)
-    name, count = most_markers(pictures)
+    name, count = marker_counts(pictures).most_common(1)[0]
     if matching >= max(1, count):
         return
     remedy = "see that light is even and the pictures sharp; is it a checkerboard without markers: --board?"

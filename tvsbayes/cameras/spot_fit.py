@@ -20,7 +20,7 @@ from math import log, pi, sqrt
 import numpy as np
 
 from tvsbayes.cameras.alternate_lines import AlternateLines, shift_of_lines, widening
-from tvsbayes.cameras.spot_noise import SpotNoise, pixel_noise, through_demosaicing
+from tvsbayes.cameras.spot_noise import PixelNoise, SpotNoise, pixel_noise, through_demosaicing
 from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, SHRINK, Patch, patch_around
 from tvsbayes.files.images import in_grey_levels
 from tvsbayes.instrument.stereo_pair import scaled_px
@@ -271,12 +271,12 @@ def skewness(fitted: _Fit, patch: Patch) -> np.ndarray:
     return np.column_stack((filters @ fitted.residual, *_noise_parts(filters, signal, patch)))
 
 
-def with_measured_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
-    """A wide patch and the noise of its own pixels; its skew up to `SKEW_SHAPE_MAX` counts as the beam's shape."""
+def measured_noise(patch: Patch) -> PixelNoise:
+    """The noise of a wide patch's own pixels; its skew up to `SKEW_SHAPE_MAX` counts as the beam's shape."""
     # The weights of a wide spot without speckle do not depend on the noise.
     fitted = fit_spot(patch, SpotNoise(speckle_contrast=0.0))
     if fitted is None:
-        return patch, SpotNoise()
+        return PixelNoise(SpotNoise(), patch.background_variance)
     height, width = patch.raw.shape
     low = np.maximum(np.floor(fitted.centre_px - patch.corner - NOISE_REACH * patch.start_sd_px), 0).astype(int)
     high = np.minimum(low + int(2 * NOISE_REACH * patch.start_sd_px) + 1, (width, height))
@@ -286,9 +286,9 @@ def with_measured_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
     (p, q), (_, r) = fitted.precision.astype(np.float32)
     signal = np.float32(fitted.height_dn) * np.exp(-(p * x * x + 2 * q * x * y + r * y * y) / 2)
     pixels = pixel_noise(raw - signal, signal, raw < CLIPPED_DN, patch.background_variance, patch.mono)
-    patch = replace(patch, background_variance=pixels.background_dn2)
-    skew = skewness(fitted, patch)[:, 0]
-    return patch, replace(pixels.noise, skew=tuple(np.clip(skew, -SKEW_SHAPE_MAX, SKEW_SHAPE_MAX).tolist()))
+    skew = skewness(fitted, replace(patch, background_variance=pixels.background_dn2))[:, 0]
+    shape = tuple(np.clip(skew, -SKEW_SHAPE_MAX, SKEW_SHAPE_MAX).tolist())
+    return replace(pixels, noise=replace(pixels.noise, skew=shape))
 
 
 def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
@@ -353,5 +353,6 @@ def find_spot(picture: np.ndarray, noise: SpotNoise | None = None, white: int | 
     """
     patch = patch_around(in_grey_levels(picture, white))
     if noise is None and not isinstance(patch, str) and patch.wide and patch.clipped_share <= CLIPPED_SHARE_MAX:
-        patch, noise = with_measured_noise(patch)
+        measured = measured_noise(patch)
+        patch, noise = replace(patch, background_variance=measured.background_dn2), measured.noise
     return widened([centre_of(patch, noise or SpotNoise())]).centres[0]

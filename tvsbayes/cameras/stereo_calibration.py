@@ -35,6 +35,7 @@ from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, rotation_matrix
 from tvsbayes.progress import Job, Show
+from tvsbayes.statistics.intervals import WithSd
 
 OUTLIER_Z, OUTLIER_SPREAD_MIN = 4.0, 0.2
 """A view is an outlier if the logarithm of its residual rms lies more than 4 robust standard deviations (1.4826 MAD,
@@ -105,7 +106,7 @@ class StereoCalibration:
     covariance_board: np.ndarray
     covariance_pitch: np.ndarray
     coverage: dict[str, float]
-    triangulated_pitch_mm: tuple[float, float]
+    triangulated_pitch_mm: WithSd[float]
     pictures: Views | None
     excluded: tuple[str, ...]
     reordered: tuple[str, ...]
@@ -156,7 +157,7 @@ class StereoCalibration:
             },
             "board_error_mm": self.board_error_mm,
             "baseline_mm": {"value": float(np.linalg.norm(self.stereo.T)), "sd": self.baseline_sd_mm},
-            "triangulated_pitch_mm": {"mean": self.triangulated_pitch_mm[0], "sd": self.triangulated_pitch_mm[1]},
+            "triangulated_pitch_mm": {"mean": self.triangulated_pitch_mm.value, "sd": self.triangulated_pitch_mm.sd},
             "coverage": self.coverage,
             "views": [vars(view) for view in self.views],
             "outliers": list(self.outliers),
@@ -374,7 +375,7 @@ def _coverage(corners: Sequence[np.ndarray | None], size: tuple[int, int]) -> fl
     return float(mask.mean())
 
 
-def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> tuple[float, float]:
+def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> WithSd[float]:
     """Mean and standard deviation of the sides of all squares, triangulated from both images, mm."""
     sides = []
     right = np.hstack([stereo.R, stereo.T[:, None]])
@@ -395,7 +396,7 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
         sides += [np.linalg.norm(np.diff(by_row, axis=axis), axis=2).ravel() for axis in (0, 1)]
     lengths = np.concatenate(sides)
     lengths = lengths[np.isfinite(lengths)]
-    return float(lengths.mean()), float(lengths.std(ddof=1))
+    return WithSd(float(lengths.mean()), float(lengths.std(ddof=1)))
 
 
 def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> list[str]:

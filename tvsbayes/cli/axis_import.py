@@ -106,14 +106,14 @@ def import_readings(
     kind = log_kind(data) if wish.kind == "auto" else wish.kind
     _check_options(kind, wish, stated, sheet)
     if kind == "phd2":
-        runs = read_runs(text_of(data, name)[0], name)
+        runs = read_runs(text_of(data, name).text, name)
         if wish.run is None and len(runs) > 1:
             _list_runs(file, to, runs, yes=yes, as_json=as_json)
             return None
         contents = _read_run(runs, file, wish)
     else:
         if kind == "epics":
-            table = camonitor_table(text_of(data, name)[0], name, stated)
+            table = camonitor_table(text_of(data, name).text, name, stated)
             stated = {**stated, "time_s": "time_s", **dict(zip(NEEDED, list(table.columns)[1:], strict=True))}
         elif kind == "klipper":
             table = klipper_table(data, name)

@@ -18,7 +18,7 @@ from tvsbayes.cli.begin_commands import has_rows
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
-from tvsbayes.errors import InputError, closest, escaped, refusal, typed
+from tvsbayes.errors import InputError, Reason, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
 from tvsbayes.files.disk import make_folder, read_bytes
 from tvsbayes.instrument.axes import sides_of
@@ -180,32 +180,32 @@ def _refuse_others(kind_of_file: str, options: Mapping[str, Any]) -> None:
         InputError: such an option differs from its default.
     """
     parameters = inspect.signature(import_).parameters
-    refused: dict[tuple[str, str], dict[str, object]] = {}
+    refused: dict[Reason, dict[str, object]] = {}
     for name, kinds in KINDS_OF.items():
         if kind_of_file not in kinds and options[name] != parameters[name].default:
             shown = "format" if name == "kind" else name
             refused.setdefault(_why_refused(kind_of_file, name), {})[shown] = options[name]
-    for (reason, remedy), given in refused.items():
-        refuse_options(reason, remedy, **given)
+    for why, given in refused.items():
+        refuse_options(why.reason, why.remedy, **given)
 
 
-def _why_refused(kind_of_file: str, option: str) -> tuple[str, str]:
-    """Reason and remedy for an option that this kind of file would ignore."""
+def _why_refused(kind_of_file: str, option: str) -> Reason:
+    """Why an option that this kind of file would ignore is refused."""
     remedy = "leave it out"
     if kind_of_file == COPY:
-        return "for tables of other programs, and FILE is a folder", remedy
+        return Reason("for tables of other programs, and FILE is a folder", remedy)
     if KINDS_OF[option] == (URDF,):
-        return "for a URDF", "add --urdf, or leave it out"
+        return Reason("for a URDF", "add --urdf, or leave it out")
     if kind_of_file in (URDF, POINTING):
-        return "for other tables", remedy
+        return Reason("for other tables", remedy)
     if kind_of_file == AXIS:
         machine = "a head" if option == "sightings" else "a scanner"
-        return f"for {machine}, and this is an axis folder", remedy
+        return Reason(f"for {machine}, and this is an axis folder", remedy)
     if option == "assume":
-        return "for a guide log or sightings", "add --axis or --sightings, or leave it out"
+        return Reason("for a guide log or sightings", "add --axis or --sightings, or leave it out")
     if AXIS in KINDS_OF[option]:
-        return "for files of an axis", "add --axis, or leave it out"
-    return "for spots in pictures, and these are sightings", remedy
+        return Reason("for files of an axis", "add --axis, or leave it out")
+    return Reason("for spots in pictures, and these are sightings", remedy)
 
 
 def _looks(

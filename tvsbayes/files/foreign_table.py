@@ -18,6 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from tvsbayes.errors import CONTROL, InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX, NUMBER
@@ -154,10 +155,17 @@ def is_foreign(head: bytes) -> bool:
     return head.startswith(marks) or re.search(rb"[;\t|]", head.partition(b"\n")[0]) is not None
 
 
+class Decoded(NamedTuple):
+    """A text and the name of its encoding."""
+
+    text: str
+    encoding: str
+
+
 def text_of(
     data: bytes, file: str, allowed: str = "a table as CSV (text) or XLSX", remedy: str = "export the table as CSV"
-) -> tuple[str, str]:
-    """Decode a text and name its encoding; `allowed` and `remedy` are used in the refusal of binary data."""
+) -> Decoded:
+    """Decode a text; `allowed` and `remedy` are used in the refusal of binary data."""
     marked = [(codec, name) for mark, codec, name in _MARKS if data.startswith(mark)]
     codec, name = marked[0] if marked else ("utf-8", "UTF-8")
     if not marked and b"\0" in data[:200]:
@@ -170,7 +178,7 @@ def text_of(
     if control := CONTROL.search(text):
         line = text.count("\n", 0, control.start()) + 1
         raise refusal("kind", file=file, line=line, found="binary data", allowed=allowed, remedy=remedy)
-    return text, name
+    return Decoded(text, name)
 
 
 def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | None:

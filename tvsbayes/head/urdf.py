@@ -362,8 +362,7 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
         edits += _element(head.urdf, tilt, "axis", {"xyz": axis})
     for name, value in reductions.items():
         if (tag := head.urdf.reduction(head.names[name])) is not None:
-            end = tag.text_begin + len(tag.text.encode())
-            edits.append(_Edit(tag.text_begin, end, f"{value:.12g}".encode()))
+            edits.append(_Edit(tag.text_begin, tag.text_begin + len(tag.text.encode()), f"{value:.12g}".encode()))
     data = head.urdf.data
     edits += [
         _Edit(tag.begin, re.compile(rb"\s*").match(data, tag.end).end(), b"")  # type: ignore[union-attr]

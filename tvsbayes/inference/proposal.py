@@ -142,7 +142,7 @@ class Independence:
     def moved(self, mean: np.ndarray, sd: np.ndarray, tables: Tables, followers: Followers) -> Independence:
         """Return a copy with other means, sds and tables; moments of tabulated coordinates come from the tables."""
         mean, sd = mean.copy(), sd.copy()
-        mean[self.places], sd[self.places] = tables.moments.value, tables.moments.u
+        mean[self.places], sd[self.places] = tables.moments.value, tables.moments.sd
         sd[self.places] *= INFLATION
         return replace(self, mean=mean, sd=sd, tables=tables, followers=followers)
 

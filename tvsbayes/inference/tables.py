@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tvsbayes.statistics.intervals import Uncertain
+from tvsbayes.statistics.intervals import WithSd
 
 NODES = np.linspace(-8.0, 12.0, 41)
 """Nodes of the tabulated densities, in w. Noise scales have a long upper tail."""
@@ -72,14 +72,14 @@ class Tables:
         return STEP * np.exp(low) * np.where(steep, np.expm1(rise) / np.where(steep, rise, 1.0), 1.0)
 
     @cached_property
-    def moments(self) -> Uncertain[np.ndarray]:
+    def moments(self) -> WithSd[np.ndarray]:
         """Compute means and sds, shape (h,) each, by the trapezoid rule with ten points per step."""
         x = np.linspace(NODES[0], NODES[-1], 10 * (len(NODES) - 1) + 1)
         lines = np.array([np.interp(x, NODES, each) for each in self.log_density])
         density = np.exp(lines.reshape(len(self.log_density), len(x)))
         density /= density.sum(axis=1, keepdims=True)
         mean = density @ x
-        return Uncertain(mean, np.sqrt(density @ x**2 - mean**2))
+        return WithSd(mean, np.sqrt(density @ x**2 - mean**2))
 
     @cached_property
     def reached(self) -> np.ndarray:

@@ -219,7 +219,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         f"{result.correlation_factor:.1f} times those of independent corners",
         f"and for a board whose corners are {result.board_error_mm:.2g} mm off a grid, as the residuals show",
         f"baseline {concise(float(np.linalg.norm(result.stereo.T)), result.baseline_sd_mm)} mm; squares, triangulated: "
-        f"{pitch_mm[0]:.3f} mm on average, sd {pitch_mm[1]:.3f}, stated {board.pitch_mm:g}",
+        f"{pitch_mm.value:.3f} mm on average, sd {pitch_mm.sd:.3f}, stated {board.pitch_mm:g}",
         "boards cover "
         + ", ".join(f"{100 * share:.0f} % of the {side} image" for side, share in result.coverage.items()),
     ]

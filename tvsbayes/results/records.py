@@ -120,13 +120,10 @@ def _array_schema(kind: type) -> dict[str, object]:
     return {"type": ["number", "array"]}
 
 
-_ATTRIBUTES = "\n\nAttributes:\n"
-
-
-def _meanings(docstring: str) -> dict[str, str]:
+def _meanings(attributes: str) -> dict[str, str]:
     """The description of each field by a docstring's section "Attributes"."""
     meanings = {}
-    for entry in re.split(r"\n(?! )", inspect.cleandoc(docstring.partition(_ATTRIBUTES)[2])):
+    for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
         names, _, meaning = entry.partition(": ")
         # Python's None is JSON's null.
         meanings.update(dict.fromkeys(names.split(", "), re.sub(r"\bNone\b", "null", " ".join(meaning.split()))))
@@ -158,14 +155,13 @@ def _alike(schema: Any) -> Any:
 
 def _described(component: dict[str, Any], kind: type[Record] | None) -> dict[str, Any]:
     """A schema completed by the declaration's descriptions and constraints; `kind` is None for a dataclass."""
-    text = component.get("description", "")
+    text, _, attributes = component.get("description", "").partition("\n\nAttributes:\n")
     keys = {} if kind is None else {field.name: field.encode_name for field in msgspec.structs.fields(kind)}
-    for name, meaning in _meanings(text).items():
+    for name, meaning in _meanings(attributes).items():
         if (key := keys.get(name, name)) in component["properties"]:
             component["properties"][key] |= {"description": meaning}
     always = () if kind is None else kind.always
-    text = " ".join(text.partition(_ATTRIBUTES)[0].split())
-    return component | {"description": text, "required": [*component["required"], *always]}
+    return component | {"description": " ".join(text.split()), "required": [*component["required"], *always]}
 
 
 def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def _widths(model: AxisModel) -> np.ndarray:
     names = model.coordinates.names
     width = np.ones(len(names))
     if "backlash" in names:
-        width[names.index("backlash")] = min(max(reversal_of(model.rows).u / model.priors["backlash"].u, 1e-9), 1.0)
+        width[names.index("backlash")] = min(max(reversal_of(model.rows).sd / model.priors["backlash"].u, 1e-9), 1.0)
     return width
 
 

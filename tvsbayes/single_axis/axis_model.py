@@ -234,7 +234,7 @@ class AxisModel:
     def _unknown_spread(self) -> np.ndarray:
         """Half of the distance (1, rows) between the possible sides of a stop, by the line's reversal."""
         reversal = reversal_of(self.rows)
-        play = max(abs(reversal.value), min(reversal.u, self.rows.travel))
+        play = max(abs(reversal.value), min(reversal.sd, self.rows.travel))
         return play_places(self.rows, np.array([play])).spread
 
     def clock(self, wave: Wave, command: np.ndarray, time_s: np.ndarray, value: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from tvsbayes.errors import InputError, NothingToEstimate, listed
 from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
-from tvsbayes.statistics.intervals import Uncertain
+from tvsbayes.statistics.intervals import WithSd
 
 SIDES = {"forward": 1, "backward": -1, "unknown": 0}
 DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}
@@ -531,14 +531,14 @@ def line_design(rows: AxisRows) -> np.ndarray:
     return np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * sign * rows.side])
 
 
-def reversal_of(rows: AxisRows) -> Uncertain[float]:
+def reversal_of(rows: AxisRows) -> WithSd[float]:
     """Backlash of the least-squares line with one reversal, unit, and its standard error: infinite if undetermined."""
     design = line_design(rows)
     solved, _, rank, _ = np.linalg.lstsq(design, rows.value, rcond=None)
     if rank < 3:
-        return Uncertain(0.0, np.inf)
+        return WithSd(0.0, np.inf)
     scatter = float(np.sqrt(np.sum((rows.value - design @ solved) ** 2) / max(len(rows.value) - 3, 1)))
-    return Uncertain(float(solved[2]), scatter * float(np.sqrt(np.linalg.inv(design.T @ design)[2, 2])))
+    return WithSd(float(solved[2]), scatter * float(np.sqrt(np.linalg.inv(design.T @ design)[2, 2])))
 
 
 def legs_are_long(rows: AxisRows) -> bool:
@@ -549,7 +549,7 @@ def legs_are_long(rows: AxisRows) -> bool:
     if np.all(rows.side >= 0) or np.all(rows.side <= 0):
         # With approaches from one side only, the backlash stays at its prior, and the offset absorbs it.
         return True
-    return bool(shortest > LONG_LEGS * abs(reversal.value) + LONG_ERRORS * reversal.u)
+    return bool(shortest > LONG_LEGS * abs(reversal.value) + LONG_ERRORS * reversal.sd)
 
 
 LINE_ROUNDS, LINE_PLAYS, LINE_PLAY_MAX = 3, 61, 0.5

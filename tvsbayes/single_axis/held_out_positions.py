@@ -19,7 +19,7 @@ from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.predicted_stops import transferred_scales
-from tvsbayes.statistics.intervals import NORMAL_95, Uncertain, rms
+from tvsbayes.statistics.intervals import NORMAL_95, WithSd, rms
 from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
@@ -37,13 +37,13 @@ def _mean_weights(rows: AxisRows, members: np.ndarray) -> np.ndarray:
     return rows.count[members] / rows.count[members].sum()
 
 
-def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> Uncertain[float]:
+def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> WithSd[float]:
     """Mean of rows `members` from offset, scale and play fitted to the other rows."""
     line = fit_line(rows, ~left_out)
     weights = _mean_weights(rows, members)
     design_row = weights @ line_design(rows)[members]
     variance = float(design_row @ line.covariance @ design_row + line.scatter**2 * weights @ weights)
-    return Uncertain(float(design_row @ line.solution), float(np.sqrt(variance)))
+    return WithSd(float(design_row @ line.solution), float(np.sqrt(variance)))
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _scores(rows: AxisRows, position: float, prediction: _Prediction) -> list[He
                 rows=len(members),
                 inside=int(np.sum(np.abs(z) <= NORMAL_95)),
                 classic_predicted=classic.value,
-                classic_u=classic.u,
+                classic_u=classic.sd,
                 end=position in (rows.positions[0], rows.positions[-1]),
             )
         )

@@ -16,11 +16,11 @@ NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 
 
-class Uncertain[T](NamedTuple):
-    """A result, a number or an array, and its standard uncertainty, of the same unit and shape."""
+class WithSd[T](NamedTuple):
+    """A value, a number or an array, and its standard deviation or uncertainty, of the same unit and shape."""
 
     value: T
-    u: T
+    sd: T
 
 
 def coverage_factor(dof: float, probability: float = 0.95) -> float:
@@ -169,9 +169,9 @@ def validate(
         lambda a, b: symmetric_interval(a, probability) - symmetric_interval(b, probability), draws, linearised
     )
     other = _with_error(lambda b: symmetric_interval(b, probability) - ends, linearised)
-    counts = np.abs(other.value) > BELIEVED * other.u
+    counts = np.abs(other.value) > BELIEVED * other.sd
     deviations = np.abs(curved.value + np.where(counts, other.value, 0.0))
-    errors = np.where(counts, np.hypot(curved.u, other.u), curved.u)
+    errors = np.where(counts, np.hypot(curved.sd, other.sd), curved.sd)
     worse = np.argmax(deviations, axis=0)[None]
     deviation, error = (np.take_along_axis(x, worse, axis=0)[0] for x in (deviations, errors))
     tolerance = numerical_tolerance(u, digits)
@@ -185,7 +185,7 @@ def validate(
     )
 
 
-def _with_error(statistic: Callable[..., np.ndarray], *draws: np.ndarray) -> Uncertain[np.ndarray]:
+def _with_error(statistic: Callable[..., np.ndarray], *draws: np.ndarray) -> WithSd[np.ndarray]:
     """Compute a statistic of draws with its Monte Carlo standard error from interleaved blocks."""
     blocks = [statistic(*(d[k::BLOCKS] for d in draws)) for k in range(BLOCKS)]
-    return Uncertain(statistic(*draws), np.std(blocks, axis=0, ddof=1) / math.sqrt(BLOCKS))
+    return WithSd(statistic(*draws), np.std(blocks, axis=0, ddof=1) / math.sqrt(BLOCKS))

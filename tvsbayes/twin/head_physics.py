@@ -7,6 +7,7 @@ azimuth 90 deg, z up.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,10 +20,15 @@ def about(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     return c * np.eye(3) + s * across + (1 - c) * np.outer(axis, axis)
 
 
-def head_beam(
-    pan_rad: np.ndarray | float, tilt_rad: np.ndarray | float, geometry: Mapping[str, float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute origin (..., 3) mm and direction (..., 3) of the beam; `tilt_rad` includes the zero of elevation.
+class Beam(NamedTuple):
+    """Origins (..., 3), mm, and directions (..., 3) of a beam."""
+
+    origin: np.ndarray
+    direction: np.ndarray
+
+
+def head_beam(pan_rad: np.ndarray | float, tilt_rad: np.ndarray | float, geometry: Mapping[str, float]) -> Beam:
+    """Compute the beam; `tilt_rad` includes the zero of elevation.
 
     The beam is offset from its axis, bent, rotated about the elevation axis, then about the azimuth axis, then tilted
     with the azimuth axis.
@@ -46,7 +52,7 @@ def head_beam(
     leaning = about(np.array([-east, north, 0.0]) / lean, np.asarray(lean)) if lean else np.eye(3)
     whole = leaning @ turned
     ahead = np.array([geometry["elevation_axis_offset_mm"], 0.0, 0.0])
-    return whole @ ahead + whole @ raised @ start, whole @ raised @ beam
+    return Beam(whole @ ahead + whole @ raised @ start, whole @ raised @ beam)
 
 
 def sighted_angles(directions: np.ndarray, noise_deg: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTION_SIGNS, FULL_
 from tvsbayes.instrument.mechanisms import HEAD, TWO_MIRROR, mechanism_of
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
-from tvsbayes.twin.head_physics import head_beam
+from tvsbayes.twin.head_physics import Beam, head_beam
 
 
 def take_up(output_deg: float, driving_deg: float, backlash_deg: float) -> float:
@@ -111,16 +111,12 @@ def stop_errors(
     return errors
 
 
-def mirror_chain(
-    psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the beam for angles psi, beta of both axes: origin (..., 3) mm and direction (..., 3) in P."""
+def mirror_chain(psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]) -> Beam:
+    """Compute the beam for angles psi, beta of both axes, in P."""
     return BEAMS[mechanism_of(geometry).word](psi_rad, beta_rad, geometry)
 
 
-def reflected_beam(
-    psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]
-) -> tuple[np.ndarray, np.ndarray]:
+def reflected_beam(psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]) -> Beam:
     """Compute the beam of a scanner by true reflections, the laser rotated into the pan stage Q (formulation 3.2)."""
     psi, beta = np.broadcast_arrays(np.asarray(psi_rad, float), np.asarray(beta_rad, float))
     tx, ty = (np.tan(np.radians(geometry[f"laser_tilt_deg.{axis}"])) for axis in "xy")
@@ -130,16 +126,16 @@ def reflected_beam(
     skew = np.radians(geometry["tilt_axis_skew_deg"])
     laser = np.array([tx, ty, -1.0]) / np.sqrt(tx * tx + ty * ty + 1)
     point = _about_z(np.broadcast_to([ox, oy, 0.0], (*psi.shape, 3)), -psi)
-    direction = _about_z(np.broadcast_to(laser, (*psi.shape, 3)), -psi)
-    point, direction = _reflect(point, direction, np.zeros(3), np.array([0.0, -np.sin(m1), np.cos(m1)]))
+    beam = Beam(point, _about_z(np.broadcast_to(laser, (*psi.shape, 3)), -psi))
+    beam = _reflect(beam, np.zeros(3), np.array([0.0, -np.sin(m1), np.cos(m1)]))
     centre = np.array(
         [geometry["tilt_axis_offset_mm.x"], -geometry["mirror_offset_mm"], geometry["tilt_axis_offset_mm.z"]]
     )
     axis = np.array([0.0, np.cos(skew), np.sin(skew)])
     across, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, -np.sin(skew), np.cos(skew)])
     radial = np.cos(beta)[..., None] * across + np.sin(beta)[..., None] * up
-    point, direction = _reflect(point, direction, centre, np.sin(m2) * radial + np.cos(m2) * axis)
-    return _about_z(point, psi), _about_z(direction, psi)
+    beam = _reflect(beam, centre, np.sin(m2) * radial + np.cos(m2) * axis)
+    return Beam(_about_z(beam.origin, psi), _about_z(beam.direction, psi))
 
 
 BEAMS = {TWO_MIRROR.word: reflected_beam, HEAD.word: head_beam}
@@ -153,13 +149,11 @@ def _about_z(vector: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     return np.stack((c * x - s * y, s * x + c * y, z), axis=-1)
 
 
-def _reflect(
-    point: np.ndarray, direction: np.ndarray, on_plane: np.ndarray, normal: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute where rays meet a mirror plane, and their directions after it."""
-    along = np.sum(direction * normal, axis=-1, keepdims=True)
-    distance = np.sum((on_plane - point) * normal, axis=-1, keepdims=True) / along
-    return point + distance * direction, direction - 2 * along * normal
+def _reflect(beam: Beam, on_plane: np.ndarray, normal: np.ndarray) -> Beam:
+    """Compute the beam after a mirror, with origins where it meets the mirror's plane."""
+    along = np.sum(beam.direction * normal, axis=-1, keepdims=True)
+    distance = np.sum((on_plane - beam.origin) * normal, axis=-1, keepdims=True) / along
+    return Beam(beam.origin + distance * beam.direction, beam.direction - 2 * along * normal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +296,9 @@ def beam_jacobian(geometry: Mapping[str, float], pose_deg: tuple[float, float]) 
     """Compute d(azimuth, elevation)/d(psi, beta) (2, 2) of the beam in P at a pose, by central differences."""
     step = 1e-5  # rad: truncation 1e-10, rounding 1e-11
     psi, beta = np.radians(pose_deg)
-    directions = mirror_chain(psi + step * np.array([1, -1, 0, 0]), beta + step * np.array([0, 0, 1, -1]), geometry)[1]
+    directions = mirror_chain(
+        psi + step * np.array([1, -1, 0, 0]), beta + step * np.array([0, 0, 1, -1]), geometry
+    ).direction
     angles = np.stack((np.arctan2(directions[:, 1], directions[:, 0]), np.arcsin(directions[:, 2])))
     return np.stack((angles[:, 0] - angles[:, 1], angles[:, 2] - angles[:, 3]), axis=1) / (2 * step)
 

@@ -280,7 +280,7 @@ def _light(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> Light:
 def _sightings(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> tuple[Sighting, ...]:
     """Compute the sighting of each look; the noise is that of `[cameras] sighting_sd_deg`."""
     psi, beta = _seen_rad(log, truth, streams)
-    directions = mirror_chain(psi, beta, truth.parameters)[1]
+    directions = mirror_chain(psi, beta, truth.parameters).direction
     noise = truth.parameters["pixel_scale"] * rig.sighting_sd_deg * streams.pixels.standard_normal((len(psi), 2))
     angles, u_deg = sighted_angles(directions, noise).tolist(), rig.sighting_sd_deg
     return tuple(

@@ -81,7 +81,7 @@ def _beam_deg(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray,
     """Compute azimuth or elevation (n,) of the beam for mirror angles of an axis, continued over turns and zenith."""
     moving, other = np.radians(angle_deg), np.full(len(angle_deg), np.radians(others_deg))
     psi, beta = (moving, other) if axis == 0 else (other, moving)
-    direction = mirror_chain(psi, beta, parameters)[1]
+    direction = mirror_chain(psi, beta, parameters).direction
     beam = np.arctan2(direction[:, 1], direction[:, 0])
     if axis == 1:
         beam = np.arcsin(direction[:, 2])

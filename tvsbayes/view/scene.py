@@ -35,7 +35,7 @@ from tvsbayes.report.evidence import GearBand, gear_bands
 from tvsbayes.results.comparison_record import Comparison
 from tvsbayes.results.estimates import StopResidual
 from tvsbayes.results.fit_record import FitRecord
-from tvsbayes.statistics.intervals import Uncertain
+from tvsbayes.statistics.intervals import WithSd
 from tvsbayes.view.laser_ways import Ways, laser_ways
 from tvsbayes.view.shapes import (
     PYRAMID_MM,
@@ -285,13 +285,13 @@ def _pictures(campaign: Campaign) -> np.ndarray:
     return np.array(held, dtype=bool).reshape(-1, 2)
 
 
-def _deviations(row_of: dict[int, int], stops: Sequence[StopResidual]) -> Uncertain[np.ndarray]:
+def _deviations(row_of: dict[int, int], stops: Sequence[StopResidual]) -> WithSd[np.ndarray]:
     """Deviations of each look's stops, deg, shape (n, 2)."""
     deviation, u = np.full((len(row_of), 2), np.nan), np.full((len(row_of), 2), np.nan)
     for stop in stops:
         rows = [row_of[spot] for spot in stop.spots]
         deviation[rows, AXES.index(stop.axis)], u[rows, AXES.index(stop.axis)] = stop.deviation_deg, stop.u_deg
-    return Uncertain(deviation, u)
+    return WithSd(deviation, u)
 
 
 def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow, ...]:
