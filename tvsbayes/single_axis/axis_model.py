@@ -234,8 +234,7 @@ class AxisModel:
     def _unknown_spread(self) -> np.ndarray:
         """Half of the distance (1, rows) between the possible sides of a stop, by the line's reversal."""
         reversal = reversal_of(self.rows)
-        play = max(abs(reversal.value), min(reversal.sd, self.rows.travel))
-        return play_places(self.rows, np.array([play])).spread
+        return play_places(self.rows, np.array([max(abs(reversal.value), min(reversal.sd, self.rows.travel))])).spread
 
     def clock(self, wave: Wave, command: np.ndarray, time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
         """Position, time or reading in which a wave is periodic, for commands, times and readings, each (t,)."""
@@ -393,7 +392,7 @@ class AxisModel:
             white = self._whitened(values, columns)
             scales = [draws.scale for draws in self.coordinates.wave_draws(w[part])]
             products = np.swapaxes(white.columns, 1, 2) @ white.columns
-            spread = rows_log_density(self.rows, values["reading_scale"])
+            spread = self.rows.log_density_within(values["reading_scale"])
             yield part, _Block(products, white.log_scatter - 2 * spread, self._factor(values, scales, informed))
 
     def white(self, w: np.ndarray) -> np.ndarray:
@@ -424,7 +423,7 @@ class AxisModel:
         log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), count)), np.empty((len(w), count, count))
         for part, block in self._blocks(w):
             normal = _normal_equations(block, 0)
-            scale = _scale(normal.information)
+            scale = np.sqrt(np.diagonal(normal.information, axis1=1, axis2=2))
             scaled = normal.information / (scale[:, :, None] * scale[:, None, :])
             root = np.linalg.cholesky(scaled)
             sides = np.concatenate([normal.right_side[:, None], functionals @ block.factor], axis=1) / scale[:, None]
@@ -500,7 +499,7 @@ class AxisModel:
         return LinearPosterior(means + self._prior_means(w), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> LinearPosterior:
-        """Prediction of some rows by all others, given the scales.
+        """Readings of some rows predicted by all others given the scales, in place of columns; noise and stop errors count.
 
         Each left-out row gets an additional unknown with a flat prior, so that it has no influence; the unknown is the
         reading minus its prediction.
@@ -508,9 +507,6 @@ class AxisModel:
         Args:
             w: coordinates (n, d).
             rows: numbers of the rows left out.
-
-        Returns:
-            Their readings in place of columns, including noise and stop errors.
         """
         extra = np.zeros((len(self.rows.move), len(rows)))
         extra[rows, np.arange(len(rows))] = 1.0
@@ -593,22 +589,10 @@ def _normal_equations(block: _Block, flat: int) -> _NormalEquations:
     return _NormalEquations(information, np.einsum("nij,nj->ni", transposed, products[:, 1:, 0]))
 
 
-def _scale(information: np.ndarray) -> np.ndarray:
-    """Root of the diagonal, shape (n, c)."""
-    return np.sqrt(np.diagonal(information, axis1=1, axis2=2))
-
-
 def _inverse(information: np.ndarray) -> np.ndarray:
     """Inverse of the matrix, by its scaled one."""
-    scale = _scale(information)
+    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
     scales = scale[:, :, None] * scale[:, None, :]
     # Fails where rounding made the matrix indefinite.
     np.linalg.cholesky(information / scales)
     return np.linalg.inv(information / scales) / scales
-
-
-def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:
-    """Log density (n,) of the scatter of readings about the means of their rows; constants include only those of u."""
-    known = rows.variance > 0
-    freedom = float(np.sum(rows.count[known] - 1))
-    return -freedom * np.log(reading_scale) - 0.5 * float(rows.within[known].sum()) / reading_scale**2

@@ -122,6 +122,12 @@ class AxisRows:
         """Whether stops were reached forward and backward; stops of unknown side are ignored."""
         return {-1, 1} <= set(self.side.tolist())
 
+    def log_density_within(self, reading_scale: np.ndarray) -> np.ndarray:
+        """Log density (n,) of the readings about the means of their rows; constants include only those of u."""
+        known = self.variance > 0
+        freedom = float(np.sum(self.count[known] - 1))
+        return -freedom * np.log(reading_scale) - 0.5 * float(self.within[known].sum()) / reading_scale**2
+
     def without(self, left_out: np.ndarray) -> AxisRows:
         """The rows where `left_out` is false; `hours` and `redrawn` are adapted, the line stays."""
         rows_kept = np.flatnonzero(~left_out)
