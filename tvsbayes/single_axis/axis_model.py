@@ -499,7 +499,7 @@ class AxisModel:
         return LinearPosterior(means + self._prior_means(w), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> LinearPosterior:
-        """Readings of some rows predicted by all others given the scales, in place of columns; noise and stop errors count.
+        """Predict readings of some rows by all others, given the scales, in place of columns; stop errors count.
 
         Each left-out row gets an additional unknown with a flat prior, so that it has no influence; the unknown is the
         reading minus its prediction.
