@@ -22,6 +22,7 @@ from tvsbayes.single_axis.filter_of_rows import Whitened, averaged_variance, whi
 from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
 from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
+from tvsbayes.statistics.predicted_readings import PredictedReadings
 
 OFFSET_TRAVELS = 1.0
 """sd of the offset's prior about the least-squares line, in travels: nearly flat."""
@@ -498,8 +499,8 @@ class AxisModel:
                 covariances[part, group[:, None], group] += factor @ np.swapaxes(factor, 1, 2)
         return LinearPosterior(means + self._prior_means(w), covariances)
 
-    def left_out(self, w: np.ndarray, rows: np.ndarray) -> LinearPosterior:
-        """Predict readings of some rows by all others, given the scales, in place of columns; stop errors count.
+    def left_out(self, w: np.ndarray, rows: np.ndarray) -> PredictedReadings:
+        """Predict readings of some rows by all others, given the scales, with noise and stop errors.
 
         Each left-out row gets an additional unknown with a flat prior, so that it has no influence; the unknown is the
         reading minus its prediction.
@@ -517,7 +518,7 @@ class AxisModel:
             expected = np.einsum("nij,nj->ni", inverse, normal.right_side)
             means[part] = self.rows.value[rows] - expected[:, self.columns :]
             covariances[part] = inverse[:, self.columns :, self.columns :]
-        return LinearPosterior(means, covariances)
+        return PredictedReadings(means, covariances)
 
     def line_terms(self, **factors: float) -> np.ndarray:
         """A functional (columns,) of `offset`, `per_command`, `ratio_contrast`, `backlash` by their factors."""

@@ -20,7 +20,6 @@ from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.predicted_stops import transferred_scales
 from tvsbayes.statistics.intervals import NORMAL_95, WithSd, rms
-from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
@@ -61,8 +60,7 @@ def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Predictio
     None where the weights are unreliable. Leave-one-out by importance sampling (Vehtari, Gelman and Gabry, Stat.
     Comput. 27 (2017) 1413), with whole positions left out.
     """
-    predicted = model.left_out(w, rows)
-    stops = PredictedReadings(predicted.mean, predicted.covariance)
+    stops = model.left_out(w, rows)
     smoothed = smoothed_weights(-stops.log_densities(model.rows.value[rows]))
     if not smoothed.pareto_k < K_MAX or effective_draws(smoothed.weights) < EFFECTIVE_MIN:
         return None
@@ -75,8 +73,7 @@ def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> _Prediction:
     rng = random_stream(seed, AxisStream.HELD_OUT)
     sample = _equal_draws(reduced, DRAWS, seed, rng)
     w = transferred_scales(reduced, sample.w, model, rng)
-    predicted = model.left_out(w, np.flatnonzero(left_out))
-    return _Prediction(*PredictedReadings(predicted.mean, predicted.covariance).pooled(), sample.fault)
+    return _Prediction(*model.left_out(w, np.flatnonzero(left_out)).pooled(), sample.fault)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
