@@ -307,11 +307,10 @@ def table(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """See the module."""
-    command = parser(__doc__)
-    command.add_argument("action", choices=("folders", "mutations", "table"))
+    command = parser(__doc__, folders=run_folders, mutations=run_mutations, table=table)
     command.add_argument("--n", type=int, default=100_000, help="mutations (%(default)s)")
     command.add_argument("--only", help="folders whose name contains this")
-    act(command, folders=run_folders, mutations=run_mutations, table=table)
+    act(command)
 
 
 if __name__ == "__main__":
