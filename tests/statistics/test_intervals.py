@@ -295,16 +295,6 @@ def test_numerical_tolerance_of_powers_of_ten_and_their_neighbours(digits):
         np.testing.assert_allclose(numerical_tolerance(u, digits), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("probability", [0.68, 0.95, 0.99])
-def test_symmetric_interval_of_normals(probability):
-    draws = 3 + 2 * np.random.default_rng(3).standard_normal((DRAWS // 5, 2, 1))
-    interval = symmetric_interval(draws, probability)
-    assert interval.shape == (2, 2, 1)
-    expected = 3 + 2 * stats.norm.ppf([0.5 - probability / 2, 0.5 + probability / 2])
-    agrees(lambda d: symmetric_interval(d, probability)[:, 0, 0], draws, expected, 0.0)
-    agrees(lambda d: symmetric_interval(d, probability)[:, 1, 0], draws, expected, 0.0)
-
-
 def test_symmetric_interval_leaves_equal_tails_of_a_skew_distribution():
     quantiles = stats.expon.ppf((np.arange(20000) + 0.5) / 20000)
     np.testing.assert_allclose(symmetric_interval(quantiles), stats.expon.ppf([0.025, 0.975]), rtol=2e-3)
