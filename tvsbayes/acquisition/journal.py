@@ -114,7 +114,8 @@ def event_of[E: Event](record: Record, *kinds: type[E]) -> E | None:
         if kind_of(kind) == record.event:
             try:
                 return msgspec.convert({"event": record.event, **record.data}, kind)
-            except msgspec.ValidationError as error:
+            # JSON may hold a lone surrogate, which UTF-8 cannot encode.
+            except (msgspec.ValidationError, UnicodeEncodeError) as error:
                 raise refused(record, error) from error
     return None
 

@@ -72,7 +72,7 @@ def frames_of(record: Record) -> list[Frame]:
     """
     try:
         return msgspec.convert(record.data.get("frames", []), list[Frame])
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:
         allowed, line = "frames as { name, sha256, bytes }", record.line
         raise refusal("journal", file=LOG, line=line, found="another", allowed=allowed, remedy=REPAIR_REMEDY) from error
 

@@ -286,6 +286,9 @@ def read_record[T: Record](kind: type[T], keys: Keys, remedy: str, *, held: bool
         hold_to_schema(keys, _record_schema(kind), remedy)
     try:
         return msgspec.convert(keys.values, kind, dec_hook=_decoded)
+    except UnicodeEncodeError as error:
+        # JSON may hold a lone surrogate in a key.
+        raise keys.refuse(error.object, "schema", "keys that UTF-8 can encode", remedy) from error
     except msgspec.ValidationError as error:
         # JSON schema does not detect 3.0 for a whole number, or array rows of different lengths.
         message, _, place = str(error).partition(" - at ")
