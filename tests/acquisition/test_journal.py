@@ -495,3 +495,14 @@ def test_300_killed_writers_lose_nothing(tmp_path, capsys):
     assert all(total > 30 for total, _ in events)
     with capsys.disabled():
         print(f"\n300 kills, {sum(e for e, _ in events)} events acknowledged, {sum(t for _, t in events)} torn ends")
+
+
+def test_a_full_journal_is_reported_and_stays_readable(tmp_path, monkeypatch):
+    monkeypatch.setattr("tvsbayes.acquisition.journal.LOG_EVENTS_MAX", 3)
+    journal = Journal.create(tmp_path / "run")
+    for step in range(2):
+        journal.append("intent", step=step)
+    with pytest.raises(DeviceFault) as caught:
+        journal.append("intent", step=2)
+    assert caught.value.code == "journal-full"
+    assert len(read_journal(tmp_path / "run").records) == 3

@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 import pytest
+from support.hostile_folders import sealed
 
-from tvsbayes.acquisition.journal import LOG, Journal, read_journal
+from tvsbayes.acquisition.journal import (
+    LOG,
+    LOG_ENTRIES_MAX,
+    LOG_EVENTS_MAX,
+    Journal,
+    Record,
+    event_of,
+    read_journal,
+)
 from tvsbayes.acquisition.journal_check import repair, verify
+from tvsbayes.acquisition.journal_events import Stop
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.errors import InputError
 
@@ -115,3 +125,31 @@ def test_lines_that_changed_places_are_put_back(tmp_path):
     history = recorded(read_journal(tmp_path / "new").records)
     assert (len(history.spots), len(history.moves), history.ignored_lines) == (4, 5, ())
     assert "gap" not in [record.event for record in read_journal(tmp_path / "new").records]
+
+
+def test_a_log_is_capped_in_events_and_entries(folder, tmp_path):
+    for data, what in ((b"\n" * (LOG_EVENTS_MAX + 1), "events"), (b"[" * (LOG_ENTRIES_MAX + 1), "entries")):
+        (folder / LOG).write_bytes(data)
+        for read in (read_journal, lambda place: repair(place, tmp_path / "repaired")):
+            with pytest.raises(InputError, match=what) as caught:
+                read(folder)
+            assert caught.value.code == "size"
+    assert not (tmp_path / "repaired").exists()
+
+
+def test_a_frame_named_twice_is_read_once(folder, tmp_path):
+    data = (folder / LOG).read_bytes()
+    (folder / LOG).write_bytes(sealed(data.replace(b"000001_left", b"000000_left")))
+    with pytest.raises(InputError, match="a frame that an event before it names"):
+        verify(folder)
+    assert repair(folder, tmp_path / "repaired").lost_frames == ["frames/000000_left.png"]
+
+
+def test_a_key_that_is_half_a_surrogate_pair_is_refused(folder):
+    """JSON may hold it; UTF-8 cannot encode it."""
+    (folder / LOG).write_bytes(sealed((folder / LOG).read_bytes().replace(b'"sha256"', b'"\\ud800"')))
+    with pytest.raises(InputError, match="frames as"):
+        verify(folder)
+    with pytest.raises(InputError) as caught:
+        event_of(Record(7, "stop", {"\ud800": 1}, 8), Stop)
+    assert caught.value.line == 8 and caught.value.message.isprintable()

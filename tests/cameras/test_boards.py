@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from support.drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
+from support.hostile_folders import png
 
 from tvsbayes.cameras import boards
 from tvsbayes.cameras.boards import Board, View, find_corners, find_views, inner_corners, why_no_board
@@ -291,3 +292,18 @@ def test_the_size_of_a_board_is_searched_in_a_smaller_copy(greys, monkeypatch):
 )
 def test_pictures_without_a_board(picture, reason):
     assert reason in why_no_board([picture], 9, 6).reason
+
+
+def test_boards_of_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
+    def decoded(path, folder):
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr(boards, "read_image", decoded)
+    (tmp_path / "left01.png").write_bytes(png(5001, 4000, raw=b""))
+    with pytest.raises(InputError) as caught:
+        boards.find_views(tmp_path, boards.Board.named("9x6", 20.0))
+    assert caught.value.code == "image-size" and "20 million" in caught.value.message
+    for name in ("left01.png", "right01.png"):
+        (tmp_path / name).write_bytes(png(5000, 4000, raw=b""))
+    with pytest.raises(AssertionError, match="decoded"):
+        boards.find_views(tmp_path, boards.Board.named("9x6", 20.0))

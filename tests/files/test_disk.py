@@ -8,10 +8,11 @@ import stat
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.disk import decode, read_bytes, require_writable, shipped_data, write_atomically
+from tvsbayes.files.disk import decode, read_arrays, read_bytes, require_writable, shipped_data, write_atomically
 
 
 def test_only_regular_files_inside_the_folder(tmp_path):
@@ -120,3 +121,24 @@ def test_a_place_for_results_is_checked_before_the_work(tmp_path):
     with pytest.raises(InputError, match="Not a directory") as refused:
         require_writable(tmp_path / "file")
     assert refused.value.code == "write" and "--out" in refused.value.remedy
+
+
+def test_arrays_come_back_as_they_were_written(tmp_path):
+    arrays = {
+        "fortran": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        "text": np.array(["a", "bcd"]),
+        "flag": np.array(True),
+        "none": np.zeros((0, 4, 4)),
+        "counts": np.arange(5, dtype=np.uint32),
+    }
+    for save in (np.savez, np.savez_compressed):
+        save(tmp_path / "a.npz", **arrays)
+        again = read_arrays(tmp_path / "a.npz", 1_000_000)
+        assert set(again) == set(arrays)
+        for name, array in arrays.items():
+            assert again[name].dtype == array.dtype
+            np.testing.assert_array_equal(again[name], array)
+    np.savez_compressed(tmp_path / "b.npz", zeros=np.zeros(1_000_000))
+    assert (tmp_path / "b.npz").stat().st_size < 1_000_000
+    with pytest.raises(ValueError, match="unpacked"):
+        read_arrays(tmp_path / "b.npz", 1_000_000)

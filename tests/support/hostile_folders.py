@@ -1,24 +1,28 @@
-"""Campaign folders from strangers: a good one, one crafted folder per threat, and seeded random mutations.
+"""Campaign folders from strangers: a good one, edits of its files by Hypothesis, and what edits do not reach, crafted.
 
-The names say which threat a folder stands for. Used by
-`promises/test_hostile.py` and, with more of everything, by `experiments/robustness/hostile.py`. No JAX, no OpenCV.
+Used by `promises/test_hostile.py` and, with more examples, by `experiments/robustness/hostile.py`. No JAX, no OpenCV.
 """
 
 from __future__ import annotations
 
+import bz2
 import io
 import json
 import os
 import re
 import struct
+import time
 import tracemalloc
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from hypothesis import HealthCheck, given, note, settings
+from hypothesis import strategies as st
+from support.fit_documents import changed, kept
 from support.small_campaign import seen_steps, small_campaign
 
 from tvsbayes.acquisition.journal import Journal, encode, read_journal
@@ -37,18 +41,26 @@ from tvsbayes.instrument.campaign import (
     parse_header,
     parse_moves,
     parse_spots,
-    read_campaign,
     write_campaign,
 )
 from tvsbayes.instrument.parameters import RIG_PRIORS
 from tvsbayes.instrument.plan import parse_plan
 from tvsbayes.instrument.rig import parse_rig_table, read_rig
 from tvsbayes.instrument.stereo_pair import parse_stereo
-from tvsbayes.results.comparison_record import COMPARISON_FORMAT
+from tvsbayes.results.comparison_record import COMPARISON_FORMAT, stored_hold_out
 from tvsbayes.results.fit_record import read_fit
 
 MEGABYTE = 1_000_000
 SIZE = 1280, 720
+CAMPAIGN = small_campaign()
+INPUTS = input_hashes(CAMPAIGN)
+PEAK_MAX, MESSAGE_BYTES_MAX = 20 * MEGABYTE, 1200
+"""The good files hold 0.1 MB; reading one may take a hundred times as much."""
+OTHER_FILE = ("missing-file", "not-a-file", "unreadable", "path")
+PNG_HEAD = 40
+FIT, COMPARED, DRAWS = "results/fit.json", "results/compare.json", "results/draws.npz"
+LOG = "journal/log.jsonl"
+FRAMES = tuple(f"frames/{spot.spot:06d}_{side}.png" for spot in CAMPAIGN.spots[:2] for side in ("left", "right"))
 PAYLOADS = (
     "</script><script>alert(1)</script>",
     '"><img src=x onerror=alert(1)>',
@@ -60,7 +72,7 @@ PAYLOADS = (
 )
 
 
-def png(width: int, height: int, depth: int = 8, colour: int = 0, raw: bytes | None = None) -> bytes:
+def png(width: int, height: int, raw: bytes | None = None) -> bytes:
     """A grey PNG of zeros, or one whose pixel data are `raw`, made without a decoder's library."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -71,55 +83,29 @@ def png(width: int, height: int, depth: int = 8, colour: int = 0, raw: bytes | N
         rows = bytes(1 + width) * 64
         raw = b"".join(packer.compress(rows) for _ in range(height // 64))
         raw += packer.compress(bytes(1 + width) * (height % 64)) + packer.flush()
-    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", raw) + chunk(b"IEND", b"")
 
 
-OPENCV = """%YAML:1.0
----
-image_width: 1280
-image_height: 720
-M1: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 802., 0., 645., 0., 801., 355., 0., 0., 1. ]
-D1: !!opencv-matrix
-   rows: 1
-   cols: 5
-   dt: d
-   data: [ -0.32, 0.11, 0.0004, -0.0006, -0.015 ]
-M2: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 798., 0., 633., 0., 799., 362., 0., 0., 1. ]
-D2: !!opencv-matrix
-   rows: 1
-   cols: 5
-   dt: d
-   data: [ -0.31, 0.1, -0.0003, 0.0005, -0.012 ]
-R: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]
-T: !!opencv-matrix
-   rows: 3
-   cols: 1
-   dt: d
-   data: [ -85.2, 0.3, -0.4 ]
-"""
+def camera_yaml() -> str:
+    """The cameras of the campaign in OpenCV's YAML."""
+    pair = {key: np.atleast_2d(getattr(CAMPAIGN.stereo, key)) for key in ("M1", "D1", "M2", "D2", "R", "T")}
+    pair["T"] = pair["T"].T
+    return "%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720\n" + "".join(
+        f"{key}: !!opencv-matrix\n   rows: {len(matrix)}\n   cols: {matrix.shape[1]}\n   dt: d\n"
+        f"   data: {matrix.ravel().tolist()}\n"
+        for key, matrix in pair.items()
+    )
 
 
-def drawn_calibration(campaign) -> Calibration:
+def drawn_calibration() -> Calibration:
     """Normal draws about the default rig, 1 % of every parameter: small enough for all draws to meet."""
     generator = np.random.default_rng(8)
     names, columns = tuple(dict.fromkeys((*INPUT_NAMES, *NOISE_NAMES))), []
     for name in names:
         value = RIG_PRIORS[name].value
         columns.append(value + 0.01 * abs(value) * generator.standard_normal(600))
-    calibration = calibration_of_draws(names, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
+    calibration = calibration_of_draws(names, np.stack(columns, axis=1), CAMPAIGN, "posterior", 0, seen_steps(CAMPAIGN))
     parts = np.stack([0.25 * calibration.covariance, 0.75 * calibration.covariance])
     return replace(calibration, causes=("pixel noise", "stereo calibration"), cause_covariance=parts)
 
@@ -143,121 +129,51 @@ def write_journal(folder: Path) -> None:
 
 def good_folder(place: Path) -> Path:
     """A campaign with everything that a command reads: results, frames, boards, a rig, a plan, a journal of its own."""
-    campaign = small_campaign()
-    write_campaign(campaign, place)
-    write_campaign(campaign, place / "journal")
+    write_campaign(CAMPAIGN, place)
+    write_campaign(CAMPAIGN, place / "journal")
     for name in ("results", "frames", "boards"):
         (place / name).mkdir()
-    hashes = input_hashes(read_campaign(place))
-    document = json.loads((Path(__file__).parents[1] / "data" / "fit-1-laplace.json").read_text()) | {"inputs": hashes}
+    document = kept("fit-1-laplace.json") | {"inputs": INPUTS}
     # Reports need these; documents of the first version lack them.
     document |= {"residuals": [], "residual_causes": [], "gap": None, "budgets": [], "positioning": []}
-    (place / "results" / "fit.json").write_text(json.dumps(document, indent=1))
+    (place / FIT).write_text(json.dumps(document, indent=1))
     ratios = np.tile([0.06, 0.06, 0.07, 0.07], (600, 1))
-    arrays = {"effective_deg_per_step": ratios}
-    draws = calibration_bytes(drawn_calibration(read_campaign(place)), **arrays)
-    (place / "results" / "draws.npz").write_bytes(draws)
+    draws = calibration_bytes(drawn_calibration(), effective_deg_per_step=ratios)
+    (place / DRAWS).write_bytes(draws)
     score = {"rms_deg": 0.1, "rms_block_deg": 0.05, "coverage": 0.95, "log_density": 1.0}
     held = {"by": "steps", "predictions": [], "classic": score, "joint": score, "ratio": 1.0, "interval95": None}
     held |= {"verdict": "joint", "reason": "smaller errors", "unseen": {"left": 1e-4}}
-    compared = {"format": COMPARISON_FORMAT, "inputs": hashes, "held_out": held}
-    (place / "results" / "compare.json").write_text(json.dumps(compared, indent=1))
-    for spot in campaign.spots[:2]:
-        for side in ("left", "right"):
-            (place / "frames" / f"{spot.spot:06d}_{side}.png").write_bytes(png(*SIZE))
+    compared = {"format": COMPARISON_FORMAT, "inputs": INPUTS, "held_out": held}
+    (place / COMPARED).write_text(json.dumps(compared, indent=1))
+    for frame in FRAMES:
+        (place / frame).write_bytes(png(*SIZE))
     for side in ("left", "right"):
         (place / "boards" / f"{side}01.png").write_bytes(png(320, 240))
     mounted = shipped_data() / "rigs" / "mounted"
     (place / "rig.toml").write_bytes((mounted / "rig.toml").read_bytes())
     (place / "plan.csv").write_bytes((mounted / "mixed.csv").read_bytes())
-    (place / "camera.yml").write_text(OPENCV)
+    (place / "camera.yml").write_text(camera_yaml())
     write_journal(place / "journal")
     return place
 
 
-Edit = Callable[[Path], object]
-
-
 @dataclass(frozen=True)
 class Crafted:
-    """A hostile folder.
+    """A folder that edits of single files practically never make.
 
     Attributes:
-        threat: line of the threat list.
-        edit: makes a good folder hostile; its parent may be used for what lies outside.
+        proves: what holds where all commands end with their codes and do no harm.
+        spoil: makes a good folder hostile; its parent may be used for what lies outside.
         commands: what is run, `@` standing for the folder.
         codes: exit codes that are right for the commands, all of them.
         large: takes seconds or much disk: for the experiment only.
     """
 
-    threat: str
-    edit: Edit
+    proves: str
+    spoil: Callable[[Path], object]
     commands: tuple[str, ...]
     codes: frozenset[int] = frozenset({2})
     large: bool = False
-
-
-def swapped(file: str, old: str, new: str) -> Edit:
-    """Replaces the first `old`, which must be there."""
-
-    def edit(folder: Path) -> None:
-        text = (folder / file).read_text()
-        assert old in text, (file, old)
-        (folder / file).write_text(text.replace(old, new, 1))
-
-    return edit
-
-
-def written(file: str, data: bytes | str | Callable[[], bytes]) -> Edit:
-    """Replaces a file."""
-
-    def edit(folder: Path) -> None:
-        content = data() if callable(data) else data
-        (folder / file).write_bytes(content.encode() if isinstance(content, str) else content)
-
-    return edit
-
-
-def linked(file: str, to: str) -> Edit:
-    """Puts a link in a file's place; a relative target is made beside the folder first."""
-
-    def edit(folder: Path) -> None:
-        path, target = folder / file, Path(to)
-        if not target.is_absolute():
-            target = folder.parent / to
-            if path.is_dir():
-                target.mkdir(exist_ok=True)
-            else:
-                target.write_bytes(path.read_bytes())
-        if path.is_dir():
-            for inner in path.iterdir():
-                inner.rename(target / inner.name)
-            path.rmdir()
-        else:
-            path.unlink()
-        path.symlink_to(target)
-
-    return edit
-
-
-def piped(file: str) -> Edit:
-    """A named pipe in a file's place."""
-
-    def edit(folder: Path) -> None:
-        (folder / file).unlink(missing_ok=True)
-        os.mkfifo(folder / file)
-
-    return edit
-
-
-def both(*edits: Edit) -> Edit:
-    """One after the other."""
-
-    def edit(folder: Path) -> None:
-        for each in edits:
-            each(folder)
-
-    return edit
 
 
 def npy(descr: str, shape: tuple[int, ...], body: bytes = b"") -> bytes:
@@ -281,8 +197,6 @@ def archive(members: dict[str, bytes], packing: int = zipfile.ZIP_DEFLATED) -> b
 
 def lying_bzip2(megabytes: int) -> bytes:
     """A bzip2 member that states 1000 bytes and unpacks to megabytes."""
-    import bz2
-
     packed, name = bz2.compress(bytes(megabytes * MEGABYTE)), b"format.npy"
     local = (
         struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 46, 0, 12, 0, 33, 0, len(packed), 1000, len(name), 0) + name + packed
@@ -292,18 +206,12 @@ def lying_bzip2(megabytes: int) -> bytes:
     return local + central + struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 1, 1, len(central), len(local), 0)
 
 
-def draws_with(**changes: object) -> Edit:
+def draws_with(folder: Path, **changes: object) -> None:
     """A `draws.npz` of the right hashes with some arrays of its own."""
-
-    def edit(folder: Path) -> None:
-        path = folder / "results" / "draws.npz"
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **{**arrays, **changes})
-        path.write_bytes(buffer.getvalue())
-
-    return edit
+    path = folder / DRAWS
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez_compressed(path, **{**arrays, **changes})
 
 
 class Touch:
@@ -313,356 +221,212 @@ class Touch:
         return os.system, ("touch pwned",)
 
 
-def pickled() -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, format=np.array([Touch()], dtype=object))
-    return buffer.getvalue()
+def change(document: Path, **values: object) -> None:
+    """Sets values of a JSON file; the parts of a key are split at "/"."""
+    content = json.loads(document.read_text())
+    for key, value in values.items():
+        content = changed(content, key, value)
+    document.write_text(json.dumps(content))
 
 
-def fit_with(key: str, value: object) -> Edit:
-    """A `fit.json` with one value of its own; the key's parts are split at "/"."""
-
-    def edit(folder: Path) -> None:
-        path = folder / "results" / "fit.json"
-        document = json.loads(path.read_text())
-        *way, last = key.split("/")
-        inner = document
-        for part in way:
-            inner = inner[part]
-        inner[last] = value
-        path.write_text(json.dumps(document))
-
-    return edit
+def long_log(folder: Path) -> None:
+    """A whole, chained log of 100 000 equal events."""
+    content, crc = [], 0
+    for number in range(100_000):
+        event = {"format": "tvsbayes-log/1"} if number == 0 else {"a": [[]] * 20}
+        content.append(encode(number, crc, "intent" if number else "created", event))
+        crc = int(content[-1][:8], 16)
+    (folder / LOG).write_bytes(b"".join(content))
 
 
-def log_of(lines: int, **data: object) -> Callable[[], bytes]:
-    """A whole, chained log of many equal events."""
-
-    def make() -> bytes:
-        content, crc = [], 0
-        for number in range(lines):
-            event = {"format": "tvsbayes-log/1"} if number == 0 else data
-            content.append(encode(number, crc, "created" if number == 0 else "intent", event))
-            crc = int(content[-1][:8], 16)
-        return b"".join(content)
-
-    return make
-
-
-def same_frame_again(folder: Path) -> None:
-    """Thousands of events that name one large, sparse picture."""
-    with open(folder / "journal" / "frames" / "000000_left.png", "wb") as file:
-        file.truncate(100 * MEGABYTE)
-    import hashlib
-
-    digest = hashlib.sha256(bytes(100 * MEGABYTE)).hexdigest()
-    entry = {"name": "frames/000000_left.png", "sha256": digest, "bytes": 100 * MEGABYTE}
-    (folder / "journal" / "log.jsonl").write_bytes(log_of(2000, frames=[entry] * 50)())
-
-
-def injected(folder: Path) -> None:
+def inject(folder: Path) -> None:
     """Payloads in every text that a report shows."""
-    notes = json.dumps("".join(PAYLOADS))
     path = folder / "campaign.toml"
-    lines = path.read_text().split("\n")
-    kept = [line for line in lines if not line.startswith(("name", "notes"))]
-    kept[1:1] = [f"name = {json.dumps(PAYLOADS[1])}", f"operator = {json.dumps(PAYLOADS[0])}", f"notes = {notes}"]
+    kept = [line for line in path.read_text().split("\n") if not line.startswith(("name", "notes"))]
+    texts = {"name": PAYLOADS[1], "operator": PAYLOADS[0], "notes": "".join(PAYLOADS)}
+    kept[1:1] = [f"{key} = {json.dumps(text)}" for key, text in texts.items()]
     path.write_text("\n".join(kept))
-    for key, value in (
-        ("command", PAYLOADS[0]),
-        ("problems", list(PAYLOADS)),
-        ("prior_conflicts", list(PAYLOADS)),
-        ("versions", {"python": PAYLOADS[2], "tvsbayes": PAYLOADS[3], "jax": PAYLOADS[4]}),
-    ):
-        fit_with(key, value)(folder)
-    draws_with(estimator=np.array(PAYLOADS[0]))(folder)
+    versions = dict(zip(("python", "tvsbayes", "jax"), PAYLOADS[2:], strict=False))
+    lists = {key: list(PAYLOADS) for key in ("problems", "prior_conflicts")}
+    change(folder / FIT, command=PAYLOADS[0], versions=versions, **lists)
+    change(folder / COMPARED, **{"held_out/verdict": PAYLOADS[0]})
+    draws_with(folder, estimator=np.array(PAYLOADS[0]))
 
 
-def many_spots(rows: int, wide: bool = False) -> Edit:
-    """A whole spots.csv of many rows, every cell its own text; a wide character makes the text four times as large."""
+def move_out(folder: Path, name: str) -> None:
+    """An inner folder lies outside, with a link to it."""
+    (folder / name).rename(folder.parent / "elsewhere")
+    (folder / name).symlink_to(folder.parent / "elsewhere")
 
-    def edit(folder: Path) -> None:
-        path = folder / "spots.csv"
-        header = path.read_text().split("\n")[0].split(",")
-        fixed = {"status": "ok", "experiment": "", "point": "", "aperture_deg": "50.125", "move": "1"}
-        with path.open("w") as file:
-            file.write(",".join(header) + "\n")
-            for row in range(rows):
-                target = "\U0001f600" if wide and row == 0 else f"t{row}"
-                cells = {**fixed, "spot": str(row), "target": target + "x" * (90 if wide else 0)}
-                values = (cells.get(c, f"{100 + 1e-4 * row:.13f}" if c[1] == "_" else f"0.1{row}") for c in header)
-                file.write(",".join(values) + "\n")
 
-    return edit
+def pipes(folder: Path) -> None:
+    """Named pipes in the place of files."""
+    for file in ("log.jsonl", FRAMES[0], DRAWS):
+        (folder / file).unlink(missing_ok=True)
+        os.mkfifo(folder / file)
+
+
+def largest_frames(folder: Path) -> None:
+    """Pictures of 49 million pixels, as `stereo.json` says."""
+    change(folder / "stereo.json", image_width=7000, image_height=7000)
+    for frame in FRAMES:
+        (folder / frame).write_bytes(png(7000, 7000))
+
+
+def many_spots(folder: Path) -> None:
+    """As many as are allowed, every cell its own text; a wide character makes the text four times as large."""
+    path = folder / "spots.csv"
+    header = path.read_text().split("\n")[0].split(",")
+    fixed = {"status": "ok", "experiment": "", "point": "", "aperture_deg": "50.125", "move": "1"}
+    with path.open("w") as file:
+        file.write(",".join(header) + "\n")
+        for row in range(200_000):
+            cells = {**fixed, "spot": str(row), "target": ("\U0001f600" if row == 0 else f"t{row}") + "x" * 90}
+            values = (cells.get(c, f"{100 + 1e-4 * row:.13f}" if c[1] == "_" else f"0.1{row}") for c in header)
+            file.write(",".join(values) + "\n")
 
 
 LOCATE = "locate @ --pan-steps 100 --tilt-steps 20 --aperture-deg 70"
 IMPORT = "stereo --import @/camera.yml --image-size 1280x720"
 BOARDS = "stereo @/boards --board 9x6 --pitch-mm 20"
-READ, ESTIMATE = ("check @",), ("classic @",)
+CALL = '!!python/object/apply:os.system ["touch pwned"]\n'
+LAUGHS = "a0: &a0 [x,x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1},*a{k - 1}]\n" for k in range(1, 9))
+PORT = '\n[positioner]\ndriver = "teensy"\nport = "spy:///dev/ptmx?file=spied.txt"\n'
+HUGE = {"format": npy("<f8", (10**11,))}
+WITHOUT_WIDTH = {"format": FORMAT_NPY, "input_names": npy("<U0", (3 * 10**7,))}
 CRAFTED: dict[str, Crafted] = {
-    "png of 900 million pixels": Crafted(
-        "decompression bomb", written("frames/000010_left.png", lambda: png(30000, 30000)), ("detect @",), large=True
-    ),
-    "png that states 900 million pixels": Crafted(
-        "decompression bomb", written("frames/000010_left.png", lambda: png(30000, 30000, raw=b"")), ("detect @",)
-    ),
-    "png of 49 million pixels, as stereo.json says": Crafted(
-        "decompression bomb",
-        both(
-            swapped("stereo.json", '"image_width": 1280', '"image_width": 7000'),
-            swapped("stereo.json", '"image_height": 720', '"image_height": 7000'),
-            *(written(f"frames/{n:06d}_{s}.png", lambda: png(7000, 7000)) for n in (10, 12) for s in ("left", "right")),
-        ),
+    "picture of 900 million pixels": Crafted(
+        "a picture that unpacks to gigabytes is refused by its header",
+        lambda folder: (folder / FRAMES[0]).write_bytes(png(30000, 30000)),
         ("detect @",),
-        frozenset({0, 2, 3}),
         large=True,
     ),
-    "board of 900 million pixels": Crafted(
-        "decompression bomb", written("boards/left01.png", lambda: png(30000, 30000, raw=b"")), (BOARDS,)
-    ),
-    "board of 49 million pixels": Crafted(
-        "decompression bomb",
-        both(*(written(f"boards/{s}01.png", lambda: png(7000, 7000)) for s in ("left", "right"))),
-        (BOARDS,),
-        large=True,
+    "pictures of 49 million pixels": Crafted(
+        "the largest frames allowed fit into the memory", largest_frames, ("detect @",), frozenset({0, 2, 3}), True
     ),
     "boards of 20 million pixels": Crafted(
-        "decompression bomb",
-        both(*(written(f"boards/{s}01.png", lambda: png(5000, 4000)) for s in ("left", "right"))),
+        "the largest pictures of boards allowed fit into the memory",
+        lambda folder: [path.write_bytes(png(5000, 4000)) for path in (folder / "boards").iterdir()],
         (BOARDS,),
         frozenset({3}),
-        large=True,
+        True,
     ),
-    "gif named png": Crafted(
-        "decoder chosen by content",
-        written("frames/000010_left.png", b"GIF89a" + bytes(100)),
-        ("detect @",),
+    "yaml that calls a command": Crafted(
+        "YAML makes no objects", lambda folder: (folder / "camera.yml").write_text(CALL), (IMPORT,)
     ),
-    "tiff among the boards": Crafted(
-        "decoder chosen by content", written("boards/left01.png", b"II*\0" + bytes(100)), (BOARDS,)
+    "yaml that doubles eight times": Crafted(
+        "anchors are refused", lambda folder: (folder / "camera.yml").write_text(LAUGHS), (IMPORT,)
     ),
-    "png of 16 bits": Crafted(
-        "decoder chosen by content", written("frames/000010_left.png", lambda: png(*SIZE, depth=16)), ("detect @",)
+    "pickle in draws.npz": Crafted(
+        "nothing is unpickled",
+        lambda folder: np.savez(folder / DRAWS, format=np.array([Touch()], dtype=object)),
+        (LOCATE, "report @"),
     ),
-    "png cut short": Crafted(
-        "decoder chosen by content", written("frames/000010_left.png", lambda: png(*SIZE)[:-30]), ("detect @",)
-    ),
-    "opencv matrix of 80 GB": Crafted(
-        "OpenCV FileStorage", swapped("camera.yml", "rows: 3\n   cols: 3", "rows: 100000\n   cols: 100000"), (IMPORT,)
-    ),
-    "opencv empty key": Crafted("OpenCV FileStorage", swapped("camera.yml", "M1:", ":"), (IMPORT,)),
-    "opencv rows that are no number": Crafted(
-        "OpenCV FileStorage", swapped("camera.yml", "rows: 3", "rows: [3]"), (IMPORT,)
-    ),
-    "yaml python tag": Crafted(
-        "YAML", written("camera.yml", '!!python/object/apply:os.system ["touch pwned"]\n'), (IMPORT,)
-    ),
-    "yaml billion laughs": Crafted(
-        "YAML",
-        written("camera.yml", "a0: &a0 [x,x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1},*a{k - 1}]\n" for k in range(1, 9))),
-        (IMPORT,),
-    ),
-    "yaml of a million brackets": Crafted("YAML", written("camera.yml", "a: " + "[" * 1_000_000), (IMPORT,)),
-    "pickle in draws.npz": Crafted("pickle, npz, npy", written("results/draws.npz", pickled), (LOCATE, "report @")),
     "npy header of 800 GB": Crafted(
-        "pickle, npz, npy",
-        written("results/draws.npz", lambda: archive({"format": npy("<f8", (10**11,))})),
+        "an array is as large as its bytes, whatever its header states",
+        lambda folder: (folder / DRAWS).write_bytes(archive(HUGE)),
         (LOCATE,),
     ),
     "npz of entries without width": Crafted(
-        "pickle, npz, npy",
-        written("results/draws.npz", lambda: archive({"format": FORMAT_NPY, "input_names": npy("<U0", (3 * 10**7,))})),
+        "entries of no bytes are counted",
+        lambda folder: (folder / DRAWS).write_bytes(archive(WITHOUT_WIDTH)),
         (LOCATE,),
-    ),
-    "npz that unpacks to 1 GB": Crafted(
-        "pickle, npz, npy",
-        written("results/draws.npz", lambda: archive({"format": npy("<f8", (125 * 10**6,), bytes(10**9))})),
-        (LOCATE,),
-        large=True,
     ),
     "npz of bzip2 that lies about its size": Crafted(
-        "pickle, npz, npy", written("results/draws.npz", lambda: lying_bzip2(30)), (LOCATE,)
+        "a bomb that states few bytes is not unpacked",
+        lambda folder: (folder / DRAWS).write_bytes(lying_bzip2(30)),
+        (LOCATE,),
     ),
-    "npz with an escape in the estimator": Crafted(
-        "pickle, npz, npy", draws_with(estimator=np.array("\x1b[2Jlaplace")), (LOCATE,)
+    "npz with ANSI and bidi characters": Crafted(
+        "a text of results that cannot be printed is refused",
+        lambda folder: draws_with(folder, estimator=np.array("\x1b[2J\u202elaplace")),
+        (LOCATE,),
     ),
-    "posterior.nc and hdf5 that nobody reads": Crafted(
-        "HDF5, NetCDF", written("results/posterior.nc", b"\x89HDF\r\n\x1a\n" + bytes(100)), READ, frozenset({0, 3})
+    "frames folder links outside": Crafted(
+        "pictures are read inside the folder", lambda folder: move_out(folder, "frames"), ("detect @",)
     ),
-    "spots.csv links outside": Crafted("path traversal", linked("spots.csv", "outside.csv"), ESTIMATE),
-    "spots.csv links to a device": Crafted("path traversal", linked("spots.csv", "/dev/zero"), READ),
-    "frame links outside": Crafted("path traversal", linked("frames/000010_left.png", "outside.png"), ("detect @",)),
-    "frames folder links outside": Crafted("path traversal", linked("frames", "elsewhere"), ("detect @",)),
     "results folder links outside": Crafted(
-        "path traversal", linked("results", "elsewhere"), ("detect @ --overlay", "fit @ --no-sample", "report @")
+        "nothing is written outside the folder",
+        lambda folder: move_out(folder, "results"),
+        ("detect @ --overlay", "fit @ --no-sample", "report @"),
     ),
-    "moves.csv is a pipe": Crafted("path traversal", piped("moves.csv"), ESTIMATE),
-    "log.jsonl is a pipe": Crafted("path traversal", piped("log.jsonl"), ("check @",)),
-    "frame is a pipe": Crafted("path traversal", piped("frames/000010_left.png"), ("detect @",)),
-    "draws.npz is a pipe": Crafted("path traversal", piped("results/draws.npz"), (LOCATE,)),
-    "frames in capitals": Crafted(
-        "path traversal",
-        lambda folder: [p.rename(p.with_name(p.name.upper())) for p in (folder / "frames").iterdir()],
-        ("detect @",),
-        frozenset({3}),
-    ),
-    "toml key of 20 000 parts": Crafted("TOML", written("campaign.toml", "a." * 20_000 + "a = 1\n"), READ),
-    "toml of brackets": Crafted("TOML", written("campaign.toml", "a = " + "[" * 10_000), READ),
-    "toml with nan in the rig": Crafted(
-        "TOML", swapped("campaign.toml", "value = 200.0", "value = nan"), (*READ, "fit @ --no-sample")
-    ),
-    "rig file of brackets": Crafted(
-        "TOML", written("rig.toml", "a = " + "{b = " * 10_000), ("check @/rig.toml", "plan @/rig.toml --given @")
-    ),
+    "pipes": Crafted("no reader waits for a writer", pipes, ("check @", "detect @", LOCATE)),
     "rig file whose port writes a file": Crafted(
-        "TOML",
-        lambda folder: (folder / "rig.toml").write_text(
-            (folder / "rig.toml").read_text()
-            + '\n[positioner]\ndriver = "teensy"\nport = "spy:///dev/ptmx?file=spied.txt"\n'
-        ),
+        "a rig file opens no spy of pySerial",
+        lambda folder: (folder / "rig.toml").write_text((folder / "rig.toml").read_text() + PORT),
         ("check @/rig.toml", "doctor @/rig.toml"),
     ),
-    "json with NaN": Crafted("JSON", swapped("stereo.json", "802.0", "NaN"), ESTIMATE),
-    "json with 1e999": Crafted("JSON", swapped("stereo.json", "802.0", "1e999"), READ),
-    "json key twice": Crafted("JSON", swapped("stereo.json", '"rms_px"', '"T"'), READ),
-    "json of 100 000 brackets": Crafted("JSON", written("stereo.json", "[" * 100_000), READ),
-    "json integer of 5000 digits": Crafted("JSON", swapped("stereo.json", "1280", "1" * 5000), READ),
-    "csv field of 131 073 characters": Crafted("CSV, float()", swapped("spots.csv", "d1", "x" * 131_073), READ),
-    "csv with NUL": Crafted("CSV, float()", swapped("spots.csv", "d1", "d\0"), READ),
-    "csv with 1_000": Crafted("CSV, float()", swapped("moves.csv", "1.5", "1_5"), ESTIMATE),
-    "csv with arabic digits": Crafted("CSV, float()", swapped("moves.csv", "1.5", "\u0661"), READ),
-    "csv with a formula": Crafted("CSV, float()", swapped("spots.csv", "d1", "=cmd|' /C calc'!A0"), READ),
-    "plan of unknown actions": Crafted("CSV, float()", swapped("plan.csv", "home", "rm -rf"), ("check @/plan.csv",)),
-    "markup in every text": Crafted("HTML report", injected, ("check @", "report @ --dcc"), frozenset({0})),
-    "line separators in a text of fit.json": Crafted(
-        "HTML report", fit_with("problems", ["\u2028\u2029"]), ("report @",), frozenset({2})
+    "markup in every text": Crafted(
+        "no text becomes part of a page", inject, ("check @", "report @ --dcc"), frozenset({0})
     ),
-    "markup in compare.json": Crafted(
-        "HTML report",
-        swapped("results/compare.json", '"verdict": "joint"', f'"verdict": {json.dumps(PAYLOADS[0])}'),
-        ("report @",),
-        frozenset({0}),
-    ),
-    "table of 200 001 spots": Crafted("resource", many_spots(200_001), ("check @",), large=True),
     "table of 200 000 spots": Crafted(
-        "resource", many_spots(200_000, wide=True), ("check @",), frozenset({0, 2}), True
-    ),
-    "log of a million lines": Crafted(
-        "resource", written("journal/log.jsonl", log_of(1_000_000)), ("check @/journal",), large=True
+        "the longest table allowed fits into memory and time", many_spots, ("check @",), frozenset({0, 2}), True
     ),
     "log of 100 000 lines": Crafted(
-        "resource",
-        written("journal/log.jsonl", log_of(100_000, a=[[]] * 20)),
-        ("check @/journal",),
-        frozenset({0}),
-        True,
-    ),
-    "log of millions of entries": Crafted(
-        "resource", written("journal/log.jsonl", log_of(3000, a=[[]] * 5000)), ("check @/journal",), large=True
-    ),
-    "log that names one frame 100 000 times": Crafted("resource", same_frame_again, ("check @/journal",), large=True),
-    "rig of 10 000 parameters": Crafted(
-        "resource",
-        written("campaign.toml", "[rig.prior]\n" + "".join(f"a{k}=1\n" for k in range(8000))),
-        READ,
+        "the longest journal allowed fits into memory and time", long_log, ("check @/journal",), frozenset({0}), True
     ),
     "folder of 20 000 frames": Crafted(
-        "resource",
+        "frames that no spot names cost nothing",
         lambda folder: [(folder / "frames" / f"{k:06d}_left.png").touch() for k in range(20_000)],
         ("check @", "detect @"),
         frozenset({0, 2}),
         True,
     ),
-    "boards by the thousand": Crafted(
-        "resource", lambda folder: [(folder / "boards" / f"left{k}.png").touch() for k in range(2000)], (BOARDS,)
-    ),
-    "fit.json of other data": Crafted(
-        "stale cache of results", fit_with("inputs/spots", "0" * 64), ("report @",), frozenset({3, 4})
-    ),
-    "draws.npz of other data": Crafted(
-        "stale cache of results", swapped("moves.csv", "1.5", "1.25"), (LOCATE,), frozenset({3, 4})
-    ),
-    "compare.json of other data": Crafted(
-        "stale cache of results",
-        both(swapped("results/compare.json", '"moves": "', '"moves": "f'), fit_with("command", "x")),
-        ("report @",),
-        frozenset({0}),
-    ),
-    "fit.json with a list for a table": Crafted(
-        "stale cache of results", fit_with("parameters/backlash_deg.pan", []), ("report @",)
-    ),
-    "fit.json with another covariance": Crafted(
-        "stale cache of results", fit_with("covariance/matrix", [[1.0]]), ("report @",)
-    ),
-    "chain.npz of zero length": Crafted(
-        "emcee file of zero length",
-        written("results/chain.npz", b""),
-        ("fit @ --resume --max-minutes 0.01",),
-        frozenset({2, 3, 4}),
-    ),
-    "a link and a bomb": Crafted(
-        "pairs",
-        both(linked("results", "elsewhere"), written("results/draws.npz", lambda: lying_bzip2(30))),
-        (LOCATE, "report @"),
-    ),
-    "nan and deep brackets": Crafted(
-        "pairs",
-        both(swapped("campaign.toml", "value = 200.0", "value = inf"), written("stereo.json", "[" * 100_000)),
-        READ,
-    ),
-    "markup and other data": Crafted(
-        "pairs", both(injected, swapped("moves.csv", "1.5", "1.25")), ("check @", LOCATE), frozenset({0, 3, 4})
-    ),
-    "escape in the name of the folder's file and a pipe": Crafted(
-        "pairs", both(written("\x1b[31m.csv", b""), piped("stereo.json")), READ
-    ),
 }
 
 
-TOKENS = (
-    *(b"nan", b"-inf", b"1e999", b"9_4.7", b"", b",", b"\n", b'"', b"'", b"[", b"{", b"]", b"}", b".", b"\r"),
-    *(b"\0", b"\xff", b"\xe2\x80\xae", b"\xef\xbb\xbf", "\u0661\u0662".encode(), "\U0001f600".encode(), b"\x1b[2J"),
-    *(b"=1+1", b"-1", b"0", b"1" * 5000, b"null", b"true", b"#", b"\\", b"\\u0000", b"[[", b'"""', b":", b"="),
-    *(b"1e-400", b"1e308", b"-1e308", b"9223372036854775808", b"0x1F", b"1979-05-27", b"<script>", b"&*!|>", b"../"),
-)
-_NUMBER = re.compile(rb"-?\d+\.?\d*(?:e-?\d+)?")
+@dataclass(frozen=True)
+class Edit:
+    """The bytes of a good file from `start` to `stop` give way to `new`, `times` over."""
+
+    start: int
+    stop: int
+    new: bytes
+    times: int = 1
 
 
-def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
-    """One to three random changes: bits, bytes, cuts, repetitions, lines, tokens, numbers, ends, whole files."""
-    for _ in range(rng.integers(1, 4)):
-        at, length = int(rng.integers(0, len(data) + 1)), int(rng.integers(0, 12))
-        kind = rng.integers(0, 10)
-        if kind == 0:
-            data = data[:at] + bytes([rng.integers(0, 256)]) + data[at + 1 :]
-        elif kind == 1 and at < len(data):
-            data = data[:at] + bytes([data[at] ^ (1 << int(rng.integers(0, 8)))]) + data[at + 1 :]
-        elif kind == 2:
-            data = data[:at] + data[at + length :]
-        elif kind == 3:
-            data = data[:at] + data[at : at + 40] * 2 + data[at:]
-        elif kind == 4:
-            data = data[:at] + TOKENS[rng.integers(0, len(TOKENS))] + data[at + length :]
-        elif kind == 5:
-            lines = data.split(b"\n")
-            one, two = rng.integers(0, len(lines), 2)
-            lines[one], lines[two] = lines[two], lines[one]
-            data = b"\n".join(lines)
-        elif kind == 6 and at < len(data) and rng.random() < 0.3:
-            data = data[:at]
-        elif kind == 7 and rng.random() < 0.1:
-            data = others[rng.integers(0, len(others))]
-        else:
-            # From a random place on: a search through the whole file would take most of the time.
-            match = _NUMBER.search(data, at)
-            if match:
-                data = data[: match.start()] + TOKENS[rng.integers(0, len(TOKENS))] + data[match.end() :]
+def edited(data: bytes, edits: Iterable[Edit]) -> bytes:
+    """From the last edit to the first: places are those of the good file."""
+    for edit in sorted(edits, key=lambda edit: edit.start, reverse=True):
+        data = data[: edit.start] + edit.new * edit.times + data[edit.stop :]
     return data
 
 
+VALUES = (
+    *(b"null", b"true", b"{}", b"[]", b"[[1]]", b'""', b'"a"', b"", b"0", b"-1", b"1e308", b"1e-400", b"1979-05-27"),
+    *(b"nan", b"NaN", b"-inf", b"1e999", b"9_4.7", b"0x1F", b"1-2", b".", b"1e", b"9,4", b" 7", b"1" * 19, b"1.5"),
+    *(b"=1+1", b"@SUM(A1)", "\u0661".encode(), b'"\\ud800"'),
+)
+SYNTAX = (
+    *(b"{", b"}", b"[", b"]", b'"', b"'", b'"""', b",", b";", b":", b"=", b".", b"#", b"\\", b"\n", b"\r", b"\0"),
+    *(b"&a", b"*a", b"!!int", b"../", b"\x1b[2J", b"\xff", b"\xef\xbb\xbf", "\u202e".encode(), "\u2028".encode()),
+    *(b"GIF89a", b"PK\3\4", b"\x89HDF\r\n\x1a\n"),
+)
+LONG = ((b"[", 100_000), (b"{b = ", 10_000), (b'{"a":', 20_000), (b"a.", 20_000), (b"1", 5000), (b"x", 200_000))
+"""Repeated: nesting, dotted keys, digits, texts."""
+
+
+def edits_of(data: bytes) -> st.SearchStrategy[list[Edit]]:
+    """One or two: of cells, keys and values into values, or of words, lines and any bytes into anything."""
+    words, lines = ([m.span() for m in re.finditer(p, data)] for p in (rb'"[^"\n]*"|[^\s,:=]+', rb"[^\n]*\n|[^\n]+$"))
+    word, line = st.sampled_from(words), st.sampled_from([*lines, (0, len(data))])
+    anywhere = st.tuples(st.integers(0, len(data)), st.integers(0, 12)).map(lambda at: (at[0], at[0] + at[1]))
+    copy, copies = (place.map(lambda at: (data[slice(*at)], 1)) for place in (word, line))
+    texts = (st.floats().map(str), st.integers().map(str), st.text(max_size=8))
+    raw = (st.sampled_from(VALUES), *(text.map(str.encode) for text in texts), st.binary(max_size=8))
+    value, *numbers, text, noise = (st.tuples(new, st.just(1)) for new in raw)
+    often = st.sampled_from([*((token, 1) for token in SYNTAX), *LONG])
+
+    def edits(place: st.SearchStrategy, *new: st.SearchStrategy) -> st.SearchStrategy[list[Edit]]:
+        one = st.builds(lambda at, new: Edit(*at, *new), place, st.one_of(*new))
+        return st.lists(one, min_size=1, max_size=2)
+
+    more = (often, copy, copies, text, noise)
+    return edits(word, value, copy, *numbers) | edits(word | line | anywhere, value, *numbers, *more)
+
+
 def sealed(log: bytes) -> bytes:
-    """A mutated journal whose CRCs and chain are made right again, so that what is behind them is reached."""
+    """An edited journal whose CRCs and chain are made right again, so that what is behind them is reached."""
     crc, lines = 0, []
     for number, line in enumerate(log.split(b"\n")[:-1]):
         body = b"%d %08x %s" % (number, crc, line[line.find(b"{") :] if b"{" in line else line)
@@ -671,23 +435,44 @@ def sealed(log: bytes) -> bytes:
     return b"".join(lines)
 
 
-def repacked(draws: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
-    """`draws.npz` with one member mutated and its CRC right again."""
+def members(draws: bytes) -> dict[str, bytes]:
+    """The `.npy` files of an archive."""
     with zipfile.ZipFile(io.BytesIO(draws)) as file:
-        members = {name.removesuffix(".npy"): file.read(name) for name in file.namelist()}
-    name = sorted(members)[rng.integers(0, len(members))]
-    # The header and the first entries: mutations deep in a table of numbers change numbers.
-    members[name] = mutate(members[name][:400], rng, others) + members[name][400:]
-    return archive(members, zipfile.ZIP_STORED)
+        return {name.removesuffix(".npy"): file.read(name) for name in file.namelist()}
+
+
+SEAM, MEMBER_HEAD = b"\n--- next member ---\n", 400
+"""Bytes of a member that are edited: header and first entries; edits deep in a table of numbers change numbers."""
+
+
+def heads(draws: bytes) -> bytes:
+    """The heads of all members, one after the other."""
+    return SEAM.join(data[:MEMBER_HEAD] for data in members(draws).values())
+
+
+def repacked(draws: bytes, edits: Sequence[Edit]) -> bytes:
+    """`draws.npz` with edits of `heads`; CRCs are right again, and a member without its seam is lost."""
+    pairs = zip(members(draws).items(), edited(heads(draws), edits).split(SEAM), strict=False)
+    return archive({name: head + data[MEMBER_HEAD:] for (name, data), head in pairs}, zipfile.ZIP_STORED)
 
 
 @dataclass(frozen=True)
 class Target:
-    """A file of the good folder, how it is mutated, and its reader."""
+    """A file of the good folder.
+
+    Attributes:
+        file: its place.
+        read: its reader.
+        command: one that reads it, `@` standing for the folder.
+        view: what of it is edited.
+        build: makes a file of the good one and the edits.
+    """
 
     file: str
     read: Callable[[Path], object]
-    change: Callable[[bytes, np.random.Generator, list[bytes]], bytes] = mutate
+    command: str = "classic @"
+    view: Callable[[bytes], bytes] = bytes
+    build: Callable[[bytes, Sequence[Edit]], bytes] = edited
 
 
 def _read_header(path: Path) -> None:
@@ -701,61 +486,103 @@ def _read_log(path: Path) -> None:
     recorded(read_journal(path.parent).records)
 
 
-STEREO = small_campaign().stereo
+def _read_comparison(path: Path) -> None:
+    stored_hold_out(replace(CAMPAIGN, path=path.parents[1]), INPUTS)
+
+
+STEPS = "steps-for @ --export json"
 TARGETS: dict[str, Target] = {
     "campaign.toml": Target("campaign.toml", _read_header),
-    "rig.toml": Target("rig.toml", read_rig),
+    "rig.toml": Target("rig.toml", read_rig, "check @/rig.toml"),
     "stereo.json": Target("stereo.json", lambda path: parse_stereo(path.read_bytes(), path.name)),
     "moves.csv": Target("moves.csv", lambda path: parse_moves(path.read_bytes(), path.name)),
-    "spots.csv": Target("spots.csv", lambda path: parse_spots(path.read_bytes(), path.name, 5, STEREO)),
-    "plan.csv": Target("plan.csv", lambda path: parse_plan(path.read_bytes(), path.name)),
-    "log.jsonl": Target("journal/log.jsonl", _read_log),
-    "log.jsonl, sealed": Target("journal/log.jsonl", _read_log, lambda *args: sealed(mutate(*args))),
-    "fit.json": Target("results/fit.json", read_fit),
-    "draws.npz": Target("results/draws.npz", read_draws),
-    "draws.npz, repacked": Target("results/draws.npz", read_draws, repacked),
-    "camera.yml": Target("camera.yml", lambda path: read_calibration([path], SIZE)),
-    "picture header": Target("frames/000010_left.png", lambda path: image_size(path.read_bytes(), path.name)),
+    "spots.csv": Target("spots.csv", lambda path: parse_spots(path.read_bytes(), path.name, 5, CAMPAIGN.stereo)),
+    "plan.csv": Target("plan.csv", lambda path: parse_plan(path.read_bytes(), path.name), "check @/plan.csv"),
+    "log.jsonl": Target(LOG, _read_log, "check @/journal"),
+    "log.jsonl, sealed": Target(LOG, _read_log, "check @/journal", build=lambda *args: sealed(edited(*args))),
+    "fit.json": Target(FIT, read_fit, "report @"),
+    "compare.json": Target(COMPARED, _read_comparison, "report @"),
+    "draws.npz": Target(DRAWS, read_draws, STEPS),
+    "draws.npz, repacked": Target(DRAWS, read_draws, STEPS, heads, repacked),
+    "camera.yml": Target("camera.yml", lambda path: read_calibration([path], SIZE), IMPORT),
+    "picture header": Target(
+        FRAMES[0], lambda path: image_size(path.read_bytes(), path.name), "detect @", lambda data: data[:PNG_HEAD]
+    ),
 }
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a mutation led to; `error` is None where the file was read."""
+    """What an edited file led to; `error` is None where it was read."""
 
-    target: str
-    number: int
     data: bytes
     error: TvsError | None
-    peak_bytes: int | None
+    peak_bytes: int
+    cpu_s: float
+
+    @property
+    def code(self) -> str:
+        """Of the refusal."""
+        return "read" if self.error is None else self.error.code
 
 
-def mutations(folder: Path, numbers: range, seed: int, traced: bool = False) -> Iterator[Outcome]:
-    """Mutate a file of the good folder, read it, put it back; anything but a documented error comes out as it is.
+def printable(error: TvsError) -> bool:
+    """Whether a message can go to a terminal and into JSON, and says what was wrong."""
+    text = error.message
+    return text.isprintable() and len(text.encode()) < MESSAGE_BYTES_MAX and bool(error.remedy)
+
+
+def outcome(folder: Path, target: Target, data: bytes, traced: bool = False) -> Outcome:
+    """Read a file with other content and put it back; anything but a documented, printable error comes out as it is.
 
     Args:
-        folder: of `good_folder`; whole again after every mutation.
-        numbers: of the mutations; each has its own random stream, so that any of them can be repeated alone.
-        seed: of all of them.
+        folder: of `good_folder`; whole again afterwards.
+        target: what is read.
+        data: the content.
         traced: measure what Python allocates (three times slower).
     """
-    names = list(TARGETS)
-    others = [(folder / target.file).read_bytes() for target in TARGETS.values()]
-    for number in numbers:
-        target = TARGETS[names[number % len(names)]]
-        path = folder / target.file
-        good = others[number % len(names)]
-        data = target.change(good, np.random.default_rng([seed, number]), others)
-        error = None
-        path.write_bytes(data)
+    path, error, peak = folder / target.file, None, 0
+    good = path.read_bytes()
+    path.write_bytes(data)
+    before = time.process_time()
+    if traced:
+        tracemalloc.start()
+    try:
+        target.read(path)
+    except TvsError as refusal:
+        error = refusal
+    finally:
         if traced:
-            tracemalloc.start()
-        try:
-            target.read(path)
-        except TvsError as refusal:
-            error = refusal
-        finally:
-            peak = tracemalloc.get_traced_memory()[1] if traced else None
+            peak = tracemalloc.get_traced_memory()[1]
             tracemalloc.stop()
-            path.write_bytes(good)
-        yield Outcome(names[number % len(names)], number, data, error, peak)
+        path.write_bytes(good)
+    if error is not None:
+        # A rig file names another file, its stereo.json.
+        assert printable(error) and ((error.file or "").endswith(path.name) or error.code in OTHER_FILE), error
+    assert peak < PEAK_MAX, f"{peak} bytes allocated"
+    return Outcome(data, error, peak, time.process_time() - before)
+
+
+def edited_files(
+    folder: Path, target: Target, count: int, seen: Callable[[Outcome], object], traced: bool = False
+) -> None:
+    """Edited files, by Hypothesis, always the same; one that breaks the law comes out shrunken.
+
+    Args:
+        folder: of `good_folder`; whole again afterwards.
+        target: what is edited and read.
+        count: examples.
+        seen: called with every outcome.
+        traced: as in `outcome`.
+    """
+    good = (folder / target.file).read_bytes()
+    view = target.view(good)
+
+    @settings(max_examples=count, derandomize=True, deadline=None, database=None, suppress_health_check=HealthCheck)
+    @given(edits_of(view))
+    def read_or_refused(edits: list[Edit]) -> None:
+        for edit in edits:
+            note(f"{target.file}: {view[edit.start : edit.stop]!r} gives way to {edit.new!r}, {edit.times} times")
+        seen(outcome(folder, target, target.build(good, edits), traced))
+
+    read_or_refused()
