@@ -215,9 +215,8 @@ def table(rows: list[dict]) -> None:
         for which in MADE:
             if way in WAYS or which != "all stated":
                 print(f"| {way}, {len(some)} | {which} | {cells([row[which] for row in some])} |")
-    print(
-        f"\nLeft out, for an RMS above {RMS_MAX_PX:g} px (a local minimum): {len(rows) - len(kept)} of {len(rows)}.\n"
-    )
+    print(f"\nLeft out, for an RMS above {RMS_MAX_PX:g} px (a local minimum):", end=" ")
+    print(f"{len(rows) - len(kept)} of {len(rows)}.\n")
     real = json.loads(REAL.read_text())
     print("Halves of the public sets: RMS of the difference of both calibrations, whitened. `own`: this project's")
     print("adjustment, with shared errors of corners and of the board.\n")

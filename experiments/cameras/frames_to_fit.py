@@ -143,9 +143,8 @@ def table(every: list[dict]) -> None:
     least = int(stats.binom.ppf(BOUND, n, 0.95))
     low, high = rms_bounds(n)
     print(f"Bounds at {BOUND:g} for {n} campaigns: {least} or more inside 95 %, rms z {low:.2f} to {high:.2f}.")
-    print(
-        "Difference: (frames - centroids) over the sd from frames, rms; sds: from frames over from centroids, median.\n"
-    )
+    print("Difference: (frames - centroids) over the sd from frames,", end=" ")
+    print("rms; sds: from frames over from centroids, median.\n")
     titles = "quantity | centroids: inside 95 % | rms z | frames: inside 95 % | rms z | mean z | difference | sds"
     print(heading(titles))
     for name in good["frames"][both[0]]["quantities"]:
@@ -195,9 +194,8 @@ def report(place: Path, twin: str) -> None:
     for method in ("fit", "contour"):
         result = detect(campaign, method)
         noise = ", ".join(f"{side} {one.speckle_contrast:.2f}" for side, one in result.noise.items())
-        print(
-            f"`detect --method {method}`: {result.statuses}, median sd {result.median_sd_px:.3f} px, contrast {noise}\n"
-        )
+        print(f"`detect --method {method}`: {result.statuses},", end=" ")
+        print(f"median sd {result.median_sd_px:.3f} px, contrast {noise}\n")
         by_hand = classic(result.campaign).directions
         summary = summarise(fit(result.campaign))
         pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])

@@ -139,9 +139,8 @@ def table(rows: list[dict]) -> None:
         sd, u, v, largest = (np.array([row[key] for row in some]) for key in keys)
         print(f"\n`rendered`: found less true corners have sd {np.median(sd):.3f} px (median of the rigs),", end=" ")
         print(f"mean error u\n{u.mean():+.4f}, v {v.mean():+.4f} px, largest {largest.max():.2f} px;", end=" ")
-        print(
-            f"outlying views, all kept: {sum(row['outliers'] for row in some)} of {sum(row['views'] for row in some)}."
-        )
+        print("outlying views, all kept:", end=" ")
+        print(f"{sum(row['outliers'] for row in some)} of {sum(row['views'] for row in some)}.")
     if HALVES.exists():
         pairs = json.loads(HALVES.read_text())
         stored, plain = (np.array([s[k] for s in pairs["splits"]]) / 24 for k in ("stored", "independent"))

@@ -22,7 +22,7 @@ import numpy as np
 
 from experiments.common.command_line import study
 from experiments.common.drawn_axes import fresh_moves, read, stands, up_and_down
-from experiments.common.rows import git
+from experiments.common.rows import commit
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensation_of
@@ -118,9 +118,7 @@ def table(rows: list[dict]) -> None:
     """Print the page."""
     good = [row for row in rows if "error" not in row]
     print("# Promised, applied, kept: drawn axes\n")
-    print(
-        f"By `experiments.compensation.kept_promises`, commit {git('rev-parse', '--short', 'HEAD')}: {len(rows)} drawn"
-    )
+    print(f"By `experiments.compensation.kept_promises`, commit {commit()}: {len(rows)} drawn")
     print(f"axes, {len(rows) - len(good)} refused, since no table is made of an answer that is not accepted.\n")
     print("## Readings after applying within the promise, wanted 93 to 97 %\n")
     print("| format | forward | backward | promised, median mm | left, median RMS mm |\n|---|---|---|---|---|")

@@ -78,9 +78,8 @@ def table(rows: list[dict]) -> None:
     made_by = "python -m experiments.compensation.periodic_drives"
     print(f"Made by `{made_by}`, commit {commits_of(rows)}. Errors in arcsec.\n")
     kept = sum(row["there"] for row in done)
-    print(
-        f"{len(rows)} drives, {len(there)} with a wave: {kept} of these got a table, {len(done) - kept} of the others."
-    )
+    print(f"{len(rows)} drives, {len(there)} with a wave:", end=" ")
+    print(f"{kept} of these got a table, {len(done) - kept} of the others.")
     low, high = (100 * bound for bound in binomial_bounds(len(done), 0.95))
     print(f"Bounds of a share over {len(done)} independent readings: {low:.0f} to {high:.0f} %; the {READINGS}")
     print("readings of a drive share its wave and walk.\n")

@@ -40,7 +40,6 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     """Simulate, fit, look at points, locate them."""
     (seed,) = task
     use_compilation_cache()
-
     start = time.perf_counter()
     simulated = simulate(mounted_rig(), shipped_plan(PROTOCOL), seed, aperture=True)
     row: dict[str, object] = {"seed": seed, "converged": False}

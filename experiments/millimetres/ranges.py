@@ -139,9 +139,8 @@ def table(rows: list[dict]) -> None:
     good = [r for r in rows if r["converged"]]
     title, words = "Millimetres: nominal, classic and joint against the truth", "RMS error against range, two protocols"
     print(title_and_figure(__file__, title, FIGURE, words))
-    print(
-        "Written by `python -m experiments.millimetres.ranges table`; mm of 3D distance; what was done stands there.\n"
-    )
+    print("Written by `python -m experiments.millimetres.ranges table`;", end=" ")
+    print("mm of 3D distance; what was done stands there.\n")
     twins_table(good)
     for protocol in PROTOCOLS:
         drawn_table(protocol, [r for r in rows if r["name"] == protocol])

@@ -99,9 +99,8 @@ def worked_example(paper: dict[str, tuple[int, float, float]]) -> None:
     _, mean, sd = paper["left"]
     low, high = (chain - mean) / sd - 0.01 / steps / sd, (chain - mean) / sd + 0.01 / steps / sd
     print(f"\nOne experiment against the Table's left: {low:+.2f} to {high:+.2f} of its sd", end=" ")
-    print(
-        f"(angles printed to 0.01 deg);\ntwo-sided p of a single value {2 * stats.t.sf(abs(low + high) / 2, 23):.2f}."
-    )
+    print("(angles printed to 0.01 deg);\ntwo-sided p of a single", end=" ")
+    print(f"value {2 * stats.t.sf(abs(low + high) / 2, 23):.2f}.")
 
 
 TEXT = """# Table 1 by the classic estimator

@@ -73,7 +73,6 @@ def job_of(name: str) -> StudyJob:
 def one_row(task: tuple[str, int]) -> dict[str, object]:
     """A row of `tvsbayes study` with the design's name."""
     use_compilation_cache()
-
     name, index = task
     return {"name": name, **study_row(job_of(name), index).as_json()}
 

@@ -113,7 +113,6 @@ def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
     """Break, fit, validate."""
     defect, size, seed = task
     use_compilation_cache()
-
     campaign, truth = broken_campaign(defect, size, seed)
     row: dict[str, object] = {"defect": defect, "size": size, "seed": seed, "unseen": unseen(campaign)}
     start = time.process_time()

@@ -170,9 +170,8 @@ def table(_: argparse.Namespace) -> None:
     }
     first, base = next(iter(runs.items()))
     print("# Same seed, same numbers\n")
-    print(
-        f"{time.strftime('%Y-%m-%d')}, commit {commit()}, {platform.machine()}. Every run is compared with `{first}`.\n"
-    )
+    print(f"{time.strftime('%Y-%m-%d')}, commit {commit()},", end=" ")
+    print(f"{platform.machine()}. Every run is compared with `{first}`.\n")
     print("| run | Python | cache | campaign and `check` | fit | chain | CPU s |\n|---|---|---|---|---|---|---|")
     for name, one in runs.items():
         same = all(one[k] == base[k] for k in ("campaign", "check"))
