@@ -50,13 +50,13 @@ class Gated(TwinObserver):
         positioner.laser(True)
         self.gate.reached(spot)
         observation = super().observe(positioner, spot)
-        u_left, v_left, u_right, v_right = observation.sighting.pixels_px
+        u_left, v_left, u_right, v_right = observation.spot.pixels_px
         pictures = {}
         for camera, (u, v) in (("left", (u_left, v_left)), ("right", (u_right, v_right))):
             image = np.full((720, 1280), 20, np.uint8)
             image[round(v) - 2 : round(v) + 3, round(u) - 2 : round(u) + 3] = 240
             pictures[frame_name(spot, camera)] = png_bytes(image)
-        return Observation(observation.sighting, pictures)
+        return Observation(observation.spot, pictures)
 
 
 class Gate:
@@ -115,11 +115,13 @@ def going(mounted_rig, tmp_path) -> Iterator[Going]:
             ended.append(run.engine.run())
         except BaseException as error:
             ended.append(error)
+        finally:
+            gate.there.set()
 
     thread = threading.Thread(target=work)
     with estimate, LivePage(live, 0) as page:
         thread.start()
-        assert gate.there.wait(SECONDS_MAX)
+        assert gate.there.wait(SECONDS_MAX) and not ended, ended
         going = Going(run, live, gate, page.link, page, thread, ended)
         try:
             yield going
