@@ -21,8 +21,8 @@ from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_view
 from tvsbayes.cameras.bundle_adjustment import (
     RESTARTS_MAX,
     BoardArrays,
+    _descents,
     _End,
-    _lowest,
     bundle_adjustment,
     correlation_factor,
 )
@@ -486,6 +486,6 @@ def test_the_accepted_end_was_repeated(monkeypatch, falls):
     following = iter(ends[1:])
     monkeypatch.setattr("tvsbayes.cameras.bundle_adjustment._descended", lambda z, arrays: next(following))
     arrays = BoardArrays(*map(jnp.zeros, [(3, 1), (1, 4, 1), (1, 4, 1), (1, 6), 24, (24, 24)]))
-    end, again = _lowest(ends[0], arrays, np.ones(24, bool), 4)
+    *_, end, again = _descents(ends[0], arrays, np.ones(24, bool), 4)
     reached = min(falls, RESTARTS_MAX)
     assert (end.z[0], again.z[0]) == (reached, reached + 1)
