@@ -30,7 +30,7 @@ from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covar
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.planner import baseline_of
 from tvsbayes.planning.search import DesignProblem
-from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, parse_target, sensitivity
+from tvsbayes.planning.target import GEARS_AT_POINT, STOP_AT_POINT, parse_target, sensitivity
 from tvsbayes.statistics.gaussian_process import matern52
 
 pytestmark = pytest.mark.usefixtures("small_searches")
@@ -298,7 +298,7 @@ def test_a_point_between_the_places_has_what_they_leave_open(real):
         # Errors of 0.05 and half the play's 0.02 deg, root mean squares of half-normals. A look there meets a stop
         # error of 0.04 deg and the scatter of looks, both as most probable: the median of a half-normal of 0.01 deg.
         of_a_look = np.hypot(0.04, 0.01 * stats.halfnorm.median())
-        assert np.sqrt(errors / at.own[AT_POINT[0]][0]) == pytest.approx(np.hypot(0.05, 0.01) / of_a_look, rel=1e-3)
+        assert np.sqrt(errors / at.own[STOP_AT_POINT][0]) == pytest.approx(np.hypot(0.05, 0.01) / of_a_look, rel=1e-3)
     assert left_open[0.0] < 0.1 * left_open[900.0]
 
 

@@ -20,7 +20,15 @@ from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_know
 from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, arrange, information_of_looks
 from tvsbayes.planning.search import DesignProblem
-from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, Sensitivity, Target, parse_target, sensitivity
+from tvsbayes.planning.target import (
+    GEARS_AT_POINT,
+    NOISE_AT_POINT,
+    STOP_AT_POINT,
+    Sensitivity,
+    Target,
+    parse_target,
+    sensitivity,
+)
 from tvsbayes.results.plan_record import steps_of
 
 pytestmark = pytest.mark.usefixtures("small_searches")
@@ -111,7 +119,7 @@ def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, pool):
 
 def test_errors_of_the_gears_at_the_point_are_not_called_its_stop(knowledge):
     """Stop 3 mm and reading 4 mm make 5 mm; with 12 mm of the gears, which nearer looks would reduce, 13 mm."""
-    parts = {AT_POINT[0]: np.array([9.0]), AT_POINT[1]: np.array([16.0]), GEARS_AT_POINT: np.array([144.0])}
+    parts = {STOP_AT_POINT: np.array([9.0]), NOISE_AT_POINT: np.array([16.0]), GEARS_AT_POINT: np.array([144.0])}
     point, none = Sensitivity(at({SCALE: 1e-3})[None], parts), np.zeros((PARAMETERS, PARAMETERS))
 
     def needed(limit_mm: float) -> str | None:
@@ -139,15 +147,15 @@ def test_shares_of_two_parameters_by_hand(knowledge):
     """Data diag(3, 1) on priors of 1: S = diag(1/4, 1/2); g = (2, 3) is pulled by S g = (1/2, 3/2)."""
     data, noise = (np.diag(at({SCALE: scale, STEREO: camera})) for scale, camera in ((3.0, 1.0), (2.0, 0.2)))
     gradient = np.stack([at({SCALE: 0.1}), at({SCALE: 2.0, STEREO: 3.0})])
-    at_point = {AT_POINT[0]: np.array([0.0, 0.5]), AT_POINT[1]: np.array([0.4, 0.0])}
+    at_point = {STOP_AT_POINT: np.array([0.0, 0.5]), NOISE_AT_POINT: np.array([0.4, 0.0])}
     target = Sensitivity(gradient, at_point)
     # Prior 1/4 and 9/4; pixels 2/4 + 0.2 * 9/4; the rest of the data 1/4 + 0.8 * 9/4; the point 0.5.
-    parts = {"focal scale": 0.25, "stereo calibration": 2.25, AT_POINT[0]: 0.5}
+    parts = {"focal scale": 0.25, "stereo calibration": 2.25, STOP_AT_POINT: 0.5}
     looks = {"pixel noise": 0.95, "stop errors of the looks": 2.05}
     assert split_of(knowledge, data, noise, target) == pytest.approx({k: v / 6 for k, v in (parts | looks).items()})
     shares = split_of(knowledge, data, None, target)
     assert shares == pytest.approx({k: v / 6 for k, v in (parts | {"looks": 3.0}).items()})
-    assert list(shares) == ["looks", "stereo calibration", AT_POINT[0], "focal scale"], "largest first"
+    assert list(shares) == ["looks", "stereo calibration", STOP_AT_POINT, "focal scale"], "largest first"
 
 
 def test_after_data_priors_and_campaign_are_one_share(knowledge):

@@ -14,7 +14,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.planning.expectation import PARAMETERS, prior_knowledge
-from tvsbayes.planning.target import AT_POINT, Target, parse_target, sensitivity
+from tvsbayes.planning.target import NOISE_AT_POINT, STOP_AT_POINT, Target, parse_target, sensitivity
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
 
 pytestmark = pytest.mark.usefixtures("small_searches")
@@ -113,7 +113,7 @@ def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig,
     at = sensitivity(target, known.z, known.space, table, np.zeros(2))
     # The machine stands at whole counters, up to half a step beside the point.
     half_step_rad = math.radians(values["degrees_per_step.tilt"]) / 2
-    for cause, variance_mm2 in zip(AT_POINT, (stop_mm2, reading_mm2), strict=True):
+    for cause, variance_mm2 in zip((STOP_AT_POINT, NOISE_AT_POINT), (stop_mm2, reading_mm2), strict=True):
         assert at.own[cause] == pytest.approx(variance_mm2, abs=half_step_rad * variance_mm2.max()), cause
     assert (moved[1] * 0.04)[2] ** 2 > 0.1 * stop_mm2[2], "tilt counts, or it could be left out"
     # Tolerance of the loop above, the half step: without the scatter of looks it would be missed.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.calibration.optics import Number
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration, Counters
+from tvsbayes.calibration.pointing import APERTURE, INPUT_NAMES, NOISE_NAMES, NOISES, STOPS, Calibration, Counters
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import SIDES
 from tvsbayes.statistics.streams import Stream, random_stream
@@ -53,7 +53,7 @@ def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
     chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
     inputs, gears = np.split(calibration.inputs[chosen], [len(INPUT_NAMES)], axis=1)
     normal = generator.standard_normal((draws, NOISES))
-    noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
+    noise = np.column_stack([normal[:, STOPS], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, APERTURE]])
     return Drawn(np.concatenate([inputs, calibration.noise[chosen]], axis=1), gears, noise)
 
 

@@ -56,6 +56,8 @@ UNIT_NOISES: dict[str, float] = {
 }
 """Noises of a look in units of their scale, with variances; a position in the play is uniform."""
 NOISES = len(UNIT_NOISES)
+STOPS, PLACES, APERTURE = slice(0, 2), slice(2, 4), 4
+"""Indices of `UNIT_NOISES` by kind."""
 COMPLEX_STEP = 1e-30
 """Imaginary step of derivatives: nothing is subtracted, so it may be arbitrarily small (Squire and Trapp, SIAM Review
 40 (1998) 110)."""
@@ -351,7 +353,7 @@ class Calibration(Shown):
             low, high = (values[f"stop_sd_deg.{name}"] for name in SIDES[axis])
             stop_sd = high if side > 0 else low if side < 0 else np.sqrt(0.5 * (low**2 + high**2))
             # If the side is unknown, the position in the play is uniform.
-            place = side if side else -2 * noise[2 + k]
+            place = side if side else -2 * noise[PLACES][k]
             angles.append(output_deg(values, axis, steps[k], place, self.period_deg.get(axis)) + stop_sd * noise[k])
         return beam_components(values, angles[0], angles[1])
 
@@ -393,7 +395,7 @@ class Calibration(Shown):
             aperture_deg: readings B.
         """
         beam = self.noisy_beam(values, noise, steps, sides)
-        true_deg = aperture_deg - values["aperture_zero_deg"] - values["aperture_sd_deg"] * noise[4]
+        true_deg = aperture_deg - values["aperture_zero_deg"] - values["aperture_sd_deg"] * noise[APERTURE]
         reach = np.asarray(range_components(*beam, values["baseline_mm"], true_deg, self.azimuth))
         return beam.met(reach)
 

@@ -350,11 +350,13 @@ class _Reader:
                 raise entry.refuse("image-size", "sizes of one proportion of width to height", remedy, found)
             self.right_size = right
             self.notes.append(f"{found}: the right camera's numbers are those of its pictures scaled to the left one's")
-        if sizes and self.stated_size not in (None, sizes[0][0]):
-            found = f"{sizes[0][0][0]} x {sizes[0][0][1]} px"
-            raise sizes[0][1].refuse("image-size", "the size of the pictures", "leave out --image-size", found)
-        if sizes or self.stated_size is not None:
-            return sizes[0][0] if sizes else self.stated_size  # type: ignore[return-value]
+        for size, entry in sizes[:1]:
+            if self.stated_size not in (None, size):
+                found = f"{size[0]} x {size[1]} px"
+                raise entry.refuse("image-size", "the size of the pictures", "leave out --image-size", found)
+            return size
+        if self.stated_size is not None:
+            return self.stated_size
         remedy = "give it with --image-size, for example 1280x720"
         file = self.fields.files[0].file
         raise refusal("missing-key", file=file, found="no image size", allowed="image_width", remedy=remedy)

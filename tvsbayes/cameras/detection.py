@@ -119,10 +119,10 @@ class Detection:
 
 def pair_status(left: Centre, right: Centre) -> str:
     """The word "ok", or the reasons of both cameras with their sides, as `spots.csv` holds them."""
-    refusals = [(c.status, side) for c, side in zip((left, right), CAMERAS, strict=True) if c.status != "ok"]
-    if len(refusals) == 2 and refusals[0][0] == refusals[1][0]:
-        return f"{refusals[0][0]} both"
-    return ", ".join(f"{reason} {side}" for reason, side in refusals) or "ok"
+    if left.status == right.status != "ok":
+        return f"{left.status} both"
+    statuses = zip((left.status, right.status), CAMERAS, strict=True)
+    return ", ".join(f"{status} {side}" for status, side in statuses if status != "ok") or "ok"
 
 
 def _row(spot: Spot, left: Centre, right: Centre) -> Spot:

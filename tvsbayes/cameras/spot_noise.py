@@ -82,8 +82,8 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
         contrasts, widths = np.array([speckle_contrast]), np.ones(1)
     squares = contrasts**2
     # A reflection in one spot must not widen all others.
-    expected = skews[:, 1] + skews[:, 2] * GAIN_MEDIAN_DN + skews[:, 3] * np.median(squares)
-    ratio = skews[:, 0] / expected
+    measured, background, per_gain, per_contrast = skews.T
+    ratio = measured / (background + per_gain * GAIN_MEDIAN_DN + per_contrast * np.median(squares))
     skews = skews[ratio <= SKEW_OUTLIER * np.median(ratio) / 0.455]  # 0.455: median of a squared normal value
     logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - deviations**2 / 2
     for measured, background, per_gain, per_contrast in skews:

@@ -189,7 +189,7 @@ def _read_run(runs: Sequence[GuideRun], file: Path, options: FileOptions) -> _Re
     (row,) = run_rows([run])
     lines = [f"{escaped(file.name)}: guide log of PHD2, run {number} of {len(runs)}, {escaped(run.mount)}"]
     lines.append(f"begins {escaped(run.begins)}, {run.minutes:.1f} minutes")
-    document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.frames) + len(run.dropped)}
+    document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.frames) + len(run.dropped_s)}
     return _ReadFile(lines, document, readings, readings.unit)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from tvsbayes.calibration.drawn_looks import Drawn, drawn
 from tvsbayes.calibration.located_point import DIVERGING_SHARE
 from tvsbayes.calibration.optics import Components, aperture_angle_deg
-from tvsbayes.calibration.pointing import Calibration, Sides
+from tvsbayes.calibration.pointing import APERTURE, Calibration, Sides
 from tvsbayes.coordinates.simple_calibration import AssumedGeometry, SimpleCalibration, assumed_geometry
 
 
@@ -53,7 +53,7 @@ def _truth(
     noise = rigs.noise.T[..., None]
     points = calibration.noisy_beam(values, noise, (pan, tilt), approach).at(range_mm)
     reading = aperture_angle_deg((points[0], points[1], points[2]), values["baseline_mm"], calibration.azimuth)
-    return _Truth(points, reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[4])
+    return _Truth(points, reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[APERTURE])
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
         rows, notes = _without_heading(rows)
         _refuse_wide(rows, separator, file)
         description = [f"CSV with {separator} between cells", encoding, *notes]
-    rows = [(line, cells) for line, cells in rows if any(cells)]
+    rows = [row for row in rows if any(row.cells)]
     if not rows:
         raise refuse("empty", found="no cells", remedy="name the file, or with --sheet the sheet, that holds the table")
     return _table(file, rows, description)
@@ -181,13 +181,21 @@ def text_of(
     return Decoded(text, name)
 
 
-def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | None:
+class _Row(NamedTuple):
+    """A row and the line of the file on which it begins."""
+
+    line: int
+    cells: list[str]
+
+
+def _paired_rows(text: str) -> tuple[list[_Row], list[str]] | None:
     """Rows of a file whose lines are "name: value" pairs, as in a serial monitor; None for any other file.
 
     A repeated name begins a new row; a time of day before the lines becomes seconds since the first row.
     """
     names: dict[str, None] = {}
-    rows: list[tuple[int, dict[str, str]]] = []
+    rows: list[dict[str, str]] = []
+    begins: list[int] = []
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
     paired, day_s, previous_s = 0, 0.0, -1.0
     for number, line in lines:
@@ -203,44 +211,44 @@ def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | N
         if len(values) < len(pairs):
             return None
         names.update(dict.fromkeys(values))
-        if not rows or rows[-1][1].keys() & values.keys():
-            rows.append((number, {}))
+        if not rows or rows[-1].keys() & values.keys():
+            rows.append({})
+            begins.append(number)
             if clock:
                 time_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) + day_s
                 day_s, time_s = (day_s + DAY_S, time_s + DAY_S) if time_s < previous_s else (day_s, time_s)
-                rows[-1][1]["time (s)"], previous_s = f"{time_s:.6f}", time_s
-        rows[-1][1].update(values)
+                rows[-1]["time (s)"], previous_s = f"{time_s:.6f}", time_s
+        rows[-1].update(values)
     if len(names) < 2 or len(rows) < 2 or paired < PAIRED_SHARE * len(lines):
         return None
-    if timed := all("time (s)" in cells for _, cells in rows) and "time (s)" not in names:
-        start_s = float(rows[0][1]["time (s)"])
-        for _, cells in rows:
+    if timed := all("time (s)" in cells for cells in rows) and "time (s)" not in names:
+        start_s = float(rows[0]["time (s)"])
+        for cells in rows:
             cells["time (s)"] = f"{float(cells['time (s)']) - start_s:.6f}"
     columns = ["time (s)"] * timed + list(names)
     description = ['lines of "name: value"']
     if unpaired := len(lines) - paired:
         description.append(f"{unpaired} other line{'s' * (unpaired > 1)} left out")
-    body = [(line, [cells.get(name, "") for name in columns]) for line, cells in rows]
-    return [(rows[0][0], columns), *body], description
+    body = [_Row(n, [cells.get(name, "") for name in columns]) for n, cells in zip(begins, rows, strict=True)]
+    return [_Row(begins[0], columns), *body], description
 
 
-def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int, list[str]]], list[str]]:
+def _without_heading(rows: list[_Row]) -> tuple[list[_Row], list[str]]:
     """The rows from the column names on, and a note on the lines above them.
 
     The names are in the first row that is at least as wide as most rows, and are not numbers. It may be wider: a last
     column of remarks is empty in most rows.
     """
-    filled = [(_filled_width(cells), k) for k, (_, cells) in enumerate(rows) if any(cells)]
-    commonest = Counter(count for count, _ in filled).most_common(1)
-    if not commonest or commonest[0][0] < 2 or 2 * commonest[0][1] <= len(filled):
+    widths = {k: _filled_width(row.cells) for k, row in enumerate(rows) if any(row.cells)}
+    usual_width, times = next(iter(Counter(widths.values()).most_common(1)), (0, 0))
+    if usual_width < 2 or 2 * times <= len(widths):
         return rows, []
-    usual_width = commonest[0][0]
-    first = next(k for count, k in filled if count >= usual_width)
-    heading = [k for _, k in filled if k < first]
-    names = [cell for cell in rows[first][1] if cell]
+    first = next(k for k, width in widths.items() if width >= usual_width)
+    heading = [k for k in widths if k < first]
+    names = [cell for cell in rows[first].cells if cell]
     if not heading or len(heading) > ABOVE_MAX or any(map(_is_number, names)):
         return rows, []
-    text = " ".join(cell for cell in rows[heading[0]][1] if cell)
+    text = " ".join(cell for cell in rows[heading[0]].cells if cell)
     amount = f"{len(heading)} lines" if len(heading) > 1 else "a line"
     return rows[first:], [f'{amount} above the names left out ("{escaped(text, 40)}")']
 
@@ -254,7 +262,7 @@ def _is_number(cell: str) -> bool:
     return bool(NUMBER.fullmatch(cell) or _COMMA.fullmatch(cell))
 
 
-def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
+def _csv_rows(text: str, file: str) -> tuple[list[_Row], str]:
     """Rows with their line numbers, and the name of the separator; lines that begin with # or % are remarks."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
     declared = next((line[4:5] for _, line in lines[:1] if line.lower().startswith("sep=")), None)
@@ -267,7 +275,7 @@ def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
         raise refusal("csv", file=file, line=1, found=found, allowed=allowed, remedy="correct or remove the line sep=")
     separator = declared or _separator([line for _, line in body])
     if separator == " ":
-        rows = [(number, line.split()) for number, line in body]
+        rows = [_Row(number, line.split()) for number, line in body]
     else:
         reader = csv.reader((line for _, line in body), delimiter=separator, skipinitialspace=True, strict=True)
         rows = []
@@ -275,7 +283,7 @@ def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
             for row in reader:
                 if reader.line_num > len(rows) + 1:
                     raise csv.Error("a line break inside a cell")
-                rows.append((body[len(rows)][0], [cell.strip() for cell in row]))
+                rows.append(_Row(body[len(rows)][0], [cell.strip() for cell in row]))
         except csv.Error as error:
             line, found, remedy = body[len(rows)][0], escaped(str(error), 120), 'close every quote " in its own line'
             raise refusal(
@@ -284,18 +292,18 @@ def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
     return rows, SEPARATORS.get(separator, f"'{escaped(separator)}'")
 
 
-def _refuse_wide(rows: Sequence[tuple[int, list[str]]], separator: str, file: str) -> None:
+def _refuse_wide(rows: Sequence[_Row], separator: str, file: str) -> None:
     """Refuse rows with more cells than the first row: all cells after a divided one are under wrong names.
 
     Raises:
         InputError: there is such a row; empty cells at its end do not count.
     """
-    filled = [(line, cells) for line, cells in rows if any(cells)]
-    width = len(filled[0][1]) if filled else 0
+    filled = [row for row in rows if any(row.cells)]
+    width = len(filled[0].cells) if filled else 0
     for line, cells in filled:
         if (count := _filled_width(cells)) <= width:
             continue
-        found = f"{count} cells under the {width} {'name' if width == 1 else 'names'} of line {filled[0][0]}"
+        found = f"{count} cells under the {width} {'name' if width == 1 else 'names'} of line {filled[0].line}"
         remedy = _WIDE.get(separator, "a separator inside a cell? put such cells in quotes; or a name is missing")
         remedy = "put # before lines that stand above the names of the columns" if width == 1 else remedy
         allowed = "as many cells in a row as there are names"
@@ -321,7 +329,7 @@ def _separator(lines: Sequence[str]) -> str:
     return next((s for s, (count, _) in divided.items() if 2 * count > len(lines)), ",")
 
 
-def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[int, list[str]]], list[str]]:
+def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[_Row], list[str]]:
     """Read the rows of one sheet of an XLSX file: values, not formulas."""
     refuse = partial(refusal, file=file)
     try:
@@ -349,7 +357,7 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
                 # Otherwise rows would be filled up to the size that the sheet states.
                 book[name].reset_dimensions()
                 rows = _cells(book[name].iter_rows(values_only=True), file)
-                if any(any(cells) for _, cells in rows):
+                if any(any(row.cells) for row in rows):
                     break
         except InputError:
             raise
@@ -360,7 +368,7 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
     return rows, [f"XLSX, sheet {escaped(str(name))}"]
 
 
-def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, list[str]]]:
+def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[_Row]:
     """Cells of a sheet as text."""
     values, cells = [], 0
     for number, row in enumerate(rows, start=1):
@@ -368,7 +376,7 @@ def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, lis
         if number > CSV_ROWS_MAX + 1 or cells > CELLS_MAX:
             allowed, remedy = f"at most {CSV_ROWS_MAX} rows, {CELLS_MAX} cells", "save the table alone in a file"
             raise refusal("size", file=file, found="more", allowed=allowed, remedy=remedy)
-        values.append((number, [_cell(value) for value in row]))
+        values.append(_Row(number, [_cell(value) for value in row]))
     return values
 
 
@@ -390,18 +398,18 @@ def _cell(value: object) -> str:
     return str(value).strip()
 
 
-def _table(file: str, rows: Sequence[tuple[int, list[str]]], description: list[str]) -> ForeignTable:
+def _table(file: str, rows: Sequence[_Row], description: list[str]) -> ForeignTable:
     """Make a table of rows of equal length under their names, with decimal points."""
-    width = max(len(cells) for _, cells in rows)
+    width = max(len(row.cells) for row in rows)
     if width > COLUMNS_MAX:
         allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
         raise refusal("size", file=file, found=f"{width} columns", allowed=allowed, remedy=remedy)
-    filled = [(line, cells + [""] * (width - len(cells))) for line, cells in rows]
-    has_header = not all(_is_number(cell) for cell in filled[0][1] if cell)
-    names = _unique(filled[0][1]) if has_header else [f"column {k}" for k in range(1, width + 1)]
+    filled = [_Row(line, cells + [""] * (width - len(cells))) for line, cells in rows]
+    has_header = not all(_is_number(cell) for cell in filled[0].cells if cell)
+    names = _unique(filled[0].cells) if has_header else [f"column {k}" for k in range(1, width + 1)]
     body = filled[1:] if has_header else filled
-    if has_header and len(body) > 1 and _units_below(body[0][1], body[1][1]):
-        names = [name and f"{name} {unit}".strip() for name, unit in zip(names, body[0][1], strict=True)]
+    if has_header and len(body) > 1 and _units_below(body[0].cells, body[1].cells):
+        names = [name and f"{name} {unit}".strip() for name, unit in zip(names, body[0].cells, strict=True)]
         description, body = [*description, "units in the row below the names"], body[1:]
     cells = [cell for _, row in body for cell in row if not isinstance(cell, _Number)]
     commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
@@ -414,7 +422,7 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], description: list[s
         if name is not None:
             body_cells = (row[k] if isinstance(row[k], _Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
             columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in body_cells)
-    return ForeignTable(file, ", ".join(description), tuple(line for line, _ in body), columns, rows[0][0])
+    return ForeignTable(file, ", ".join(description), tuple(line for line, _ in body), columns, rows[0].line)
 
 
 def _units_below(cells: Sequence[str], next_cells: Sequence[str]) -> bool:

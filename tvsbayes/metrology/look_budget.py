@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.pointing import UNIT_NOISES, Calibration
+from tvsbayes.calibration.pointing import APERTURE, PLACES, STOPS, UNIT_NOISES, Calibration
 from tvsbayes.instrument.axes import HOME_APPROACH
 from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
@@ -92,7 +92,7 @@ def budget(
     calibrated, at_look = jacobian[:, :count], jacobian[:, count:]
     by_cause = [np.einsum("ij,jk,ik->i", calibrated, c, calibrated) for c in parts]
     noise_variance = at_look**2 * np.diag(covariance)[count:]
-    by_cause += [noise_variance[:, :2].sum(axis=1), noise_variance[:, 2:4].sum(axis=1), noise_variance[:, 4]]
+    by_cause += [noise_variance[:, kind].sum(axis=1) for kind in (STOPS, PLACES)] + [noise_variance[:, APERTURE]]
     variance = np.array(by_cause)
     u = np.sqrt(np.diag(covariance))
     # Constants have correlation 0.

@@ -27,6 +27,8 @@ from tvsbayes.statistics.streams import Stream, random_stream
 
 PIXEL_COLUMN = INDEX["pixel_scale"]
 SCALES = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
+STOPS, PIXEL = slice(0, 4), 4
+"""Indices of `SCALES` by kind."""
 """Columns of the noise scales: stops by direction (right, left, down, up), pixels."""
 
 
@@ -82,8 +84,8 @@ def judged_z(
             share = known * np.radians(instruments.physical[:, column, None]) ** 2
             share = share / (1 + share)
             stops = times_seen * (side[:, axis] == sign)
-            estimate(column, 2 * np.sum(stops * share**2, axis=1), noise[:, 2 * axis + index])
-    estimate(PIXEL_COLUMN, 2.0 * looks, noise[:, 4])
+            estimate(column, 2 * np.sum(stops * share**2, axis=1), noise[:, STOPS][:, 2 * axis + index])
+    estimate(PIXEL_COLUMN, 2.0 * looks, noise[:, PIXEL])
     return z
 
 
@@ -248,7 +250,7 @@ class Assurance:
         """
         u, true = np.asarray(self.family.knowledge.space.u)[SCALES], instruments.value[:, SCALES]
         old_sd, new_sd = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))
-        pixel = new_sd[:, 4] / old_sd[:, 4]
+        pixel = new_sd[:, PIXEL] / old_sd[:, PIXEL]
         sides = (self.looks.side > 0).astype(int)
 
         def of_angles(sd_deg: np.ndarray) -> np.ndarray:
@@ -259,7 +261,7 @@ class Assurance:
         old_root, new_root = (
             p[:, None, None, None] ** 2 * (np.eye(4) - scatter)
             + scatter
-            + of_angles(scale[:, :4].reshape(-1, 2, 2)[:, [0, 1], sides])
+            + of_angles(scale[:, STOPS].reshape(-1, 2, 2)[:, [0, 1], sides])
             for p, scale in ((np.ones(len(pixel)), old_sd), (pixel, new_sd))
         )
         transform = np.linalg.solve(np.linalg.cholesky(new_root), np.linalg.cholesky(old_root))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tvsbayes.calibration.drawn_looks import noise_of_a_look
-from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
+from tvsbayes.calibration.pointing import APERTURE, INPUT_NAMES, STOPS, Calibration
 from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import APPROACH_SIGN, DIRECTIONS
@@ -152,7 +152,7 @@ class Sensitivity:
         return float(self.values(covariance, factor))
 
 
-AT_POINT = ("stop error at the point", "aperture noise at the point")
+STOP_AT_POINT, NOISE_AT_POINT = "stop error at the point", "aperture noise at the point"
 GEARS_AT_POINT = "gear errors between the places"
 
 
@@ -198,7 +198,7 @@ def sensitivity(
     count = len(inputs)
     jacobian = calibration.derivatives(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)[rows]
     variances = jacobian[:, count:] ** 2
-    by_source = {AT_POINT[0]: variances[:, :2].sum(axis=1), AT_POINT[1]: variances[:, 4]}
+    by_source = {STOP_AT_POINT: variances[:, STOPS].sum(axis=1), NOISE_AT_POINT: variances[:, APERTURE]}
     gradient = jacobian[:, :count] @ slope[inputs]
     if not gears.size:
         return Sensitivity(gradient, by_source)

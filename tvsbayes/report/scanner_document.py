@@ -99,11 +99,11 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
             worst = chance_text(max(chances) if verdict == NOT_MET else min(chances), bound)
             names = ", ".join(c.quantity for c in same_limit)
             judgements.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
-    text = "; ".join(sentence for _, sentence in judgements)
+    text, (worst, _) = "; ".join(sentence for _, sentence in judgements), judgements[0]
     prefix = ""
     if failed and validation is not None:
         prefix = "With that factor: " if validation.widens else "As fitted: "
-    return Verdict(failed + prefix + text[0].upper() + text[1:], judgements[0][0].replace(" ", "-"))
+    return Verdict(failed + prefix + text[0].upper() + text[1:], worst.replace(" ", "-"))
 
 
 def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:

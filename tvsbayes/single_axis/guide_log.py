@@ -81,7 +81,7 @@ class GuideRun:
         pier: side of the pier.
         header: numbers of the header by the names of `_HEADER`.
         frames: those with a star.
-        dropped: (line, time_s) of frames without a star.
+        dropped_s: times of frames without a star.
         breaks: indices of `frames` with a new zero: after dithers, new lock positions, settling, pauses.
         counts: numbers of events by name.
         ended: whether the log contains the end of the run.
@@ -94,7 +94,7 @@ class GuideRun:
     pier: str = "unknown"
     header: dict[str, float] = field(default_factory=dict)
     frames: list[GuideFrame] = field(default_factory=list)
-    dropped: list[tuple[int, float]] = field(default_factory=list)
+    dropped_s: list[float] = field(default_factory=list)
     breaks: set[int] = field(default_factory=set)
     counts: Counter[str] = field(default_factory=Counter)
     ended: bool = False
@@ -198,11 +198,11 @@ def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settli
     try:
         cells = dict(zip(columns, next(csv.reader([line])), strict=False))
         time_s, device = float(cells["Time"]), cells.get("mount", "Mount")
-        last = max((run.frames[-1].time_s if run.frames else 0.0, run.dropped[-1][1] if run.dropped else 0.0))
+        last = max((run.frames[-1].time_s if run.frames else 0.0, run.dropped_s[-1] if run.dropped_s else 0.0))
         if time_s < last or not math.isfinite(time_s):
             run.counts["damaged row"] += 1
         elif device == "DROP" or cells["RARawDistance"] == "":
-            run.dropped.append((number, time_s))
+            run.dropped_s.append(time_s)
         elif device != "Mount":
             run.counts[f"rows of {escaped(device, 12)}"] += 1
         else:
@@ -222,7 +222,7 @@ def run_rows(runs: Sequence[GuideRun]) -> list[dict[str, object]]:
             "begins": run.begins,
             "minutes": round(run.minutes, 1),
             "frames": len(run.frames),
-            "dropped": len(run.dropped),
+            "dropped": len(run.dropped_s),
             "settling": run.settling,
             "dithers": run.counts["dither"],
             "declination_deg": run.header.get("declination_deg"),
@@ -334,7 +334,7 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
         remedy = "name another run with --run"
         raise refusal("empty", file=file, line=run.line, found=f"{used} frames", allowed="three or more", remedy=remedy)
     # Frames before the first stretch belong to no move.
-    frames += [(time_s, -1, None, "dropped") for _, time_s in run.dropped]
+    frames += [(time_s, -1, None, "dropped") for time_s in run.dropped_s]
     starts_s = [move.time_s for move in moves]
     rows = [
         (time_s, max(0, sum(start_s <= time_s for start_s in starts_s) - 1) if move < 0 else move, value, status)
@@ -345,7 +345,8 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
         Reading(k, move, None if value is None else round(value, 4), 0.0, status, time_s)
         for k, (time_s, move, value, status) in enumerate(rows)
     )
-    drive = LoggedDrive(scale.drive_arcsec_per_s, _header_of(run, file), _between(rows), PRIORS)
+    between = _between([time_s for time_s, *_ in rows])
+    drive = LoggedDrive(scale.drive_arcsec_per_s, _header_of(run, file), between, PRIORS)
     notes = (_frames_text(run, used, len(moves)), *_remarks(run))
     return ForeignReadings(tuple(moves), readings, (*scale.assumed, *ASSUMED), "arcsec", drive, notes)
 
@@ -356,10 +357,10 @@ def _several(count: int, name: str) -> str:
 
 def _frames_text(run: GuideRun, used: int, stretches: int) -> str:
     """Numbers of frames used and left out, in words."""
-    events = [f"{run.settling} while settling", f"{len(run.dropped)} dropped"]
+    events = [f"{run.settling} while settling", f"{len(run.dropped_s)} dropped"]
     events += [_several(n, name) for name in ("damaged row", "calibration step") if (n := run.counts[name])]
     events += [f"{n} {name}" for name, n in run.counts.items() if name.startswith("rows of") and n]
-    text = f"frames: {used} used of {len(run.frames) + len(run.dropped)} ({', '.join(events)} left out)"
+    text = f"frames: {used} used of {len(run.frames) + len(run.dropped_s)} ({', '.join(events)} left out)"
     breaks = [_several(run.counts["dither"], "dither"), *([_several(n, "pause")] if (n := run.counts["pause"]) else [])]
     words = "of its own each" if stretches > 1 else "of its own"
     return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {words} ({', '.join(breaks)})"
@@ -393,7 +394,7 @@ def _header_of(run: GuideRun, file: str) -> dict[str, object]:
     return header
 
 
-def _between(rows: Sequence[tuple[float, int, float | None, str]]) -> tuple[float, float] | None:
+def _between(times_s: Sequence[float]) -> tuple[float, float] | None:
     """Range of periods, s, for a search: from a minute to a third of the run; None for a short run."""
-    span_s = rows[-1][0] - rows[0][0]
+    span_s = times_s[-1] - times_s[0]
     return (60.0, round(span_s / 3.0, 0)) if span_s > 360.0 else None

@@ -109,10 +109,10 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
 
 def _series(rows: Sequence[tuple[float, float]]) -> Series:
     """Rows in time order; only the last of several at one time."""
-    ordered = sorted(enumerate(rows), key=lambda row: (row[1][0], row[0]))
-    times = np.array([row[0] for _, row in ordered])
+    ordered = sorted(rows, key=lambda row: row[0])
+    times = np.array([time_s for time_s, _ in ordered])
     is_last = np.r_[np.diff(times) > EQUAL_S, True]
-    return Series(times[is_last], np.array([row[1] for _, row in ordered])[is_last])
+    return Series(times[is_last], np.array([value for _, value in ordered])[is_last])
 
 
 def _series_names(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> dict[str, str]:
