@@ -72,7 +72,7 @@ class NormalModel:
 
 @dataclass(frozen=True)
 class SampledHeadlines:
-    """Draws of the free coordinates z (n, d) and of the headlines (n, quantities), with weights (n,)."""
+    """Draws of the free coordinates z (n, d) and of the headlines `labels` (n, quantities), with weights (n,)."""
 
     z: np.ndarray
     values: np.ndarray
@@ -80,7 +80,6 @@ class SampledHeadlines:
     half: np.ndarray
     """Coordinates whose quantity is half-normal a priori, shape (d,)."""
     labels: tuple[str, ...] = ()
-    """Labels of the headlines."""
 
     @property
     def normal(self) -> NormalModel:

@@ -194,8 +194,7 @@ def _paired_rows(text: str) -> tuple[list[_Row], list[str]] | None:
     A repeated name begins a new row; a time of day before the lines becomes seconds since the first row.
     """
     names: dict[str, None] = {}
-    rows: list[dict[str, str]] = []
-    begins: list[int] = []
+    rows, begins = list[dict[str, str]](), list[int]()
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
     paired, day_s, previous_s = 0, 0.0, -1.0
     for number, line in lines:

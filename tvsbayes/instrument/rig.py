@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from tvsbayes.errors import InputError, closest, entry_refusal, escaped
 from tvsbayes.files.disk import read_bytes
@@ -190,14 +190,21 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     return closest(name, allowed)
 
 
-def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[Keys, str, str]]:
-    """Every entry as (its table, its key there, its full name), for quoted and dotted keys."""
+class _Place(NamedTuple):
+    """The table of an entry, and its key there."""
+
+    keys: Keys
+    key: str
+
+
+def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[str, _Place]]:
+    """Every entry by its full name, for quoted and dotted keys."""
     for key, value in table.values.items():
         name = prefix + key
         if isinstance(value, dict) and value and name in _GROUPS and not {"value", "u"} & set(value):
             yield from _entries(table.table(key), name + ".")
         else:
-            yield table, key, name
+            yield name, _Place(table, key)
 
 
 def _in_blocks(names: Iterable[str]) -> str:
@@ -213,23 +220,23 @@ def _in_blocks(names: Iterable[str]) -> str:
     )
 
 
-def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Keys, str]]:
-    """Location of each parameter name in a table; `allowed` lists the permitted names."""
-    entries: dict[str, tuple[Keys, str]] = {}
-    for keys, key, name in _entries(table):
+def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, _Place]:
+    """Place of each parameter name in a table; `allowed` lists the permitted names."""
+    entries: dict[str, _Place] = {}
+    for name, place in _entries(table):
         if name not in allowed:
             # Keys of [rig] that are not priors were read before.
             own_keys = () if "rig" not in table.path or "prior" in table.path else _OWN_KEYS
             names = "only " + _in_blocks((*allowed, *own_keys))
             found = f"the name {escaped(name)}"
-            raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), found)
+            raise place.keys.refuse(place.key, "unknown-key", names, _explanation(name, allowed), found)
         if name in entries:
-            raise keys.refuse(key, "duplicate-key", "every name once", "remove one", f"{name} twice")
-        entries[name] = keys, key
+            raise place.keys.refuse(place.key, "duplicate-key", "every name once", "remove one", f"{name} twice")
+        entries[name] = place
     return entries
 
 
-def _parse_priors(entries: Mapping[str, tuple[Keys, str]]) -> dict[str, Prior]:
+def _parse_priors(entries: Mapping[str, _Place]) -> dict[str, Prior]:
     """The stated priors, checked."""
     priors: dict[str, Prior] = {}
     for name, (keys, key) in entries.items():

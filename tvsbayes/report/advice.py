@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from tvsbayes.errors import listed
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import REGISTRY, STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.parameters import QUANTITIES, REGISTRY, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import ASSUMED_REMEDY, Stereo
 from tvsbayes.report.document import sentence
-from tvsbayes.report.parameter_words import quantity_in_words, sentence_in_words
+from tvsbayes.report.parameter_words import sentence_in_words
 from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 from tvsbayes.results.metrology_tables import BudgetTable
 
@@ -115,7 +115,8 @@ def assumed_stereo(stereo: Stereo | None, budgets: Sequence[BudgetTable]) -> str
     for table in budgets:
         for row in table.rows:
             if row.quantity == cause and row.share >= SHARE_NAMED:
-                words, part = quantity_in_words(table.quantity)
+                quantity = QUANTITIES.get(table.quantity)
+                words, part = (quantity.words, " ".join(quantity.parts)) if quantity else (table.quantity, "")
                 parts.setdefault(f"{100 * row.share:.0f} % of the variance of {words}", []).append(part)
     shares = [f"{share} ({', '.join(named)})" if any(named) else share for share, named in parts.items()]
     text = "the stereo covariance is assumed, not estimated"

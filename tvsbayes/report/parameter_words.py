@@ -27,12 +27,6 @@ def name_in_words(name: str) -> str:
     return name if quantity is None or not quantity.words else quantity.in_words
 
 
-def quantity_in_words(name: str) -> tuple[str, str]:
-    """Quantity and part in words: of `effective_deg_per_step.left` "the effective ratio" and "left"."""
-    quantity = QUANTITIES.get(name)
-    return (name, "") if quantity is None or not quantity.words else (quantity.words, " ".join(quantity.parts))
-
-
 def source_in_words(source: str) -> str:
     """A row of a budget in words, with part and unit: a parameter or its prior; others are unchanged."""
     for prefix, article in (("prior of ln ", ""), ("prior of ", "the ")):
