@@ -62,7 +62,7 @@ OF_ONE_INSTRUMENT = {
     "twin.physics": "the twin's own such column",
     "twin.simulated_axis": "the twin of an axis",
     "report.axis_document": "the report of an axis",
-    "report.head_document": "the report of a head with sightings",
+    "report.head_document": "the report of a head",
     "view.laser_ways": "draws the mirrors of a scanner",
 }
 """Rooms and modules that may know which instrument they serve. Others ask what the instrument has:

@@ -74,9 +74,19 @@ INSTRUMENTS = {
             "watch": "use compare --by positions",
         },
     ),
+    "pan-tilt": Instrument(
+        "a head that turns a laser",
+        "the folder of a head",
+        "tvsbayes.cli.head_commands",
+        "fit, then report",
+        shared=(
+            *("simulate", "detect", "view", "export", "locate", "steps-for", "plan", "watch"),
+            *("classic", "fit", "compare", "import"),
+        ),
+    ),
     "pan-tilt-sightings": Instrument(
         "a head that says where it points",
-        "the folder of one",
+        "the folder of a head",
         "tvsbayes.cli.head_commands",
         "of such a head: check, classic, fit, compare, report, watch, verify, plan, study, compensate --to urdf, "
         "steps-for --azimuth-deg --elevation-deg",

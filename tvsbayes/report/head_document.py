@@ -1,6 +1,7 @@
-"""The document of a head with sightings: ratios, terms, stops, weaknesses.
+"""The document of a pan-tilt head: ratios, terms, stops, weaknesses.
 
-Only the pointing model is computed here, for comparison with the fit. deg, deg/step.
+Only the estimate to compare with is computed here: the pointing model of sightings, the classic ratios of spots. deg,
+deg/step.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from tvsbayes.display import concise
+from tvsbayes.estimators.four_point import classic_of
 from tvsbayes.head.pointing_model import PointingModel, pointing_model
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.advice import LAPLACE_SHORT
 from tvsbayes.report.document import Document, FigureView, Issue, Section, about_table
 from tvsbayes.report.figures import intervals
@@ -23,14 +26,20 @@ from tvsbayes.report.scanner_document import answer_table, measured_days, verdic
 from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.fit_record import FitRecord
 
-METHOD = (
+OPTICS = (
     "The line of sight is that of two geared axes by exact rotations: the azimuth axis leans, the elevation axis is "
     "not square to it, nor the line of sight to the elevation axis, and it sags. To first order these are TPOINT's "
-    "terms.",
-    "Counters drive gears with a ratio, a difference of both directions, play, errors that repeat by position, a zero "
-    "that drifts; every stop has an error of its own. Each sighting gives two residuals on the sphere.",
-    "Refraction is as the table of sightings has it.",
+    "terms."
 )
+GEARS = (
+    "Counters drive gears with a ratio, a difference of both directions, play, errors that repeat by position, a zero "
+    "that drifts; every stop has an error of its own."
+)
+LOOKS = {
+    "sighting": "Each sighting gives two residuals on the sphere. Refraction is as the table of sightings has it.",
+    "spot": "Each spot gives three residuals: the four pixels of the stereo pair less the range.",
+}
+"""What a look gives, by its kind."""
 
 
 def pointing_table(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> TableView:
@@ -51,12 +60,12 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
     """The document with its number.
 
     Args:
-        campaign: campaign of a head, with sightings.
+        campaign: campaign of a head.
         record: its `fit.json`.
         issue: laboratory, customer and day.
         doubts: warnings of `check`.
     """
-    summary = record.summary
+    summary, look = record.summary, campaign.looks_table.required[0]
     weaknesses = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
     warnings = [*summary.problems, *(f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts)]
     warnings += [f"`check` warns: {sentence_in_words(text)}" for text in doubts]
@@ -64,20 +73,24 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
         warnings.append(LAPLACE_SHORT)
     validation = [] if summary.validation is None else validation_lines(summary.validation)
     stops = () if record.evidence is None else record.evidence.residuals
-    joint = {name: (estimate.value, estimate.sd) for name, estimate in summary.parameters.items()}
-    tables = [headline_table(summary), pointing_table(pointing_model(campaign), joint)]
+    tables, classic, source = [headline_table(summary)], None, f"The {look}s are taken as stated."
+    if campaign.has_images:
+        classic, source = classic_of(campaign), traceability(campaign).statement
+    else:
+        joint = {name: (estimate.value, estimate.sd) for name, estimate in summary.parameters.items()}
+        tables.append(pointing_table(pointing_model(campaign), joint))
     noise, scale = summary.noise, summary.parameters["pixel_scale"].value
     scatter = f"chi-square {noise.chi2:.1f} for {noise.dof:.1f} degrees of freedom; "
-    scatter += f"sightings scatter by {scale:.2f} times their stated u."
+    scatter += f"{look}s scatter by {scale:.2f} times their stated u."
     sections = [
         Section("Result", tables=tables, opened=True),
         Section("Stops", text=[scatter], figures=[view for axis in AXES for view in stop_views(stops, axis)]),
         Section(
-            "What the sightings do not determine",
+            f"What the {look}s do not determine",
             items=[sentence_in_words(text) for text in weaknesses] or ["No remarks."],
         ),
         Section("Signs of model errors", items=validation or ["Not asked."]),
-        Section("Method", text=METHOD),
+        Section("Method", text=[OPTICS, GEARS, LOOKS[look]]),
     ]
     return numbered(
         Document(
@@ -85,12 +98,12 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
             name=campaign.title,
             about=about_table(campaign.header, measured_days(campaign, issue), issue),
             verdict=verdict_of(summary, (), doubts),
-            answer=answer_table(summary, None, "the line of sight"),
+            answer=answer_table(summary, classic, "the line of sight"),
             picture=FigureView(
                 intervals(summary), "Ratios with 95 % intervals; values in the table", "Effective ratios."
             ),
-            steps=["`tvsbayes compare CAMPAIGN --by positions` says how well the fit predicts sightings left out."],
-            traceable="The sightings are taken as stated.",
+            steps=[f"`tvsbayes compare CAMPAIGN --by positions` says how well the fit predicts {look}s left out."],
+            traceable=source,
             warnings=warnings,
             versions=record.provenance.versions,
             sections=sections,
