@@ -132,7 +132,7 @@ FAULTS = (
           "test_a_calibration_has_not_changed_from_itself"),
     Fault("the classic and the joint estimate change places in the hold-out", "held_out.judge",
           Local("ratio", "1 / value"), "test_scores_of_predictions_by_hand"),
-    Fault("watching ignores that it tests many things", "null_distribution", Call("min", "logs[1]"),
+    Fault("watching ignores that it tests many things", "null_distribution", Call("min", "own[0]"),
           "test_false_alarms_and_power_are_those_of_the_linear_model"),
     Fault("a watched change was there from the first day", "WatchedLooks.linear", Reads("self.first", "0"),
           "test_the_departure_is_that_of_a_dense_gaussian"),
