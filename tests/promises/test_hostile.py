@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 from support.hostile_folders import (
     CRAFTED,
     FIT,
-    MEGABYTE,
     TARGETS,
     change,
     edited_files,
@@ -59,7 +58,7 @@ def folder(tmp_path) -> Path:
 
 def refused(good: Path, target: str, content: bytes) -> InputError:
     """How a file with other content is refused."""
-    error = outcome(good, TARGETS[target], content, traced=len(content) > MEGABYTE / 5).error
+    error = outcome(good, TARGETS[target], content).error
     assert isinstance(error, InputError) and error.found and error.allowed
     return error
 
@@ -123,7 +122,7 @@ REFUSED = (
     ("campaign.toml", "[rig.prior]", MANY, 20, "rig.prior.a0", "unknown-key"),
     ("campaign.toml", "", "\n", None, "format", "missing-key"),
     ("stereo.json", '"rms_px"', '"\\ud800"', None, "\\ud800", "unknown-key"),
-    ("camera.yml", "", "a: " + "[" * 1_000_000, None, None, "container"),
+    ("camera.yml", "", "a: " + "[" * 100_000, None, None, "container"),
     ("camera.yml", "M1:", ":", None, None, "container"),
     ("camera.yml", "rows: 3", "rows: [3]", None, "M1", "matrix"),
     ("camera.yml", "3\n   cols: 3", "100000\n   cols: 100000", None, "M1", "matrix"),
@@ -186,7 +185,7 @@ def files_of(place: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(
-    ("examples", "traced"), [(12, True), pytest.param(100, False, marks=pytest.mark.thorough)], ids=("few", "many")
+    ("examples", "traced"), [(10, True), pytest.param(100, False, marks=pytest.mark.thorough)], ids=("few", "many")
 )
 @pytest.mark.parametrize("name", TARGETS)
 def test_edited_files_are_read_or_refused(good, name, examples, traced):
