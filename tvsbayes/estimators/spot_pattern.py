@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -231,7 +232,7 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
         rows = np.array([k for k, s in enumerate(pattern.spots) if s.target == name and not apart[k]], int)
         if len(rows) < PLANE_MIN:
             continue
-        away, unsure = _off_plane_mm(pattern.points_mm[rows])
+        away, unsure = _off_plane(pattern.points_mm[rows])
         # Consecutive rows have one placement where no other sheet was used in between.
         placement = np.cumsum(np.diff(rows, prepend=rows[0]) > 1)
         spread, apart_mm = _spread(away), _from_neighbours(away[:, None], placement, np.abs(away) / ALONE)
@@ -255,13 +256,15 @@ def _mm_per_pixel(pattern: SpotPattern, rows: np.ndarray) -> np.ndarray:
     return pattern.points_mm[rows, 0] ** 2 / (stereo.M1[0, 0] * float(np.linalg.norm(stereo.T)))
 
 
-def _off_plane_mm(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute depths of points (n, 3) above the plane of most of them, and the uncertainty of that plane there.
+class _OffPlane(NamedTuple):
+    """Depths (n,) above a plane, mm, and ratios (n,) of their variances to those with a known plane."""
 
-    Returns:
-        (n,) mm, and (n,) ratio of the variance of such a depth to that with a known plane: far from all other looks the
-        error of the plane's slope adds to it.
-    """
+    away_mm: np.ndarray
+    unsure: np.ndarray
+
+
+def _off_plane(points_mm: np.ndarray) -> _OffPlane:
+    """Compute depths of points (n, 3) above the plane of most of them; far from all others its slope's error adds."""
     design = np.column_stack((np.ones(len(points_mm)), points_mm[:, 1:] - points_mm[:, 1:].mean(axis=0)))
     weights = np.ones(len(points_mm))
     for _ in range(10):
@@ -272,7 +275,7 @@ def _off_plane_mm(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     weighted = design * weights[:, None]
     leverage = np.einsum("ij,jk,ik->i", design, np.linalg.pinv(weighted.T @ weighted), design)
     others = leverage / np.maximum(1 - weights**2 * leverage, 1e-9)
-    return away, 1 + others
+    return _OffPlane(away, 1 + others)
 
 
 def _from_neighbours(values: np.ndarray, placement: np.ndarray, alone: np.ndarray) -> np.ndarray:

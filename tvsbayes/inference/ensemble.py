@@ -72,7 +72,7 @@ class Run[D: Density]:
             state = np.random.RandomState(start.seed).get_state()
             empty = np.zeros((0, walkers, dimension))
             chain = Chain(empty, np.zeros((0, walkers)), np.zeros(walkers), state, 0, 0.0, FIRST_CHECK)
-        self.before, self.goal, self.saved_at = chain, chain.goal, began
+        self.before, self.goal, self.saved_at, self.ended = chain, chain.goal, began, False
         self.invalid = density.invalid
         self.walkers = Walkers(density, self.proposal, positions, chain)
 
@@ -95,17 +95,16 @@ class Run[D: Density]:
             self.keep(self.chain())
         self.saved_at = time.monotonic()
 
-    def look(self) -> tuple[Sample, bool]:
-        """Diagnose the sample so far and say whether it is final; else set the next test."""
+    def look(self) -> Sample:
+        """Diagnose the sample so far, and set whether the run has ended, or else the next test."""
         chain = self.chain()
         sample = diagnose(self.start, chain, self.tier)
         convergence = sample.convergence
         assert isinstance(convergence, Convergence)
-        if not convergence.missing or hopeless(convergence):
-            return sample, True
-        if len(chain.w) >= self.goal:
+        self.ended = not convergence.missing or hopeless(convergence)
+        if not self.ended and len(chain.w) >= self.goal:
             self.goal = next_look(chain, convergence)
-        return sample, False
+        return sample
 
     def too_short(self) -> bool:
         """Whether autocorrelation times alone require more steps; then the next test is set."""
@@ -121,8 +120,8 @@ class Run[D: Density]:
         done, towards = len(self.before.w), OpenEnded()
         # An interrupted chain is first extended to its next test, so that it ends where an uninterrupted run ends.
         if done >= self.goal and not self.too_short():
-            sample, ended = self.look()
-            if ended:
+            sample = self.look()
+            if self.ended:
                 return sample
         try:
             while True:
@@ -132,8 +131,8 @@ class Run[D: Density]:
                 elapsed = time.monotonic() - self.began
                 over = elapsed > seconds
                 if over or (done >= self.goal and not self.too_short()):
-                    sample, ended = self.look()
-                    if ended or over:
+                    sample = self.look()
+                    if self.ended or over:
                         self.save()
                         return sample
                 elif time.monotonic() - self.saved_at > CHECKPOINT_SECONDS:

@@ -55,15 +55,6 @@ def _repeat_sd(model: AxisModel) -> float:
     return max(float(np.sqrt(squares / freedom)) if freedom else 0.0, 1e-4 * rows.travel)
 
 
-def _widths(model: AxisModel) -> np.ndarray:
-    """Expected widths (d,) of the coordinates."""
-    names = model.coordinates.names
-    width = np.ones(len(names))
-    if "backlash" in names:
-        width[names.index("backlash")] = min(max(reversal_of(model.rows).sd / model.priors["backlash"].u, 1e-9), 1.0)
-    return width
-
-
 def _start(model: AxisModel, stop_sd: float) -> np.ndarray:
     """Start coordinates (d,) for stops with scatter `stop_sd`."""
     names = model.coordinates.names
@@ -130,7 +121,10 @@ def _search(model: AxisModel, start: np.ndarray, bounded: bool = False) -> AxisM
     if not len(start):
         alone = float(model.log_density(start[None])[0])
         return AxisMode(start, np.zeros((0, 0)), alone, _missing(alone))
-    width = _widths(model)
+    # The expected widths of the coordinates.
+    width, names = np.ones(len(start)), model.coordinates.names
+    if "backlash" in names:
+        width[names.index("backlash")] = min(max(reversal_of(model.rows).sd / model.priors["backlash"].u, 1e-9), 1.0)
 
     def value(v: np.ndarray) -> float:
         density = float(model.log_density((start + width * v)[None])[0])
