@@ -7,7 +7,7 @@ import os
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.csv_table import CSV_LINE_CHARS_MAX, append_line, csv_bytes, parse_table, table_blocks
+from tvsbayes.files.csv_table import CSV_LINE_CHARS_MAX, CSV_ROWS_MAX, append_line, csv_bytes, parse_table, table_blocks
 
 
 @pytest.mark.parametrize("cell", ["0", "-0", "+1.5", ".5", "5.", "1e3", "1E-3", "-9.25e+2", "000012"])
@@ -90,6 +90,7 @@ def test_bom_crlf_and_column_order_are_accepted():
         (b"a,b\n1,2\n1,\xe9\n", 3, "encoding"),
         ("a,b\n1,2\n".encode("utf-16"), None, "encoding"),
         (b"a,b\n1," + b"2" * CSV_LINE_CHARS_MAX + b"\n", 2, "size"),
+        (b"a,b\n" + b"1,2\n" * (CSV_ROWS_MAX + 1), CSV_ROWS_MAX + 2, "size"),
     ],
 )
 def test_broken_tables_name_their_line(data, line, code):
