@@ -142,9 +142,9 @@ def test_fit_samples_writes_for_arviz_and_keeps_the_better_answer(ask, grid_fold
 
     monkeypatch.setattr(diagnosis, "ESS_LIMIT", 10**9)
     code, document = ask("fit", grid_folder, "--seed", 2, "--resume", "--max-minutes", "0.01")
-    # A chain that ends too soon is a worse answer than that of the weighted draws.
-    assert (code, document["answer"], document["tier"]) == (0, "accepted", "importance")
-    assert document["monte_carlo_error"]["effective_deg_per_step.left"]["mean"] <= 0.1
+    # A chain that ends too soon is a better answer than weighted draws which allow only Laplace's.
+    assert (code, document["answer"], document["tier"]) == (0, "rough", "emcee")
+    assert document["monte_carlo_error"]["effective_deg_per_step.left"]["mean"] <= 0.3
     code, document = ask("fit", grid_folder, "--seed", 3, "--resume")
     assert (code, document["error"]["code"]) == (2, "other-chain")
 
@@ -160,7 +160,7 @@ def test_unreliable_weights_fall_back_to_laplace_with_a_warning(ask, say, grid_f
     assert document["problems"][0].startswith("LAPLACE: the weights of importance sampling have Pareto k")
     code, text, _ = say("fit", grid_folder, "--quick")
     assert code == 0 and "not sampled: the weights of importance sampling have Pareto k" in text
-    assert text.rstrip().splitlines()[-1].startswith("verdict: usable with care: the posterior could not be sampled")
+    assert "\nverdict: usable with care: the posterior could not be sampled" in text
 
 
 @pytest.mark.thorough

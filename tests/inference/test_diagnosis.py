@@ -5,17 +5,18 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, autoregressive, route
 
-from tvsbayes.inference.chain import GROUPS, Chain
+from tvsbayes.inference.chain import GROUPS, Chain, better
 from tvsbayes.inference.density import Points
 from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT, autocorrelation_steps, diagnose, grouped
 from tvsbayes.inference.importance import Sample
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
+from tvsbayes.results.convergence import Convergence, Importance, NamedValue, Reweighted
 
 WALKERS, STEPS = 64, 400
 
@@ -177,3 +178,21 @@ def test_groups_are_neighbours_in_order_of_time():
     groups = grouped(values)
     assert groups.shape == (GROUPS, 6)
     np.testing.assert_array_equal(groups[1], [20, 30, 21, 31, 22, 32])
+
+
+@pytest.mark.parametrize(
+    ("weighted", "chain", "agrees", "chosen"),
+    [
+        ("accepted", "accepted", True, "chain"),
+        ("accepted", "rough", None, "weighted"),
+        ("rough", "laplace", None, "weighted"),
+        ("laplace", "rough", None, "chain"),
+        ("accepted", "rough", False, "chain"),
+    ],
+)
+def test_the_better_answer_is_kept(weighted, chain, agrees, chosen):
+    """The chain where both are equally good, and where it contradicts the weighted draws."""
+    agreement = None if agrees is None else SimpleNamespace(agrees=agrees)
+    early = SimpleNamespace(convergence=SimpleNamespace(answer=weighted))
+    walked = SimpleNamespace(convergence=Mock(spec=Convergence, answer=chain, agreement=agreement))
+    assert better(early, walked) is {"weighted": early, "chain": walked}[chosen]
