@@ -10,7 +10,6 @@ from support.small_posterior import SIGMAS
 from support.varying_gears import varying_gears
 
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.inference.importance import K_MAX
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.posterior.draws import headline_names
@@ -54,13 +53,12 @@ def test_the_line_through_the_looks_is_found_and_the_local_slope_knows_less(gear
 
 @pytest.mark.slow
 def test_both_samplers_say_the_same(gear_fit):
-    """The chain's limits are met; where importance sampling needs more draws for its own, it still agrees."""
+    """Both are accepted, and agree within their Monte Carlo errors."""
     fitted = gear_fit[1]
     chain, run = sample(fitted, "emcee", seed=5, max_minutes=20.0), importance_run(fitted, 5)
     weighted = run.density.posterior(run.sample, run.seed)
     assert chain.convergence.stuck_walkers == ()
-    importance = weighted.convergence.importance
-    assert importance.pareto_k < K_MAX and importance.least_ess.value > 400, importance
+    assert chain.convergence.answer == weighted.convergence.answer == "accepted", weighted.convergence.importance
     for name in headline_names(fitted):
         one, other = (posterior.propagate(lambda p, name=name: p[name]) for posterior in (chain, weighted))
         mean_error, sd_error = (np.hypot(getattr(one, e), getattr(other, e)) for e in ("mcse_mean", "mcse_sd"))
