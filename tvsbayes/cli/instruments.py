@@ -80,7 +80,7 @@ INSTRUMENTS = {
         "tvsbayes.cli.head_commands",
         "fit, then report",
         shared=(
-            *("simulate", "detect", "view", "export", "locate", "steps-for", "plan", "watch"),
+            *("simulate", "check", "detect", "view", "export", "locate", "steps-for", "plan", "watch"),
             *("classic", "fit", "compare", "import"),
         ),
     ),

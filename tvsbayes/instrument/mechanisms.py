@@ -146,5 +146,5 @@ def mechanism_named(word: object, sightings: bool) -> Mechanism | None:
 
 
 def mechanism_of(names: Container[str]) -> Mechanism:
-    """The first entry with such parameters, told by the zero of the tilt axis; without that the scanner."""
+    """The first entry with such parameters, by the name of the zero of the tilt axis; without one the scanner."""
     return next((kind for kind in MECHANISMS.values() if kind.tilt_zero in names), TWO_MIRROR)

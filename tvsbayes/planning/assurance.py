@@ -27,9 +27,9 @@ from tvsbayes.statistics.streams import Stream, random_stream
 
 PIXEL_COLUMN = INDEX["pixel_scale"]
 SCALES = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
+"""Columns of the noise scales: stops by direction (right, left, down, up), pixels."""
 STOPS, PIXEL = slice(0, 4), 4
 """Indices of `SCALES` by kind."""
-"""Columns of the noise scales: stops by direction (right, left, down, up), pixels."""
 
 
 def judged_z(

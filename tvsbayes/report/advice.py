@@ -116,7 +116,9 @@ def assumed_stereo(stereo: Stereo | None, budgets: Sequence[BudgetTable]) -> str
         for row in table.rows:
             if row.quantity == cause and row.share >= SHARE_NAMED:
                 quantity = QUANTITIES.get(table.quantity)
-                words, part = (quantity.words, " ".join(quantity.parts)) if quantity else (table.quantity, "")
+                words, part = (
+                    (quantity.words, " ".join(quantity.parts)) if quantity and quantity.words else (table.quantity, "")
+                )
                 parts.setdefault(f"{100 * row.share:.0f} % of the variance of {words}", []).append(part)
     shares = [f"{share} ({', '.join(named)})" if any(named) else share for share, named in parts.items()]
     text = "the stereo covariance is assumed, not estimated"
