@@ -1,6 +1,7 @@
 """What `import` prints and writes for every sample, frozen.
 
-`pytest -n0 tests/importing --snapshot-update` freezes it anew. A difference is no failure of the importer by itself: it shows what moves, and the change that moves it says why.
+`pytest -n0 tests/importing --snapshot-update` freezes it anew. A difference is no failure of the importer by
+itself: it shows what moves, and the change that moves it says why.
 """
 
 from __future__ import annotations
