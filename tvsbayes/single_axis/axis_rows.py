@@ -17,6 +17,7 @@ import numpy as np
 from tvsbayes.errors import InputError, NothingToEstimate, listed
 from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
+from tvsbayes.statistics.wrapped import turn_jumps
 from tvsbayes.statistics.intervals import WithSd
 
 SIDES = {"forward": 1, "backward": -1, "unknown": 0}
@@ -26,8 +27,6 @@ ROWS_MAX = 2000
 """Largest number of moves with readings: a fit with this number takes minutes."""
 LONG_LEGS, LONG_ERRORS = 2.0, 10.0
 """No stop lies inside the play where the shortest leg exceeds these numbers of reversals plus standard errors."""
-WRAP_SHARE = 0.7
-"""Share of a turn: a step of the readings that deviates more counts as a jump by whole turns."""
 
 
 @dataclass(frozen=True)
@@ -185,26 +184,6 @@ def _means(used: Sequence[Reading]) -> dict[int, dict[str, float]]:
         else:
             means[move] = {"value": float(values.mean()), "variance": 0.0, "within": 0.0, "count": len(of_move)}
     return means
-
-
-def turn_jumps(command: np.ndarray, value: np.ndarray, turn: float) -> dict[int, float]:
-    """Jumps of the readings by row, turns; empty where there are none.
-
-    Args:
-        command: commands of the readings in time order, shape (rows,).
-        value: readings, shape (rows,).
-        turn: one turn in the unit of the readings.
-    """
-    step = np.diff(command)
-    moving = step != 0
-    if moving.sum() < 3:
-        return {}
-    rise = np.diff(value)
-    slope = float(np.median(rise[moving] / step[moving]))
-    deviation = rise - slope * step
-    jumps = np.flatnonzero(np.abs(deviation) > WRAP_SHARE * turn)
-    # With a slope wrong by a turn per step, all steps or none jump; only rare jumps are wraps.
-    return {int(k) + 1: float(deviation[k] / turn) for k in jumps} if 2 * len(jumps) < len(step) else {}
 
 
 def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray, moves: np.ndarray) -> None:

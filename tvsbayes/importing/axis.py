@@ -1,0 +1,564 @@
+"""Moves and readings of an axis from a foreign table: one row is a move, a reading, or both.
+
+Successive rows at the same command are readings of one stop; rows without a value are moves without a reading. A column
+of directions gives the side of approach of a stop; where the rows before lead to another side, the missing move is
+inserted and marked. Assumptions about what the table does not state are listed in words. Everything ends in plain rows
+by the names of `moves.csv`, `readings.csv` and `campaign.toml`.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from tvsbayes.errors import Candidate, escaped, question, refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.axis_columns import FIELDS, axis_columns
+from tvsbayes.importing.cells import FieldCells, homings_of, left_out, seconds_of, status_of, temperatures_of
+from tvsbayes.importing.columns import Understood, ask_column, choice, columns_of, table_document, table_lines
+from tvsbayes.importing.rest import at_rest
+from tvsbayes.importing.runs import long_table
+from tvsbayes.importing.table import ForeignTable
+from tvsbayes.importing.words import Unit, means, name_of, parse_unit, place_of, plain, words_of
+from tvsbayes.statistics.wrapped import turn_jumps
+
+NUMBER_MAX = 1e12
+"""Largest absolute command or reading."""
+TURN_TOLERANCE = 0.1
+"""Largest deviation of a jump from whole turns by play and errors of gears, turns."""
+JUMP_SDS = 6.0
+"""Largest deviation of a jump from a power of two, in typical deviations of steps from the line, plus two counts."""
+BITS = range(8, 33)
+"""Exponents of encoders that count modulo a power of two."""
+OVERSHOOT_SHARE = 0.05
+"""Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
+CONTRARY_MIN = 4
+"""Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
+UNIT_SLOPE = 0.05
+"""Largest deviation from 1 of the slope of readings over commands, where both are taken to be in one unit."""
+ANGLE_SPAN = 360.0
+STATUS_SHARE = 0.5
+"""Share of rows that a status of 0 and 1 may leave out without a question."""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the user states about a table of an axis.
+
+    Attributes:
+        columns: column by field, "" for none.
+        units: unit by field, as text.
+        deviations: whether readings are actual less commanded position.
+        counts_per_turn: counts after which readings restart; 0: nowhere.
+        order: order of runs beside each other, one of `runs.ORDERS`.
+        coverage: coverage factor of the column of uncertainties.
+        status_ok: number of a status that means a good row.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    deviations: bool = False
+    counts_per_turn: float | None = None
+    order: str | None = None
+    coverage: float | None = None
+    status_ok: float | None = None
+
+
+@dataclass(frozen=True)
+class AxisRows:
+    """An axis folder as plain rows.
+
+    Attributes:
+        moves: rows of `moves.csv` by column.
+        readings: rows of `readings.csv` by column.
+        unit: unit of the readings, where the file states one or it follows.
+        assumed: assumptions in words, with the option that overrides them, if any.
+        notes: remarks on rows used and left out.
+        header: entries of `campaign.toml` outside `[axis]`.
+        axis: entries of `[axis]`.
+        lines: the columns as understood, for people.
+        document: the same for programs.
+    """
+
+    moves: list[dict[str, Any]]
+    readings: list[dict[str, Any]]
+    unit: str | None
+    assumed: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    header: Mapping[str, Any] = field(default_factory=dict)
+    axis: Mapping[str, Any] = field(default_factory=dict)
+    lines: tuple[str, ...] = ()
+    document: Mapping[str, Any] = field(default_factory=dict)
+
+
+def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = None) -> AxisRows:
+    """Derive an axis folder from a table.
+
+    Args:
+        table: the foreign table.
+        wishes: what the user states about it.
+        folder_unit: unit of readings that the folder states already.
+
+    Raises:
+        Question: the table can be read in several ways.
+        InputError: a cell is not a value of its field, or the table has no row or lacks a column.
+    """
+    table.require_rows()
+    runs = long_table(table, wishes.columns, wishes.order)
+    known = axis_columns(runs.table, runs.stated, wishes.deviations)
+    table, columns = runs.table, dict(known.columns)
+    assumed = [*runs.remarks, *known.remarks]
+    table = _good_rows(table, columns, wishes, assumed)
+    table = _resting_rows(table, columns, wishes, assumed)
+    cells, notations = FieldCells(table, columns).with_plain("command", "value", "u")
+    assumed += [column.remark for column in notations.values() if column.remark]
+    units = _units(cells, {f: c.unit for f, c in notations.items()}, wishes)
+    commands = cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)
+    values = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
+    stated_u = cells.numbers("u", 0.0, NUMBER_MAX, optional=True, default=0.0)
+    values, stated_u, unit = _in_one_unit(cells, commands, values, stated_u, units, wishes, assumed)
+    time_unit = _stated_unit(cells, "time_s", wishes)
+    times = seconds_of(cells, assumed, time_unit)
+    homings, statuses = homings_of(cells, assumed), cells.text("status")
+    if times is None:
+        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
+    stops = _Stops(cells, commands, values, homings, assumed)
+    readings: list[dict[str, Any]] = []
+    for row, (command, value) in enumerate(zip(commands, values, strict=True)):
+        stops.go(row, command, None if times is None else times[row])
+        if value is not None or statuses[row]:
+            status = status_of(cells, row, {"value": value}, "reading")
+            move = stops.moves[-1]["move"]
+            readings.append({"reading": len(readings), "move": move, "value": value, "u": stated_u[row], "status": status})
+    assumed += left_out(cells, statuses, "reading") + stops.remarks()
+    if "u" not in cells:
+        assumed.append("u: none, so that the scatter of stops covers the readings' own")
+    readings, wrapped = unwrapped(stops.moves, readings, folder_unit or unit or "deg", wishes.counts_per_turn)
+    assumed += wrapped
+    shown = Understood(columns, tuple(dict.fromkeys((*known.unused, *runs.unused))))
+    lines = tuple(table_lines(table, shown, FIELDS, _shown_units(units, unit, cells)))
+    return AxisRows(stops.moves, readings, unit, tuple(assumed), lines=lines, document=table_document(table, shown))
+
+
+# --- rows that count -------------------------------------------------------------------------------------------------
+def _good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
+    """The table with a status that can be one: it leaves some readings, and its 0 and 1 say which is good."""
+    if "status" not in columns:
+        return table
+    name = columns["status"]
+    cells = table.columns[name]
+    if wishes.status_ok is not None:
+        good = ["ok" if NUMBER.fullmatch(cell) and float(cell) == wishes.status_ok else cell and f"status {cell}" for cell in cells]
+        return replace(table, columns={**table.columns, name: tuple(good)})
+    bad = [bool(cell.strip()) and not means(cell, "good") for cell in cells]
+    if "status" in wishes.columns or not any(bad):
+        return table
+    codes = {float(cell) for cell in cells if NUMBER.fullmatch(cell)}
+    if all(bad) or (codes == {0.0} and all(NUMBER.fullmatch(cell) for cell in cells)):
+        assumed.append(f"status: column {escaped(name)} would leave out every reading, so it is none")
+        del columns["status"]
+        return table
+    if codes and sum(bad) > STATUS_SHARE * len(cells):
+        found = f"column {escaped(name)}, which leaves out {sum(bad)} of {len(cells)} rows where 1 means good"
+        known = columns_of(table)
+        candidates = [
+            Candidate(f"{code:g} is good", ("--assume", f"status_ok={code:g}"), {name: known[name].first}) for code in sorted(codes)
+        ]
+        raise ask_column(table, found, [*candidates, choice({"status": ""}, known)], "a status whose good rows are known")
+    return table
+
+
+def _resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
+    """The rows at which the axis rests: by a column that says so, else by the readings of each command."""
+    if wishes.columns.get("moving") == "":
+        return table
+    known = columns_of(table)
+    command, value = (known[columns[name]].values for name in ("command", "value"))
+    if "moving" in columns:
+        name = columns.pop("moving")
+        is_resting = place_of(words_of(name), "resting") is not None
+        says_yes = np.array([means(cell, "good") for cell in table.columns[name]])
+        rests, how = says_yes == is_resting, f"column {escaped(name)}"
+    else:
+        rests, how = at_rest(command, value), "the readings of each command"
+    if rests.all() or not rests.any():
+        return table
+    moved = int((~rests).sum())
+    assumed.append(f"rest: {moved} of {len(rests)} rows left out, in which the axis still moved by {how}; --column moving= keeps them")
+    keep = np.flatnonzero(rests)
+    cells = {name: tuple(column[k] for k in keep) for name, column in table.columns.items()}
+    return replace(table, columns=cells, lines=tuple(table.lines[k] for k in keep))
+
+
+# --- units -----------------------------------------------------------------------------------------------------------
+def _stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:
+    """The unit of a field that the user states.
+
+    Raises:
+        InputError: no unit, or none of its kind.
+    """
+    text = wishes.units.get(name)
+    if text is None:
+        return None
+    unit = parse_unit(text)
+    if unit is None and name == "value":
+        return Unit(text, "own", 1.0)
+    if unit is None:
+        allowed, remedy = "a unit such as mm, um, 1/100 mm, deg, arcsec, turn, s, ms", "name one of them"
+        raise refusal("usage", file=f"--unit {name}={escaped(text)}", found="no unit", allowed=allowed, remedy=remedy)
+    return unit
+
+
+def _units(cells: FieldCells, written: Mapping[str, Unit | None], wishes: Wishes) -> dict[str, Unit | None]:
+    """Units of command, reading and u: stated, of the cells, or of the names.
+
+    Raises:
+        Question: a unit that nobody knows.
+    """
+    units: dict[str, Unit | None] = {}
+    for name in ("command", "value", "u", "time_s"):
+        if name not in cells:
+            continue
+        column = name_of(cells.columns[name])
+        unit = _stated_unit(cells, name, wishes) or written.get(name) or column.unit
+        if unit is None and column.unknown and name != "command":
+            known = columns_of(cells.table)
+            own = [column.unknown] if name == "value" else []
+            usual = {"time_s": ("s", "ms", "min")}.get(name, ("mm", "um", "deg", "arcsec", "counts"))
+            found = f"unit {escaped(column.unknown)} of column {escaped(column.text)}, which is not known"
+            first = {column.text: known[column.text].first}
+            candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}"), first) for text in (*own, *usual)]
+            raise question(
+                file=cells.table.file, line=cells.table.first_line, found=found, allowed="a unit that is known, or one that is stated",
+                candidates=candidates, code="unit",
+            )
+        units[name] = unit
+    return units
+
+
+def _in_one_unit(
+    cells: FieldCells,
+    commands: Sequence[float],
+    values: Sequence[float | None],
+    stated_u: Sequence[float],
+    units: Mapping[str, Unit | None],
+    wishes: Wishes,
+    assumed: list[str],
+) -> tuple[list[float | None], list[float], str | None]:
+    """Readings and their standard u in one unit, with its name."""
+    unit, command_unit = units["value"], units["command"]
+    if not wishes.deviations and len(set(values)) > 2 and list(values) == list(commands):
+        assumed.append("value: equals the command in every row: what was read, or the command again?")
+    if wishes.deviations:
+        factor = _deviation_factor(cells, unit, command_unit)
+        values = [None if d is None else c + factor * d for c, d in zip(commands, values, strict=True)]
+        assumed.append("value: the command plus the deviation, because --deviations says so")
+        given, unit = unit or command_unit, command_unit or unit
+    else:
+        given = unit
+        if unit is not None and unit.per_number != 1.0:
+            values = [None if v is None else unit.per_number * v for v in values]
+            assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
+            unit = unit.whole
+        elif unit is None and (unit := _unit_of_command(commands, values, command_unit)) is not None:
+            given = unit
+            assumed.append(f"unit: {unit.name}, that of the commands, which the readings follow 1 to 1; --unit value=mm says another")
+    if unit is None and _are_counts(cells.text("value")):
+        unit = given = Unit("counts", "count", 1.0)
+        assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
+    return list(values), _standard_u(cells, stated_u, units.get("u"), given, unit, wishes, assumed), unit and unit.name
+
+
+def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit | None) -> float:
+    """Units of the command per unit of a deviation.
+
+    Raises:
+        Question: a unit that is missing.
+        InputError: units of two kinds.
+    """
+    if unit is None and command_unit is None:
+        return 1.0
+    table = cells.table
+    if command_unit is None or unit is None:
+        name, other = ("command", unit) if command_unit is None else ("value", command_unit)
+        found = f"no unit of column {escaped(cells.columns[name])} beside {other.name} of the other"  # type: ignore[union-attr]
+        usual = dict.fromkeys((other.name, *(("mm", "um") if other.kind == "length" else ("deg", "arcsec"))))  # type: ignore[union-attr]
+        candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}")) for text in usual]
+        raise question(file=table.file, line=table.first_line, found=found, allowed="two units", candidates=candidates, code="unit")
+    factor = unit.in_units_of(command_unit)
+    if factor is None:
+        found, allowed = f"deviations in {unit.name} from commands in {command_unit.name}", "deviations in a unit of the commands"
+        remedy = "add a column of positions, or of commands in the unit of the deviations"
+        raise refusal("unit", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy)
+    return factor
+
+
+def _unit_of_command(
+    commands: Sequence[float], values: Sequence[float | None], command_unit: Unit | None
+) -> Unit | None:
+    """The commands' unit of length or angle, where readings without one follow them 1 to 1."""
+    pairs = [(c, v) for c, v in zip(commands, values, strict=True) if v is not None]
+    if command_unit is None or command_unit.kind not in ("length", "angle") or len({c for c, _ in pairs}) < 2:
+        return None
+    slope = np.polyfit(*np.array(pairs).T, 1)[0]
+    return command_unit if abs(slope - 1.0) <= UNIT_SLOPE else None
+
+
+def _are_counts(cells: Sequence[str]) -> bool:
+    numbers = [float(cell) for cell in cells if NUMBER.fullmatch(cell)]
+    return bool(numbers) and all(n.is_integer() for n in numbers) and max(numbers) - min(numbers) > ANGLE_SPAN
+
+
+def _standard_u(
+    cells: FieldCells,
+    stated: Sequence[float],
+    unit: Unit | None,
+    reading: Unit | None,
+    result: Unit | None,
+    wishes: Wishes,
+    assumed: list[str],
+) -> list[float]:
+    """Standard uncertainties in the readings' unit.
+
+    Args:
+        cells: cells of the table.
+        stated: the numbers of the column.
+        unit: the column's unit.
+        reading: unit of the numbers that were read, which is that of u where its column states none.
+        result: unit of the readings written.
+        wishes: what the user states.
+        assumed: sentences, to which what was done is added.
+
+    Raises:
+        Question: the units of u and of the readings are of two kinds, or that of the readings is missing.
+    """
+    if "u" not in cells:
+        return list(stated)
+    name, table = cells.columns["u"], cells.table
+    unit = unit or reading
+    factor = 1.0 if unit is None else None if result is None else unit.in_units_of(result)
+    if factor is None:
+        found = f"u in {unit.name} in column {escaped(name)}, of readings in {result.name if result else 'an unnamed unit'}"  # type: ignore[union-attr]
+        usual = {"length": ("mm", "um"), "angle": ("deg", "arcsec")}.get(unit.kind, ()) if result is None else ()  # type: ignore[union-attr]
+        candidates = [Candidate(f"readings in {text}", ("--unit", f"value={text}")) for text in dict.fromkeys((unit.name, *usual))]  # type: ignore[union-attr]
+        candidates = (candidates if result is None else []) + [Candidate("no column of u", ("--column", "u="))]
+        raise question(file=table.file, line=table.first_line, found=found, allowed="units of one kind", candidates=candidates, code="unit")
+    if factor != 1.0:
+        assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")  # type: ignore[union-attr]
+    coverage = wishes.coverage or name_of(name).coverage
+    if coverage is not None and coverage != 1.0:
+        assumed.append(f"u: column {escaped(name)} is an expanded uncertainty, over {coverage:g}; --assume coverage=NUMBER says another")
+    return [u * factor / (coverage or 1.0) for u in stated]
+
+
+def _shown_units(units: Mapping[str, Unit | None], unit: str | None, cells: FieldCells) -> dict[str, str]:
+    shown = {name: u.name for name, u in units.items() if u is not None}
+    shown |= {"value": unit} if unit else {}
+    return shown | ({"time_s": shown.get("time_s", "s")} if "time_s" in cells else {})
+
+
+# --- moves -----------------------------------------------------------------------------------------------------------
+class _Stops:
+    """Moves of a table, row by row, including those implied by its column of directions.
+
+    Attributes:
+        moves: moves so far.
+    """
+
+    def __init__(
+        self,
+        cells: FieldCells,
+        commands: Sequence[float],
+        values: Sequence[float | None],
+        homings: Sequence[bool],
+        assumed: list[str],
+    ) -> None:
+        self._cells, self._commands, self._values, self._homings = cells, commands, values, homings
+        self._sides = _sides(cells, commands, homings, assumed)
+        self._temperatures = temperatures_of(cells, assumed)
+        self._has_temperatures = "temperature_degC" in cells
+        counts = [name for name in cells.table.columns if name_of(name).has("repeat") and name not in cells.columns.values()]
+        self._counts = cells.table.columns[counts[0]] if counts else None
+        self._reach = OVERSHOOT_SHARE * (max(commands) - min(commands)) or 1.0
+        self._overshoots = self._went_past()
+        self.moves: list[dict[str, Any]] = []
+        self._inserted = self._repeats = 0
+        self._refuse_contrary()
+
+    def _went_past(self) -> bool:
+        """Whether the axis overshot and returned where the side changes at one command.
+
+        The alternative is a second reading at standstill. The axis overshot if, in most such rows, the readings change
+        as they differ between the two sides elsewhere.
+        """
+        values_at: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+        for command, side, value in zip(self._commands, self._sides, self._values, strict=True):
+            if side and value is not None:
+                values_at[command][side].append(value)
+        gaps = [median(by_side[-1]) - median(by_side[1]) for by_side in values_at.values() if len(by_side) == 2]
+        gap = median(gaps) if gaps else 0.0
+        is_overshoot = []
+        for row in range(1, len(self._commands)):
+            value, previous, side = self._values[row], self._values[row - 1], self._sides[row]
+            reversed_here = self._commands[row] == self._commands[row - 1] and side * self._sides[row - 1] < 0
+            if reversed_here and value is not None and previous is not None:
+                is_overshoot.append(abs(value - previous + side * gap) <= abs(value - previous))
+        return 2 * sum(is_overshoot) >= len(is_overshoot)
+
+    def _refuse_contrary(self) -> None:
+        """Refuse directions that are all opposite to the commands."""
+        steps = [b - a for a, b in zip(self._commands, self._commands[1:], strict=False)]
+        moved = [row for row, step in enumerate(steps, start=1) if step and self._sides[row] and not self._homings[row]]
+        contrary = [row for row in moved if self._sides[row] * steps[row - 1] < 0]
+        if len(contrary) >= CONTRARY_MIN and contrary == moved and {self._sides[row] for row in moved} == {-1, 1}:
+            remedy = "exchange the words; or --column approach= takes directions from the order of the commands"
+            raise self._cells.refuse(contrary[0], "approach", "forward where commands rise", remedy)
+
+    def go(self, row: int, command: float, at_s: float | None) -> None:
+        """Add the moves of a row, timed by the table or by the number of the move."""
+        homed = self._homings[row] or not self.moves
+        side = self._sides[row]
+        step = 0.0 if homed else command - self.moves[-1]["command"]
+        if not homed and side and side * step <= 0 and (step or self._turned(row, side)):
+            before = self.moves[-1]
+            ends = (command, before["command"])
+            via = max(ends) + self._reach if side < 0 else min(ends) - self._reach
+            self._add(via, None if at_s is None else 0.5 * (before["time_s"] + at_s), homed=False, assumed=1)
+            self._inserted += 1
+            step = command - via
+        if homed or step:
+            self._add(command, at_s, homed=homed, side=side, temperature=self._temperatures[row])
+        else:
+            self._repeats += 1
+
+    def _turned(self, row: int, side: int) -> bool:
+        """Whether a stop at the previous command was approached again: from the other side, or as a repetition."""
+        if side == self._sides[row - 1] or not self._sides[row - 1]:
+            is_next = self._counts is not None and self._counts[row] != self._counts[row - 1]
+            return is_next and bool(self._sides[row - 1])
+        return self._overshoots
+
+    def _add(
+        self, command: float, at_s: float | None, *, homed: bool, side: int = 0, temperature: float | None = None, assumed: int = 0
+    ) -> None:
+        number = len(self.moves)
+        move = {
+            "move": number,
+            "segment": self.moves[-1]["segment"] + homed if self.moves else 0,
+            "time_s": float(number) if at_s is None else at_s,
+            "command": command,
+            "approach": {1: "forward", -1: "backward", 0: "unknown"}[side] if homed else "",
+        }
+        move |= {"temperature_degC": temperature} if self._has_temperatures else {}
+        self.moves.append(move | ({"assumed": 1} if assumed else {}))
+
+    def remarks(self) -> list[str]:
+        """Assumptions about moves, in words."""
+        sentences = []
+        if n := self._repeats:
+            sentences.append(f"{n} row{'s' * (n > 1)} at the command before: read at that stop again, without a move")
+        if n := self._inserted:
+            name = escaped(self._cells.columns["approach"])
+            sentences.append(
+                f"{n} move{'s' * (n > 1)} added, {self._reach:.6g} past the stop, where column {name} states another "
+                "side than the row before gives; --column approach= takes sides from the order only"
+            )
+        if "approach" not in self._cells:
+            sentences.append("approach: unknown at the beginning of each segment")
+        return sentences
+
+
+def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool], assumed: list[str]) -> list[int]:
+    """Direction of each row: 1 forward, -1 backward, 0 unstated.
+
+    The order of the commands decides the meaning of two unknown words.
+    """
+    texts = cells.text("approach")
+    words = [plain(text).strip() or text.strip() for text in texts]
+    sides = {word: 1 if means(text, "forward") else -1 if means(text, "backward") else 0 for word, text in zip(words, texts, strict=True)}
+    unknown = sorted(word for word, side in sides.items() if not side and word not in ("", "unknown"))
+    if len(unknown) == 2 and len(set(words) - {"", "unknown"}) == 2:
+        signs_of: dict[str, set[int]] = {word: set() for word in unknown}
+        for row in range(1, len(words)):
+            step = commands[row] - commands[row - 1]
+            if step and words[row] in signs_of and not homings[row]:
+                signs_of[words[row]].add(1 if step > 0 else -1)
+        signs = [next(iter(signs_of[word])) if len(signs_of[word]) == 1 else 0 for word in unknown]
+        if signs[0] * signs[1] < 0:
+            sides |= dict(zip(unknown, signs, strict=True))
+            forward, backward = (escaped(unknown[signs.index(side)], 24) for side in (1, -1))
+            assumed.append(f"approach: {forward} is forward and {backward} backward, as the commands rise and fall")
+            unknown = []
+    for row, word in enumerate(words):
+        if word in unknown:
+            allowed = "forward or backward, + or -, fwd or rev, up or down, unknown"
+            remedy = "forward is the direction of rising commands; or leave it out with --column approach="
+            raise cells.refuse(row, "approach", allowed, remedy)
+    return [sides[word] for word in words]
+
+
+# --- whole turns -----------------------------------------------------------------------------------------------------
+def unwrapped(
+    moves: Sequence[Mapping[str, Any]], readings: list[dict[str, Any]], unit: str, counts_per_turn: float | None = None
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """The readings with whole turns added where an encoder or autocollimator wraps, and a sentence on it.
+
+    Args:
+        moves: rows of moves.
+        readings: rows of readings.
+        unit: unit of the readings; lengths are unchanged unless the readings count to a power of two.
+        counts_per_turn: period of the wrapping, in the readings' unit; 0: no wrapping.
+
+    Raises:
+        InputError: readings jump repeatedly by a number that is not stated as their period.
+    """
+    if counts_per_turn == 0:
+        return readings, []
+    usable = [k for k, reading in enumerate(readings) if reading["status"] == "ok" and reading["value"] is not None]
+    command = np.array([moves[readings[k]["move"]]["command"] for k in usable])
+    value = np.array([readings[k]["value"] for k in usable], dtype=float)
+    of_angle = parse_unit(unit)
+    turn = counts_per_turn or (360.0 / of_angle.scale if of_angle and of_angle.kind == "angle" else None) or _counts_of(command, value)
+    jumps = turn_jumps(command, value, turn) if turn is not None else {}
+    # An outlier also jumps, and back, but not by whole turns.
+    if turn is None or not jumps or any(abs(jump - round(jump)) > TURN_TOLERANCE for jump in jumps.values()):
+        return readings, []
+    rows, turns = list(readings), 0
+    for row, k in enumerate(usable):
+        turns -= round(jumps.get(row, 0.0))
+        rows[k] = {**rows[k], "value": float(value[row]) + turn * turns}
+    times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
+    sentence = f"value: jumps by whole turns {times}, which are added: {turn:g} {unit} each; "
+    return rows, [sentence + "--counts-per-turn says another"]
+
+
+def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
+    """Period of wrapped whole numbers: the power of two that bounds them all, if they jump by it.
+
+    Raises:
+        InputError: the readings jump by another number.
+    """
+    if len(value) < 3 or np.any(value != np.round(value)):
+        return None
+    span = float(np.ptp(value)) + 1.0
+    turn = next((2.0**bits for bits in BITS if 2.0**bits >= span), None)
+    jumps = turn_jumps(command, value, span)
+    if turn is None or not jumps:
+        return None
+    typical = span * float(np.median(np.abs(list(jumps.values()))))
+    if any(abs(abs(jump) * span / typical - 1.0) > TURN_TOLERANCE for jump in jumps.values()):
+        return None
+    rise, step = np.diff(value), np.diff(command)
+    residuals = np.delete(rise - np.median(rise[step != 0] / step[step != 0]) * step, [row - 1 for row in jumps])
+    if abs(typical - turn) <= JUMP_SDS * float(np.median(np.abs(residuals))) + 2.0:
+        return turn
+    found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
+    remedy = "state where the encoder restarts, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
+    raise refusal("wrapped", file="value", found=found, allowed=allowed, remedy=remedy)
+
+

@@ -1,0 +1,231 @@
+"""Tables of an axis with a column for each run, turned into tables with a row for each reading."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean, stdev
+
+from tvsbayes.errors import Candidate, escaped, question, refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.table import ForeignTable, table_of
+from tvsbayes.importing.words import Name, listed, means, name_of
+
+FORWARD, ALTERNATE, REPEATS = "forward", "alternate", "repeats"
+ORDERS = (FORWARD, ALTERNATE, REPEATS)
+"""Values of --runs: all runs rise; every second run falls; readings of one stop."""
+AGREEMENT_ERRORS = 3.0
+"""Standard errors of the mean difference of two groups of runs within which they agree."""
+POSITIONS_MIN = 3
+_ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
+_NEVER = ("aside", "temperature", "time", "index", "several", "moving", "resting", "status", "approach")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A column of readings: its number, and its side, 1 forward, -1 backward, 0 unnamed."""
+
+    name: Name
+    number: int
+    side: int
+
+
+@dataclass(frozen=True)
+class LongTable:
+    """A table with a row for each reading, its columns as stated or known by field, and remarks in words."""
+
+    table: ForeignTable
+    stated: Mapping[str, str]
+    remarks: list[str]
+    unused: tuple[str, ...] = ()
+
+
+def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None = None) -> LongTable:
+    """A table with a column for each run as one with a row for each reading; other tables are unchanged.
+
+    Forward runs have rising, backward runs falling commands, in the order of their numbers.
+
+    Args:
+        table: the foreign table.
+        stated: column by field, as the user states it; with `value` or `approach` stated, the table is not converted.
+        order: one of `ORDERS`, for runs without words of direction.
+
+    Raises:
+        Question: the order of runs that differ, or which column has the commands.
+    """
+    runs = _runs(table)
+    if not runs or stated.get("value") or stated.get("approach"):
+        return LongTable(table, stated, [])
+    command = stated.get("command") or _command(table, runs)
+    remarks, sides = [], [run.side for run in runs]
+    names = [run.name.text for run in runs]
+    if not any(sides) and not _row_sides(table):
+        order = order or _order(table, runs)
+        sides = [1 if order != ALTERNATE or k % 2 == 0 else -1 for k in range(len(runs))]
+    positions = [float(cell) for cell in table.columns[command]]
+    rising = sorted(range(len(positions)), key=positions.__getitem__)
+    side_of_row = _row_sides(table)
+    if side_of_row and not any(run.side for run in runs):
+        rows = [
+            (row, k)
+            for k in range(len(runs))
+            for side in (1, -1)
+            for row in (rising if side > 0 else rising[::-1])
+            if side_of_row[row] == side
+        ]
+        remarks.append(f"runs: {len(runs)} columns ({listed(names)}), each forward and then backward as its rows say")
+    elif order == REPEATS:
+        rows = [(row, k) for row in range(len(positions)) for k in range(len(runs))]
+        remarks.append(f"columns {listed(names)}: readings of one stop each; --runs says another")
+    else:
+        rows = [(row, k) for k in range(len(runs)) for row in (rising if sides[k] > 0 else rising[::-1])]
+        words = "forward runs rise, backward runs fall" if any(run.side for run in runs) else f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
+        remarks.append(f"runs: {len(runs)} columns ({listed(names)}), read one after the other; {words}")
+    unit = next((run.name.unit for run in runs if run.name.unit), None)
+    factors = [run.name.unit.in_units_of(unit) if run.name.unit and unit else 1.0 for run in runs]
+    if None in factors or (unit and any(run.name.unit is None for run in runs)):
+        found = f"runs in several units, or some without ({listed(names)})"
+        remedy = "give all runs in one unit"
+        raise refusal("csv", file=table.file, line=table.first_line, found=found, allowed="one unit", remedy=remedy)
+    kind = "deviation" if any(run.name.has("deviation") for run in runs) else "reading"
+    bracket = f" ({unit.name})" if unit and unit.per_number == 1.0 else f" ({unit.per_number:g} {unit.name})" if unit else ""
+    unknown = next((run.name.unknown for run in runs if run.name.unknown), "")
+    reading = f"{kind}{bracket or (f' ({unknown})' if unknown else '')}"
+    columns: dict[str, Sequence[object]] = {command: [table.columns[command][row] for row, _ in rows]}
+    if order != REPEATS:
+        columns["direction"] = [
+            "forward" if (side_of_row[row] if side_of_row else sides[k]) > 0 else "backward" for row, k in rows
+        ]
+        columns["cycle"] = [str(runs[k].number) for _, k in rows]
+    columns[reading] = [_scaled(table.columns[names[k]][row], factors[k]) for row, k in rows]
+    rest = [name for name in table.columns if name not in (*names, command)]
+    spread = [name for name in rest if name_of(name).has("u", "expanded")]
+    if len(spread) == 1:
+        columns[spread[0]] = [table.columns[spread[0]][row] for row, _ in rows]
+    by_rows = table_of(table.file, table.kind, columns, [table.lines[row] for row, _ in rows])
+    by_rows = replace(by_rows, first_line=table.first_line)
+    unused = tuple(name for name in rest if spread != [name])
+    return LongTable(by_rows, {**stated, "command": command}, remarks, unused)
+
+
+def _row_sides(table: ForeignTable) -> list[int]:
+    """The side of each row where a column of words states one for all, else []."""
+    for text, cells in table.columns.items():
+        if name_of(text).has("approach") and all(means(cell, "forward") or means(cell, "backward") for cell in cells):
+            return [1 if means(cell, "forward") else -1 for cell in cells]
+    return []
+
+
+def _scaled(cell: str, factor: float | None) -> str:
+    return cell if factor == 1.0 or not NUMBER.fullmatch(cell) else repr((factor or 1.0) * float(cell))
+
+
+def _numeric(cells: Sequence[str]) -> bool:
+    filled = [cell for cell in cells if cell]
+    return bool(filled) and all(map(NUMBER.fullmatch, filled))
+
+
+def _runs(table: ForeignTable) -> list[Run]:
+    """Columns with one run each, in order: those with words of direction, else those alike but for a number."""
+    sided: list[Run] = []
+    alike: defaultdict[tuple[str, ...], list[Run]] = defaultdict(list)
+    for text, cells in table.columns.items():
+        name = name_of(text.translate(_ARROWS))
+        name = replace(name, text=text)
+        if not _numeric(cells) or name.has(*_NEVER) and not name.has("run") or name.has("u", "expanded"):
+            continue
+        signed = re.match(r"\s*([+-])\s*\d+\b", text)
+        side = (1 if signed[1] == "+" else -1) if signed else name.has("forward") - name.has("backward")
+        both = name.has("forward") and name.has("backward")
+        if name.has("several") and not side:
+            continue
+        if side and not both and len(name.numbers) < 2:
+            sided.append(Run(name, name.numbers[0] if name.numbers else 1, side))
+        elif not side and name.numbers:
+            skeleton = tuple(word for word in name.words if not word.isdigit())
+            alike[skeleton].append(Run(name, name.numbers[-1], 0))
+    if len(sided) > 1 and len({(run.number, run.side) for run in sided}) == len(sided):
+        return sorted(sided, key=lambda run: (run.number, -run.side))
+    groups = [runs for runs in alike.values() if len(runs) > 1 and len({run.number for run in runs}) == len(runs)]
+    groups = [runs for runs in groups if _are_runs(runs, table)]
+    return sorted(groups[0], key=lambda run: run.number) if len(groups) == 1 else []
+
+
+def _are_runs(runs: Sequence[Run], table: ForeignTable) -> bool:
+    """Whether columns alike but for a number are runs: by a word, by no word at all, or as readings counted from 1."""
+    name = runs[0].name
+    words = [word for word in name.words if not word.isdigit()]
+    counted = sorted(run.number for run in runs) in ([*range(1, len(runs) + 1)], [*range(len(runs))])
+    rest = [text for text in table.columns if text not in {run.name.text for run in runs}]
+    others = any(name_of(text).has("value") and _numeric(table.columns[text]) for text in rest)
+    if name.has("command") or not counted:
+        return False
+    return name.has("run") or not words or (not others and name.has("value", "position", "deviation"))
+
+
+def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
+    """The column of the commands beside the runs.
+
+    Raises:
+        Question: none or several could be it.
+    """
+    names = {run.name.text for run in runs}
+    rest = [name_of(text) for text, cells in table.columns.items() if text not in names and _numeric(cells)]
+    rest = [name for name in rest if all(table.columns[name.text])]
+    for kind in ("command", "position", ""):
+        fit = [name for name in rest if (name.has(kind) if kind else not name.has("aside", "temperature", "time", "index", "u", "statistic"))]
+        fit = [name for name in fit if not (kind and name.has("aside", "u", "temperature", "time"))]
+        if len(fit) == 1:
+            return fit[0].text
+        if fit:
+            rest = fit
+            break
+    found = f"runs ({listed(run.name.text for run in runs)}) and no column that is surely their position"
+    allowed = "one column of numbers"
+    if not rest:
+        remedy = "add the commanded positions as a column"
+        raise refusal("missing-column", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy)
+    candidates = [
+        Candidate(f"commands in {escaped(name.text)}", ("--column", f"command={name.text}"), {name.text: table.columns[name.text][:3]})
+        for name in rest
+    ]
+    raise question(file=table.file, line=table.first_line, found=found, allowed=allowed, candidates=candidates, code="missing-column")
+
+
+def _order(table: ForeignTable, runs: Sequence[Run]) -> str:
+    """`FORWARD` where odd and even, first and second runs agree within scatter.
+
+    Raises:
+        Question: they differ, or the columns may be repeated readings of one stop.
+    """
+    names = [run.name.text for run in runs]
+    values = [[float(cell) if cell else math.nan for cell in table.columns[name]] for name in names]
+    is_run = runs[0].name.has("run") or not any(not word.isdigit() for word in runs[0].name.words)
+    is_reading = not is_run and runs[0].name.has("value")
+    half = len(runs) // 2
+    if not is_reading and _agree(values[::2], values[1::2]) and _agree(values[:half], values[half:]):
+        return FORWARD
+    found = f"columns {listed(names)} without words of direction"
+    found += "" if is_reading else ", whose readings differ by more than their scatter"
+    candidates = [
+        Candidate("every run with rising commands", ("--runs", FORWARD)),
+        Candidate("the first run rising, the second falling, and so on", ("--runs", ALTERNATE)),
+        Candidate("repeated readings of each stop", ("--runs", REPEATS)),
+    ]
+    raise question(file=table.file, line=table.first_line, found=found, allowed="an order that is known", candidates=candidates, code="runs")
+
+
+def _agree(some: Sequence[Sequence[float]], others: Sequence[Sequence[float]]) -> bool:
+    """Whether the means of two groups of runs agree over the positions, within the scatter of one reading."""
+    places = [k for k in range(len(some[0])) if not any(math.isnan(run[k]) for run in (*some, *others))]
+    gaps = [fmean(run[k] for run in some) - fmean(run[k] for run in others) for k in places]
+    if len(gaps) < POSITIONS_MIN:
+        return False
+    within = [run[k] - fmean(r[k] for r in group) for group in (some, others) for run in group for k in places]
+    freedom = len(places) * (len(some) + len(others) - 2)
+    scatter = math.sqrt(sum(e * e for e in within) / freedom) if freedom else stdev(gaps) / math.sqrt(2.0)
+    error = scatter * math.sqrt((1 / len(some) + 1 / len(others)) / len(places))
+    return abs(fmean(gaps)) <= max(scatter, AGREEMENT_ERRORS * error)
