@@ -1,0 +1,530 @@
+"""Guide logs of PHD2 and KStars, and tables of time and periodic error: a mount's RA axis while it tracks a star.
+
+A run lies between "Guiding Begins" and "Guiding Ends". Distances are pixels on the sky, durations ms, times s since the
+beginning of the run. A pulse acts after its frame: the star's uncorrected motion is the raw distance plus the pulses of
+all previous frames. Where the star is ahead of the mount, the axis lags: its angle is the drive's less the motion.
+Angles of the axis, arcsec: those on the sky over cos(declination).
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
+from typing import Any, NamedTuple
+
+from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.axis import AxisRows
+from tvsbayes.importing.columns import columns_of
+from tvsbayes.importing.table import ForeignTable
+from tvsbayes.importing.words import place_of
+
+SIDEREAL_ARCSEC_PER_S = 1296000.0 / 86164.0905
+"""A turn in a sidereal day (Explanatory Supplement to the Astronomical Almanac, 3rd edition, table 15.3)."""
+PULSE_MAX = 1.2
+"""Largest rate of a pulse, sidereal rates: guide speeds of mounts are at most one."""
+RATES_AGREE = 0.25
+"""Largest relative difference of two statements of the rate of a pulse."""
+RATES_EQUAL = 0.05
+"""Largest relative difference of rates between which nothing needs to decide."""
+BEGINS, ENDS = "Guiding Begins at ", "Guiding Ends"
+NEEDED = ("Time", "RARawDistance", "RADuration", "RADirection")
+DECLINATION_MAX_DEG = 85.0
+"""Largest declination: above it 1 / cos(declination) magnifies the seeing beyond the errors of the axis."""
+PRIORS = {"per_command": {"value": 1.0, "u": 1e-3}, "transmission_error": {"value": 0.0, "u": 10.0}}
+"""Priors of `[axis]`, arcsec: refraction and polar alignment change the apparent rate by parts in 1000; periodic errors
+of worms are some arcsec to some tens of arcsec."""
+ASSUMED = (
+    "a pulse acts after its frame: motion = raw distance + W - E pulses of the frames before",
+    "sign: a star ahead of the mount, which W pulses answer, is an axis that lags: angle = drive - motion",
+)
+ASSUMPTIONS = {
+    "declination_deg": "declination of the star",
+    "pulse_arcsec_per_s": "what a pulse turns the axis by, arcsec/s",
+    "pixel_arcsec": "scale of the guide camera, arcsec per pixel",
+    "drive_arcsec_per_s": "rate of the drive: sidereal",
+    "pe_sign": "1 where a positive periodic error is an axis ahead of its drive, else -1",
+}
+"""Values that `--assume` may state, with their meaning."""
+_NUMBER = r"(-?\d+(?:\.\d+)?)"
+_HEADER = {
+    "pixel_arcsec": re.compile(rf"^Pixel scale = {_NUMBER} arc-sec/px"),
+    "exposure_ms": re.compile(rf"^Exposure = {_NUMBER} ms"),
+    "x_rate": re.compile(rf"\bxRate = {_NUMBER}"),
+    "at_equator": re.compile(rf"^Norm rates RA = {_NUMBER}"),
+    "guide_speed": re.compile(rf"\bRA Guide Speed = {_NUMBER} a-s/s"),
+    "calibration_deg": re.compile(rf"\bCal Dec = {_NUMBER}"),
+    "declination_deg": re.compile(rf"^(?:RA = [^,]*, *)?Dec = {_NUMBER} deg"),
+    "pulse_max_ms": re.compile(rf"\bMax RA duration = {_NUMBER}"),
+}
+_CALIBRATED = re.compile(rf"Calibration guide speeds: RA = {_NUMBER} a-s/s")
+_MOUNT, _PIER = re.compile(r"^Mount = ([^,]*)"), re.compile(r"\bPier side = (\w+)")
+_WORM = re.compile(r"^!WormPeriod\s*=\s*(\d+(?:\.\d+)?)", re.MULTILINE)
+
+
+class GuideFrame(NamedTuple):
+    """A frame with a star: line of the log, time, raw distance, pulse with W positive, whether the guider settles."""
+
+    line: int
+    time_s: float
+    raw_px: float
+    pulse_ms: float
+    settling: bool
+
+
+@dataclass
+class GuideRun:
+    """A run of a log.
+
+    Attributes:
+        number: number of the run, from 1.
+        line: first line of the run.
+        begins: local time as written, "" if missing.
+        mount: driver of the mount as logged.
+        pier: side of the pier.
+        header: numbers of the header by the names of `_HEADER`.
+        frames: those with a star.
+        dropped_s: times of frames without a star.
+        breaks: indices of `frames` with a new zero: after dithers, new lock positions, settling, pauses.
+        counts: numbers of events by name.
+        ended: whether the log contains the end of the run.
+        program: that wrote the log, "PHD2" or "KStars".
+    """
+
+    number: int
+    line: int
+    begins: str
+    mount: str = "unknown"
+    pier: str = "unknown"
+    header: dict[str, float] = field(default_factory=dict)
+    frames: list[GuideFrame] = field(default_factory=list)
+    dropped_s: list[float] = field(default_factory=list)
+    breaks: set[int] = field(default_factory=set)
+    counts: Counter[str] = field(default_factory=Counter)
+    ended: bool = False
+    program: str = "PHD2"
+
+    @property
+    def minutes(self) -> float:
+        """Time from the first frame to the last."""
+        return (self.frames[-1].time_s - self.frames[0].time_s) / 60.0 if self.frames else 0.0
+
+    @property
+    def settling(self) -> int:
+        """Number of frames while the mount settled."""
+        return sum(frame.settling for frame in self.frames)
+
+
+def is_guide_log(text: str) -> bool:
+    """Whether a text is a guide log of PHD2 or KStars."""
+    return BEGINS in text or text.startswith(("PHD2 version", "KStars version"))
+
+
+def read_runs(text: str, file: str) -> list[GuideRun]:
+    """The runs of a log, without runs that have no frame.
+
+    Raises:
+        InputError: no run, or a table of frames without a required column.
+    """
+    runs: list[GuideRun] = []
+    run: GuideRun | None = None
+    columns: list[str] | None = None
+    settling, calibrating, calibration_steps = False, False, 0
+    program, calibration = ("KStars" if text.lstrip("\ufeff").startswith("KStars") else "PHD2"), dict[str, float]()
+    for number, text_line in enumerate(text.splitlines(), start=1):
+        line = text_line.strip()
+        if line.startswith(BEGINS):
+            run = GuideRun(len(runs) + 1, number, line[len(BEGINS) :], header=dict(calibration))
+            columns, settling, calibrating = None, False, False
+            run.counts["calibration step"], calibration_steps = calibration_steps, 0
+            runs.append(run)
+        elif line.startswith("Calibration Begins at"):
+            calibrating, run = True, None
+        elif calibrating:
+            if match := _CALIBRATED.search(line):
+                calibration["calibrated_speed"] = float(match[1])
+            calibration_steps += line.startswith(("West,", "East,", "North,", "South,", "Backlash,"))
+        elif run is None or not line:
+            continue
+        elif line.startswith(ENDS):
+            run.ended, run = True, None
+        elif line.startswith("INFO:"):
+            settling = _event(run, line, settling)
+        elif line.startswith("Frame,"):
+            columns = line.split(",")
+            if missing := [name for name in NEEDED if name not in columns]:
+                found, remedy = f"no column {', '.join(missing)}", "export the log of the guider unchanged"
+                raise refusal("csv", file=file, line=number, found=found, allowed=", ".join(NEEDED), remedy=remedy)
+        elif columns is None:
+            _header(run, line)
+        else:
+            _frame(run, number, line, columns, settling)
+    runs_kept = [run for run in runs if run.frames]
+    for k, run in enumerate(runs_kept, start=1):
+        run.number, run.program = k, program
+    if not runs_kept:
+        found, remedy = "no run with frames", "give a log that holds guiding, not only calibration"
+        raise refusal("empty", file=file, found=found, allowed=f'frames after "{BEGINS.strip()}"', remedy=remedy)
+    return runs_kept
+
+
+def _header(run: GuideRun, line: str) -> None:
+    for name, pattern in _HEADER.items():
+        if (match := pattern.search(line)) and name not in run.header:
+            run.header[name] = float(match[1])
+    if match := _MOUNT.search(line):
+        run.mount = match[1].strip()
+    if match := _PIER.search(line):
+        run.pier = match[1]
+
+
+def _event(run: GuideRun, line: str, settling: bool) -> bool:
+    """Apply an INFO line to the run; return whether the mount settles from here on."""
+    if "Settling started" in line:
+        run.breaks.add(len(run.frames))
+        return True
+    if "Settling complete" in line or "Settling failed" in line:
+        run.breaks.add(len(run.frames))
+        return False
+    if "DITHER by" in line or "SET LOCK POSITION" in line or "LOCK SHIFT" in line:
+        run.counts["dither"] += "DITHER by" in line
+        run.breaks.add(len(run.frames))
+    elif "received RESUME" in line or "Resumed" in line:
+        run.counts["pause"] += 1
+        run.breaks.add(len(run.frames))
+    elif "Guiding parameter change" in line and " RA " in line:
+        run.counts["change of the RA algorithm"] += 1
+    return settling
+
+
+def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settling: bool) -> None:
+    """Add a row of the table to the run; a truncated row, or one of another device, is only counted."""
+    try:
+        cells = dict(zip(columns, next(csv.reader([line])), strict=False))
+        time_s, device = float(cells["Time"]), cells.get("mount", "Mount")
+        last = max((run.frames[-1].time_s if run.frames else 0.0, run.dropped_s[-1] if run.dropped_s else 0.0))
+        if time_s < last or not math.isfinite(time_s):
+            run.counts["damaged row"] += 1
+        elif device == "DROP" or cells["RARawDistance"] == "":
+            run.dropped_s.append(time_s)
+        elif device != "Mount":
+            run.counts[f"rows of {escaped(device, 12)}"] += 1
+        else:
+            raw, pulse_ms = float(cells["RARawDistance"]), float(cells["RADuration"] or 0)
+            sign = {"W": 1.0, "E": -1.0, "": 0.0}[cells["RADirection"].strip()[:1].upper()]
+            run.frames.append(GuideFrame(number, time_s, raw, sign * pulse_ms, settling))
+            run.counts["frame with a saturated star"] += cells.get("ErrorCode") == "1"
+    except (KeyError, ValueError, csv.Error, StopIteration):
+        run.counts["damaged row"] += 1
+
+
+def run_rows(runs: Sequence[GuideRun]) -> list[dict[str, object]]:
+    """A row for each run, for the printed list of a log with several runs."""
+    return [
+        {
+            "run": run.number,
+            "begins": run.begins,
+            "minutes": round(run.minutes, 1),
+            "frames": len(run.frames),
+            "dropped": len(run.dropped_s),
+            "settling": run.settling,
+            "dithers": run.counts["dither"],
+            "declination_deg": run.header.get("declination_deg"),
+            "pier": run.pier,
+            "mount": run.mount,
+        }
+        for run in runs
+    ]
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Conversion of a log to angles of the axis, and its sources in words."""
+
+    pixel_arcsec: float
+    cos_declination: float
+    pulse_arcsec_per_s: float
+    drive_arcsec_per_s: float
+    assumed: tuple[str, ...]
+
+
+def _scale(run: GuideRun, runs: Sequence[GuideRun], stated: Mapping[str, float], file: str) -> _Scale:
+    """The conversion of a run.
+
+    Raises:
+        Question: nothing decides the rate of the pulses, or statements of it disagree.
+        InputError: a number that the log does not state, with the option that states it.
+    """
+    known = {**run.header, **stated}
+    for name, words in (("pixel_arcsec", "the pixel scale"), ("declination_deg", "the declination")):
+        if name not in known:
+            found, remedy = f"run {run.number} does not state {words}", f"state it: --assume {name}=NUMBER"
+            raise refusal("missing-value", file=file, line=run.line, found=found, allowed="a number", remedy=remedy)
+    pixel, declination = known["pixel_arcsec"], known["declination_deg"]
+    if not abs(declination) <= DECLINATION_MAX_DEG:
+        found, allowed = f"a declination of {declination:g} deg", f"at most {DECLINATION_MAX_DEG:g} deg"
+        remedy = "take a run on a star nearer to the equator; or is another one right: --assume declination_deg=NUMBER"
+        raise refusal("range", file=file, line=run.line, found=found, allowed=allowed, remedy=remedy)
+    if not pixel > 0:
+        raise InputError("usage", "--assume pixel_arcsec: allowed: above 0", remedy="state arcsec per pixel")
+    cosine = math.cos(math.radians(declination))
+    assumed = [f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg="]
+    assumed.append(f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=")
+    if "pulse_arcsec_per_s" in stated:
+        pulse = stated["pulse_arcsec_per_s"]
+        assumed.append(f"pulses turn the axis by {pulse:g} arcsec/s, as stated")
+    else:
+        pulse, text = _logged_pulse(run, runs, pixel, declination, file)
+        assumed.append(f"{text}; --assume pulse_arcsec_per_s=")
+    drive = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
+    assumed.append(f"the drive turns at {drive:.6g} arcsec/s; --assume drive_arcsec_per_s=")
+    return _Scale(pixel, cosine, pulse, drive, tuple(assumed))
+
+
+def _hypotheses(run: GuideRun, pixel: float, declination_deg: float) -> dict[str, float]:
+    """Rates of the axis during a pulse, arcsec/s, by what the program's xRate may be.
+
+    PHD2: px/s at the declination of the run or of the calibration. KStars: arcsec/s on the sky at the declination of
+    the run (Ekos, internalguider: 1000 / raPulseMillisecondsPerArcsecond); before, px/s.
+    """
+    if "x_rate" not in run.header:
+        return {}
+    cosine, rate = math.cos(math.radians(declination_deg)), run.header["x_rate"]
+    if run.program == "KStars":
+        return {"xRate in arcsec/s on the sky": rate / cosine, "xRate in px/s": rate * pixel / cosine}
+    rates = {"xRate in px/s at the run's declination": rate * pixel / cosine}
+    calibration = run.header.get("calibration_deg")
+    if calibration is not None and abs(calibration) < 90:
+        name = f"xRate in px/s at the calibration's declination of {calibration:g} deg"
+        rates[name] = rate * pixel / math.cos(math.radians(calibration))
+    return rates
+
+
+def _logged_pulse(
+    run: GuideRun, runs: Sequence[GuideRun], pixel: float, declination_deg: float, file: str
+) -> tuple[float, str]:
+    """Rate of the axis during a pulse, arcsec/s, with its source in words: the hypothesis that other statements bear out.
+
+    Raises:
+        Question: hypotheses that differ, between which nothing decides; statements that disagree; a rate above sidereal.
+    """
+    rates = _hypotheses(run, pixel, declination_deg)
+    header, cosine = run.header, math.cos(math.radians(declination_deg))
+    if not rates:
+        found, remedy = f"run {run.number} does not state xRate", "state it: --assume pulse_arcsec_per_s=NUMBER"
+        raise refusal("missing-value", file=file, line=run.line, found=found, allowed="a number", remedy=remedy)
+    evidence = {
+        "Norm rates": header.get("at_equator"),
+        "the mount's guide speed": header.get("guide_speed"),
+        "the calibration's guide speed": header["calibrated_speed"] / cosine if "calibrated_speed" in header else None,
+    }
+    evidence = {name: rate for name, rate in evidence.items() if rate}
+    others = _other_rates(run, runs)
+    if others is not None:
+        evidence["the other runs"] = others
+    deciding = next(iter(evidence.values()), None)
+    near = min(rates, key=lambda name: abs(math.log(rates[name] / deciding))) if deciding else next(iter(rates))
+    pulse = rates[near]
+    text = f"pulses turn the axis by {pulse:.4g} arcsec/s: {near}"
+    text += "".join(f"; {name}: {rate:.4g}, {100 * (rate / pulse - 1):+.0f} %" for name, rate in evidence.items())
+    against = [name for name, rate in evidence.items() if abs(rate / pulse - 1) > RATES_AGREE]
+    undecided = not evidence and max(rates.values()) / min(rates.values()) - 1 > RATES_EQUAL
+    if against or undecided or pulse > PULSE_MAX * SIDEREAL_ARCSEC_PER_S:
+        says = {**rates, **evidence}
+        allowed = f"statements that agree to {RATES_AGREE:.0%}, at most {PULSE_MAX:g} x sidereal"
+        candidates = [
+            Candidate(name, ("--assume", f"pulse_arcsec_per_s={rate:.5g}"))
+            for name, rate in says.items()
+            if rate <= PULSE_MAX * SIDEREAL_ARCSEC_PER_S
+        ]
+        found = f"rates of a pulse of run {run.number}: " + ", ".join(f"{rate:.4g} arcsec/s ({name})" for name, rate in says.items())
+        raise question(file=file, line=run.line, found=found, allowed=allowed, candidates=candidates, code="pulse-rate")
+    return pulse, text
+
+
+def _other_rates(run: GuideRun, runs: Sequence[GuideRun]) -> float | None:
+    """The rate that the runs of a log state alike, arcsec/s: one hypothesis is the same at all declinations."""
+    rows = []
+    for other in runs:
+        if {"pixel_arcsec", "declination_deg", "x_rate"} <= other.header.keys() and abs(other.header["declination_deg"]) < 85:
+            rates = [*_hypotheses(other, other.header["pixel_arcsec"], other.header["declination_deg"]).values()]
+            if len(rates) == 2:
+                rows.append(rates)
+    if len(rows) < 2 or run.program == "KStars":
+        return None
+    spreads = [max(column) / min(column) - 1 for column in zip(*rows, strict=True)]
+    best = min((0, 1), key=lambda k: spreads[k])
+    if spreads[1 - best] < RATES_EQUAL or spreads[best] > 0.5 * spreads[1 - best]:
+        return None
+    return median(row[best] for row in rows)
+
+
+def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapping[str, float]) -> AxisRows:
+    """A run as moves and readings: the drive's angle less the star's uncorrected motion, both in arcsec of the axis.
+
+    Args:
+        run: a run of the log.
+        runs: all runs of the log.
+        file: its name.
+        stated: numbers by the names of `ASSUMPTIONS`, which override those of the log.
+
+    Raises:
+        InputError: a number that neither `stated` nor the log contains, or fewer than three usable frames.
+    """
+    scale = _scale(run, runs, stated, file)
+    moves: list[dict[str, Any]] = []
+    frames: list[tuple[float, int, float | None, str]] = []
+    pulse_sum, needs_move = 0.0, True
+    for k, (_, time_s, raw, pulse_ms, settling) in enumerate(run.frames):
+        needs_move = needs_move or k in run.breaks
+        status, value = "settling" if settling else "ok", None
+        if not settling:
+            if needs_move:
+                moves.append(_drive_move(len(moves), time_s, scale.drive_arcsec_per_s))
+                pulse_sum, needs_move = 0.0, False
+            motion = raw * scale.pixel_arcsec / scale.cos_declination + pulse_sum
+            value = scale.drive_arcsec_per_s * time_s - motion
+        frames.append((time_s, len(moves) - 1, value, status))
+        pulse_sum += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
+    used = sum(value is not None for _, _, value, _ in frames)
+    if used < 3:
+        remedy = "name another run with --run"
+        raise refusal("empty", file=file, line=run.line, found=f"{used} frames", allowed="three or more", remedy=remedy)
+    # Frames before the first stretch belong to no move.
+    frames += [(time_s, -1, None, "dropped") for time_s in run.dropped_s]
+    starts_s = [move["time_s"] for move in moves]
+    rows = [
+        (time_s, max(0, sum(start_s <= time_s for start_s in starts_s) - 1) if move < 0 else move, value, status)
+        for time_s, move, value, status in sorted(frames, key=lambda row: row[0])
+        if time_s >= starts_s[0]
+    ]
+    readings = [
+        {"reading": k, "move": move, "value": None if v is None else round(v, 4), "u": 0.0, "status": status, "time_s": t}
+        for k, (t, move, v, status) in enumerate(rows)
+    ]
+    axis = {**PRIORS, **_search_of([time_s for time_s, *_ in rows])}
+    header = {"rate": scale.drive_arcsec_per_s, **_header_of(run, file)}
+    notes = (_frames_text(run, used, len(moves)), *_remarks(run))
+    return AxisRows(moves, readings, "arcsec", (*scale.assumed, *ASSUMED), notes, header, axis)
+
+
+def _drive_move(number: int, time_s: float, rate: float) -> dict[str, Any]:
+    return {"move": number, "segment": number, "time_s": time_s, "command": round(rate * time_s, 6), "approach": "forward"}
+
+
+def _search_of(times_s: Sequence[float]) -> dict[str, Any]:
+    """The range of an unknown period, s: from a minute to a third of the run; nothing for a short run."""
+    span_s = times_s[-1] - times_s[0]
+    return {"periods_in": "seconds", "period_between": [60.0, round(span_s / 3.0, 0)]} if span_s > 360.0 else {}
+
+
+# --- tables of time and periodic error -------------------------------------------------------------------------------
+def is_periodic_error(text: str, table: ForeignTable) -> bool:
+    """Whether a table holds times and a periodic error, and nothing that is commanded."""
+    if _WORM.search(text):
+        return True
+    columns = columns_of(table).values()
+    has_error = any(place_of(column.name.words, "periodic-error") is not None and column.numeric for column in columns)
+    return has_error and not any(column.name.has("command") for column in columns)
+
+
+def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, float]) -> AxisRows:
+    """Times and periodic errors of a drive at constant rate as readings in motion, arcsec.
+
+    Args:
+        table: columns of times and errors; of EQMOD's recorder the first and the last of three.
+        text: text of the file, for the period of the worm that it may state.
+        stated: numbers by the names of `ASSUMPTIONS`.
+
+    Raises:
+        InputError: no times or errors, or fewer than three of them.
+    """
+    known = columns_of(table)
+    worm = _WORM.search(text)
+    errors = [n for n, c in known.items() if place_of(c.name.words, "periodic-error") is not None and c.numeric]
+    times = [n for n, c in known.items() if c.name.has("time") and c.numeric]
+    if worm and not errors and len(known) == 3:
+        times, _, errors = ([name] for name in known)
+    if len(errors) != 1 or len(times) != 1:
+        found = f"{len(times)} columns of times and {len(errors)} of a periodic error"
+        remedy = "give a table with one column of each, as Time (s), PE (arcsec)"
+        raise refusal("missing-column", file=table.file, line=table.first_line, found=found, allowed="one of each", remedy=remedy)
+    time_unit, error_unit = known[times[0]].name.unit, known[errors[0]].name.unit
+    scale_s = time_unit.scale if time_unit and time_unit.kind == "time" else 1.0
+    scale = 3600.0 * error_unit.scale * error_unit.per_number if error_unit and error_unit.kind == "angle" else 1.0
+    sign = math.copysign(1.0, stated.get("pe_sign", 1.0))
+    rate = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
+    pairs = [
+        (scale_s * float(t), scale * float(e))
+        for t, e in zip(table.columns[times[0]], table.columns[errors[0]], strict=True)
+        if NUMBER.fullmatch(t) and NUMBER.fullmatch(e)
+    ]
+    if len(pairs) < 3 or any(b[0] < a[0] for a, b in pairwise(pairs)):
+        found, remedy = f"{len(pairs)} rows of numbers, or times that step back", "give the rows as they were recorded"
+        raise refusal("empty", file=table.file, found=found, allowed="three or more in time order", remedy=remedy)
+    readings = [
+        {"reading": k, "move": 0, "value": round(rate * t + sign * e, 4), "u": 0.0, "status": "ok", "time_s": t}
+        for k, (t, e) in enumerate(pairs)
+    ]
+    axis: dict[str, Any] = {**PRIORS, **_search_of([t for t, _ in pairs])}
+    assumed = [
+        f"times in column {escaped(times[0])}, periodic error in column {escaped(errors[0])}, {'arcsec' if scale == 1 else error_unit.name}",  # type: ignore[union-attr]
+        f"the drive turns at {rate:.6g} arcsec/s; --assume drive_arcsec_per_s=",
+        f"sign: a positive error is an axis {'ahead of' if sign > 0 else 'behind'} its drive; --assume pe_sign={-sign:g} says the other",
+    ]
+    if worm:
+        axis = {**PRIORS, "periods_in": "seconds", "periods": [float(worm[1])]}
+        assumed.append(f"the worm's period: {worm[1]} s, as the file says")
+    header = {"rate": rate, "name": table.file[:200]}
+    notes = (f"{len(pairs)} of {len(table)} rows are numbers",)
+    return AxisRows([_drive_move(0, pairs[0][0], rate)], readings, "arcsec", tuple(assumed), notes, header, axis)
+
+
+def _several(count: int, name: str) -> str:
+    return f"{count} {name}{'s' * (count != 1)}"
+
+
+def _frames_text(run: GuideRun, used: int, stretches: int) -> str:
+    """Numbers of frames used and left out, in words."""
+    events = [f"{run.settling} while settling", f"{len(run.dropped_s)} dropped"]
+    events += [_several(n, name) for name in ("damaged row", "calibration step") if (n := run.counts[name])]
+    events += [f"{n} {name}" for name, n in run.counts.items() if name.startswith("rows of") and n]
+    text = f"frames: {used} used of {len(run.frames) + len(run.dropped_s)} ({', '.join(events)} left out)"
+    breaks = [_several(run.counts["dither"], "dither"), *([_several(n, "pause")] if (n := run.counts["pause"]) else [])]
+    words = "of its own each" if stretches > 1 else "of its own"
+    return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {words} ({', '.join(breaks)})"
+
+
+def _remarks(run: GuideRun) -> list[str]:
+    """Further remarks on a run."""
+    remarks = [f"pier side {run.pier}"]
+    if not run.ended:
+        remarks.append("the log does not say that the run ended: it may be cut off")
+    times = [frame.time_s for frame in run.frames]
+    step = median([b - a for a, b in pairwise(times)] or [0.0])
+    pulses = [abs(frame.pulse_ms) for frame in run.frames]
+    if long_pulses := sum(p > 1000.0 * step for p in pulses):
+        remarks.append(f"{long_pulses} pulses last longer than the {step:.2g} s between frames and act in part later")
+    if (limit_ms := run.header.get("pulse_max_ms")) and (at_limit := sum(p >= limit_ms for p in pulses)):
+        remarks.append(f"{at_limit} pulses at their limit of {limit_ms:g} ms")
+    if n := run.counts["frame with a saturated star"]:
+        remarks.append(f"{n} frame{'s' * (n > 1)} with a saturated star, used")
+    if n := run.counts["change of the RA algorithm"]:
+        remarks.append(f"{n} change{'s' * (n > 1)} of the RA algorithm during the run")
+    return remarks
+
+
+def _header_of(run: GuideRun, file: str) -> dict[str, object]:
+    header: dict[str, object] = {"name": f"{file}, run {run.number}", "instrument": run.mount[:200]}
+    try:
+        header["created"] = datetime.datetime.fromisoformat(run.begins)
+    except ValueError:
+        header["notes"] = f"begins {run.begins[:100]}"
+    return header
