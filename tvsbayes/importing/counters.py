@@ -1,0 +1,102 @@
+"""Moves of an instrument with two axes from a foreign table, as plain rows of `moves.csv`.
+
+Successive rows at the same counters belong to one move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from tvsbayes.importing.cells import FieldCells, homings_of, seconds_of, temperatures_of
+
+AXES = ("pan", "tilt")
+COUNTERS = ("pan_steps", "tilt_steps")
+COUNTER_MAX = 10**9
+SIDES = {"pan": ("left", "right", "unknown"), "tilt": ("up", "down", "unknown")}
+"""Words of an approach: the direction of the last move of an axis."""
+FIELDS = ("move", "segment", "time_s", *COUNTERS, "pan_approach", "tilt_approach", "temperature_degC")
+"""Fields of a row of moves."""
+Pair = tuple[int, int]
+
+
+class RowMoves(NamedTuple):
+    """Rows of `moves.csv`, and the number of the move of every row of the table."""
+
+    moves: list[dict[str, Any]]
+    move_of_row: list[int]
+
+
+def moves_of_rows(
+    cells: FieldCells,
+    counters: Sequence[Pair],
+    assumed: list[str],
+    *,
+    relative: bool = False,
+    approach: tuple[str, str] = ("unknown", "unknown"),
+) -> RowMoves:
+    """Derive the moves of a table with counters.
+
+    Args:
+        cells: cells of the table by field.
+        counters: pan and tilt of every row, steps.
+        assumed: sentences, to which assumptions are added.
+        relative: whether counters are the steps of each move.
+        approach: side from which pan and tilt came to the first row, where no column says it.
+
+    Raises:
+        InputError: a cell is not a value of its field.
+    """
+    numbers = cells.text("move") if "move" in cells else None
+    homings, times_s = homings_of(cells, assumed), seconds_of(cells, assumed)
+    temperatures = temperatures_of(cells, assumed)
+    approaches = [_approaches(cells, axis, approach[k]) for k, axis in enumerate(AXES)]
+    moves: list[dict[str, Any]] = []
+    move_of_row: list[int] = []
+    at, segment = (0, 0), 0
+    for row, pair in enumerate(counters):
+        homed = homings[row]
+        segment += homed
+        may_repeat = row > 0 and (numbers[row] == numbers[row - 1] if numbers else True) and not homed
+        repeats = may_repeat and (numbers is not None or pair == ((0, 0) if relative else at))
+        if not repeats:
+            at = (at[0] + pair[0], at[1] + pair[1]) if relative and row and not homed else pair
+            first = row == 0 or homed
+            sides = [column[row] if first else "" for column in approaches]
+            time_s = float(len(moves)) if times_s is None else times_s[row]
+            values = (len(moves), segment, time_s, *at, *sides, temperatures[row])
+            moves.append(dict(zip(FIELDS, values, strict=True)))
+        elif not relative and pair != at:
+            remedy = "a new move begins a new number; or leave the column out with --column move="
+            allowed = f"the counters of its move, {at[0]} and {at[1]}"
+            raise cells.refuse(row, COUNTERS[pair[1] != at[1]], allowed, remedy)
+        move_of_row.append(len(moves) - 1)
+    if times_s is None:
+        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
+    if "pan_approach" not in cells and "unknown" in approach:
+        assumed.append("approach: unknown; say how the axes came to the first row, --pan-approach left or right ...")
+    if relative:
+        assumed.append("counters: summed up, because --relative says that each is the steps of its move")
+    return RowMoves(moves, move_of_row)
+
+
+def whole_counters(cells: FieldCells) -> list[Pair]:
+    """Pan and tilt of every row as whole numbers.
+
+    Raises:
+        InputError: a cell is none.
+    """
+    remedy = "give the counters of the motors; angles are what the fit finds"
+    columns = [cells.whole(name, -COUNTER_MAX, COUNTER_MAX, remedy=remedy) for name in COUNTERS]
+    return list(zip(*columns, strict=True))  # type: ignore[arg-type]
+
+
+def _approaches(cells: FieldCells, axis: str, default: str) -> list[str]:
+    """The approach side of an axis, for every row."""
+    name = f"{axis}_approach"
+    words = [word.lower() or default for word in cells.text(name)]
+    for row, word in enumerate(words):
+        if word not in SIDES[axis]:
+            remedy = "name the direction of the last move of the axis"
+            raise cells.refuse(row, name, ", ".join(SIDES[axis]), remedy)
+    return words

@@ -1,0 +1,234 @@
+"""Moves and sightings of a head from a foreign table: counters or encoder angles, and the directions that were found.
+
+One row is a move, a sighting, or both. Encoder angles become counters of `STEP_DEG`. Everything ends in plain rows by
+the names of `moves.csv` and `sightings.csv`. Degrees; u are standard uncertainties.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from tvsbayes.errors import Candidate, escaped, question
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.cells import FieldCells, is_segment, left_out, status_of
+from tvsbayes.importing.columns import Column, Understood, ask_column, check_stated, choice, columns_of, missing_column
+from tvsbayes.importing.counters import AXES, COUNTERS, moves_of_rows, whole_counters
+from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
+from tvsbayes.importing.table import ForeignTable
+from tvsbayes.importing.words import Unit, listed, place_of, unit_named
+
+STEP_DEG = 1e-5
+"""Size of a counter step: encoders are read in degrees, and 0.04 arcsec is far below telescopes' pointing errors."""
+U_DEG = 0.01
+"""Standard uncertainty of a sighting where a table states none; the fit estimates its scale."""
+ANGLES = ("azimuth_deg", "elevation_deg")
+FIELDS = (*MOVE_FIELDS, *ANGLES, "u_deg", "status")
+"""All fields that a table of sightings can have."""
+NEEDED = (*COUNTERS, *ANGLES)
+TURN_RAD = 2 * math.pi
+ANGLE_MAX_DEG, ELEVATION_MAX_DEG = 1e6, 180.0
+U_MAX_DEG = 10.0
+
+
+@dataclass(frozen=True)
+class SightingWishes:
+    """What the user states about a table of sightings.
+
+    Attributes:
+        columns: column by field, "" for none.
+        angle_unit: "deg" or "rad" of angles whose columns state none.
+        relative: whether counters are the steps of each move.
+        approach: side from which pan and tilt came to the first row.
+        u_deg: standard uncertainty of a sighting where no column states it.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    angle_unit: str | None = None
+    relative: bool = False
+    approach: tuple[str, str] = ("unknown", "unknown")
+    u_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class SightingRows:
+    """A head's tables as plain rows.
+
+    Attributes:
+        moves: rows of `moves.csv` by column.
+        sightings: rows of `sightings.csv` by column.
+        encoders: axes whose counters are angles of an encoder.
+        assumed: assumptions about what the table does not state, in words.
+        understood: columns by field.
+        units: unit by field, as shown.
+    """
+
+    moves: list[dict[str, Any]]
+    sightings: list[dict[str, Any]]
+    encoders: frozenset[str]
+    assumed: tuple[str, ...]
+    understood: Understood
+    units: Mapping[str, str]
+
+
+def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
+    """Derive moves and sightings from a table.
+
+    Raises:
+        Question: two columns could be one field; angles without a unit that may be radians.
+        InputError: a cell is not a value of its field, the table has no row or lacks a column.
+    """
+    table.require_rows()
+    known = sighting_columns(table, wishes.columns)
+    assumed = list(known.remarks)
+    cells, notations = FieldCells(table, known.columns).with_plain(*NEEDED, "u_deg")
+    assumed += [column.remark for column in notations.values() if column.remark]
+    written = {name: column.unit for name, column in notations.items()}
+    units = _units(cells, columns_of(table), written, wishes)
+    of_encoders = [name for name in COUNTERS if name in units]
+    counters = _counters(cells, units, assumed)
+    rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
+    angles: dict[str, list[float | None]] = {}
+    for name, low, high in zip((*ANGLES, "u_deg"), (-ANGLE_MAX_DEG, -ELEVATION_MAX_DEG, 0.0), (ANGLE_MAX_DEG, ELEVATION_MAX_DEG, U_MAX_DEG), strict=True):
+        if name in cells:
+            scale = units[name].scale * units[name].per_number
+            angles[name] = [None if v is None else scale * v for v in cells.numbers(name, low / scale, high / scale, optional=True)]
+    if "u_deg" not in cells:
+        u = U_DEG if wishes.u_deg is None else wishes.u_deg
+        angles["u_deg"] = [u] * len(table)
+        how = "; --assume u_deg=NUMBER states another, and the fit finds the scale"
+        assumed.append(f"standard uncertainty of a sighting: {u:g} deg{how}")
+    elif (coverage := columns_of(table)[known.columns["u_deg"]].name.coverage) is not None:
+        angles["u_deg"] = [None if u is None else u / coverage for u in angles["u_deg"]]
+        assumed.append(f"u_deg: column {escaped(known.columns['u_deg'])} is an expanded uncertainty, over {coverage:g}")
+    statuses, sightings = cells.text("status"), list[dict[str, Any]]()
+    for row in range(len(table)):
+        values = {name: column[row] for name, column in angles.items()}
+        if not statuses[row] and all(values[name] is None for name in ANGLES):
+            continue
+        status = status_of(cells, row, values, "sighting")
+        sightings.append({"sighting": row, "move": rows.move_of_row[row], **values, "status": status})
+    assumed += left_out(cells, statuses, "sighting")
+    encoders = frozenset(AXES[COUNTERS.index(name)] for name in of_encoders)
+    shown = {name: unit.name for name, unit in units.items()}
+    shown = {**dict.fromkeys(COUNTERS, "steps"), **shown, **({"time_s": "s"} if "time_s" in cells else {})}
+    return SightingRows(rows.moves, sightings, encoders, tuple(assumed), known, shown)
+
+
+def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understood:
+    """The columns of a table of sightings by field.
+
+    Raises:
+        Question: two columns could be one field.
+        InputError: a field or column that does not exist, or no column for a needed field.
+    """
+    known = columns_of(table)
+    check_stated(list(known), stated, FIELDS)
+    taken = {name: text for name, text in stated.items() if text}
+    taken |= {f: f for f in known if f in FIELDS and f not in stated and f not in taken.values()}
+    claims: dict[str, list[str]] = {}
+    for text, column in known.items():
+        role = field_of(column)
+        if text not in taken.values() and role is not None and role not in taken and role not in stated:
+            claims.setdefault(role, []).append(text)
+    for role, names in claims.items():
+        # Of two directions the one that was found.
+        found = [name for name in names if known[name].name.words and place_of(known[name].name.words, "observed") is not None]
+        names = found if len(found) == 1 and role in ANGLES else names
+        if len(names) > 1:
+            candidates = [choice({role: name}, known) for name in (*names, *([] if role in NEEDED else [""]))]
+            raise ask_column(table, f"{len(names)} columns that could be {role} ({listed(names)})", candidates)
+        taken[role] = names[0]
+    if missing := [name for name in NEEDED if name not in taken]:
+        raise missing_column(table, taken, missing)
+    unused = tuple(text for text in known if text not in taken.values())
+    return Understood(taken, unused)
+
+
+def field_of(column: Column) -> str | None:
+    """The field to which a column belongs by its name."""
+    name = column.name
+    words, kind = name.words, name.unit.kind if name.unit else ""
+    of_axis = [k for k, concept in enumerate(("azimuth", "elevation")) if place_of(words, concept) is not None]
+    # "s" stands for seconds here.
+    if name.has("expanded") or (name.has("u") and (words != ("s",))) or (name.has("deviation") and kind == "angle" and len(of_axis) != 1):
+        return "u_deg"
+    if name.has("temperature") or kind == "temperature":
+        return "temperature_degC"
+    if len(of_axis) == 1:
+        if "approach" in words:
+            return f"{AXES[of_axis[0]]}_approach"
+        counted = place_of(words, "counter") is not None and place_of(words, "observed") is None
+        return COUNTERS[of_axis[0]] if counted else ANGLES[of_axis[0]]
+    if name.has("aside") or of_axis:
+        return None
+    if kind == "time" or name.has("time"):
+        return "time_s"
+    if place_of(words, "move") is not None:
+        return "move"
+    if name.has("segment") and is_segment(column.cells):
+        return "segment"
+    return "status" if name.has("status") else None
+
+
+def _units(
+    cells: FieldCells, known: Mapping[str, Column], written: Mapping[str, Unit | None], wishes: SightingWishes
+) -> dict[str, Unit]:
+    """Units of angles by field; whole counters have none.
+
+    Raises:
+        Question: angles within a radian's turn, of columns without a unit; a unit that is not known.
+    """
+    stated = None if wishes.angle_unit is None else unit_named(wishes.angle_unit)
+    units: dict[str, Unit] = {}
+    for name in (*ANGLES, *COUNTERS, "u_deg"):
+        if name not in cells:
+            continue
+        column = known[cells.columns[name]]
+        unit = written.get(name) or column.name.unit
+        unit = unit if unit is not None and unit.kind == "angle" else None
+        if unit is None and column.name.unknown and name not in COUNTERS and stated is None:
+            found = f"unit {escaped(column.name.unknown)} of column {escaped(column.name.text)}, which is not known"
+            raise _ask_angles(cells, column, found)
+        if name in COUNTERS:
+            numbers = [float(cell) for cell in cells.text(name) if NUMBER.fullmatch(cell)]
+            if unit is None and any(not number.is_integer() for number in numbers):
+                unit = stated or units[ANGLES[0]]
+        elif unit is None and name == "u_deg":
+            unit = units["azimuth_deg"]
+        elif unit is None:
+            unit = stated
+            numbers = [abs(float(cell)) for cell in cells.text(name) if NUMBER.fullmatch(cell)]
+            if unit is None and numbers and max(numbers) <= TURN_RAD and name == ANGLES[0]:
+                raise _ask_angles(cells, column, f"angles up to {max(numbers):.4g} in column {escaped(column.name.text)}, without a unit")
+            unit = unit or (units[ANGLES[0]] if ANGLES[0] in units else unit_named("deg"))
+        if unit is not None:
+            units[name] = unit
+    return units
+
+
+def _ask_angles(cells: FieldCells, column: Column, found: str):
+    first = {column.name.text: column.first}
+    candidates = [Candidate(f"they are in {unit}", ("--angles", unit), first) for unit in ("rad", "deg")]
+    return question(file=cells.table.file, line=cells.table.first_line, found=found, allowed="angles of a known unit", candidates=candidates, code="unit")
+
+
+def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) -> list[tuple[int, int]]:
+    """Counters of every row, with angles of encoders in steps of `STEP_DEG`."""
+    of_encoders: dict[str, Sequence[int]] = {}
+    for name in (name for name in COUNTERS if name in units):
+        unit = units[name]
+        scale = unit.scale * unit.per_number
+        limit = ANGLE_MAX_DEG / 100 / scale
+        of_encoders[name] = [round(scale / STEP_DEG * (v or 0.0)) for v in cells.numbers(name, -limit, limit)]
+        assumed.append(f"{name}: angles in {unit.name} as they stand, without whole turns, in steps of {STEP_DEG:g} deg")
+    if len(of_encoders) == len(COUNTERS):
+        return list(zip(*(of_encoders[name] for name in COUNTERS), strict=True))  # type: ignore[arg-type]
+    if not of_encoders:
+        return whole_counters(cells)
+    columns = [of_encoders.get(name) or cells.whole(name, -(10**9), 10**9) for name in COUNTERS]
+    return list(zip(*columns, strict=True))  # type: ignore[arg-type]
+
+
