@@ -333,3 +333,18 @@ def test_nothing_to_estimate():
     assert caught.value.exit_code == 3
     with pytest.raises(NothingToEstimate):
         classic(replace(campaign, spots=()))
+
+
+def test_each_direction_counts_from_one():
+    """The paper's Table 1 from a book that begins anew in each direction; a skipped one is named with its direction."""
+    ways = {"left": ("pan", 200), "right": ("pan", -200), "up": ("tilt", 100), "down": ("tilt", -100)}
+    rows = [(*way, 10.0, 10.0 + 0.06 * way[1] + 0.3 * k) for way in ways.values() for k in range(3)]
+    campaign = make_campaign(rows)
+    unique = classic(campaign)
+    restarted = tuple(replace(spot, experiment=1 + spot.experiment % 3) for spot in campaign.spots)
+    result = classic(replace(campaign, spots=restarted))
+    assert result.directions == unique.directions and {r.n for r in result.directions.values()} == {3}
+    assert {(e.direction, e.experiment) for e in result.experiments} == {(d, n) for d in ways for n in (1, 2, 3)}
+    lost = replace(restarted[4 * 4], status="too dim")
+    (skipped,) = classic(replace(campaign, spots=(*restarted[:16], lost, *restarted[17:]))).skipped
+    assert (skipped.direction, skipped.experiment, skipped.name) == ("right", 2, "2 (right)")

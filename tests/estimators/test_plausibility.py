@@ -119,7 +119,7 @@ def test_incomplete_experiments_and_refused_spots_are_counted(paper_twin):
     check = check_campaign(replace(paper_twin, spots=tuple(spots)))
     assert check.refused == {"saturated": 1}
     assert (check.ok_spots, check.experiments) == (383, 95)
-    assert [w for w in check.warnings if w.startswith("experiment 1 is not complete")]
+    assert [w for w in check.warnings if w.startswith("experiment 1 (left) is not complete")]
 
 
 def test_swapped_cameras_and_wrong_units_are_certain(paper_twin):

@@ -205,7 +205,7 @@ def test_forty_thousand_spots_and_more_are_read():
     campaign = small_campaign()
     base = campaign.spots[4]
     spots = [dataclasses.replace(base, spot=i, u_left_px=100.0 + i / 1000) for i in range(40_000)]
-    again = parse_spots(spots_bytes(spots), "spots.csv", len(campaign.moves), campaign.stereo)
+    again = parse_spots(spots_bytes(spots), "spots.csv", campaign.moves, campaign.stereo)
     assert list(again) == spots
 
 

@@ -142,7 +142,7 @@ def test_texts_are_accepted_by_the_campaign_reader():
     assert [spot.target for spot in result.spots] == ["sheet -50", "50", "sheet =near", "sheet one left"]
     assert [spot.status for spot in result.spots] == ["refused", "refused: -", "refused: @late", "too dim"]
     stereo = small_campaign().stereo
-    assert parse_spots(spots_bytes(result.spots), "spots.csv", 4, stereo) == result.spots
+    assert parse_spots(spots_bytes(result.spots), "spots.csv", result.moves, stereo) == result.spots
 
 
 def test_numbers_that_cannot_be_kept_are_reported():

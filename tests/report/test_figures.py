@@ -41,6 +41,15 @@ def test_the_papers_figures_for_any_campaign(evidence):
     assert angles == [f"before: {first.theta_i_deg:.2f} deg", f"after: {first.theta_f_deg:.2f} deg"]
     with pytest.raises(ValueError, match="not complete"):
         trajectories(campaign, 10_000)
+    # A book that counts anew in each direction: the number alone names several.
+    same = next(e for e in result.experiments if e.direction != first.direction)
+    spots = tuple(
+        replace(s, experiment=number) if s.experiment in (number, same.experiment) else s for s in campaign.spots
+    )
+    with pytest.raises(ValueError, match="give its direction"):
+        trajectories(replace(campaign, spots=spots), number)
+    drawn = trajectories(replace(campaign, spots=spots), number, same.direction).axes[0]
+    assert drawn.get_title().startswith(f"experiment {number} ({same.direction})")
     with pytest.raises(ValueError, match="allowed: left, right, up, down"):
         direction_scatter(result, "Left")
 

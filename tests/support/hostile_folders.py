@@ -496,7 +496,9 @@ TARGETS: dict[str, Target] = {
     "rig.toml": Target("rig.toml", read_rig, "check @/rig.toml"),
     "stereo.json": Target("stereo.json", lambda path: parse_stereo(path.read_bytes(), path.name)),
     "moves.csv": Target("moves.csv", lambda path: parse_moves(path.read_bytes(), path.name)),
-    "spots.csv": Target("spots.csv", lambda path: parse_spots(path.read_bytes(), path.name, 5, CAMPAIGN.stereo)),
+    "spots.csv": Target(
+        "spots.csv", lambda path: parse_spots(path.read_bytes(), path.name, CAMPAIGN.moves[:5], CAMPAIGN.stereo)
+    ),
     "plan.csv": Target("plan.csv", lambda path: parse_plan(path.read_bytes(), path.name), "check @/plan.csv"),
     "log.jsonl": Target(LOG, _read_log, "check @/journal"),
     "log.jsonl, sealed": Target(LOG, _read_log, "check @/journal", build=lambda *args: sealed(edited(*args))),

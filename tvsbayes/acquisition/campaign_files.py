@@ -70,7 +70,7 @@ def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[
     ]
     moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
     if campaign.moves:
-        parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo_pair)
+        parse_spots(table, "spots.csv", parse_moves(moves), campaign.stereo_pair)
     files = {"moves.csv": moves, "spots.csv": table}
     if tables_only:
         return files
@@ -144,7 +144,7 @@ def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
     waiting = {spot.spot: spot for spot in campaign.spots if spot.status == UNDETECTED}
     try:
         data = read_bytes(folder / "spots.csv", CSV_BYTES_MAX, folder)
-        present = parse_spots(data, "spots.csv", len(campaign.moves), campaign.stereo_pair)
+        present = parse_spots(data, "spots.csv", campaign.moves, campaign.stereo_pair)
     except InputError:
         return {}
     return {

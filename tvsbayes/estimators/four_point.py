@@ -21,6 +21,7 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign, Look, Move, ordered_spots, pixels_of
+from tvsbayes.instrument.experiments import experiments_of, name_of, rank
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
 from tvsbayes.results.records import Record
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
@@ -53,10 +54,16 @@ class Experiment:
 
 @dataclass(frozen=True)
 class SkippedExperiment:
-    """An experiment that could not be used, and why in words."""
+    """An experiment that could not be used, and why in words; direction None where its move has none."""
 
     experiment: int
+    direction: str | None
     reason: str
+
+    @property
+    def name(self) -> str:
+        """Number and direction in words."""
+        return name_of(self.direction, self.experiment)
 
 
 class _Unusable(Exception):
@@ -68,7 +75,7 @@ class Selection:
     """The complete experiments of a campaign, as arrays over e experiments.
 
     Attributes:
-        experiments: (e,) experiment numbers.
+        experiments: (e,) experiment numbers; with `direction` they are keys.
         spot_rows: (e, 4) rows of `campaign.spots` of points 1 to 4.
         pixels: (e, 4, 4) u_left, v_left, u_right, v_right of points 1 to 4, px.
         steps: (e,) signed N.
@@ -204,24 +211,26 @@ def select_experiments(campaign: Campaign) -> Selection:
     Between them exactly one axis has moved, without homing.
     """
     moves = {move.move: move for move in campaign.moves}
-    rows: dict[int, list[int]] = {}
-    for row, spot in enumerate(campaign.spots):
-        if spot.experiment is not None:
-            rows.setdefault(spot.experiment, []).append(row)
-    kept: dict[int, list[int]] = {}
+    looks = campaign.spots
+    order = sorted(range(len(looks)), key=lambda row: (looks[row].move, looks[row].spot))
+    at = [(moves[look.move].pan_steps, moves[look.move].tilt_steps) for look in looks]
+    numbered = [look.experiment for look in looks], [look.point for look in looks]
+    kept: list[int] = []
+    spot_rows_kept: list[list[int]] = []
     moved: list[tuple[int, int]] = []
     skipped: list[SkippedExperiment] = []
-    for number in sorted(rows):
+    for (direction, number), rows in experiments_of(*numbered, at, order):
         try:
-            by_point = _by_point(campaign.spots, rows[number])
-            moved.append(_moved([moves[campaign.spots[row].move] for row in by_point]))
-            kept[number] = by_point
+            by_point = _by_point(looks, rows)
+            moved.append(_moved([moves[looks[row].move] for row in by_point]))
+            spot_rows_kept.append(by_point)
+            kept.append(number)
         except _Unusable as reason:
-            skipped.append(SkippedExperiment(number, str(reason)))
-    spot_rows = np.array(list(kept.values()), dtype=int).reshape(-1, 4)
+            skipped.append(SkippedExperiment(number, direction, str(reason)))
+    spot_rows = np.array(spot_rows_kept, dtype=int).reshape(-1, 4)
     pan, tilt = np.array(moved, dtype=int).reshape(-1, 2).T
     return Selection(
-        experiments=np.array(list(kept), dtype=int),
+        experiments=np.array(kept, dtype=int),
         spot_rows=spot_rows,
         pixels=pixels_of(campaign.spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
         steps=pan + tilt,
@@ -288,10 +297,10 @@ def classic(campaign: Campaign) -> ClassicResult:
     for row in np.flatnonzero(~finite):
         lost = not np.isfinite(points[row]).all()
         reason = "a pixel cannot be undistorted or triangulated" if lost else "both points of a beam are the same"
-        skipped.append(SkippedExperiment(int(selection.experiments[row]), reason))
-    skipped.sort(key=lambda one: one.experiment)
+        skipped.append(SkippedExperiment(int(selection.experiments[row]), str(selection.direction[row]), reason))
+    skipped.sort(key=lambda one: rank((one.direction, one.experiment)))
     if not finite.any():
-        first = f"; the first: experiment {skipped[0].experiment}, {skipped[0].reason}" if skipped else ""
+        first = f"; the first: experiment {skipped[0].name}, {skipped[0].reason}" if skipped else ""
         raise NothingToEstimate(
             "no-experiment",
             f"no complete four-point experiment among the {len(skipped)} named in spots.csv{first}",

@@ -289,9 +289,9 @@ def _metres(campaign: Campaign) -> list[str]:
 
 def _incomplete(skipped: Sequence[SkippedExperiment]) -> list[str]:
     """Write one sentence for all experiments that are incomplete for the same reason."""
-    by_reason: dict[str, list[int]] = {}
+    by_reason: dict[str, list[str]] = {}
     for one in skipped:
-        by_reason.setdefault(one.reason, []).append(one.experiment)
+        by_reason.setdefault(one.reason, []).append(one.name)
     return [
         f"{'experiments' if len(experiments) > 1 else 'experiment'} {listed(experiments, SPOTS_LISTED)} "
         f"{'are' if len(experiments) > 1 else 'is'} not complete: {reason}"

@@ -26,7 +26,6 @@ from tvsbayes.files.csv_kind import (
     filled_where_ok,
     first_of_segment,
     follows_a_move,
-    refuse_repeated,
     segments_in_time,
     templates,
     unique,
@@ -37,6 +36,7 @@ from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_toml,
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
+from tvsbayes.instrument.experiments import check_experiments
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, parse_sightings
 from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, no_stereo_pair, parse_stereo, stereo_bytes, triangulate
@@ -381,35 +381,24 @@ def parse_moves(data: bytes, file: str = MOVES.file) -> tuple[Move, ...]:
     return MOVES.parse(data, file)
 
 
-def check_experiments(
-    table: Table, experiments: Sequence[int | None], points: Sequence[int | None], usable: Sequence[bool]
-) -> None:
-    """Refuse an experiment without point or the reverse, and a point that usable looks of an experiment repeat."""
-    pairs = list(zip(experiments, points, strict=True))
-    for row, (experiment, point) in enumerate(pairs):
-        if (experiment is None) != (point is None):
-            column = "experiment" if experiment is None else "point"
-            allowed = "experiment and point both given or both empty"
-            raise table.refuse(row, column, "missing", allowed, "complete the pair or empty it")
-    keys = [pair if is_usable and pair != (None, None) else None for pair, is_usable in zip(pairs, usable, strict=True)]
-    refuse_repeated(table, "point", keys, "every point of an experiment once")
-
-
-def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spot, ...]:
+def parse_spots(data: bytes, file: str, moves: Sequence[Move], stereo: Stereo) -> tuple[Spot, ...]:
     """The checked rows of `spots.csv`, in the order of the file.
 
     Args:
         data: the file's bytes.
         file: its name, for errors.
-        moves: number of moves, which `move` must name.
+        moves: the moves, which `move` must name.
         stereo: gives the image size.
     """
-    return SPOTS.parse(data, file, follows_a_move(moves, "look"), _points_once, partial(_in_image, stereo=stereo))
+    checks = follows_a_move(len(moves), "look"), partial(_experiments, moves=moves), partial(_in_image, stereo=stereo)
+    return SPOTS.parse(data, file, *checks)
 
 
-def _points_once(table: Table, values: Values) -> None:
-    """Refuse a point of an experiment that was seen twice; a look without a spot may be repeated."""
-    check_experiments(table, values["experiment"], values["point"], [status == "ok" for status in values["status"]])
+def _experiments(table: Table, values: Values, moves: Sequence[Move]) -> None:
+    """Refuse experiments that are not told apart; a look without a spot may be repeated."""
+    counters = [(moves[move].pan_steps, moves[move].tilt_steps) for move in values["move"]]
+    order = sorted(range(len(table)), key=lambda row: (values["move"][row], values["spot"][row]))
+    check_experiments(table, values, counters, order, [status == "ok" for status in values["status"]])
 
 
 def _in_image(table: Table, values: Values, stereo: Stereo) -> None:
@@ -461,7 +450,7 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> Campaign:
     if stereo is None:
         looks = parse_sightings(files[SIGHTINGS.file], SIGHTINGS.file, len(moves))
         return Campaign(moves, looks, None, rig, header, path)
-    return Campaign(moves, parse_spots(files["spots.csv"], "spots.csv", len(moves), stereo), stereo, rig, header, path)
+    return Campaign(moves, parse_spots(files["spots.csv"], "spots.csv", moves, stereo), stereo, rig, header, path)
 
 
 def read_campaign(folder: Path | str) -> Campaign:

@@ -19,8 +19,9 @@ from tvsbayes.files.csv_kind import Column, CsvKind, Values, counted
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, Axis, PanApproach, TiltApproach, direction_of
-from tvsbayes.instrument.campaign import Move, check_experiments, next_move
+from tvsbayes.instrument.campaign import Move, next_move
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
+from tvsbayes.instrument.experiments import check_experiments
 from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import rests_of
@@ -66,7 +67,11 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 def _check_actions(table: Table, values: Values, unplaced: bool) -> None:
     """Refuse an action without its columns or with another's, and a look before a placement unless none is needed."""
-    check_experiments(table, values["experiment"], values["point"], [True] * len(table))
+    at, counters = (0, 0), []
+    for action, *steps in zip(values["action"], values["pan_steps"], values["tilt_steps"], strict=True):
+        at = PlanStep(0, action, *steps).counters(at)
+        counters.append(at)
+    check_experiments(table, values, counters, range(len(table)), [True] * len(table))
     targets, sheet = values["target"], ""
     for row, action in enumerate(values["action"]):
         if action not in (_PLAN_ACTIONS if row else ("home",)):

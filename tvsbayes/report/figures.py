@@ -16,6 +16,7 @@ from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, Selection, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import Campaign, stereo_spots
+from tvsbayes.instrument.experiments import name_of
 from tvsbayes.report.drawing import (
     BLACK,
     BLUE,
@@ -59,38 +60,49 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def _row_of(selection: Selection, experiment: int) -> int:
+def _row_of(selection: Selection, experiment: int, direction: str | None) -> int:
     """The row of a complete experiment."""
-    rows = np.flatnonzero(selection.experiments == experiment)
-    if not len(rows):
-        known = listed(selection.experiments.tolist(), 10)
-        raise ValueError(f"experiment {experiment} is not complete; complete are {known or 'none'}")
-    return int(rows[0])
+    wanted = (selection.experiments == experiment) & np.isin(selection.direction, direction or DIRECTIONS)
+    rows = np.flatnonzero(wanted)
+    if len(rows) == 1:
+        return int(rows[0])
+    if len(rows):
+        there = ", ".join(selection.direction[rows])
+        raise ValueError(f"experiment {experiment} is there for {there}: give its direction too")
+    named = zip(selection.direction.tolist(), selection.experiments.tolist(), strict=True)
+    known = listed([name_of(*key) for key in named], 10)
+    raise ValueError(f"experiment {name_of(direction, experiment)} is not complete; complete are {known or 'none'}")
 
 
-def trajectories(campaign: Campaign, experiment: int) -> Figure:
+def trajectories(campaign: Campaign, experiment: int, direction: str | None = None) -> Figure:
     """Draw the beam before and after the steps of one experiment, in the plane of its angle (paper, Figures 10 and 12).
 
+    Args:
+        campaign: the campaign.
+        experiment: number of the experiment.
+        direction: left, right, up or down, where several directions have that number.
+
     Raises:
-        ValueError: the experiment is not complete.
+        ValueError: the experiment is not complete, or several have that number.
     """
     selection = select_experiments(campaign)
-    row = _row_of(selection, experiment)
+    row = _row_of(selection, experiment, direction)
     points, axis, steps = campaign.points_mm[selection.spot_rows[row]], selection.axis[row], selection.steps[row]
     coordinate = 1 if axis == "pan" else 2
     before, after = points[[0, 1]], points[[3, 2]]
     with drawing(3.6) as figure:
         axes = figure.add_subplot()
         for pair, name, colour, marker in ((before, "before", BLUE, "o"), (after, "after", RED, "^")):
-            direction = pair[1] - pair[0]
-            start, end = pair[0] - 0.6 * direction, pair[1] + 0.2 * direction
+            along = pair[1] - pair[0]
+            start, end = pair[0] - 0.6 * along, pair[1] + 0.2 * along
             axes.plot([start[0], end[0]], [start[coordinate], end[coordinate]], color=colour, linewidth=1)
-            angle = np.degrees(np.arctan2(direction[coordinate], direction[0]))
+            angle = np.degrees(np.arctan2(along[coordinate], along[0]))
             label = f"{name}: {angle:.2f} deg".replace("-", "\u2212")
             axes.plot(pair[:, 0], pair[:, coordinate], marker, color=colour, label=label, linestyle="none")
         for number, point in enumerate(points, start=1):
             axes.annotate(f"P{number}", (point[0], point[coordinate]), (4, 5), textcoords="offset points")
-        title = f"experiment {experiment}: {axis} by {steps:+d} steps".replace("-", "\u2212")
+        title = f"experiment {name_of(selection.direction[row], experiment)}: {axis} by {steps:+d} steps"
+        title = title.replace("-", "\u2212")
         axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if coordinate == 1 else 'Z (up)'}, mm", title=title)
         # Equal scales keep angles true.
         axes.set_aspect("equal", adjustable="datalim")
@@ -98,17 +110,17 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
     return figure
 
 
-def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
+def points_3d(campaign: Campaign, experiment: int | None = None, direction: str | None = None) -> Figure:
     """Draw spots in frame S: the four of one experiment, or all of a campaign (paper, Figure 11).
 
     Raises:
-        ValueError: the experiment is not complete.
+        ValueError: the experiment is not complete, or several have that number.
     """
     if experiment is None:
         points = campaign.usable_points_mm
     else:
         selection = select_experiments(campaign)
-        points = campaign.points_mm[selection.spot_rows[_row_of(selection, experiment)]]
+        points = campaign.points_mm[selection.spot_rows[_row_of(selection, experiment, direction)]]
     with drawing(4.0) as figure:
         axes = figure.add_subplot(projection="3d")
         axes.scatter(*points.T, s=12 if experiment is None else 40, color=BLUE, depthshade=False, rasterized=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from tvsbayes.display import concise
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, Axis
+from tvsbayes.instrument.experiments import name_of
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
@@ -129,11 +130,12 @@ def _one_experiment(e: Evidence) -> list[FigureView]:
     """The first complete experiment as in the paper: its beams and its points."""
     if e.classic is None or not e.classic.experiments:
         return []
-    number = e.classic.experiments[0].experiment
+    first = e.classic.experiments[0]
+    name = name_of(first.direction, first.experiment)
     beams = FigureView(
-        figures.trajectories(e.campaign, number),
-        f"Beams of experiment {number} before and after its steps, with the angle of each",
-        f"Experiment {number}: the beam before and after, in the plane of its angle.",
+        figures.trajectories(e.campaign, first.experiment, first.direction),
+        f"Beams of experiment {name} before and after its steps, with the angle of each",
+        f"Experiment {name}: the beam before and after, in the plane of its angle.",
     )
     return [beams]
 

@@ -36,7 +36,7 @@ PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 def classic_text(result: ClassicResult) -> str:
     """The classic estimator's table, and the experiments that it left out."""
-    skipped = [f"experiment {s.experiment} skipped: {s.reason}" for s in result.skipped]
+    skipped = [f"experiment {s.name} skipped: {s.reason}" for s in result.skipped]
     return terminal(classic_table(result), *skipped)
 
 
