@@ -14,7 +14,7 @@ import typer
 
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import styled
-from tvsbayes.errors import InputError, TvsError, escaped, refusal, typed
+from tvsbayes.errors import InputError, Question, TvsError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
 
 INTERRUPTED = 130
@@ -98,6 +98,11 @@ def error_document(error: TvsError) -> dict[str, Any]:
     """The JSON document of an error."""
     fields = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
     fields |= {"message": error.message, "found": error.found, "allowed": error.allowed, "remedy": error.remedy}
+    if isinstance(error, Question):
+        fields["candidates"] = [
+            {"says": c.says, "first": {name: list(cells) for name, cells in c.first.items()}, "command": command}
+            for c, command in zip(error.candidates, error.commands or [None] * len(error.candidates), strict=True)
+        ]
     return {"error": fields}
 
 

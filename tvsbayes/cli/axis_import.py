@@ -3,41 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tvsbayes.cli.app import finish, refuse_options, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
-from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
-from tvsbayes.errors import InputError, escaped, refusal, typed
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
+from tvsbayes.errors import Candidate, InputError, escaped, question, refusal, typed
+from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, read_bytes
 from tvsbayes.files.documents import toml_line
-from tvsbayes.files.foreign_table import ForeignTable, read_foreign, text_of
-from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
-from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, axis_templates, readings_bytes, unit_of_folder
-from tvsbayes.single_axis.foreign_columns import deviation_columns, long_table, refuse_small
-from tvsbayes.single_axis.foreign_readings import (
-    AXIS_FIELDS,
-    ForeignReadings,
-    LoggedDrive,
-    map_axis_columns,
-    readings_of,
-    unwrapped,
+from tvsbayes.importing.axis import AxisRows, Wishes, axis_rows
+from tvsbayes.importing.guide import (
+    GuideRun,
+    is_guide_log,
+    is_periodic_error,
+    periodic_error_rows,
+    read_runs,
+    rows_of_run,
+    run_rows,
 )
-from tvsbayes.single_axis.guide_log import GuideRun, is_guide_log, read_runs, readings_of_run, run_rows
-from tvsbayes.single_axis.joined_series import camonitor_table, is_camonitor, is_klipper, klipper_table
+from tvsbayes.importing.series import epics_table, is_archive, is_camonitor, is_klipper, klipper_table
+from tvsbayes.importing.table import ForeignTable, is_workbook, read_foreign, text_of
+from tvsbayes.single_axis.axis_campaign import (
+    AxisMove,
+    Reading,
+    axis_moves_bytes,
+    axis_templates,
+    readings_bytes,
+    unit_of_folder,
+)
 
-KINDS = ("csv", "phd2", "epics", "klipper")
-"""Kinds of files of an axis: tables, guide logs, series logged by camonitor or Klipper."""
-_LOG, _TABLES = ("phd2",), ("csv", "epics", "klipper")
+LOGS = {
+    "phd2": "a guide log of PHD2 or KStars",
+    "epics": "a log of EPICS",
+    "klipper": "a log of Klipper",
+    "pe": "a table of times and periodic errors",
+}
+"""Logs that are always of one axis, by kind."""
+KINDS = ("csv", *LOGS)
+_TABLES = ("csv", "epics", "klipper")
 KINDS_OF = {
-    **{"run": _LOG, "assume": _LOG, "column": _TABLES, "deviations": _TABLES, "counts_per_turn": _TABLES},
-    "sheet": ("csv",),
+    **{"run": ("phd2",), "assume": KINDS, "column": _TABLES, "unit": _TABLES, "deviations": ("csv",)},
+    **{"runs": ("csv",), "counts_per_turn": _TABLES, "sheet": ("csv", "pe")},
 }
 """Kinds for which an option is."""
-NEEDED = ("command", "value")
 UNIT = "deg"
 """Unit of readings in the template, where no column states one."""
 
@@ -51,35 +61,30 @@ class FileOptions:
         run: number of a run of a guide log.
         deviations: whether readings are actual minus commanded position.
         counts_per_turn: counts after which readings restart.
-        assume: numbers that a guide log does not state, by name.
+        runs: order of runs beside each other.
+        units: unit by field.
+        assume: numbers that the file does not state, by name.
     """
 
     kind: str = "auto"
     run: int | None = None
     deviations: bool = False
     counts_per_turn: float | None = None
+    runs: str | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
     assume: Mapping[str, float] = field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class _ReadFile:
-    """The contents of a file: lines for people, a document for programs, readings and their unit."""
-
-    lines: list[str]
-    document: dict[str, Any]
-    readings: ForeignReadings
-    unit: str | None
-
-
-LOGS = {"phd2": "a guide log of PHD2", "epics": "a log of camonitor", "klipper": "a log of Klipper"}
-"""Logs that are always of one axis, by kind."""
+    def wishes(self, columns: Mapping[str, str]) -> Wishes:
+        """What they say about a table."""
+        coverage, status_ok = (self.assume.get(name) for name in ("coverage", "status_ok"))
+        return Wishes(columns, self.units, self.deviations, self.counts_per_turn, self.runs, coverage, status_ok)
 
 
 def log_kind(data: bytes) -> str:
-    """The kind of a file of one axis: one of `LOGS`, else "csv"."""
-    packed = data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"\x1f\x8b"))
+    """The kind of a file of one axis by its first bytes: one of `LOGS`, else "csv"."""
+    packed = is_workbook(data) or data.startswith(b"\x1f\x8b")
     text = "" if packed else data.decode("utf-8-sig", errors="replace")
-    recognised = {"phd2": is_guide_log(text), "epics": is_camonitor(text), "klipper": is_klipper(data)}
+    recognised = {"phd2": is_guide_log(text), "epics": is_camonitor(text) or is_archive(text), "klipper": is_klipper(data)}
     return next((kind for kind, matches in recognised.items() if matches), "csv")
 
 
@@ -104,53 +109,63 @@ def import_readings(
     """
     data, name = read_bytes(file, CSV_BYTES_MAX), escaped(file.name)
     kind = log_kind(data) if wish.kind == "auto" else wish.kind
-    _check_options(kind, wish, stated, sheet)
     if kind == "phd2":
+        _check_options(kind, wish, stated, sheet)
         runs = read_runs(text_of(data, name).text, name)
         if wish.run is None and len(runs) > 1:
             _list_runs(file, to, runs, yes=yes, as_json=as_json)
             return None
-        contents = _read_run(runs, file, wish)
+        rows, lines, document = _run_of(runs, file, wish)
     else:
-        if kind == "epics":
-            table = camonitor_table(text_of(data, name).text, name, stated)
-            stated = {**stated, "time_s": "time_s", **dict(zip(NEEDED, list(table.columns)[1:], strict=True))}
-        elif kind == "klipper":
-            table = klipper_table(data, name)
+        table, text = _table(kind, data, file, sheet, stated)
+        if kind == "csv" and not stated and text and is_periodic_error(text, table):
+            kind = "pe"
+        _check_options(kind, wish, stated, sheet)
+        if kind == "pe":
+            rows = periodic_error_rows(table, text, wish.assume)
+            lines = [f"{table.file}: {table.kind}; {len(table)} rows, {LOGS[kind]}"]
+            document: dict[str, Any] = {"file": table.file, "kind": kind, "rows": len(table)}
         else:
-            table = read_foreign(file, sheet)
-        contents = _read_table(table, stated, wish, to)
+            named = dict(zip(("command", "value"), list(table.columns)[1:], strict=True)) if kind in ("epics", "klipper") and "time_s" in table.columns else {}
+            rows = axis_rows(table, wish.wishes({**stated, **named}), unit_of_folder(to))
+            lines, document = list(rows.lines), dict(rows.document)
     _refuse_filled(to)
-    return _import_of(contents, to)
+    return _import_of(rows, lines, document, to)
 
 
-def _import_of(contents: _ReadFile, to: Path) -> Import:
+def _table(kind: str, data: bytes, file: Path, sheet: str | None, stated: Mapping[str, str]) -> tuple[ForeignTable, str]:
+    """The table of a file, and its text where it has one."""
+    name = escaped(file.name)
+    if kind == "klipper":
+        return klipper_table(data, name), ""
+    if kind == "epics":
+        return epics_table(text_of(data, name).text, name, stated), ""
+    return read_foreign(file, sheet), "" if is_workbook(data) else text_of(data, name).text
+
+
+def _import_of(rows: AxisRows, lines: Sequence[str], document: Mapping[str, Any], to: Path) -> Import:
     """The import of a file that was read."""
-    table, unit = contents.readings, contents.unit
-    assumed = [*table.assumed, _unit_line(to, unit), *_drive_lines(table)]
-    lines = [*contents.lines, *table.notes, *(f"assumed: {text}" for text in assumed)]
-    ok = sum(reading.status == "ok" for reading in table.readings)
-    lines.append(f"gives: {len(table.moves)} moves, {len(table.readings)} readings{_minutes(table)}")
-    document = {**contents.document, "notes": list(table.notes), "assumed": assumed, "moves": len(table.moves)}
-    document |= {"readings": len(table.readings), "ok": ok, "campaign": str(to)}
+    assumed = [*rows.assumed, _unit_line(to, rows.unit), *_axis_lines(rows)]
+    lines = [*lines, *rows.notes, *(f"assumed: {text}" for text in assumed)]
+    ok = sum(reading["status"] == "ok" for reading in rows.readings)
+    times = [reading["time_s"] for reading in rows.readings if "time_s" in reading]
+    over = f" over {(times[-1] - times[0]) / 60:.1f} minutes" if times else ""
+    lines.append(f"gives: {len(rows.moves)} moves, {len(rows.readings)} readings{over}")
+    document = {**document, "notes": list(rows.notes), "assumed": assumed, "moves": len(rows.moves)}
+    document |= {"readings": len(rows.readings), "ok": ok, "campaign": str(to)}
     command = f"tvsbayes calibrate {typed(to)}"
 
     def outcome(written: list[str]) -> dict[str, Any]:
         return {"files": written, "next": command if written else None}
 
-    return Import(lines, document, lambda: _write(to, table, unit), f"`{command}`", CORRECT_HINT, outcome)
-
-
-def _minutes(readings: ForeignReadings) -> str:
-    """The duration of a log, as text."""
-    times = [reading.time_s for reading in readings.readings if reading.time_s is not None]
-    return f" over {(times[-1] - times[0]) / 60:.1f} minutes" if times else ""
+    hint = ", or correct it with --column, --unit"
+    return Import(lines, document, lambda: _write(to, rows), f"`{command}`", hint, outcome)
 
 
 def _check_options(kind: str, opts: FileOptions, stated: Mapping[str, str], sheet: str | None) -> None:
     """Refuse options that a file of this kind would ignore."""
-    given: dict[str, object] = {"run": opts.run, "assume": opts.assume or None, "column": stated or None}
-    given |= {"deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn, "sheet": sheet}
+    given: dict[str, object] = {"run": opts.run, "column": stated or None, "unit": opts.units or None}
+    given |= {"deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn, "sheet": sheet, "runs": opts.runs}
     refused = {name: value for name, value in given.items() if kind not in KINDS_OF[name]}
     refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **refused)
 
@@ -159,88 +174,48 @@ def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_
     """Print the runs of a log, one of which can be imported.
 
     Raises:
-        InputError: --yes without the number of a run.
+        Question: --yes without the number of a run.
     """
     from tvsbayes.report.tables import TableView
 
     rows = run_rows(runs)
     longest = max(rows, key=lambda row: row["minutes"])["run"]  # type: ignore[arg-type, return-value]
-    command = f"tvsbayes import {typed(file)} --axis --run {longest} --to {typed(to)} --yes"
     if yes:
+        candidates = [
+            Candidate(f"run {row['run']}, {row['minutes']} minutes", ("--run", str(row["run"])))
+            for row in sorted(rows, key=lambda row: -row["minutes"])[:6]  # type: ignore[operator]
+        ]
         found, allowed = f"{len(runs)} runs", "one run a campaign"
-        remedy = f"name one: `{command}` takes the longest"
-        raise refusal("usage", file=escaped(file.name), found=found, allowed=allowed, remedy=remedy)
+        raise question(file=escaped(file.name), found=found, allowed=allowed, candidates=candidates, code="usage")
+    command = f"tvsbayes import {typed(file)} --axis --run {longest} --to {typed(to)} --yes"
     cells = [["" if value is None else escaped(str(value), 40) for value in row.values()] for row in rows]
-    caption = f"{escaped(file.name)}: guide log of PHD2 with {len(runs)} runs, one campaign each"
+    caption = f"{escaped(file.name)}: guide log of {runs[0].program} with {len(runs)} runs, one campaign each"
     text = f"{TableView(caption, list(rows[0]), cells).text()}\nnothing written\nnext: `{command}`"
     document = {"file": escaped(file.name), "kind": "phd2", "runs": rows, "campaign": str(to), "files": []}
     finish({**document, "next": command}, text, as_json)
 
 
-def _read_run(runs: Sequence[GuideRun], file: Path, options: FileOptions) -> _ReadFile:
-    """One run of a guide log."""
+def _run_of(runs: Sequence[GuideRun], file: Path, options: FileOptions) -> tuple[AxisRows, list[str], dict[str, Any]]:
+    """One run of a guide log, with what is shown of it."""
     number = 1 if options.run is None else options.run
     if not 1 <= number <= len(runs):
         message = f"--run {number}: {escaped(file.name)} holds {len(runs)} runs; allowed: 1 to {len(runs)}"
         remedy = "leave --run and --yes out for the list"
         raise InputError("usage", message, allowed=f"1 to {len(runs)}", remedy=remedy)
     run = runs[number - 1]
-    readings = readings_of_run(run, escaped(file.name), options.assume)
+    rows = rows_of_run(run, runs, escaped(file.name), options.assume)
     (row,) = run_rows([run])
-    lines = [f"{escaped(file.name)}: guide log of PHD2, run {number} of {len(runs)}, {escaped(run.mount)}"]
+    lines = [f"{escaped(file.name)}: guide log of {run.program}, run {number} of {len(runs)}, {escaped(run.mount)}"]
     lines.append(f"begins {escaped(run.begins)}, {run.minutes:.1f} minutes")
     document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.frames) + len(run.dropped_s)}
-    return _ReadFile(lines, document, readings, readings.unit)
+    return rows, lines, document
 
 
-def _read_table(table: ForeignTable, stated: Mapping[str, str], options: FileOptions, to: Path) -> _ReadFile:
-    """The contents of a table, by the names of its columns and by its cells.
-
-    Raises:
-        InputError: missing or ambiguous columns, or cells that are not valid.
-    """
-    rows = long_table(table, stated)
-    table, stated, remarks = rows.table, rows.stated, rows.remarks
-    known = map_axis_columns(table.columns, stated)
-    missing = [field for field in NEEDED if field not in known.columns]
-    if missing or known.ambiguous:
-        besides = "; or is a column actual less commanded position: --column value=NAME --deviations"
-        raise column_refusal(table, known, missing, AXIS_FIELDS, NEEDED, besides * ("value" in missing))
-    if not options.deviations and "value" not in stated:
-        refuse_small(table, known.columns)
-    deviations = {} if options.deviations else deviation_columns(table, known.columns)
-    for name, text in deviations.items():
-        remarks.append(f"column {escaped(name)} is {text} in every row: a deviation, no uncertainty; set aside")
-    columns = {field: name for field, name in known.columns.items() if name not in deviations or field in stated}
-    known = replace(known, columns=columns, unused=tuple(dict.fromkeys((*known.unused, *deviations))))
-    readings = readings_of(table, known.columns, options.deviations)
-    unit = readings.unit or unit_of_name(known.columns["value"], READING_UNITS)
-    cells = [cell for cell in table.columns[known.columns["value"]] if cell]
-    numbers = [float(cell) for cell in cells if NUMBER.fullmatch(cell)]
-    if unit is None and numbers and all(n.is_integer() for n in numbers) and max(numbers) - min(numbers) > 360:
-        unit = "counts"
-        remarks.append("unit: whole numbers over more than 360, so counts; `unit` in campaign.toml says another")
-    readings = unwrapped(readings, unit_of_folder(to) or unit or UNIT, options.counts_per_turn)
-    readings = replace(readings, assumed=(*remarks, *readings.assumed))
-
-    def unit_shown(field: str, name: str) -> str:
-        return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
-
-    return _ReadFile(table_lines(table, known, AXIS_FIELDS, unit_shown), table_document(table, known), readings, unit)
-
-
-def _drive_lines(readings: ForeignReadings) -> list[str]:
-    """Entries of campaign.toml for a drive at constant rate, as lines."""
-    drive = readings.drive
-    if drive is None:
-        return []
-    lines = [f"campaign.toml: {name} = {{ value = {v:g}, u = {u:g} }}" for name, (v, u) in drive.priors.items()]
-    if drive.period_between is None:
-        return [*lines, "too short a run to look for a period; state `periods` in campaign.toml where one is known"]
-    low, high = drive.period_between
-    lines.append(
-        f"campaign.toml: period_between = [{low:g}, {high:g}] s, a minute to a third of the run; change it there"
-    )
+def _axis_lines(rows: AxisRows) -> list[str]:
+    """Entries of campaign.toml that the file gives, as lines."""
+    lines = [f"campaign.toml: {toml_line(name, value)}" for name, value in rows.axis.items()]
+    if "rate" in rows.header and not {"period_between", "periods"} & rows.axis.keys():
+        lines.append("too short a run to look for a period; state `periods` in campaign.toml where one is known")
     return lines
 
 
@@ -265,24 +240,31 @@ def _refuse_filled(to: Path) -> None:
             raise occupied(path)
 
 
-def _write(to: Path, rows: ForeignReadings, unit: str | None) -> list[str]:
-    """Write the tables and last the commented campaign.toml; `unit` is that of the column."""
-    contents = {"moves.csv": axis_moves_bytes(rows.moves), "readings.csv": readings_bytes(rows.readings)}
+def _write(to: Path, rows: AxisRows) -> list[str]:
+    """Write the tables and last the commented campaign.toml."""
+    known = AxisMove.__dataclass_fields__
+    moves = [AxisMove(**{k: v for k, v in row.items() if k in known}) for row in rows.moves]
+    readings = [Reading(**row) for row in rows.readings]
+    contents = {"moves.csv": axis_moves_bytes(moves), "readings.csv": readings_bytes(readings)}
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
-        template = axis_templates()["campaign.toml"]
-        stated = unit or UNIT
-        template = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{stated}"'.encode())
-        contents["campaign.toml"] = template if rows.drive is None else _with_drive(template, rows.drive)
+        contents["campaign.toml"] = _header(rows)
     return write_files(to, contents)
 
 
-def _with_drive(template: bytes, drive: LoggedDrive) -> bytes:
-    """The commented campaign.toml of a drive at constant rate."""
-    header = "\n".join(toml_line(key, value) for key, value in {"rate": drive.rate, **drive.header}.items())
-    priors = {name: {"value": value, "u": u} for name, (value, u) in drive.priors.items()}
-    axis = [toml_line(name, entry) for name, entry in priors.items()]
-    if drive.period_between is not None:
-        axis += [toml_line("periods_in", "seconds"), toml_line("period_between", list(drive.period_between))]
-    text = template.decode().replace('\nname = "my axis"\n', f"\n{header}\n")
-    return text.replace("\n[axis]\n", "\n[axis]\n" + "\n".join(axis) + "\n").encode()
+def _header(rows: AxisRows) -> bytes:
+    """The commented campaign.toml with the entries that the file gives.
+
+    Raises:
+        InputError: a unit that is too long to be one.
+    """
+    unit = rows.unit or UNIT
+    if len(unit) > 20:
+        raise refusal("unit", file="--unit", found=escaped(unit), allowed="at most 20 characters", remedy="shorten it")
+    text = axis_templates()["campaign.toml"].decode()
+    text = text.replace(f'\nunit = "{UNIT}"', f"\n{toml_line('unit', unit)}")
+    if rows.header:
+        text = text.replace('\nname = "my axis"\n', "\n" + "\n".join(toml_line(k, v) for k, v in rows.header.items()) + "\n")
+    if rows.axis:
+        text = text.replace("\n[axis]\n", "\n[axis]\n" + "\n".join(toml_line(k, v) for k, v in rows.axis.items()) + "\n")
+    return text.encode()

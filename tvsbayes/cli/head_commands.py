@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,32 +17,25 @@ import numpy as np
 from tvsbayes.cli.app import check_output, command_line, finish, report_line, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.report_page import DRAWING, written_page
-from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped, refusal, typed
 from tvsbayes.files.csv_kind import templates
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
-from tvsbayes.files.foreign_table import read_foreign
-from tvsbayes.head.foreign_sightings import (
-    NEEDED,
-    SIGHTING_FIELDS,
-    ForeignSightings,
-    sighting_field,
-    sightings_of_table,
-)
+from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadJoints, HeadModel, head_joints, ratios_of
+from tvsbayes.importing.columns import table_document, table_lines
+from tvsbayes.importing.sightings import FIELDS, SightingWishes, sighting_rows
+from tvsbayes.importing.table import read_foreign
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import MOVES, SPOTS, input_hashes, read_campaign
+from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, input_hashes, read_campaign
 from tvsbayes.instrument.campaign_header import header_values, mechanism_key
-from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, map_columns, unit_of_name
-from tvsbayes.instrument.corrections import Correction
+from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
-from tvsbayes.instrument.foreign_looks import Notation
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.instrument.sightings import SIGHTINGS
+from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sightings_of
 from tvsbayes.pipeline import FITTING, StoredOrFitted
 from tvsbayes.progress import Job
 
@@ -112,41 +105,46 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
 
 
 def import_sightings(
-    file: Path,
-    to: Path,
-    stated: Mapping[str, str],
-    sheet: str | None,
-    notation: Notation,
-    correction: Correction,
-    u_deg: float | None,
+    file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction
 ) -> Import:
     """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
-
-    def unit(field: str, name: str) -> str:
-        stated_unit = unit_of_name(name, SECONDS if field == "time_s" else DEGREES)
-        default = "s" if field == "time_s" else "steps" if field in COUNTERS else notation.angle_unit or "deg"
-        return (stated_unit or default) if field in ("time_s", "u_deg", *NEEDED) else ""
-
     table = read_foreign(file, sheet)
-    mapping = map_columns(table.columns, stated, SIGHTING_FIELDS, sighting_field)
-    missing = [field for field in NEEDED if field not in mapping.columns]
-    if missing or mapping.ambiguous:
-        raise column_refusal(table, mapping, missing, SIGHTING_FIELDS, NEEDED)
+    rows = sighting_rows(table, wishes)
+    assumed = list(rows.assumed)
+    listed = [Move(**row) for row in rows.moves], [Sighting(**row) for row in rows.sightings]
+    changed = corrected(*listed, correction)
+    moves, sightings = changed.moves or (), sightings_of(changed.spots or ())
     joints = _joints_of(to)
     reversed_axes = () if joints is None else [axis for axis in AXES if joints.sign[axis] < 0]
-    sightings = sightings_of_table(table, mapping.columns, notation, correction, u_deg, reversed_axes)
-    contents = _sighting_files(sightings, to, table.file)
-    ok = sum(sighting.status == "ok" for sighting in sightings.sightings)
-    lines = [*table_lines(table, mapping, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in contents.assumed)]
-    lines.append(f"gives: {len(sightings.moves)} moves, {len(sightings.sightings)} sightings, {ok} of use")
-    document = {**table_document(table, mapping), "assumed": contents.assumed, "moves": len(sightings.moves)}
-    document |= {"sightings": len(sightings.sightings), "ok": ok, "campaign": str(to)}
+    if turned := tuple(axis for axis in reversed_axes if axis in rows.encoders and falls(moves, sightings, axis)):
+        assumed += [f"{axis}_steps: angles of the joint of the URDF, which falls there" for axis in turned]
+        of_joint = corrected(moves, None, Correction(flipped=turned))
+        moves, assumed = of_joint.moves or (), [*assumed, *of_joint.changes]
+    priors = first_priors(moves, sightings, rows.encoders, assumed)
+    imported = ImportedHead(moves, sightings, priors, rows.encoders, (*assumed, *changed.changes))
+    contents = _sighting_files(imported, to, table.file)
+    ok = sum(sighting.status == "ok" for sighting in sightings)
+    lines = [*table_lines(table, rows.understood, FIELDS, rows.units), *(f"assumed: {text}" for text in contents.assumed)]
+    lines.append(f"gives: {len(moves)} moves, {len(sightings)} sightings, {ok} of use")
+    document = {**table_document(table, rows.understood), "assumed": contents.assumed, "moves": len(moves)}
+    document |= {"sightings": len(sightings), "ok": ok, "campaign": str(to)}
 
     def write() -> list[str]:
         to.mkdir(parents=True, exist_ok=True)
         return write_files(to, contents.files)
 
-    return Import(lines, document, write, f"`tvsbayes check {typed(to)}`", CORRECT_HINT)
+    return Import(lines, document, write, f"`tvsbayes check {typed(to)}`", ", or correct it with --column")
+
+
+@dataclass(frozen=True)
+class ImportedHead:
+    """Moves and sightings of a table, priors of ratios and zeros, axes read by encoders, and assumptions in words."""
+
+    moves: Sequence[Move]
+    sightings: Sequence[Sighting]
+    priors: dict[str, Prior]
+    encoders: Set[str]
+    assumed: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ class _SightingFiles:
     assumed: list[str]
 
 
-def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFiles:
+def _sighting_files(rows: ImportedHead, to: Path, table: str) -> _SightingFiles:
     """The tables, with campaign and rig file, whose ratios are added where the folder states none.
 
     Raises:

@@ -9,6 +9,7 @@ import inspect
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -18,7 +19,7 @@ from tvsbayes.cli.begin_commands import has_rows
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
-from tvsbayes.errors import InputError, Reason, closest, escaped, refusal, typed
+from tvsbayes.errors import InputError, Question, Reason, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
 from tvsbayes.files.disk import make_folder, read_bytes
 from tvsbayes.instrument.axes import sides_of
@@ -36,7 +37,7 @@ KINDS_OF: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("column", "sheet"), (AXIS, SIGHTINGS, LOOKS)),
     **{"pixels_from": (COPY, LOOKS), "angles": (SIGHTINGS, LOOKS), "sd_px": (LOOKS,)},
     **{"axis": (AXIS,), "sightings": (SIGHTINGS,), "kind": (POINTING, AXIS)},
-    **dict.fromkeys(("run", "deviations", "counts_per_turn"), (AXIS,)),
+    **dict.fromkeys(("run", "runs", "unit", "deviations", "counts_per_turn"), (AXIS,)),
     "assume": (AXIS, SIGHTINGS),
     **dict.fromkeys(("relative", "flip", "shift_moves"), (COPY, SIGHTINGS, LOOKS)),
     "swap": (COPY, LOOKS),
@@ -54,7 +55,10 @@ def import_(
     column: Annotated[
         list[str] | None, typer.Option("--column", help="FIELD=NAME: which column it is, u_left_px=XL; repeatable.")
     ] = None,
-    sheet: Annotated[str | None, typer.Option("--sheet", help="Of an XLSX file (default: first with cells).")] = None,
+    unit: Annotated[
+        list[str] | None, typer.Option("--unit", help="Of an axis: FIELD=UNIT, value=um, u=1/100 mm; repeatable.")
+    ] = None,
+    sheet: Annotated[str | None, typer.Option("--sheet", help="Of a workbook (default: first with cells).")] = None,
     pixels_from: Annotated[
         int, typer.Option("--pixels-from", min=0, max=1, help="Number of the first pixel: 0, or 1 as in MATLAB.")
     ] = 0,
@@ -70,9 +74,13 @@ def import_(
     ] = False,
     kind: Annotated[
         str,
-        typer.Option("--format", help="auto, pointing (telescope); of an axis csv, phd2, epics (camonitor), klipper."),
+        typer.Option("--format", help="auto, pointing (telescope); of an axis csv, phd2 (and KStars), epics, klipper, pe."),
     ] = "auto",
     run: Annotated[int | None, typer.Option("--run", min=1, help="Of a guide log: run; without it a list.")] = None,
+    runs: Annotated[
+        str | None,
+        typer.Option("--runs", help="Of runs side by side: forward, alternate, or repeats (readings of one stop)."),
+    ] = None,
     deviations: Annotated[
         bool, typer.Option("--deviations", help="Of an axis: readings are actual less commanded position.")
     ] = False,
@@ -82,7 +90,7 @@ def import_(
     ] = None,
     assume: Annotated[
         list[str] | None,
-        typer.Option("--assume", help="NAME=NUMBER that a guide log, or sightings (u_deg), lack; repeatable."),
+        typer.Option("--assume", help="NAME=NUMBER that a file does not state, as u_deg=0.01; repeatable."),
     ] = None,
     relative: Annotated[bool, typer.Option("--relative", help="Counters are the steps of each move.")] = False,
     flip: Annotated[
@@ -113,49 +121,77 @@ def import_(
     A campaign folder as FILE: a copy, corrected by the options that change its tables.
     """
     options = locals()
+    try:
+        _import(options)
+    except Question as asked:
+        raise asked.asked_by(_typed_command(options)) from None
+
+
+def _typed_command(options: Mapping[str, Any]) -> list[str]:
+    """The command line of these options, with --yes, to which an answer is added."""
+    words = ["tvsbayes", "import", str(options["file"])]
+    for name, parameter in inspect.signature(import_).parameters.items():
+        value, option = options[name], f"--{'format' if name == 'kind' else name.replace('_', '-')}"
+        if name in ("file", "as_json", "yes") or value == parameter.default:
+            continue
+        words += [option] if value is True else [w for one in (value if isinstance(value, list) else [value]) for w in (option, str(one))]
+    return [*words, "--yes"]
+
+
+def _import(options: Mapping[str, Any]) -> None:
+    """Import a file by the options of `import_`."""
     from tvsbayes.instrument.corrections import Correction, flipped_axis, shift_of
     from tvsbayes.instrument.foreign_looks import SD_PX, Notation
 
-    approach = (pan_approach, tilt_approach)
-    check_word("--angles", angles, ("deg", "rad"), "write --angles deg or --angles rad")
-    notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
+    o = SimpleNamespace(**options)
+    approach = (o.pan_approach, o.tilt_approach)
+    check_word("--angles", o.angles, ("deg", "rad"), "write --angles deg or --angles rad")
+    notation = Notation(o.pixels_from, o.angles, SD_PX if o.sd_px is None else o.sd_px, o.relative, approach)
     sides_of(approach)
-    stated = dict(map(_field_and_column, column or ()))
-    flipped = tuple(dict.fromkeys(map(flipped_axis, flip or ())))
-    correction = Correction(flipped, tuple(map(shift_of, shift_moves or ())), swap)
+    example = "u_left_px=XL; --column target= where the table has none"
+    stated = dict(_named("--column", text, example) for text in o.column or ())
+    flipped = tuple(dict.fromkeys(map(flipped_axis, o.flip or ())))
+    correction = Correction(flipped, tuple(map(shift_of, o.shift_moves or ())), o.swap)
     task: Import | None
-    kind_of_file = _kind_of_file(file, to, options)
+    kind_of_file = _kind_of_file(o.file, o.to, options)
     _refuse_others(kind_of_file, options)
     if kind_of_file in (SIGHTINGS, LOOKS):
         from tvsbayes.cli.axis_import import refuse_log
 
-        refuse_log(file)
+        refuse_log(o.file)
     if kind_of_file == COPY:
-        task = _corrected_campaign(file, to, replace(correction, pixels_from=pixels_from, relative=relative), options)
+        wanted = replace(correction, pixels_from=o.pixels_from, relative=o.relative)
+        task = _corrected_campaign(o.file, o.to, wanted, options)
     elif kind_of_file == URDF:
         from tvsbayes.cli.head_commands import import_urdf
 
-        task = import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn)
+        task = import_urdf(o.file, o.to, {"pan": o.pan_joint, "tilt": o.tilt_joint}, o.steps_per_turn)
     elif kind_of_file == POINTING:
-        task = _pointing_table(file, to)
+        task = _pointing_table(o.file, o.to)
     elif kind_of_file == AXIS:
         from tvsbayes.cli.axis_import import KINDS, FileOptions, import_readings
-        from tvsbayes.single_axis.guide_log import ASSUMPTIONS
+        from tvsbayes.importing.guide import ASSUMPTIONS
+        from tvsbayes.importing.runs import ORDERS
 
-        assumed = _assumptions(assume, ASSUMPTIONS, "declination_deg=45.9")
-        check_word("--format", kind, ("auto", *KINDS), closest(kind, KINDS, "leave it out: it is in the file"))
-        wish = FileOptions(kind, run, deviations, counts_per_turn, assumed)
-        task = import_readings(file, to, stated, sheet, wish, yes=yes, as_json=as_json)
+        of_tables = {"coverage": "coverage factor of the column of u", "status_ok": "status of a good row"}
+        assumed = _assumptions(o.assume, {**ASSUMPTIONS, **of_tables}, "declination_deg=45.9")
+        check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
+        check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")
+        units = dict(_named("--unit", text, "value=um") for text in o.unit or ())
+        wish = FileOptions(o.kind, o.run, o.deviations, o.counts_per_turn, o.runs, units, assumed)
+        task = import_readings(o.file, o.to, stated, o.sheet, wish, yes=o.yes, as_json=o.as_json)
     elif kind_of_file == SIGHTINGS:
         from tvsbayes.cli.head_commands import import_sightings
+        from tvsbayes.importing.sightings import SightingWishes
 
-        u_deg = _assumptions(assume, {"u_deg": "standard uncertainty"}, "u_deg=0.005").get("u_deg")
-        task = import_sightings(file, to, stated, sheet, notation, correction, u_deg)
+        u_deg = _assumptions(o.assume, {"u_deg": "standard uncertainty"}, "u_deg=0.005").get("u_deg")
+        wishes = SightingWishes(stated, o.angles, o.relative, approach, u_deg)
+        task = import_sightings(o.file, o.to, o.sheet, wishes, correction)
     else:
-        interactive = not (yes or as_json) and is_interactive()
-        task = _looks(file, to, stated, sheet, notation, correction, interactive)
+        interactive = not (o.yes or o.as_json) and is_interactive()
+        task = _looks(o.file, o.to, stated, o.sheet, notation, correction, interactive)
     if task is not None:
-        task.carry_out(to, yes, as_json)
+        task.carry_out(o.to, o.yes, o.as_json)
 
 
 def _kind_of_file(file: Path, to: Path, options: Mapping[str, Any]) -> str:
@@ -255,8 +291,8 @@ def _looks(
 
 def _pointing_table(file: Path, to: Path) -> Import:
     """Import a pointing table of a telescope as a campaign of sightings."""
-    from tvsbayes.head.foreign_sightings import STEP_DEG
     from tvsbayes.head.pointing_table import U_ARCSEC, campaign_of, read_stars
+    from tvsbayes.importing.sightings import STEP_DEG
     from tvsbayes.instrument.campaign import write_campaign
 
     table = read_stars(file)
@@ -281,13 +317,13 @@ def _pointing_table(file: Path, to: Path) -> Import:
     return Import(lines, document, write, next_step, outcome=lambda written: {"written": bool(written)})
 
 
-def _field_and_column(text: str) -> tuple[str, str]:
-    """Split --column FIELD=NAME."""
-    field, sign, name = text.partition("=")
+def _named(option: str, text: str, example: str) -> tuple[str, str]:
+    """Split FIELD=NAME."""
+    name, sign, value = text.partition("=")
     if not sign:
-        remedy = "write --column u_left_px=XL; --column target= where the table has none"
-        raise InputError("usage", f"--column {escaped(text)}: no =", allowed="FIELD=NAME", remedy=remedy)
-    return field.strip(), name.strip()
+        remedy = f"write {option} {example}"
+        raise InputError("usage", f"{option} {escaped(text)}: no =", allowed="FIELD=NAME", remedy=remedy)
+    return name.strip(), value.strip()
 
 
 def _assumptions(texts: list[str] | None, known: Mapping[str, str], example: str) -> dict[str, float]:

@@ -17,7 +17,7 @@ import numpy as np
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.head.foreign_sightings import STEP_DEG
+from tvsbayes.importing.sightings import STEP_DEG
 from tvsbayes.instrument.campaign import Campaign, Move, next_move
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior, names_of

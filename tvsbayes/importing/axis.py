@@ -159,11 +159,12 @@ def _good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, ass
     if "status" in wishes.columns or not any(bad):
         return table
     codes = {float(cell) for cell in cells if NUMBER.fullmatch(cell)}
-    if all(bad) or (codes == {0.0} and all(NUMBER.fullmatch(cell) for cell in cells)):
+    if all(bad):
         assumed.append(f"status: column {escaped(name)} would leave out every reading, so it is none")
         del columns["status"]
         return table
-    if codes and sum(bad) > STATUS_SHARE * len(cells):
+    coded = all(NUMBER.fullmatch(cell) or not cell for cell in cells)
+    if coded and sum(bad) > STATUS_SHARE * len(cells):
         found = f"column {escaped(name)}, which leaves out {sum(bad)} of {len(cells)} rows where 1 means good"
         known = columns_of(table)
         candidates = [

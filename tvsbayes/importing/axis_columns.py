@@ -278,7 +278,8 @@ def _take_value(
         return
     following = [name for name in others if follows(command, known[name])]
     copies = [name for name in (*weak, *following) if _repeats(command, known[name])]
-    pool = strong or [n for n in weak if n not in copies] or [n for n in following if n not in copies]
+    pools = (strong, [n for n in weak if n not in copies], [n for n in following if n not in copies], weak, following)
+    pool = next(filter(None, pools), [])
     if len(pool) == 1:
         taken["value"] = pool[0]
         if pool[0] in following:

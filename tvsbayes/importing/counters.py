@@ -12,7 +12,7 @@ from tvsbayes.importing.cells import FieldCells, homings_of, seconds_of, tempera
 
 AXES = ("pan", "tilt")
 COUNTERS = ("pan_steps", "tilt_steps")
-COUNTER_MAX = 10**9
+COUNTER_MAX = 10**8
 SIDES = {"pan": ("left", "right", "unknown"), "tilt": ("up", "down", "unknown")}
 """Words of an approach: the direction of the last move of an axis."""
 FIELDS = ("move", "segment", "time_s", *COUNTERS, "pan_approach", "tilt_approach", "temperature_degC")

@@ -82,7 +82,9 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
         remarks.append(f"columns {listed(names)}: readings of one stop each; --runs says another")
     else:
         rows = [(row, k) for k in range(len(runs)) for row in (rising if sides[k] > 0 else rising[::-1])]
-        words = "forward runs rise, backward runs fall" if any(run.side for run in runs) else f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
+        turning = any(run.name.has("clockwise") for run in runs)
+        named = "runs to the right rise, those to the left fall" if turning else "forward runs rise, backward runs fall"
+        words = named if any(run.side for run in runs) else f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
         remarks.append(f"runs: {len(runs)} columns ({listed(names)}), read one after the other; {words}")
     unit = next((run.name.unit for run in runs if run.name.unit), None)
     factors = [run.name.unit.in_units_of(unit) if run.name.unit and unit else 1.0 for run in runs]
@@ -138,8 +140,9 @@ def _runs(table: ForeignTable) -> list[Run]:
         if not _numeric(cells) or name.has(*_NEVER) and not name.has("run") or name.has("u", "expanded"):
             continue
         signed = re.match(r"\s*([+-])\s*\d+\b", text)
-        side = (1 if signed[1] == "+" else -1) if signed else name.has("forward") - name.has("backward")
-        both = name.has("forward") and name.has("backward")
+        rising, falling = name.has("forward", "clockwise"), name.has("backward", "counterclockwise")
+        side = (1 if signed[1] == "+" else -1) if signed else rising - falling
+        both = rising and falling
         if name.has("several") and not side:
             continue
         if side and not both and len(name.numbers) < 2:

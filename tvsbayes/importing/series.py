@@ -87,6 +87,10 @@ def epics_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable
         remedy = "name two series of one time with --column command=NAME --column value=NAME"
         raise refusal("empty", file=file, found=found, allowed="series that overlap in time", remedy=remedy)
     commands, interpolated = _command_at(log, read.times_s[inside])
+    held = log.values[np.searchsorted(log.times_s, read.times_s[inside] + EQUAL_S, side="right") - 1]
+    # A command that is logged once a move jumps; between two such rows no axis was halfway.
+    if interpolated and _scatter(held, read.values[inside]) <= _scatter(commands, read.values[inside]):
+        commands, interpolated = held, 0
     notes += [f"command {escaped(command)}, reading {escaped(value)}"]
     notes += [f"{interpolated} commands interpolated in time, {int((~inside).sum())} readings outside left out"]
     return _joined(file, notes, read.times_s[inside], commands, read.values[inside], (command, value))
@@ -170,7 +174,8 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
             message = f"--column {field}={escaped(name)}: no such series; allowed: {listed}"
             raise InputError("usage", message, allowed=listed, remedy="name one of them")
     free = [name for name in changing if name not in names.values()]
-    for field, concept in (("value", "logged-reading"), ("command", "logged-command")):
+    concepts = (("value", "logged-reading"), ("value", "logged-readback"), ("command", "logged-command"))
+    for field, concept in concepts:
         matching = [name for name in free if place_of(words_of(name), concept) is not None]
         if field not in names and len(matching) == 1:
             names[field] = matching[0]
@@ -227,6 +232,13 @@ def _command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]
     moving = (gap <= min(STANDSTILL_INTERVALS * typical, INTERVAL_MAX_S)) & (fraction * gap > EQUAL_S)
     rise = commands.values[after] - commands.values[k]
     return commands.values[k] + np.where(moving, fraction * rise, 0.0), int(moving.sum())
+
+
+def _scatter(commands: np.ndarray, values: np.ndarray) -> float:
+    """Scatter of readings about a line over their commands; infinite where these are one."""
+    if len(np.unique(commands)) < 2:
+        return np.inf
+    return float(np.std(values - np.polyval(np.polyfit(commands, values, 1), commands)))
 
 
 # --- Klipper ---------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from tvsbayes.errors import Candidate, escaped, question
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.cells import FieldCells, is_segment, left_out, status_of
 from tvsbayes.importing.columns import Column, Understood, ask_column, check_stated, choice, columns_of, missing_column
-from tvsbayes.importing.counters import AXES, COUNTERS, moves_of_rows, whole_counters
+from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Unit, listed, place_of, unit_named
@@ -221,14 +221,14 @@ def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) 
     for name in (name for name in COUNTERS if name in units):
         unit = units[name]
         scale = unit.scale * unit.per_number
-        limit = ANGLE_MAX_DEG / 100 / scale
+        limit = COUNTER_MAX * STEP_DEG / scale
         of_encoders[name] = [round(scale / STEP_DEG * (v or 0.0)) for v in cells.numbers(name, -limit, limit)]
         assumed.append(f"{name}: angles in {unit.name} as they stand, without whole turns, in steps of {STEP_DEG:g} deg")
     if len(of_encoders) == len(COUNTERS):
         return list(zip(*(of_encoders[name] for name in COUNTERS), strict=True))  # type: ignore[arg-type]
     if not of_encoders:
         return whole_counters(cells)
-    columns = [of_encoders.get(name) or cells.whole(name, -(10**9), 10**9) for name in COUNTERS]
+    columns = [of_encoders.get(name) or cells.whole(name, -COUNTER_MAX, COUNTER_MAX) for name in COUNTERS]
     return list(zip(*columns, strict=True))  # type: ignore[arg-type]
 
 

@@ -169,6 +169,7 @@ _COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:[.,][0-9]+)?)\b|\b([23])\s*(?:x\s*
 COVERAGE_USUAL = 2.0
 _KNOWN = ("command", "value", "position", "deviation", "u", "expanded", "time", "segment", "approach", "status", "moving")
 _KNOWN += ("resting", "temperature", "repeat", "index", "aside", "statistic", "run", "several", "forward", "backward")
+_KNOWN += ("clockwise", "counterclockwise")
 
 
 @dataclass(frozen=True)
