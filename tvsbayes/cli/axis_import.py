@@ -59,7 +59,7 @@ class FileOptions:
     Attributes:
         kind: "auto" or one of `KINDS`.
         run: number of a run of a guide log.
-        deviations: whether readings are actual minus commanded position.
+        deviations: whether readings are actual minus commanded position; None where the names decide.
         counts_per_turn: counts after which readings restart.
         runs: order of runs beside each other.
         units: unit by field.
@@ -68,7 +68,7 @@ class FileOptions:
 
     kind: str = "auto"
     run: int | None = None
-    deviations: bool = False
+    deviations: bool | None = None
     counts_per_turn: float | None = None
     runs: str | None = None
     units: Mapping[str, str] = field(default_factory=dict)
@@ -80,10 +80,10 @@ class FileOptions:
         return Wishes(columns, self.units, self.deviations, self.counts_per_turn, self.runs, coverage, status_ok)
 
 
-def log_kind(data: bytes) -> str:
-    """The kind of a file of one axis by its first bytes: one of `LOGS`, else "csv"."""
+def log_kind(data: bytes, file: str) -> str:
+    """The kind of a file of one axis by its content: one of `LOGS`, else "csv"."""
     packed = is_workbook(data) or data.startswith(b"\x1f\x8b")
-    text = "" if packed else data.decode("utf-8-sig", errors="replace")
+    text = "" if packed or is_klipper(data) else text_of(data, file).text
     recognised = {"phd2": is_guide_log(text), "epics": is_camonitor(text) or is_archive(text), "klipper": is_klipper(data)}
     return next((kind for kind, matches in recognised.items() if matches), "csv")
 
@@ -94,7 +94,7 @@ def refuse_log(file: Path) -> None:
     Raises:
         InputError: the file is one.
     """
-    kind = log_kind(read_bytes(file, CSV_BYTES_MAX))
+    kind = log_kind(read_bytes(file, CSV_BYTES_MAX), escaped(file.name))
     if kind in LOGS:
         message = f"{escaped(file.name)} is {LOGS[kind]}, which is of one axis"
         raise InputError("usage", message, remedy="import it with --axis, and without --sightings")
@@ -108,7 +108,7 @@ def import_readings(
     Returns None where the runs of a log were listed instead.
     """
     data, name = read_bytes(file, CSV_BYTES_MAX), escaped(file.name)
-    kind = log_kind(data) if wish.kind == "auto" else wish.kind
+    kind = log_kind(data, name) if wish.kind == "auto" else wish.kind
     if kind == "phd2":
         _check_options(kind, wish, stated, sheet)
         runs = read_runs(text_of(data, name).text, name)

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 COPY, URDF, POINTING, AXIS, SIGHTINGS, LOOKS = "copy", "urdf", "pointing", "axis", "sightings", "looks"
 """Kinds of files; --format names that of a telescope's table."""
+ANGLE_UNITS = ("deg", "rad", "mrad", "gon", "arcmin", "arcsec")
 KINDS_OF: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("column", "sheet"), (AXIS, SIGHTINGS, LOOKS)),
     **{"pixels_from": (COPY, LOOKS), "angles": (SIGHTINGS, LOOKS), "sd_px": (LOOKS,)},
@@ -63,7 +64,7 @@ def import_(
         int, typer.Option("--pixels-from", min=0, max=1, help="Number of the first pixel: 0, or 1 as in MATLAB.")
     ] = 0,
     angles: Annotated[
-        str | None, typer.Option("--angles", help="deg or rad: of aperture readings, sightings (default: by name).")
+        str | None, typer.Option("--angles", help="deg, rad ...: of aperture readings, sightings (default: by name).")
     ] = None,
     sd_px: Annotated[
         float | None, typer.Option("--sd-px", min=1e-4, max=100.0, help="Of centroids, where no column has it: 0.1.")
@@ -82,8 +83,9 @@ def import_(
         typer.Option("--runs", help="Of runs side by side: forward, alternate, or repeats (readings of one stop)."),
     ] = None,
     deviations: Annotated[
-        bool, typer.Option("--deviations", help="Of an axis: readings are actual less commanded position.")
-    ] = False,
+        bool | None,
+        typer.Option("--deviations/--positions", help="Of an axis: readings are actual less commanded position, or not."),
+    ] = None,
     counts_per_turn: Annotated[
         float | None,
         typer.Option("--counts-per-turn", min=0.0, max=1e12, help="Of an axis: where readings restart; 0: nowhere."),
@@ -134,7 +136,8 @@ def _typed_command(options: Mapping[str, Any]) -> list[str]:
         value, option = options[name], f"--{'format' if name == 'kind' else name.replace('_', '-')}"
         if name in ("file", "as_json", "yes") or value == parameter.default:
             continue
-        words += [option] if value is True else [w for one in (value if isinstance(value, list) else [value]) for w in (option, str(one))]
+        option = "--positions" if name == "deviations" and value is False else option
+        words += [option] if isinstance(value, bool) else [w for one in (value if isinstance(value, list) else [value]) for w in (option, str(one))]
     return [*words, "--yes"]
 
 
@@ -145,7 +148,7 @@ def _import(options: Mapping[str, Any]) -> None:
 
     o = SimpleNamespace(**options)
     approach = (o.pan_approach, o.tilt_approach)
-    check_word("--angles", o.angles, ("deg", "rad"), "write --angles deg or --angles rad")
+    check_word("--angles", o.angles, ANGLE_UNITS, "write --angles deg or --angles rad")
     notation = Notation(o.pixels_from, o.angles, SD_PX if o.sd_px is None else o.sd_px, o.relative, approach)
     sides_of(approach)
     example = "u_left_px=XL; --column target= where the table has none"

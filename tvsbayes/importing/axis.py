@@ -62,7 +62,7 @@ class Wishes:
 
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
-    deviations: bool = False
+    deviations: bool | None = None
     counts_per_turn: float | None = None
     order: str | None = None
     coverage: float | None = None
@@ -257,13 +257,13 @@ def _in_one_unit(
         assumed.append("value: equals the command in every row: what was read, or the command again?")
     if wishes.deviations:
         factor = _deviation_factor(cells, unit, command_unit)
-        values = [None if d is None else c + factor * d for c, d in zip(commands, values, strict=True)]
+        values = [None if d is None else _rounded(c + factor * d) for c, d in zip(commands, values, strict=True)]
         assumed.append("value: the command plus the deviation, because --deviations says so")
         given, unit = unit or command_unit, command_unit or unit
     else:
         given = unit
         if unit is not None and unit.per_number != 1.0:
-            values = [None if v is None else unit.per_number * v for v in values]
+            values = [None if v is None else _rounded(unit.per_number * v) for v in values]
             assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
             unit = unit.whole
         elif unit is None and (unit := _unit_of_command(commands, values, command_unit)) is not None:
@@ -273,6 +273,11 @@ def _in_one_unit(
         unit = given = Unit("counts", "count", 1.0)
         assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
     return list(values), _standard_u(cells, stated_u, units.get("u"), given, unit, wishes, assumed), unit and unit.name
+
+
+def _rounded(number: float) -> float:
+    """A number without the last digits of its floating point."""
+    return float(f"{number:.13g}")
 
 
 def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit | None) -> float:
@@ -354,7 +359,7 @@ def _standard_u(
     coverage = wishes.coverage or name_of(name).coverage
     if coverage is not None and coverage != 1.0:
         assumed.append(f"u: column {escaped(name)} is an expanded uncertainty, over {coverage:g}; --assume coverage=NUMBER says another")
-    return [u * factor / (coverage or 1.0) for u in stated]
+    return [_rounded(u * factor / (coverage or 1.0)) for u in stated]
 
 
 def _shown_units(units: Mapping[str, Unit | None], unit: str | None, cells: FieldCells) -> dict[str, str]:

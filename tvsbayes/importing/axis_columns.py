@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tvsbayes.errors import escaped
+from tvsbayes.errors import Candidate, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.cells import date_time, is_clock, is_segment, time_of_day
 from tvsbayes.importing.columns import (
@@ -24,7 +24,7 @@ from tvsbayes.importing.columns import (
     missing_column,
 )
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import listed
+from tvsbayes.importing.words import listed, means
 
 FIELDS = ("command", "value", "u", "status", "segment", "time_s", "approach", "temperature_degC", "moving")
 """All fields of a table of an axis."""
@@ -37,16 +37,17 @@ STEADY_SHARE, STEP_TOLERANCE = 0.7, 0.2
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 """Readings in the unit of the commands are not positions if they span less than the first share of the commands' range
 and scatter by more than the second share of their own span about a line."""
-DEVIATIONS = "--deviations"
+DEVIATIONS, POSITIONS = "--deviations", "--positions"
+"""Options that say what the readings are."""
 
 
-def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: bool = False) -> Understood:
+def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: bool | None = None) -> Understood:
     """The columns of an axis' table by field.
 
     Args:
         table: a table with a row for each reading or move.
         stated: column by field, as the user states it; "" where the table has no such column.
-        deviations: whether the readings are actual less commanded position.
+        deviations: whether the readings are actual less commanded position; None where nobody says it.
 
     Raises:
         Question: two columns could be one field.
@@ -90,6 +91,8 @@ def _role(column: Column) -> str:
         return "segment"
     if name.has("repeat", "index") and not kind and column.whole and not name.has("command", "value"):
         return "aside"
+    if _states_sides(column):
+        return "approach"
     command, value = name.place("command"), name.place("value")
     if column.numeric and (command is not None or value is not None):
         return "command" if value is None or (command is not None and command < value) else "value"
@@ -98,6 +101,13 @@ def _role(column: Column) -> str:
     if name.has("statistic") and not name.has("position"):
         return "aside"
     return "position" if name.has("position") or (unit is not None and not name.words) else ""
+
+
+def _states_sides(column: Column) -> bool:
+    """Whether the cells of a column are words of direction, whatever its name."""
+    words = {cell for cell in column.cells if cell}
+    sides = ("forward", "backward", "clockwise", "counterclockwise")
+    return bool(words) and len(words) <= 3 and all(any(means(word, side) for side in sides) and not NUMBER.fullmatch(word) for word in words)
 
 
 def _of_device(known: Mapping[str, Column], names: list[str], command: str) -> list[str]:
@@ -253,7 +263,7 @@ def _take_value(
     taken: dict[str, str],
     stated: Mapping[str, str],
     remarks: list[str],
-    deviations: bool,
+    deviations: bool | None,
 ) -> None:
     """Take the column of the readings, and set columns of deviations aside that follow from it.
 
@@ -290,15 +300,18 @@ def _take_value(
             candidates = [choice({"value": pool[0]}, known), *(choice({"value": n}, known, DEVIATIONS) for n in unexplained)]
             raise ask_column(table, found, candidates)
         _ask_what_is_left(table, known, [*strong, *weak, *others], taken)
-        _ask_small(table, command, known[pool[0]], known)
+        if deviations is None:
+            _ask_small(table, command, known[pool[0]], known)
         return
     if len(pool) > 1:
         candidates = [choice({"value": name}, known) for name in pool]
         raise ask_column(table, f"{len(pool)} columns that could be the reading ({listed(pool)})", candidates)
     if differences:
+        if deviations is False and len(differences) == 1:
+            taken["value"] = differences[0]
+            return
         found = f"no reading but {listed(differences)}, by its name a deviation"
-        candidates = [choice({"value": name}, known, DEVIATIONS) for name in differences]
-        candidates += [choice({"value": name}, known) for name in differences]
+        candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS) for name in differences]
         raise ask_column(table, found, candidates, "positions, or deviations that are stated as such")
     rest = [name for name in (*weak, *others, *of_role.get("u", ())) if name not in taken.values()]
     if rest:
@@ -306,6 +319,13 @@ def _take_value(
         candidates = [choice({"value": name}, known, *extra) for name in rest for extra in ((), (DEVIATIONS,))]
         raise ask_column(table, found, candidates)
     raise missing_column(table, taken, ["value"], _besides([]))
+
+
+def _meaning(known: Mapping[str, Column], name: str, option: str) -> Candidate:
+    """The answer that a column holds deviations or positions; columns of runs are known by their names again."""
+    words = {DEVIATIONS: "actual less commanded position", POSITIONS: "positions"}[option]
+    first = {name: known[name].first}
+    return Candidate(f"{escaped(name)} ({', '.join(known[name].first)}) holds {words}", (option,), first)
 
 
 def _set_aside(
@@ -412,5 +432,5 @@ def _ask_small(table: ForeignTable, command: Column, value: Column, known: Mappi
     if np.std(v - slope * c - level) > LOOSE_SHARE * span:
         name = value.name.text
         found = f"readings in column {escaped(name)} that span {span:.3g} {units[0].name} over {np.ptp(c):.6g} of commands"  # type: ignore[union-attr]
-        candidates = [choice({"value": name}, known, DEVIATIONS), choice({"value": name}, known)]
+        candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS)]
         raise ask_column(table, found, candidates, "positions, or deviations that are stated as such")

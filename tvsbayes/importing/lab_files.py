@@ -28,6 +28,10 @@ def labview_rows(text: str, file: str) -> Rows | None:
         cells = [cell.strip() for cell in line.split(separator)]
         if any(cells):
             rows.append(Row(number, cells))
+    labels = next((line.split(separator) for line in lines[ends[-2] :] if line.startswith("Y_Unit_Label")), [])
+    for k, label in enumerate(labels[1:], start=1):
+        if rows and label.strip() and k < len(rows[0].cells) and "(" not in rows[0].cells[k]:
+            rows[0].cells[k] += f" ({label.strip()})"
     date = " ".join(header.get(key, "").strip() for key in ("Date", "Time"))
     return Rows(rows, ["LabVIEW measurement file", *([f"begun {date.strip()}"] if date.strip() else [])])
 

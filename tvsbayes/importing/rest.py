@@ -8,7 +8,8 @@ ROWS_MIN = 4
 """Rows of one command, in the median of all commands, from which a table is telemetry."""
 TAIL_SHARE = 1 / 3
 """Last share of the rows of a command, in which the axis should rest."""
-NOISE_SDS = 5.0
+NOISE_SDS, DIGITS = 5.0, 3.0
+"""Largest distance from rest of a row at rest: standard deviations of last rows, and digits of the readings."""
 STEP_SHARE = 0.02
 """Least distance of the first row of a command from rest, as a share of its step, at which the axis was under way."""
 
@@ -31,10 +32,10 @@ def at_rest(command: np.ndarray, value: np.ndarray) -> np.ndarray:
         return rests
     tails = [block[-max(2, round(TAIL_SHARE * len(block))) :] for block in blocks]
     levels = [float(np.median(value[tail])) if len(tail) else np.nan for tail in tails]
-    noise = [1.4826 * float(np.median(np.abs(value[tail] - level))) for tail, level in zip(tails, levels, strict=True)]
+    noise = [float(np.std(value[tail])) for tail in tails]
     steps = np.diff(np.unique(value[np.isfinite(value)]))
     resolution = float(steps.min()) if len(steps) else 0.0
-    tolerance = max(NOISE_SDS * float(np.median(noise)), 1.5 * resolution)
+    tolerance = max(NOISE_SDS * float(np.median(noise)), DIGITS * resolution)
     for k, (block, level) in enumerate(zip(blocks, levels, strict=True)):
         if len(block) < 2:
             continue

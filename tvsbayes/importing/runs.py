@@ -21,6 +21,8 @@ AGREEMENT_ERRORS = 3.0
 """Standard errors of the mean difference of two groups of runs within which they agree."""
 POSITIONS_MIN = 3
 _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
+_SIGN = re.compile(r"^\s*([+-])\s*\d*\s*(?:[(\[/,]|$)|^\s*\d+\s*([+-])\s*(?:[(\[/,]|$)|\s\(?([+-])\)?\s*(?:[(\[/,]|$)")
+"""A sign in place of a direction: "+1", "1 - (mm)", "Run 1 (+)"."""
 _NEVER = ("aside", "temperature", "time", "index", "several", "moving", "resting", "status", "approach")
 
 
@@ -60,7 +62,9 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     if not runs or stated.get("value") or stated.get("approach"):
         return LongTable(table, stated, [])
     command = stated.get("command") or _command(table, runs)
-    remarks, sides = [], [run.side for run in runs]
+    remarks: list[str] = []
+    runs = _turned(table, runs, remarks)
+    sides = [run.side for run in runs]
     names = [run.name.text for run in runs]
     if not any(sides) and not _row_sides(table):
         order = order or _order(table, runs)
@@ -82,8 +86,7 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
         remarks.append(f"columns {listed(names)}: readings of one stop each; --runs says another")
     else:
         rows = [(row, k) for k in range(len(runs)) for row in (rising if sides[k] > 0 else rising[::-1])]
-        turning = any(run.name.has("clockwise") for run in runs)
-        named = "runs to the right rise, those to the left fall" if turning else "forward runs rise, backward runs fall"
+        named = "forward runs rise, backward runs fall"
         words = named if any(run.side for run in runs) else f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
         remarks.append(f"runs: {len(runs)} columns ({listed(names)}), read one after the other; {words}")
     unit = next((run.name.unit for run in runs if run.name.unit), None)
@@ -113,6 +116,21 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     return LongTable(by_rows, {**stated, "command": command}, remarks, unused)
 
 
+def _turned(table: ForeignTable, runs: list[Run], remarks: list[str]) -> list[Run]:
+    """Runs to the right and left with the side that lags as the forward one: play holds the reading back."""
+    if not any(run.name.has("clockwise", "counterclockwise") for run in runs):
+        return runs
+    means = {
+        side: fmean(float(cell) for run in runs if run.side == side for cell in table.columns[run.name.text] if cell)
+        for side in {run.side for run in runs}
+    }
+    rises = len(means) < 2 or means[1] <= means[-1]
+    first = next(run.name.text for run in runs if (run.side > 0) == rises)
+    remarks.append(f"runs: those as {escaped(first)} rise, since their readings lag behind the others")
+    turned = runs if rises else [replace(run, side=-run.side) for run in runs]
+    return sorted(turned, key=lambda run: (run.number, -run.side))
+
+
 def _row_sides(table: ForeignTable) -> list[int]:
     """The side of each row where a column of words states one for all, else []."""
     for text, cells in table.columns.items():
@@ -139,9 +157,9 @@ def _runs(table: ForeignTable) -> list[Run]:
         name = replace(name, text=text)
         if not _numeric(cells) or name.has(*_NEVER) and not name.has("run") or name.has("u", "expanded"):
             continue
-        signed = re.match(r"\s*([+-])\s*\d+\b", text)
+        signed = _SIGN.search(text)
         rising, falling = name.has("forward", "clockwise"), name.has("backward", "counterclockwise")
-        side = (1 if signed[1] == "+" else -1) if signed else rising - falling
+        side = (1 if "+" in signed.groups() else -1) if signed else rising - falling
         both = rising and falling
         if name.has("several") and not side:
             continue

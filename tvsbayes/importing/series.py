@@ -36,7 +36,7 @@ INVALID = 3
 """Severity of a value that is none (EPICS, alarm.h)."""
 PAIRS_ASKED = 6
 _CAMONITOR = re.compile(
-    r"(?P<name>\S+)\s+(?:\(\S+\)\s*)?(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?)\s+"
+    r"(?P<name>(?=\S*[A-Za-z])\S+)\s+(?:\(\S+\)\s*)?(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?)\s+"
     r"(?P<value>\S+)(?:\s+(?P<rest>\S.*))?"
 )
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")

@@ -28,7 +28,8 @@ ANGLES = ("azimuth_deg", "elevation_deg")
 FIELDS = (*MOVE_FIELDS, *ANGLES, "u_deg", "status")
 """All fields that a table of sightings can have."""
 NEEDED = (*COUNTERS, *ANGLES)
-TURN_RAD = 2 * math.pi
+SPANS = {"rad": 2 * math.pi, "deg": 360.0, "gon": 400.0, "mrad": 2000 * math.pi, "arcmin": 21600.0, "arcsec": math.inf}
+"""Largest absolute angle in a unit, in the order in which the units are asked for."""
 ANGLE_MAX_DEG, ELEVATION_MAX_DEG = 1e6, 180.0
 U_MAX_DEG = 10.0
 
@@ -86,7 +87,7 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
     cells, notations = FieldCells(table, known.columns).with_plain(*NEEDED, "u_deg")
     assumed += [column.remark for column in notations.values() if column.remark]
     written = {name: column.unit for name, column in notations.items()}
-    units = _units(cells, columns_of(table), written, wishes)
+    units = _units(cells, columns_of(table), written, wishes, assumed)
     of_encoders = [name for name in COUNTERS if name in units]
     counters = _counters(cells, units, assumed)
     rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
@@ -133,6 +134,12 @@ def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understo
         role = field_of(column)
         if text not in taken.values() and role is not None and role not in taken and role not in stated:
             claims.setdefault(role, []).append(text)
+    for angle, counter in zip(ANGLES, COUNTERS, strict=True):
+        # "M1 az" beside "azimuth_rad": whole numbers without a unit are the counters.
+        names = claims.get(angle, [])
+        whole = [name for name in names if known[name].whole and known[name].name.unit is None]
+        if len(names) == 2 and len(whole) == 1 and not ({counter} & (claims.keys() | taken.keys() | stated.keys())):
+            claims[counter], claims[angle] = whole, [name for name in names if name not in whole]
     for role, names in claims.items():
         # Of two directions the one that was found.
         found = [name for name in names if known[name].name.words and place_of(known[name].name.words, "observed") is not None]
@@ -174,7 +181,7 @@ def field_of(column: Column) -> str | None:
 
 
 def _units(
-    cells: FieldCells, known: Mapping[str, Column], written: Mapping[str, Unit | None], wishes: SightingWishes
+    cells: FieldCells, known: Mapping[str, Column], written: Mapping[str, Unit | None], wishes: SightingWishes, assumed: list[str]
 ) -> dict[str, Unit]:
     """Units of angles by field; whole counters have none.
 
@@ -201,17 +208,26 @@ def _units(
         elif unit is None:
             unit = stated
             numbers = [abs(float(cell)) for cell in cells.text(name) if NUMBER.fullmatch(cell)]
-            if unit is None and numbers and max(numbers) <= TURN_RAD and name == ANGLES[0]:
-                raise _ask_angles(cells, column, f"angles up to {max(numbers):.4g} in column {escaped(column.name.text)}, without a unit")
-            unit = unit or (units[ANGLES[0]] if ANGLES[0] in units else unit_named("deg"))
+            unit = unit or units.get(ANGLES[0])
+            largest = max(numbers, default=0.0)
+            limits = [u for u, most in SPANS.items() if largest <= most]
+            if unit is None and limits[0] != "deg":
+                found = f"angles up to {largest:.4g} in column {escaped(column.name.text)}, without a unit"
+                raise _ask_angles(cells, column, found, limits)
+            if unit is not None and name == ANGLES[1] and largest * unit.scale > ELEVATION_MAX_DEG and stated is None and known[cells.columns[ANGLES[0]]].name.unit is None:
+                found = f"elevations up to {largest:.4g} in column {escaped(column.name.text)}, without a unit"
+                raise _ask_angles(cells, column, found, [u for u in limits if u not in ("rad", "deg")])
+            if unit is None:
+                unit = unit_named("deg")
+                assumed.append(f"angles: no unit in column {escaped(column.name.text)}, so deg; --angles says another")
         if unit is not None:
             units[name] = unit
     return units
 
 
-def _ask_angles(cells: FieldCells, column: Column, found: str):
+def _ask_angles(cells: FieldCells, column: Column, found: str, units: Sequence[str] = ("deg", "rad")):
     first = {column.name.text: column.first}
-    candidates = [Candidate(f"they are in {unit}", ("--angles", unit), first) for unit in ("rad", "deg")]
+    candidates = [Candidate(f"they are in {unit}", ("--angles", unit), first) for unit in units]
     return question(file=cells.table.file, line=cells.table.first_line, found=found, allowed="angles of a known unit", candidates=candidates, code="unit")
 
 

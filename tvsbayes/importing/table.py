@@ -33,6 +33,8 @@ CELLS_MAX = 4_000_000
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """Separators in the order in which they are tried: a decimal comma must not be taken for one."""
 ROWS_TRIED = 50
+NUMERIC_SHARE = 0.6
+"""Least share of numbers in a column of numbers."""
 ABOVE_MAX = 50
 """Largest number of lines above the names of columns: serial number, date, operator."""
 KINDS = "a table as text (CSV and its like), XLSX, XLS or ODS"
@@ -196,8 +198,8 @@ def _text_rows(text: str, file: str) -> tuple[list[Row], str, list[tuple[int, st
     """Rows with their line numbers, the separator, and the remarks above the first row."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
     declared = next((line[4:5] for _, line in lines[:1] if line.lower().startswith("sep=")), None)
-    remarks = [(n, line.strip()) for n, line in lines if line.lstrip().startswith(REMARKS)]
-    body = [(n, line) for n, line in lines if not line.lstrip().startswith(REMARKS)][declared is not None :]
+    remarks = [(n, line.strip()) for n, line in lines if _is_remark(line)]
+    body = [(n, line) for n, line in lines if not _is_remark(line)][declared is not None :]
     remarks = [(n, line) for n, line in remarks if body and n < body[0][0]]
     if _is_markdown([line for _, line in body]):
         body, declared = _markdown_rows(lines), "|"
@@ -209,6 +211,11 @@ def _text_rows(text: str, file: str) -> tuple[list[Row], str, list[tuple[int, st
         raise refusal("csv", file=file, line=1, found=found, allowed=allowed, remedy="correct or remove the line sep=")
     separator = declared or _separator([line for _, line in body])
     return _divided(body, separator, file), separator, remarks
+
+
+def _is_remark(line: str) -> bool:
+    """Whether a line is a remark; "#;Position" begins with a name for the number of the row."""
+    return line.lstrip().startswith(REMARKS) and not re.match(r'\s*"?#"?\s*[;,|\t]', line)
 
 
 def _divided(body: Sequence[tuple[int, str]], separator: str, file: str) -> list[Row]:
@@ -424,31 +431,60 @@ def _alpha(cells: Sequence[str]) -> bool:
 def _headed(found: Rows) -> Rows:
     """The rows from the column names on, and a note on the lines above them.
 
-    The names are in the first row that is at least as wide as most rows, and are not numbers. It may be wider: a last
-    column of remarks is empty in most rows.
+    The names stand in the row above the first one with numbers in the columns of numbers; units may stand between,
+    groups of columns above. A row with numbers holds no names.
     """
-    rows, notes = found
-    rows = [row for row in rows if any(row.cells)]
-    widths = {k: _filled_width(row.cells) for k, row in enumerate(rows)}
-    usual_width, times = next(iter(Counter(widths.values()).most_common(1)), (0, 0))
-    if usual_width < 2 or 2 * times <= len(widths):
+    rows, notes = [row for row in found.rows if any(row.cells)], found.notes
+    data = _first_data(rows)
+    if not data:
         return Rows(rows, notes)
-    first = next(k for k, width in widths.items() if width >= usual_width)
-    names = [cell for cell in rows[first].cells if cell]
-    if first and _is_group_row(rows[first - 1].cells, rows[first:]):
-        first -= 1
-    if not first or first > ABOVE_MAX or any(map(is_number, names)):
+    first = data
+    above = data - 2 if data > 1 and _all_units(rows[data - 1].cells) else data - 1
+    if _may_be_names(rows[above].cells, rows[data].cells):
+        first = above
+        if first and _is_group_row(rows[first - 1].cells, rows[first].cells):
+            first -= 1
+    if not first:
         return Rows(rows, notes)
     text = " ".join(cell for cell in rows[0].cells if cell)
     amount = f"{first} lines" if first > 1 else "a line"
     return Rows(rows[first:], [*notes, f'{amount} above the names left out ("{escaped(text, 40)}")'])
 
 
-def _is_group_row(above: Sequence[str], rows: Sequence[Row]) -> bool:
-    """Whether a row above the names groups them, as "Run 1,,Run 2,": cells with gaps, at the columns of the names."""
+def _first_data(rows: Sequence[Row]) -> int:
+    """The first row with numbers in all columns of numbers; 0 where no column holds any, or the lines above are many."""
+    width = max((len(row.cells) for row in rows), default=0)
+    tail = rows[len(rows) // 2 :]
+    numeric = []
+    for k in range(width):
+        cells = [row.cells[k] for row in tail if k < len(row.cells) and row.cells[k]]
+        if sum(map(is_number, cells)) > NUMERIC_SHARE * max(len(cells), 1) and len(cells) > NUMERIC_SHARE * len(tail):
+            numeric.append(k)
+    for first, row in enumerate(rows[: ABOVE_MAX + 1]):
+        cells = [row.cells[k] if k < len(row.cells) else "" for k in numeric]
+        if any(map(is_number, cells)) and all(is_number(c) or not c or means(c, "empty") for c in cells):
+            return first
+    return 0
+
+
+def _may_be_names(cells: Sequence[str], data: Sequence[str]) -> bool:
+    """Whether a row can hold the names of the columns: no number, but as many texts as most of the data."""
+    filled = [cell for cell in cells if cell]
+    numbers = sum(map(is_number, data))
+    return len(filled) >= max(2, numbers) and not any(is_number(c) and not c.lstrip("+-").isdigit() for c in filled) and not is_number(filled[0])
+
+
+def _all_units(cells: Sequence[str]) -> bool:
+    """Whether a row below the names holds units and nothing else."""
+    texts = [cell.strip("()[] ") for cell in cells if cell]
+    return bool(texts) and all(parse_unit(t) is not None or not words_of(t) or means(t, "empty") for t in texts)
+
+
+def _is_group_row(above: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether a row above the names groups them, as "Run 1,,Run 2,": fewer cells, with gaps, at the columns of names."""
     filled = [k for k, cell in enumerate(above) if cell]
-    is_gapped = len(filled) > 1 and any(b - a > 1 for a, b in zip(filled, filled[1:], strict=False))
-    return is_gapped and not any(map(is_number, above)) and len(rows) > 2
+    is_gapped = filled != list(range(len(filled)))
+    return is_gapped and not any(map(is_number, above)) and filled[-1] < len(names)
 
 
 def table_of_rows(file: str, rows: Sequence[Row], description: Sequence[str]) -> ForeignTable:

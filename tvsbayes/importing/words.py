@@ -64,25 +64,33 @@ def place_of(words: Sequence[str], concept: str, file: str = "tables.toml") -> i
     """Place of the first word or phrase of a concept among words; None where there is none."""
     singles, phrases = _index(concept, file)
     for place, word in enumerate(words):
-        if word in singles or any(
-            word.startswith(phrase[0][:-1]) if phrase[0].endswith("*") else tuple(words[place : place + len(phrase)]) == phrase
-            for phrase in phrases
-        ):
+        if word in singles or any(_matches(words[place : place + len(phrase)], phrase) for phrase in phrases):
             return place
     return None
+
+
+def _matches(words: Sequence[str], phrase: Sequence[str]) -> bool:
+    """Whether words are a phrase; "soll*" and "*winkel" are longer words that begin or end so."""
+    if len(words) < len(phrase):
+        return False
+    if phrase[0].endswith("*"):
+        return words[0].startswith(phrase[0][:-1])
+    return words[0].endswith(phrase[0][1:]) if phrase[0].startswith("*") else tuple(words) == tuple(phrase)
 
 
 @cache
 def _index(concept: str, file: str) -> tuple[frozenset[str], Phrases]:
     phrases = vocabulary(concept, file)
-    plain_words = {phrase[0] for phrase in phrases if len(phrase) == 1 and not phrase[0].endswith("*")}
-    return frozenset(plain_words), tuple(p for p in phrases if len(p) > 1 or p[0].endswith("*"))
+    singles = {phrase[0] for phrase in phrases if len(phrase) == 1 and "*" not in phrase[0]}
+    return frozenset(singles), tuple(p for p in phrases if len(p) > 1 or "*" in p[0])
 
 
 def means(text: str, concept: str) -> bool:
     """Whether a whole cell is one of the words of a concept, signs included."""
     cell = plain(text).strip() or text.strip()
-    return cell in _cells(concept)
+    # "+1" and "1.0" are the number 1; a sign alone is a word.
+    number = re.fullmatch(r"\+?(\d+)(?:[.,]0*)?", cell)
+    return cell in _cells(concept) or (number is not None and number[1] in _cells(concept))
 
 
 @cache
@@ -219,7 +227,8 @@ def name_of(text: str) -> Name:
     """Read a column's name."""
     unit, unknown, rest = None, "", text
     for match in reversed(list(_BRACKETS.finditer(text))):
-        pieces = [piece.strip() for piece in re.split("[,;]", match[1])]
+        # Whole first: "0,01 mm" is one unit.
+        pieces = [match[1], *re.split("[,;]", match[1])]
         unit = next((found for piece in pieces if (found := parse_unit(piece)) is not None), None)
         if unit is not None:
             rest = text[: match.start()] + " " + text[match.end() :]
@@ -276,8 +285,11 @@ def _of_count(unit: Unit, text: str) -> list[str]:
 
 def _may_end(unit: Unit, word: str, before: Sequence[str]) -> bool:
     """Whether a word at the end of a name is its unit, by the words before it."""
-    if unit.kind == "other" or (_is_direction(word) and unit.kind != "temperature"):
+    if unit.kind == "other":
         return False
+    if _is_direction(word) and unit.kind != "temperature":
+        # "Rev 1" is a run, "Measured rev" a number of revolutions.
+        return any(place_of(before, concept) is not None for concept in ("command", "value", "position"))
     if unit.kind == "temperature":
         return place_of(before, "temperature") is not None or word in ("celsius", "kelvin", "fahrenheit", "degc")
     if unit.kind == "time" and len(word) < 2:
