@@ -214,6 +214,11 @@ FAULTS = (
           "test_a_pair_off_its_epipolar_lines_is_refused"),
     Fault("the stereo calibration divides by n instead of n - p", "bundle_adjustment.bundle_adjustment",
           Local("dof", "int(kept.sum())"), "test_degrees_of_freedom_are_coordinates_less_unknowns"),
+    # A run.
+    Fault("a program under the place command's wrapper moves on", "place_command._signalled",
+          Call("killpg", "process.send_signal(arg1)"), "test_the_program_below_a_wrapper_is_ended_with_it"),
+    Fault("a place command's whole output is held", "place_command.OUTPUT_BYTES_MAX", Constant("10**9"),
+          "test_a_flood_is_read_and_never_more_than_64_kb_of_it_held"),
     # The twin.
     Fault("simulated stop errors are drawn anew while the axis stands", "physics.stop_errors",
           Argument("counters", "value + 1e-9 * np.arange(len(value))"), "test_stop_errors_persist_and_are_redrawn"),
