@@ -14,9 +14,9 @@ import pytest
 from support.bench_runs import Run, events, small_plan
 from support.firmware_sessions import NO_EMULATOR
 
+from tvsbayes.acquisition import place_command
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator
-from tvsbayes.acquisition import place_command
 from tvsbayes.acquisition.place_command import OUTPUT_BYTES_MAX, WORDS_MAX, PlaceCommand, require_placed
 from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError

@@ -32,7 +32,7 @@ def first():
 def shared(first: WayDraws, rounds: int = 1) -> WayDraws:
     """Draws reweighted for another way, which has the same density here."""
     target = Target(first.target.fit, first.target.path)
-    way = WayDraws(target, Pool.empty(first.pool.next_proposal), SEED, shared=True)
+    way = WayDraws(target, Pool.empty(first.pool.next_proposal), SEED, (1, 0), shared=True)
     return way.extended(rounds, first.pool)
 
 
@@ -41,7 +41,7 @@ def second():
     """Two rounds of a way's own draws, by the proposal fitted for the most probable one."""
     run = small_run()
     target = Target(run.density.fit, run.density.path)
-    return WayDraws(target, Pool.empty(run.pool.proposals[-1]), SEED + 1).extended(2, run.pool)
+    return WayDraws(target, Pool.empty(run.pool.proposals[-1]), SEED, (1, 0)).extended(2, run.pool)
 
 
 def test_the_same_density_reweighted_has_the_same_weights(first):
