@@ -229,6 +229,9 @@ FAULTS = (
           "test_drift_grows_with_the_root_of_time_and_restarts_at_a_homing"),
     Fault("true ratios of two directions are exchanged", "true_headlines.effective_deg_per_step",
           Local("half", "-value"), "test_the_headline_is_the_line_through_the_looks"),
+    # Studies.
+    Fault("a row of a study counts whatever its numbers are", "StudyRows._take", Call("_digest", "stated"),
+          "test_a_row_that_does_not_say_what_was_written_is_made_again"),
     # One axis.
     Fault("an axis is homed from the wrong side", "play_places", Local("side", "-value"),
           "test_play_is_the_clip_of_the_definition"),
