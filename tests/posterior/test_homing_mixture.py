@@ -67,8 +67,9 @@ def test_a_way_that_shares_all_draws_adds_no_knowledge(first):
     assert mixture.acceptance.missing == one.acceptance.missing == () and mixture.improved() is None
 
 
-def test_independent_draws_add_their_squared_errors(first, second):
-    """Shares of the error are those of the variance of a sum of independent means."""
+def test_independent_draws_add_their_squared_errors(first, second, monkeypatch):
+    """Shares of the error of a mean are those of the variance of a sum; an end's error comes from few draws."""
+    monkeypatch.setattr(homing_mixture, "END_ERROR_MAX", 1e9)
     mixture = Mixture((first, second), 0)
     shares = mixture.shares_of_error
     assert shares.sum() == pytest.approx(1) and shares[1] > shares[0], "two rounds are less than three or more"
