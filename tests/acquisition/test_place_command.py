@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import re
+import select
+import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support.bench_runs import Run, events, small_plan
 from support.firmware_sessions import NO_EMULATOR
 
+from tvsbayes.acquisition import place_command
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator
-from tvsbayes.acquisition.place_command import WORDS_MAX, PlaceCommand
+from tvsbayes.acquisition.place_command import OUTPUT_BYTES_MAX, WORDS_MAX, PlaceCommand, require_placed
 from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.campaign import read_campaign
@@ -21,6 +26,52 @@ from tvsbayes.positioner.emulated_board import EmulatedBoard
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 SAYS = "import sys; print('moved to', *sys.argv[1:])"
 WAITS = "import threading; print('on my way', flush=True); threading.Event().wait()"
+
+
+MOVES_ON = """
+import signal, sys, threading
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+with open(sys.argv[1], "w") as alive:
+    print("moving", file=alive, flush=True)
+    threading.Event().wait()
+"""
+"""A mover below a wrapper, which holds a pipe open for as long as it runs and takes no SIGTERM."""
+WRAPPER = f"""
+import subprocess, sys, threading
+subprocess.Popen([sys.executable, "-c", {MOVES_ON!r}, sys.argv[1]])
+print("started the mover", flush=True)
+open(sys.argv[1] + ".go").read() if sys.argv[2] == "leaves" else threading.Event().wait()
+"""
+
+
+class Mover:
+    """The mover of a wrapper, watched by the pipe that it holds open."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, ending: str = "waits") -> None:
+        monkeypatch.setattr(place_command, "GRACE_S", 0.2)
+        self.path = folder / "alive"
+        os.mkfifo(self.path)
+        os.mkfifo(f"{self.path}.go")
+        self.pipe, self.ending = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK), ending
+        self.command = PlaceCommand((sys.executable, "-c", WRAPPER, str(self.path), ending), 60.0)
+
+    def moves(self) -> bool:
+        """Whether it has begun; lets a wrapper that leaves it go."""
+        begun = bool(select.select([self.pipe], [], [], 0)[0]) and os.read(self.pipe, 100) == b"moving\n"
+        if begun and self.ending == "leaves":
+            Path(f"{self.path}.go").write_text("go")
+        return begun
+
+    def gone(self) -> bool:
+        """Whether nothing holds the pipe any more, at the latest in a minute."""
+        return bool(select.select([self.pipe], [], [], 60)[0]) and os.read(self.pipe, 100) == b""
+
+
+@pytest.fixture
+def mover(tmp_path, monkeypatch) -> Iterator[Mover]:
+    watched = Mover(tmp_path, monkeypatch)
+    yield watched
+    os.close(watched.pipe)
 
 
 def program(code: str, limit_s: float = 60.0) -> PlaceCommand:
@@ -108,9 +159,49 @@ def test_stop_ends_the_program_too(mounted_rig, tmp_path, monkeypatch):
     assert [one["exit_code"] for one in events(tmp_path / "c", "place_command")] == [None]
 
 
-def test_long_output_is_kept_short():
-    done = program("print('x' * 10**6 + 'end')").run("d1", 175.0, 0, lambda: True)
-    assert len(done.words) == WORDS_MAX and done.words.strip().endswith("end")
+def test_the_program_below_a_wrapper_is_ended_with_it(mover):
+    done = mover.command.run("d1", 175.0, 0, lambda: not mover.moves())
+    assert done.exit_code is None and done.words == "started the mover\n" and mover.gone()
+
+
+def test_ctrl_c_at_once_ends_the_program_below_a_wrapper(mover):
+    def interrupted() -> bool:
+        if mover.moves():
+            signal.raise_signal(signal.SIGINT)
+        return True
+
+    with pytest.raises(KeyboardInterrupt):
+        mover.command.run("d1", 175.0, 0, interrupted)
+    assert mover.gone()
+
+
+def test_what_a_program_leaves_running_is_ended_and_said(tmp_path, monkeypatch):
+    mover = Mover(tmp_path, monkeypatch, "leaves")
+    done = mover.command.run("d1", 175.0, 0, lambda: mover.moves() or True)
+    assert (done.exit_code, done.left_running) == (0, True) and mover.gone()
+    os.close(mover.pipe)
+
+
+def test_the_end_of_long_output_is_kept_and_the_rest_is_said_to_be_discarded():
+    done = program("print('x' * 3 * 10**6 + 'end'); raise SystemExit(3)").run("d1", 175.0, 0, lambda: True)
+    assert len(done.words) == WORDS_MAX and done.words.strip().endswith("end") and done.output_bytes == 3_000_004
+    with pytest.raises(DeviceFault, match="the end of 3000004 bytes; the rest is discarded"):
+        require_placed(done)
+
+
+def test_a_flood_is_read_and_never_more_than_64_kb_of_it_held(monkeypatch):
+    """A program that waits for its reader writes 4 MB, none of which meets a disk."""
+    held, ordinary = [], place_command.os.read
+
+    def watched(*arguments):
+        held.append(len(output.kept))
+        return ordinary(*arguments)
+
+    output = place_command._Output()
+    monkeypatch.setattr(place_command, "_Output", lambda: output)
+    monkeypatch.setattr(place_command.os, "read", watched)
+    done = program("import os\nfor _ in range(64): os.write(1, b'A' * 65535 + b'\\n')").run("d1", 1.0, 0, lambda: True)
+    assert (done.exit_code, done.output_bytes) == (0, 64 * 65536) and max(held) == OUTPUT_BYTES_MAX == 65536
 
 
 @pytest.mark.parametrize("line", ["", "'", "no-such-program-anywhere --fast"])

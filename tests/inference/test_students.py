@@ -71,6 +71,36 @@ def test_a_bent_target_is_followed_from_a_guess_that_is_far_too_narrow():
     assert evidence.log_evidence == pytest.approx(np.log(np.pi), abs=SIGMAS * evidence.log_evidence_mcse)
 
 
+class Integrating(Toy):
+    """Draws a number for every point as a quantity that is integrated out."""
+
+    def valued(self, w, generator):
+        """A standard normal number beside."""
+        return Points(w, self(w), {"beside": generator.standard_normal(len(w))})
+
+
+def test_numbers_of_what_is_integrated_out_are_of_the_seed_and_of_no_other_round(monkeypatch):
+    """Over three seeds, pilot and final rounds, and rounds after another fit of the proposal."""
+    begun, ordinary = [], Integrating.valued
+
+    def recorded(self, w, generator):
+        points = ordinary(self, w, generator)
+        begun.append(points.parts["beside"][:2].tolist())
+        return points
+
+    monkeypatch.setattr(Integrating, "valued", recorded)
+    for seed in (0, 1, 2):
+        weighted_run(Integrating(bent, 0.1), seed, pilots_max=3)
+    numbers = [number for pair in begun for number in pair]
+    assert len(begun) > 3 * 6 and len(set(numbers)) == len(numbers)
+
+
+def test_a_seed_gives_the_same_numbers_whatever_is_integrated_out():
+    one, again = (weighted_run(Integrating(bent, 0.1), 1, pilots_max=3).pool.drawn for _ in range(2))
+    np.testing.assert_array_equal(one.parts["beside"], again.parts["beside"])
+    np.testing.assert_array_equal(one.w, weighted_run(Toy(bent, 0.1), 1, pilots_max=3).pool.drawn.w)
+
+
 @pytest.mark.parametrize("which", [0, 1])
 def test_its_steps_keep_the_target(which):
     mixture = StudentMixture.about(np.zeros(2), np.eye(2))

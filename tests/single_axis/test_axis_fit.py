@@ -9,9 +9,12 @@ import pytest
 from support.axes import FIRST_EDITION, campaign, drawn, random_moves, runs
 
 from tvsbayes.inference import ensemble
+from tvsbayes.inference.importance import weighted_run
 from tvsbayes.results.tiers import CHAIN, RUNS
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
-from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_density import AxisDensity
+from tvsbayes.single_axis.axis_fit import fit_axis, model_of
+from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import summarise_axis
 
@@ -44,6 +47,17 @@ def test_both_tiers_agree_and_a_seed_gives_the_same():
     quick, again = (fit_axis(axis, tier="importance", seed=1) for _ in range(2))
     np.testing.assert_array_equal(quick.draws["backlash"], again.draws["backlash"])
     json.dumps(summarise_axis(one).as_json(), allow_nan=False)
+
+
+def test_the_seed_is_that_of_the_line_which_is_integrated_out():
+    model = model_of(drawn(3, runs(1)).campaign)
+    density = AxisDensity(model, find_mode(model))
+    one, again, other = (weighted_run(density, seed).pool.drawn.parts["linear"] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, again)
+    # Independent normal numbers; those of one stream correlate by 0.4 and 0.7 in the first and third column.
+    count = min(len(one), len(other))
+    correlation = [np.corrcoef(one[:count, k], other[:count, k])[0, 1] for k in range(one.shape[1])]
+    assert np.abs(correlation).max() < 5 / np.sqrt(count)
 
 
 class OtherRun(ensemble.Run):

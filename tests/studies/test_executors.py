@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from concurrent.futures import CancelledError, Future
@@ -11,7 +12,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, TvsError
+from tvsbayes.files.disk import shipped_data
 from tvsbayes.studies.executors import SINGLE_THREADED, made_rows
 
 
@@ -109,3 +112,14 @@ def test_dask_without_its_extra_is_refused(job, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match="needs the extra dask"):
         next(made_rows(job, [0], "dask"))
+
+
+@pytest.mark.parametrize(("engine", "code"), [("dask", "no-dask"), ("threads", "engine")])
+def test_a_missing_engine_is_said_before_the_command_begins(tmp_path, monkeypatch, capsys, engine, code):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    rigs, rows = shipped_data() / "rigs" / "mounted", tmp_path / "rows.jsonl"
+    plan = next(rigs.glob("*.csv"))
+    arguments = [str(rigs / "rig.toml"), str(plan), "--engine", engine, "--rows", str(rows), "--json"]
+    assert run(["study", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert json.loads(out)["error"]["code"] == code and "campaigns" not in err and not rows.exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -76,6 +77,32 @@ def test_a_second_study_cuts_off_nothing_that_the_first_has_written(tmp_path, jo
     second.append(invented(job, 2))
     first.append(invented(job, 3))
     assert path.read_bytes().startswith(data) and sorted(StudyRows(path).of(job.key)) == [0, 1, 2, 3]
+
+
+def edited(line: str, **numbers: object) -> str:
+    """A line with other numbers, and the hash of the true ones."""
+    return json.dumps({**json.loads(line), **numbers})
+
+
+@pytest.mark.parametrize(
+    "forge",
+    [
+        lambda line: edited(line, target=1e-9),
+        lambda line: edited(line, index=7),
+        lambda line: json.dumps({k: v for k, v in json.loads(line).items() if k != "sha256"}),
+        lambda line: re.sub(r'"pit": [^,]*,', '"pit": 0.5,', line, count=1),
+    ],
+)
+def test_a_row_that_does_not_say_what_was_written_is_made_again(job, quick, tmp_path, forge):
+    path = tmp_path / "rows.jsonl"
+    whole = study(job, 3, StudyRows(path))
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], forge(lines[1]), lines[2]]) + "\n")
+    stored = StudyRows(path)
+    assert stored.damaged(job.key) == [2] and sorted(stored.of(job.key)) == [0, 2]
+    quick.clear()
+    assert study(job, 3, stored) == whole and quick == [1]
+    assert sorted(StudyRows(path).of(job.key)) == [0, 1, 2], "the good row that was added counts"
 
 
 def test_rows_that_cannot_be_written_are_refused_before_the_first_fit(tmp_path):

@@ -70,8 +70,9 @@ class Placed(Event, frozen=True):
 
 
 class PlaceCommanded(Event, frozen=True, kw_only=True, tag="place_command"):
-    """A program has placed the sheet (`exit_code` 0) or failed; None where it had to be ended. `words`: its output.
+    """A program has placed the sheet (`exit_code` 0) or failed; None where it had to be ended.
 
+    `words`: the end of its output of `output_bytes`; `left_running`: it left something running, which was ended.
     `placement` counts the placements of the plan from 0. `placed` follows after success.
     """
 
@@ -84,6 +85,8 @@ class PlaceCommanded(Event, frozen=True, kw_only=True, tag="place_command"):
     seconds: float
     limit_s: float
     words: str
+    output_bytes: int | UnsetType = UNSET
+    left_running: bool | UnsetType = UNSET
 
 
 class TrueAngles(Struct, frozen=True):

@@ -400,16 +400,21 @@ def study(
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
     from tvsbayes.statistics.chances import ASSURED
+    from tvsbayes.studies.executors import require_engine
     from tvsbayes.studies.rows import StudyRows
     from tvsbayes.studies.study import study as run_study
     from tvsbayes.studies.study_job import ESTIMATORS, StudyJob
 
+    require_engine(engine)
     if estimator not in ESTIMATORS:
         allowed = " and ".join(ESTIMATORS)
         raise InputError("usage", f"--estimator {escaped(estimator)}: allowed are {allowed}", remedy="choose one")
     compile_for(report_line)
     job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture, estimator)
     stored = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
+    if damaged := stored.damaged(job.key):
+        lines = ", ".join(map(str, damaged))
+        report_line(f"warning: {escaped(str(stored.path), 200)}: not as study wrote it, made again: line {lines}")
     missing = n - sum(index < n for index in stored.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(stored.path), 200)}")
     with waiting("every campaign that is done is kept; the same command goes on from there") as progress:

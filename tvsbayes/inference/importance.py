@@ -105,9 +105,12 @@ class Pool:
     def extended(self, density: Density, generator: np.random.RandomState, fitted: bool) -> Pool:
         """Add another round; fit the proposal to all draws if `fitted`."""
         proposal, before = self.next_proposal, density.invalid
+        # A separate stream, since drawing the quantities integrated out must not change the draws of w; its seed is
+        # the state of the generator, which no other round of this or of another seed has.
+        _, key, place, *_ = generator.get_state()
+        integrated_out = random_stream(int(place), Stream.POOLED_ROUNDS, *key.tolist())
         w = proposal.draw(ROUND, generator)
-        # A separate stream: drawing the quantities integrated out must not change the draws of w.
-        valued = density.valued(w, random_stream(0 if self.points is None else len(self.points), Stream.POOLED_ROUNDS))
+        valued = density.valued(w, integrated_out)
         proposals, counts = self.proposals, self.counts
         if proposals and proposals[-1] is proposal:
             counts = (*counts[:-1], counts[-1] + ROUND)

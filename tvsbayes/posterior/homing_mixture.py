@@ -47,13 +47,14 @@ class WayDraws:
     Attributes:
         target: its density.
         pool: its draws.
-        seed: seed of all random numbers.
+        seed: seed of all random numbers; `part`: number of the way, and of fits of its proposal, which draw others.
         shared: whether these are the first draws of the most probable way, weighed anew.
     """
 
     target: Target
     pool: Pool
     seed: int
+    part: tuple[int, int] = (0, 0)
     shared: bool = False
 
     @cached_property
@@ -79,26 +80,27 @@ class WayDraws:
     @property
     def refitted(self) -> WayDraws:
         """Draw as many rounds from a proposal fitted to these draws, which are left out."""
-        empty = replace(self, pool=Pool.empty(self.pool.refitted, self.pool.invalid), seed=self.seed + 1)
+        part = self.part[0], self.part[1] + 1
+        empty = replace(self, pool=Pool.empty(self.pool.refitted, self.pool.invalid), part=part)
         return empty.extended(self.rounds, self.pool)
 
     def extended(self, rounds: int, first: Pool) -> WayDraws:
         """Extend to so many rounds; shared draws by those of `first`, which has as many."""
-        pool, generator = self.pool, np.random.RandomState([self.seed, sum(self.pool.counts)])
+        pool, generator = self.pool, np.random.RandomState([self.seed, *self.part, sum(self.pool.counts)])
         while sum(pool.counts) < rounds * ROUND:
             if self.shared:
-                pool = _weighed_anew(self.target, pool, first, self.seed)
+                pool = _weighed_anew(self.target, pool, first, self.seed, self.part[0])
             else:
                 pool = pool.extended(self.target, generator, fitted=False)
         return replace(self, pool=pool)
 
 
-def _weighed_anew(target: Target, pool: Pool, first: Pool, seed: int) -> Pool:
-    """Extend a pool by the next round of `first`, under another way of homing."""
+def _weighed_anew(target: Target, pool: Pool, first: Pool, seed: int, way: int) -> Pool:
+    """Extend a pool by the next round of `first`, under another way of homing, of this number."""
     begin, before = sum(pool.counts), target.invalid
     subset = first.drawn.taken(slice(begin, begin + ROUND))
     mapped = Mapped(subset.parts["z"], subset.parts["log_jacobian"])
-    normal = target.place_normals(ROUND, random_stream(seed, Stream.OTHER_HOMING, begin // ROUND))
+    normal = target.place_normals(ROUND, random_stream(seed, Stream.OTHER_HOMING, begin // ROUND, way))
     added = target.at(subset.w, mapped, normal)
     return replace(
         pool,
@@ -235,8 +237,8 @@ class Mixture:
         """Draw from another way of homing itself, by its own map and the proposal fitted for the most probable way."""
         first = self.ways[0]
         target = Target(way.target.fit, transport_beside(way.target.fit, first.target.path))
-        # Another seed: the same numbers in the proposal of the first way would tie the draws of both.
-        empty = WayDraws(target, Pool.empty(first.pool.proposals[-1]), way.seed + 1000 * place)
+        # Numbers of its own: the same ones in the proposal of the first way would tie the draws of both.
+        empty = WayDraws(target, Pool.empty(first.pool.proposals[-1]), way.seed, (place, 0))
         return empty.extended(ALONE_ROUNDS, first.pool)
 
     def posterior(self, seconds: float) -> Posterior:
@@ -260,8 +262,10 @@ def homing_mixture(run: ImportanceRun[Target]) -> Posterior:
     """Compute the posterior over all ways of homing of a fit, from the draws of the most probable one."""
     began = time.monotonic()
     shared = [
-        WayDraws(Target(way.fit, run.density.path), Pool.empty(run.pool.next_proposal), run.seed, shared=True)
-        for way in run.density.fit.mixture[1:]
+        WayDraws(
+            Target(way.fit, run.density.path), Pool.empty(run.pool.next_proposal), run.seed, (place, 0), shared=True
+        )
+        for place, way in enumerate(run.density.fit.mixture[1:], 1)
         if way.fit
     ]
     if not shared:

@@ -62,7 +62,7 @@ class PriorConflict:
 
 
 def prior_conflicts(
-    model: AxisModel, w: np.ndarray, stated: Mapping[str, AxisPrior], defaults: Mapping[str, AxisPrior]
+    model: AxisModel, w: np.ndarray, stated: Mapping[str, AxisPrior], defaults: Mapping[str, AxisPrior], seed: int
 ) -> tuple[PriorConflict, ...]:
     """Priors that the readings contradict.
 
@@ -71,8 +71,10 @@ def prior_conflicts(
         w: coordinates of equal draws of its posterior, shape (n, d).
         stated: entries of `[axis]`.
         defaults: complete priors without the stated entries.
+        seed: seed of all random numbers.
     """
-    conflicts = [_absorbed_conflict(model, name, defaults[name]) for name in ABSORBED if name in stated]
+    rng = random_stream(seed, AxisStream.PRIOR_CONFLICTS)
+    conflicts = [_absorbed_conflict(model, name, defaults[name], rng) for name in ABSORBED if name in stated]
     values = model.coordinates.values(w)
     for k, name in enumerate(model.coordinates.names):
         key = name.split(".")[0]
@@ -99,7 +101,9 @@ def conflict_text(conflict: PriorConflict) -> str:
     return conflict_sentence(quantity, conflict.distance, entry, REMEDY)
 
 
-def _absorbed_conflict(model: AxisModel, name: str, default: AxisPrior) -> PriorConflict | None:
+def _absorbed_conflict(
+    model: AxisModel, name: str, default: AxisPrior, rng: np.random.Generator
+) -> PriorConflict | None:
     """The conflict of prior and readings beyond both u; None where there is none or the test is not possible."""
     prior = model.priors[name]
     if prior.u >= default.u or (name == "backlash" and not model.rows.both_sides):
@@ -108,7 +112,6 @@ def _absorbed_conflict(model: AxisModel, name: str, default: AxisPrior) -> Prior
     mode = find_mode(without_prior)
     if mode.missing:
         return None
-    rng = np.random.default_rng(0)
     w = rng.multivariate_normal(mode.w, mode.covariance, DRAWS) if len(mode.w) else np.zeros((DRAWS, 0))
     draws = without_prior.linear(w).drawn(without_prior.line_terms(**{name: 1.0})[None], rng)[:, 0]
     value, sd = float(draws.mean()), float(draws.std())
@@ -203,7 +206,7 @@ class AxisFit(Shown):
     @cached_property
     def conflicts(self) -> tuple[PriorConflict, ...]:
         """Priors that the readings contradict."""
-        return prior_conflicts(self.model, self.w, self.campaign.stated, default_priors(self.rows))
+        return prior_conflicts(self.model, self.w, self.campaign.stated, default_priors(self.rows), self.seed)
 
     @cached_property
     def linear(self) -> LinearPosterior:

@@ -20,7 +20,7 @@ class Stream(IntEnum):
     """Offset of systematic resampling."""
     ORDER_OF_DRAWS = 3
     POOLED_ROUNDS = 4
-    """Errors of the gears at places, for rounds of importance sampling; the seed is the number of draws before."""
+    """Errors of the gears at places, for rounds of importance sampling; the seed is the state of the generator of w."""
     CALIBRATION_NOISE = 5
     """Scatter of stops and aperture readings in a calibration."""
     LOOKS = 6
@@ -60,6 +60,7 @@ class AxisStream(IntEnum):
     HELD_OUT_BY_WEIGHTS = 8
     PERIODS = 9
     EFFECTIVE_BACKLASH = 10
+    PRIOR_CONFLICTS = 11
     PREDICTED_STOPS = 21
 
 

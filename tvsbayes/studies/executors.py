@@ -33,6 +33,23 @@ def _in_worker(job: StudyJob, index: int) -> StudyRow:
     return study_row(job, index)
 
 
+def require_engine(engine: str) -> None:
+    """Refuse an engine that cannot compute rows, before the first row.
+
+    Raises:
+        InputError: there is no such engine, or Dask is not installed.
+    """
+    if engine not in ENGINES:
+        found, allowed = f"no engine {escaped(engine)}", ", ".join(ENGINES)
+        raise InputError("engine", found, column="--engine", allowed=allowed, remedy="name one")
+    try:
+        if engine == "dask":
+            import distributed  # noqa: F401
+    except ImportError as error:
+        remedy = "pip install 'tvsbayes[dask]', or use --engine processes"
+        raise InputError("no-dask", "the engine dask needs the extra dask", column="--engine", remedy=remedy) from error
+
+
 def made_rows(
     job: StudyJob, indices: Sequence[int], engine: str = "serial", workers: int = 2, address: str | None = None
 ) -> Generator[StudyRow]:
@@ -50,11 +67,7 @@ def made_rows(
     Raises:
         InputError: there is no such engine, Dask is not installed, or a worker died.
     """
-    if engine not in ENGINES:
-        allowed = ", ".join(ENGINES)
-        raise InputError(
-            "engine", f"no engine {escaped(engine)}", column="--engine", allowed=allowed, remedy="name one"
-        )
+    require_engine(engine)
     if engine == "serial":
         for index in indices:
             yield study_row(job, index)
@@ -82,12 +95,9 @@ def _by_processes(job: StudyJob, indices: Sequence[int], workers: int, address: 
 
 def _by_dask(job: StudyJob, indices: Sequence[int], workers: int, address: str | None) -> Iterator[StudyRow]:
     """Compute rows on a Dask cluster; another worker repeats the rows of one that dies."""
-    try:
-        from distributed import Client, KilledWorker, LocalCluster, as_completed
-        from distributed.comm import CommClosedError
-    except ImportError as error:
-        remedy = "pip install 'tvsbayes[dask]', or use --engine processes"
-        raise InputError("no-dask", "the engine dask needs the extra dask", column="--engine", remedy=remedy) from error
+    from distributed import Client, KilledWorker, LocalCluster, as_completed
+    from distributed.comm import CommClosedError
+
     local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
     try:
         with LocalCluster(**local) if address is None else nullcontext(address) as place, Client(place) as client:

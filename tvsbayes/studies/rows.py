@@ -1,11 +1,12 @@
 """Rows of studies, one simulated and fitted campaign each, in a file of JSON lines.
 
 Headlines in deg/step, deg and mm, the target in its unit, seconds of computing. A row is identified by its design, the
-hash of all its inputs, and the number of its campaign.
+hash of all its inputs, and the number of its campaign; its line ends with the hash of all that it says.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tempfile
@@ -101,8 +102,10 @@ class StudyRows:
         self.path = Path(path)
         data = read_bytes(self.path, ROWS_BYTES_MAX) if self.path.exists() else b""
         whole = data[: data.rfind(b"\n") + 1]
-        rows = (self._row(line, number) for number, line in enumerate(whole.splitlines(), 1))
-        self.rows = {(row.design, row.index): row for row in rows}
+        self.rows: dict[tuple[str, int], StudyRow] = {}
+        self._damaged: dict[int, tuple[str, int]] = {}
+        for number, line in enumerate(whole.splitlines(), 1):
+            self._take(line, number)
         self.torn, self._size = len(data) - len(whole), len(data)
         # Without a complete row the file may not be a study's; its unterminated line must not be removed as torn.
         if not whole and not (data.startswith(_LINE_BEGINS) or _LINE_BEGINS.startswith(data)):
@@ -132,14 +135,24 @@ class StudyRows:
         except OSError as error:
             raise self._unwritable(escaped(error.strerror or str(error))) from error
 
-    def _row(self, line: bytes, number: int) -> StudyRow:
+    def _take(self, line: bytes, number: int) -> None:
+        """Read a row; one that does not say what was written counts as damaged."""
         try:
             document = json.loads(line)
-            if document["format"] == STUDY_FORMAT:
-                return StudyRow.from_json(document)
-        except (ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError):
-            pass
-        raise self._no_row(number)
+            if document["format"] != STUDY_FORMAT:
+                raise self._no_row(number)
+            stated, row = document.pop("sha256", ""), StudyRow.from_json(document)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, msgspec.ValidationError) as error:
+            raise self._no_row(number) from error
+        key = row.design, row.index
+        if stated == _digest(document):
+            self.rows[key] = row
+        else:
+            self._damaged[number] = key
+
+    def damaged(self, design: str) -> list[int]:
+        """Return lines of a design that are not as they were written, and whose campaigns have no other row."""
+        return [line for line, key in self._damaged.items() if key[0] == design and key not in self.rows]
 
     def _no_row(self, number: int) -> InputError:
         return InputError(
@@ -157,7 +170,8 @@ class StudyRows:
 
     def append(self, row: StudyRow) -> None:
         """Add a row and wait until it is on disk."""
-        line = json.dumps({"format": STUDY_FORMAT, **row.as_json()}, allow_nan=False).encode() + b"\n"
+        document = {"format": STUDY_FORMAT, **row.as_json()}
+        line = json.dumps({**document, "sha256": _digest(document)}, allow_nan=False).encode() + b"\n"
         with self._open() as file:
             # If the file size has changed, its last line was not torn but that of a second study.
             if self.torn and self.path.stat().st_size == self._size:
@@ -167,3 +181,7 @@ class StudyRows:
             file.flush()
             os.fsync(file.fileno())
         self.rows[row.design, row.index] = row
+
+
+def _digest(document: Mapping[str, object]) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()

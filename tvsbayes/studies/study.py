@@ -20,7 +20,7 @@ from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import Record
 from tvsbayes.statistics.chances import LEVELS, binomial_bounds, rms_bounds, share_interval95
 from tvsbayes.statistics.intervals import NORMAL_95
-from tvsbayes.studies.executors import made_rows
+from tvsbayes.studies.executors import made_rows, require_engine
 from tvsbayes.studies.rows import StudyRow, StudyRows
 from tvsbayes.studies.study_job import StudyJob
 
@@ -168,9 +168,10 @@ def study(
         progress: called with the share that is done after every row.
 
     Raises:
-        InputError: no such engine.
+        InputError: no such engine, or Dask is not installed.
         NotConverged: not one fit ended well.
     """
+    require_engine(engine)
     done = rows.of(job.key)
     missing = [index for index in range(count) if index not in done]
     with Job({CAMPAIGNS: 1.0}, progress) as work:

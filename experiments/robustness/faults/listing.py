@@ -118,6 +118,9 @@ FAULTS = (
     Fault("ways of homing are as probable as their evidence alone", "WayDraws.log_evidence",
           Returns("value - np.log(prior_chance(self.target.fit.sides))"),
           "test_a_way_is_as_probable_as_firmware_homes_that_way"),
+    Fault("what is integrated out is drawn from the same numbers for every seed", "Pool.extended",
+          Local("integrated_out", "random_stream(len(self.points or ()), Stream.POOLED_ROUNDS)"),
+          "test_numbers_of_what_is_integrated_out_are_of_the_seed_and_of_no_other_round"),
     Fault("weights with a Pareto k of 2 pass", "importance.K_MAX", Constant("2.0"),
           "test_the_tail_index_that_draws_can_bear_grows_with_their_number"),
     Fault("posterior sds are a fifth too small", "weighted_summary", Keyword("sd", "0.8 * value"),
@@ -214,6 +217,11 @@ FAULTS = (
           "test_a_pair_off_its_epipolar_lines_is_refused"),
     Fault("the stereo calibration divides by n instead of n - p", "bundle_adjustment.bundle_adjustment",
           Local("dof", "int(kept.sum())"), "test_degrees_of_freedom_are_coordinates_less_unknowns"),
+    # A run.
+    Fault("a program under the place command's wrapper moves on", "place_command._signalled",
+          Call("killpg", "process.send_signal(arg1)"), "test_the_program_below_a_wrapper_is_ended_with_it"),
+    Fault("a place command's whole output is held", "place_command.OUTPUT_BYTES_MAX", Constant("10**9"),
+          "test_a_flood_is_read_and_never_more_than_64_kb_of_it_held"),
     # The twin.
     Fault("simulated stop errors are drawn anew while the axis stands", "physics.stop_errors",
           Argument("counters", "value + 1e-9 * np.arange(len(value))"), "test_stop_errors_persist_and_are_redrawn"),
@@ -221,6 +229,9 @@ FAULTS = (
           "test_drift_grows_with_the_root_of_time_and_restarts_at_a_homing"),
     Fault("true ratios of two directions are exchanged", "true_headlines.effective_deg_per_step",
           Local("half", "-value"), "test_the_headline_is_the_line_through_the_looks"),
+    # Studies.
+    Fault("a row of a study counts whatever its numbers are", "StudyRows._take", Call("_digest", "stated"),
+          "test_a_row_that_does_not_say_what_was_written_is_made_again"),
     # One axis.
     Fault("an axis is homed from the wrong side", "play_places", Local("side", "-value"),
           "test_play_is_the_clip_of_the_definition"),
