@@ -107,7 +107,7 @@ class Question(InputError):
 
 
 def question(
-    *, file: str, found: str, allowed: str, candidates: Sequence[Candidate], line: int | None = None, code: str = "ambiguous"
+    *, file: str, found: str, allowed: str, candidates: Sequence[Candidate], code: str, line: int | None = None
 ) -> Question:
     """Build the `Question` whose message states the place, what was found and what is allowed."""
     where = file + (f" line {line}" if line else "")

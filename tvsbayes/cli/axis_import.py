@@ -23,8 +23,10 @@ from tvsbayes.importing.guide import (
     rows_of_run,
     run_rows,
 )
+from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.series import epics_table, is_archive, is_camonitor, is_klipper, klipper_table
-from tvsbayes.importing.table import ForeignTable, is_workbook, read_foreign, text_of
+from tvsbayes.importing.table import WORKBOOKS, ForeignTable
+from tvsbayes.importing.text import text_of
 from tvsbayes.single_axis.axis_campaign import (
     AxisMove,
     Reading,
@@ -82,9 +84,13 @@ class FileOptions:
 
 def log_kind(data: bytes, file: str) -> str:
     """The kind of a file of one axis by its content: one of `LOGS`, else "csv"."""
-    packed = is_workbook(data) or data.startswith(b"\x1f\x8b")
+    packed = data.startswith(WORKBOOKS) or data.startswith(b"\x1f\x8b")
     text = "" if packed or is_klipper(data) else text_of(data, file).text
-    recognised = {"phd2": is_guide_log(text), "epics": is_camonitor(text) or is_archive(text), "klipper": is_klipper(data)}
+    recognised = {
+        "phd2": is_guide_log(text),
+        "epics": is_camonitor(text) or is_archive(text),
+        "klipper": is_klipper(data),
+    }
     return next((kind for kind, matches in recognised.items() if matches), "csv")
 
 
@@ -126,21 +132,27 @@ def import_readings(
             lines = [f"{table.file}: {table.kind}; {len(table)} rows, {LOGS[kind]}"]
             document: dict[str, Any] = {"file": table.file, "kind": kind, "rows": len(table)}
         else:
-            named = dict(zip(("command", "value"), list(table.columns)[1:], strict=True)) if kind in ("epics", "klipper") and "time_s" in table.columns else {}
+            named = (
+                dict(zip(("command", "value"), list(table.columns)[1:], strict=True))
+                if kind in ("epics", "klipper") and "time_s" in table.columns
+                else {}
+            )
             rows = axis_rows(table, wish.wishes({**stated, **named}), unit_of_folder(to))
             lines, document = list(rows.lines), dict(rows.document)
     _refuse_filled(to)
     return _import_of(rows, lines, document, to)
 
 
-def _table(kind: str, data: bytes, file: Path, sheet: str | None, stated: Mapping[str, str]) -> tuple[ForeignTable, str]:
+def _table(
+    kind: str, data: bytes, file: Path, sheet: str | None, stated: Mapping[str, str]
+) -> tuple[ForeignTable, str]:
     """The table of a file, and its text where it has one."""
     name = escaped(file.name)
     if kind == "klipper":
         return klipper_table(data, name), ""
     if kind == "epics":
         return epics_table(text_of(data, name).text, name, stated), ""
-    return read_foreign(file, sheet), "" if is_workbook(data) else text_of(data, name).text
+    return read_foreign(file, sheet), "" if data.startswith(WORKBOOKS) else text_of(data, name).text
 
 
 def _import_of(rows: AxisRows, lines: Sequence[str], document: Mapping[str, Any], to: Path) -> Import:
@@ -264,7 +276,11 @@ def _header(rows: AxisRows) -> bytes:
     text = axis_templates()["campaign.toml"].decode()
     text = text.replace(f'\nunit = "{UNIT}"', f"\n{toml_line('unit', unit)}")
     if rows.header:
-        text = text.replace('\nname = "my axis"\n', "\n" + "\n".join(toml_line(k, v) for k, v in rows.header.items()) + "\n")
+        text = text.replace(
+            '\nname = "my axis"\n', "\n" + "\n".join(toml_line(k, v) for k, v in rows.header.items()) + "\n"
+        )
     if rows.axis:
-        text = text.replace("\n[axis]\n", "\n[axis]\n" + "\n".join(toml_line(k, v) for k, v in rows.axis.items()) + "\n")
+        text = text.replace(
+            "\n[axis]\n", "\n[axis]\n" + "\n".join(toml_line(k, v) for k, v in rows.axis.items()) + "\n"
+        )
     return text.encode()

@@ -26,8 +26,8 @@ from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadJoints, HeadModel, head_joints, ratios_of
 from tvsbayes.importing.columns import table_document, table_lines
+from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.sightings import FIELDS, SightingWishes, sighting_rows
-from tvsbayes.importing.table import read_foreign
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, input_hashes, read_campaign
 from tvsbayes.instrument.campaign_header import header_values, mechanism_key
@@ -124,7 +124,8 @@ def import_sightings(
     imported = ImportedHead(moves, sightings, priors, rows.encoders, (*assumed, *changed.changes))
     contents = _sighting_files(imported, to, table.file)
     ok = sum(sighting.status == "ok" for sighting in sightings)
-    lines = [*table_lines(table, rows.understood, FIELDS, rows.units), *(f"assumed: {text}" for text in contents.assumed)]
+    lines = table_lines(table, rows.understood, FIELDS, rows.units)
+    lines += [f"assumed: {text}" for text in contents.assumed]
     lines.append(f"gives: {len(moves)} moves, {len(sightings)} sightings, {ok} of use")
     document = {**table_document(table, rows.understood), "assumed": contents.assumed, "moves": len(moves)}
     document |= {"sightings": len(sightings), "ok": ok, "campaign": str(to)}

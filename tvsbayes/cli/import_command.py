@@ -75,7 +75,7 @@ def import_(
     ] = False,
     kind: Annotated[
         str,
-        typer.Option("--format", help="auto, pointing (telescope); of an axis csv, phd2 (and KStars), epics, klipper, pe."),
+        typer.Option("--format", help="auto, pointing (telescope); of an axis csv, phd2 (KStars), epics, klipper, pe."),
     ] = "auto",
     run: Annotated[int | None, typer.Option("--run", min=1, help="Of a guide log: run; without it a list.")] = None,
     runs: Annotated[
@@ -84,7 +84,7 @@ def import_(
     ] = None,
     deviations: Annotated[
         bool | None,
-        typer.Option("--deviations/--positions", help="Of an axis: readings are actual less commanded position, or not."),
+        typer.Option("--deviations/--positions", help="Of an axis: readings are actual less commanded position."),
     ] = None,
     counts_per_turn: Annotated[
         float | None,
@@ -137,7 +137,8 @@ def _typed_command(options: Mapping[str, Any]) -> list[str]:
         if name in ("file", "as_json", "yes") or value == parameter.default:
             continue
         option = "--positions" if name == "deviations" and value is False else option
-        words += [option] if isinstance(value, bool) else [w for one in (value if isinstance(value, list) else [value]) for w in (option, str(one))]
+        values = value if isinstance(value, list) else [value]
+        words += [option] if isinstance(value, bool) else [word for one in values for word in (option, str(one))]
     return [*words, "--yes"]
 
 

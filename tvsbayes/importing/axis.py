@@ -16,15 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from tvsbayes.errors import Candidate, escaped, question, refusal
+from tvsbayes.errors import Candidate, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
+from tvsbayes.importing.axis_units import Wishes, in_one_unit, shown_units, stated_unit, units_of
 from tvsbayes.importing.cells import FieldCells, homings_of, left_out, seconds_of, status_of, temperatures_of
 from tvsbayes.importing.columns import Understood, ask_column, choice, columns_of, table_document, table_lines
 from tvsbayes.importing.rest import at_rest
 from tvsbayes.importing.runs import long_table
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, means, name_of, parse_unit, place_of, plain, words_of
+from tvsbayes.importing.words import means, name_of, parse_unit, place_of, plain, words_of
 from tvsbayes.statistics.wrapped import turn_jumps
 
 NUMBER_MAX = 1e12
@@ -39,34 +40,8 @@ OVERSHOOT_SHARE = 0.05
 """Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
 CONTRARY_MIN = 4
 """Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
-UNIT_SLOPE = 0.05
-"""Largest deviation from 1 of the slope of readings over commands, where both are taken to be in one unit."""
-ANGLE_SPAN = 360.0
 STATUS_SHARE = 0.5
 """Share of rows that a status of 0 and 1 may leave out without a question."""
-
-
-@dataclass(frozen=True)
-class Wishes:
-    """What the user states about a table of an axis.
-
-    Attributes:
-        columns: column by field, "" for none.
-        units: unit by field, as text.
-        deviations: whether readings are actual less commanded position.
-        counts_per_turn: counts after which readings restart; 0: nowhere.
-        order: order of runs beside each other, one of `runs.ORDERS`.
-        coverage: coverage factor of the column of uncertainties.
-        status_ok: number of a status that means a good row.
-    """
-
-    columns: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    deviations: bool | None = None
-    counts_per_turn: float | None = None
-    order: str | None = None
-    coverage: float | None = None
-    status_ok: float | None = None
 
 
 @dataclass(frozen=True)
@@ -117,12 +92,12 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     table = _resting_rows(table, columns, wishes, assumed)
     cells, notations = FieldCells(table, columns).with_plain("command", "value", "u")
     assumed += [column.remark for column in notations.values() if column.remark]
-    units = _units(cells, {f: c.unit for f, c in notations.items()}, wishes)
+    units = units_of(cells, {f: c.unit for f, c in notations.items()}, wishes)
     commands = cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)
     values = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
     stated_u = cells.numbers("u", 0.0, NUMBER_MAX, optional=True, default=0.0)
-    values, stated_u, unit = _in_one_unit(cells, commands, values, stated_u, units, wishes, assumed)
-    time_unit = _stated_unit(cells, "time_s", wishes)
+    values, stated_u, unit = in_one_unit(cells, commands, values, stated_u, units, wishes, assumed)
+    time_unit = stated_unit(cells, "time_s", wishes)
     times = seconds_of(cells, assumed, time_unit)
     homings, statuses = homings_of(cells, assumed), cells.text("status")
     if times is None:
@@ -134,14 +109,16 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
         if value is not None or statuses[row]:
             status = status_of(cells, row, {"value": value}, "reading")
             move = stops.moves[-1]["move"]
-            readings.append({"reading": len(readings), "move": move, "value": value, "u": stated_u[row], "status": status})
+            readings.append(
+                {"reading": len(readings), "move": move, "value": value, "u": stated_u[row], "status": status}
+            )
     assumed += left_out(cells, statuses, "reading") + stops.remarks()
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
     readings, wrapped = unwrapped(stops.moves, readings, folder_unit or unit or "deg", wishes.counts_per_turn)
     assumed += wrapped
     shown = Understood(columns, tuple(dict.fromkeys((*known.unused, *runs.unused))))
-    lines = tuple(table_lines(table, shown, FIELDS, _shown_units(units, unit, cells)))
+    lines = tuple(table_lines(table, shown, FIELDS, shown_units(units, unit, cells)))
     return AxisRows(stops.moves, readings, unit, tuple(assumed), lines=lines, document=table_document(table, shown))
 
 
@@ -153,7 +130,10 @@ def _good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, ass
     name = columns["status"]
     cells = table.columns[name]
     if wishes.status_ok is not None:
-        good = ["ok" if NUMBER.fullmatch(cell) and float(cell) == wishes.status_ok else cell and f"status {cell}" for cell in cells]
+        good = [
+            "ok" if NUMBER.fullmatch(cell) and float(cell) == wishes.status_ok else cell and f"status {cell}"
+            for cell in cells
+        ]
         return replace(table, columns={**table.columns, name: tuple(good)})
     bad = [bool(cell.strip()) and not means(cell, "good") for cell in cells]
     if "status" in wishes.columns or not any(bad):
@@ -168,9 +148,12 @@ def _good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, ass
         found = f"column {escaped(name)}, which leaves out {sum(bad)} of {len(cells)} rows where 1 means good"
         known = columns_of(table)
         candidates = [
-            Candidate(f"{code:g} is good", ("--assume", f"status_ok={code:g}"), {name: known[name].first}) for code in sorted(codes)
+            Candidate(f"{code:g} is good", ("--assume", f"status_ok={code:g}"), {name: known[name].first})
+            for code in sorted(codes)
         ]
-        raise ask_column(table, found, [*candidates, choice({"status": ""}, known)], "a status whose good rows are known")
+        raise ask_column(
+            table, found, [*candidates, choice({"status": ""}, known)], "a status whose good rows are known"
+        )
     return table
 
 
@@ -190,182 +173,12 @@ def _resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, 
     if rests.all() or not rests.any():
         return table
     moved = int((~rests).sum())
-    assumed.append(f"rest: {moved} of {len(rests)} rows left out, in which the axis still moved by {how}; --column moving= keeps them")
+    assumed.append(
+        f"rest: {moved} of {len(rests)} rows left out, where the axis still moved by {how}; --column moving= keeps them"
+    )
     keep = np.flatnonzero(rests)
     cells = {name: tuple(column[k] for k in keep) for name, column in table.columns.items()}
     return replace(table, columns=cells, lines=tuple(table.lines[k] for k in keep))
-
-
-# --- units -----------------------------------------------------------------------------------------------------------
-def _stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:
-    """The unit of a field that the user states.
-
-    Raises:
-        InputError: no unit, or none of its kind.
-    """
-    text = wishes.units.get(name)
-    if text is None:
-        return None
-    unit = parse_unit(text)
-    if unit is None and name == "value":
-        return Unit(text, "own", 1.0)
-    if unit is None:
-        allowed, remedy = "a unit such as mm, um, 1/100 mm, deg, arcsec, turn, s, ms", "name one of them"
-        raise refusal("usage", file=f"--unit {name}={escaped(text)}", found="no unit", allowed=allowed, remedy=remedy)
-    return unit
-
-
-def _units(cells: FieldCells, written: Mapping[str, Unit | None], wishes: Wishes) -> dict[str, Unit | None]:
-    """Units of command, reading and u: stated, of the cells, or of the names.
-
-    Raises:
-        Question: a unit that nobody knows.
-    """
-    units: dict[str, Unit | None] = {}
-    for name in ("command", "value", "u", "time_s"):
-        if name not in cells:
-            continue
-        column = name_of(cells.columns[name])
-        unit = _stated_unit(cells, name, wishes) or written.get(name) or column.unit
-        if unit is None and column.unknown and name != "command":
-            known = columns_of(cells.table)
-            own = [column.unknown] if name == "value" else []
-            usual = {"time_s": ("s", "ms", "min")}.get(name, ("mm", "um", "deg", "arcsec", "counts"))
-            found = f"unit {escaped(column.unknown)} of column {escaped(column.text)}, which is not known"
-            first = {column.text: known[column.text].first}
-            candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}"), first) for text in (*own, *usual)]
-            raise question(
-                file=cells.table.file, line=cells.table.first_line, found=found, allowed="a unit that is known, or one that is stated",
-                candidates=candidates, code="unit",
-            )
-        units[name] = unit
-    return units
-
-
-def _in_one_unit(
-    cells: FieldCells,
-    commands: Sequence[float],
-    values: Sequence[float | None],
-    stated_u: Sequence[float],
-    units: Mapping[str, Unit | None],
-    wishes: Wishes,
-    assumed: list[str],
-) -> tuple[list[float | None], list[float], str | None]:
-    """Readings and their standard u in one unit, with its name."""
-    unit, command_unit = units["value"], units["command"]
-    if not wishes.deviations and len(set(values)) > 2 and list(values) == list(commands):
-        assumed.append("value: equals the command in every row: what was read, or the command again?")
-    if wishes.deviations:
-        factor = _deviation_factor(cells, unit, command_unit)
-        values = [None if d is None else _rounded(c + factor * d) for c, d in zip(commands, values, strict=True)]
-        assumed.append("value: the command plus the deviation, because --deviations says so")
-        given, unit = unit or command_unit, command_unit or unit
-    else:
-        given = unit
-        if unit is not None and unit.per_number != 1.0:
-            values = [None if v is None else _rounded(unit.per_number * v) for v in values]
-            assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
-            unit = unit.whole
-        elif unit is None and (unit := _unit_of_command(commands, values, command_unit)) is not None:
-            given = unit
-            assumed.append(f"unit: {unit.name}, that of the commands, which the readings follow 1 to 1; --unit value=mm says another")
-    if unit is None and _are_counts(cells.text("value")):
-        unit = given = Unit("counts", "count", 1.0)
-        assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
-    return list(values), _standard_u(cells, stated_u, units.get("u"), given, unit, wishes, assumed), unit and unit.name
-
-
-def _rounded(number: float) -> float:
-    """A number without the last digits of its floating point."""
-    return float(f"{number:.13g}")
-
-
-def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit | None) -> float:
-    """Units of the command per unit of a deviation.
-
-    Raises:
-        Question: a unit that is missing.
-        InputError: units of two kinds.
-    """
-    if unit is None and command_unit is None:
-        return 1.0
-    table = cells.table
-    if command_unit is None or unit is None:
-        name, other = ("command", unit) if command_unit is None else ("value", command_unit)
-        found = f"no unit of column {escaped(cells.columns[name])} beside {other.name} of the other"  # type: ignore[union-attr]
-        usual = dict.fromkeys((other.name, *(("mm", "um") if other.kind == "length" else ("deg", "arcsec"))))  # type: ignore[union-attr]
-        candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}")) for text in usual]
-        raise question(file=table.file, line=table.first_line, found=found, allowed="two units", candidates=candidates, code="unit")
-    factor = unit.in_units_of(command_unit)
-    if factor is None:
-        found, allowed = f"deviations in {unit.name} from commands in {command_unit.name}", "deviations in a unit of the commands"
-        remedy = "add a column of positions, or of commands in the unit of the deviations"
-        raise refusal("unit", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy)
-    return factor
-
-
-def _unit_of_command(
-    commands: Sequence[float], values: Sequence[float | None], command_unit: Unit | None
-) -> Unit | None:
-    """The commands' unit of length or angle, where readings without one follow them 1 to 1."""
-    pairs = [(c, v) for c, v in zip(commands, values, strict=True) if v is not None]
-    if command_unit is None or command_unit.kind not in ("length", "angle") or len({c for c, _ in pairs}) < 2:
-        return None
-    slope = np.polyfit(*np.array(pairs).T, 1)[0]
-    return command_unit if abs(slope - 1.0) <= UNIT_SLOPE else None
-
-
-def _are_counts(cells: Sequence[str]) -> bool:
-    numbers = [float(cell) for cell in cells if NUMBER.fullmatch(cell)]
-    return bool(numbers) and all(n.is_integer() for n in numbers) and max(numbers) - min(numbers) > ANGLE_SPAN
-
-
-def _standard_u(
-    cells: FieldCells,
-    stated: Sequence[float],
-    unit: Unit | None,
-    reading: Unit | None,
-    result: Unit | None,
-    wishes: Wishes,
-    assumed: list[str],
-) -> list[float]:
-    """Standard uncertainties in the readings' unit.
-
-    Args:
-        cells: cells of the table.
-        stated: the numbers of the column.
-        unit: the column's unit.
-        reading: unit of the numbers that were read, which is that of u where its column states none.
-        result: unit of the readings written.
-        wishes: what the user states.
-        assumed: sentences, to which what was done is added.
-
-    Raises:
-        Question: the units of u and of the readings are of two kinds, or that of the readings is missing.
-    """
-    if "u" not in cells:
-        return list(stated)
-    name, table = cells.columns["u"], cells.table
-    unit = unit or reading
-    factor = 1.0 if unit is None else None if result is None else unit.in_units_of(result)
-    if factor is None:
-        found = f"u in {unit.name} in column {escaped(name)}, of readings in {result.name if result else 'an unnamed unit'}"  # type: ignore[union-attr]
-        usual = {"length": ("mm", "um"), "angle": ("deg", "arcsec")}.get(unit.kind, ()) if result is None else ()  # type: ignore[union-attr]
-        candidates = [Candidate(f"readings in {text}", ("--unit", f"value={text}")) for text in dict.fromkeys((unit.name, *usual))]  # type: ignore[union-attr]
-        candidates = (candidates if result is None else []) + [Candidate("no column of u", ("--column", "u="))]
-        raise question(file=table.file, line=table.first_line, found=found, allowed="units of one kind", candidates=candidates, code="unit")
-    if factor != 1.0:
-        assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")  # type: ignore[union-attr]
-    coverage = wishes.coverage or name_of(name).coverage
-    if coverage is not None and coverage != 1.0:
-        assumed.append(f"u: column {escaped(name)} is an expanded uncertainty, over {coverage:g}; --assume coverage=NUMBER says another")
-    return [_rounded(u * factor / (coverage or 1.0)) for u in stated]
-
-
-def _shown_units(units: Mapping[str, Unit | None], unit: str | None, cells: FieldCells) -> dict[str, str]:
-    shown = {name: u.name for name, u in units.items() if u is not None}
-    shown |= {"value": unit} if unit else {}
-    return shown | ({"time_s": shown.get("time_s", "s")} if "time_s" in cells else {})
 
 
 # --- moves -----------------------------------------------------------------------------------------------------------
@@ -388,7 +201,9 @@ class _Stops:
         self._sides = _sides(cells, commands, homings, assumed)
         self._temperatures = temperatures_of(cells, assumed)
         self._has_temperatures = "temperature_degC" in cells
-        counts = [name for name in cells.table.columns if name_of(name).has("repeat") and name not in cells.columns.values()]
+        counts = [
+            name for name in cells.table.columns if name_of(name).has("repeat") and name not in cells.columns.values()
+        ]
         self._counts = cells.table.columns[counts[0]] if counts else None
         self._reach = OVERSHOOT_SHARE * (max(commands) - min(commands)) or 1.0
         self._overshoots = self._went_past()
@@ -450,7 +265,14 @@ class _Stops:
         return self._overshoots
 
     def _add(
-        self, command: float, at_s: float | None, *, homed: bool, side: int = 0, temperature: float | None = None, assumed: int = 0
+        self,
+        command: float,
+        at_s: float | None,
+        *,
+        homed: bool,
+        side: int = 0,
+        temperature: float | None = None,
+        assumed: int = 0,
     ) -> None:
         number = len(self.moves)
         move = {
@@ -486,7 +308,10 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
     """
     texts = cells.text("approach")
     words = [plain(text).strip() or text.strip() for text in texts]
-    sides = {word: 1 if means(text, "forward") else -1 if means(text, "backward") else 0 for word, text in zip(words, texts, strict=True)}
+    sides = {
+        word: 1 if means(text, "forward") else -1 if means(text, "backward") else 0
+        for word, text in zip(words, texts, strict=True)
+    }
     unknown = sorted(word for word, side in sides.items() if not side and word not in ("", "unknown"))
     if len(unknown) == 2 and len(set(words) - {"", "unknown"}) == 2:
         signs_of: dict[str, set[int]] = {word: set() for word in unknown}
@@ -529,7 +354,11 @@ def unwrapped(
     command = np.array([moves[readings[k]["move"]]["command"] for k in usable])
     value = np.array([readings[k]["value"] for k in usable], dtype=float)
     of_angle = parse_unit(unit)
-    turn = counts_per_turn or (360.0 / of_angle.scale if of_angle and of_angle.kind == "angle" else None) or _counts_of(command, value)
+    turn = (
+        counts_per_turn
+        or (360.0 / of_angle.scale if of_angle and of_angle.kind == "angle" else None)
+        or _counts_of(command, value)
+    )
     jumps = turn_jumps(command, value, turn) if turn is not None else {}
     # An outlier also jumps, and back, but not by whole turns.
     if turn is None or not jumps or any(abs(jump - round(jump)) > TURN_TOLERANCE for jump in jumps.values()):
@@ -566,5 +395,3 @@ def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
     found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
     remedy = "state where the encoder restarts, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
     raise refusal("wrapped", file="value", found=found, allowed=allowed, remedy=remedy)
-
-

@@ -33,12 +33,13 @@ COPY_SHARE = 1e-9
 FOLLOWS_R2 = 0.98
 """Least squared correlation with the commands of a column that follows them."""
 STEADY_SHARE, STEP_TOLERANCE = 0.7, 0.2
-"""Share of steps that are in proportion to those of the commands, to this tolerance, in a column that wraps or jumps."""
+"""Share of steps in proportion to those of the commands, to this tolerance, in a column that wraps or jumps."""
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 """Readings in the unit of the commands are not positions if they span less than the first share of the commands' range
 and scatter by more than the second share of their own span about a line."""
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
 """Options that say what the readings are."""
+AS_STATED = "positions, or deviations that are stated as such"
 
 
 def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: bool | None = None) -> Understood:
@@ -94,9 +95,9 @@ def _role(column: Column) -> str:
     if _states_sides(column):
         return "approach"
     command, value = name.place("command"), name.place("value")
-    if column.numeric and (command is not None or value is not None):
+    if (column.numeric or column.has_digits) and (command is not None or value is not None):
         return "command" if value is None or (command is not None and command < value) else "value"
-    if not column.numeric:
+    if not column.numeric and not (column.has_digits and name.has("command", "value", "position")):
         return "aside"
     if name.has("statistic") and not name.has("position"):
         return "aside"
@@ -107,7 +108,11 @@ def _states_sides(column: Column) -> bool:
     """Whether the cells of a column are words of direction, whatever its name."""
     words = {cell for cell in column.cells if cell}
     sides = ("forward", "backward", "clockwise", "counterclockwise")
-    return bool(words) and len(words) <= 3 and all(any(means(word, side) for side in sides) and not NUMBER.fullmatch(word) for word in words)
+    return (
+        bool(words)
+        and len(words) <= 3
+        and all(any(means(word, side) for side in sides) and not NUMBER.fullmatch(word) for word in words)
+    )
 
 
 def _of_device(known: Mapping[str, Column], names: list[str], command: str) -> list[str]:
@@ -192,14 +197,19 @@ def _relative_times(column: Column) -> np.ndarray | None:
         return scale * (column.values - column.values[0])
     if not is_clock(column.cells) or all(len(cell) <= 10 and time_of_day(cell) is None for cell in column.cells):
         return None
-    seconds = [of_day if (of_day := time_of_day(c)) is not None else (at.timestamp() if (at := date_time(c)) else np.nan) for c in column.cells]
+    seconds = [
+        of_day if (of_day := time_of_day(c)) is not None else (at.timestamp() if (at := date_time(c)) else np.nan)
+        for c in column.cells
+    ]
     return np.array(seconds) - seconds[0]
 
 
 def _equal_clocks(times: np.ndarray, others: np.ndarray) -> bool:
     """Whether two clocks agree but for their unit, to a second or a hundredth."""
     span, other_span = np.ptp(times), np.ptp(others)
-    scale = next((s for s in (1.0, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9) if span and abs(other_span / s / span - 1) < 0.01), 1.0)
+    scale = next(
+        (s for s in (1.0, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9) if span and abs(other_span / s / span - 1) < 0.01), 1.0
+    )
     return bool(np.all(np.abs(others / scale - times) <= 1.0 + 0.01 * span))
 
 
@@ -230,7 +240,9 @@ def _take_command(
     if readings and len(pool) == 1:
         taken["command"] = pool[0]
         if not weak:
-            remarks.append(f"command: column {escaped(pool[0])}, the only other one of numbers; --column command= says another")
+            remarks.append(
+                f"command: column {escaped(pool[0])}, the only other one of numbers; --column command= says another"
+            )
         return
     if not readings and len(pool) == 1 and len(of_role.get("deviation", ())) == 1:
         taken["command"] = pool[0]
@@ -273,7 +285,9 @@ def _take_value(
     """
     command = known[taken["command"]]
     differences = of_role.get("deviation", [])
-    strong, weak, others = ([n for n in of_role.get(role, ()) if n not in taken.values()] for role in ("value", "position", ""))
+    strong, weak, others = (
+        [n for n in of_role.get(role, ()) if n not in taken.values()] for role in ("value", "position", "")
+    )
     if deviations and "value" not in taken:
         pool = differences or strong or weak or others
         if len(pool) == 1:
@@ -293,11 +307,16 @@ def _take_value(
     if len(pool) == 1:
         taken["value"] = pool[0]
         if pool[0] in following:
-            remarks.append(f"value: column {escaped(pool[0])}, the only other one that follows the commands; --column value= says another")
+            remarks.append(
+                f"value: column {escaped(pool[0])}, the only other that follows the commands; --column value= changes it"
+            )
         unexplained = _set_aside(known, differences, taken, remarks)
         if unexplained and (not strong or not follows(command, known[pool[0]])):
             found = f"column {escaped(pool[0])} beside column {escaped(unexplained[0])}, which is not their difference"
-            candidates = [choice({"value": pool[0]}, known), *(choice({"value": n}, known, DEVIATIONS) for n in unexplained)]
+            candidates = [
+                choice({"value": pool[0]}, known),
+                *(choice({"value": n}, known, DEVIATIONS) for n in unexplained),
+            ]
             raise ask_column(table, found, candidates)
         _ask_what_is_left(table, known, [*strong, *weak, *others], taken)
         if deviations is None:
@@ -312,7 +331,7 @@ def _take_value(
             return
         found = f"no reading but {listed(differences)}, by its name a deviation"
         candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS) for name in differences]
-        raise ask_column(table, found, candidates, "positions, or deviations that are stated as such")
+        raise ask_column(table, found, candidates, AS_STATED, "deviations")
     rest = [name for name in (*weak, *others, *of_role.get("u", ())) if name not in taken.values()]
     if rest:
         found = f"no column that is surely the reading; numbers are in {listed(rest)}"
@@ -356,7 +375,11 @@ def difference(column: Column, command: Column, value: Column) -> str:
     # The written digits of the difference, of the reading and of the command, in the unit of the difference.
     tolerance = _half_digit(column) + to_column * (_half_digit(value) + to_reading * _half_digit(command)) + 1e-12
     names = escaped(value.name.text), escaped(command.name.text)
-    forms = ((gap, f"{names[0]} - {names[1]}"), (-gap, f"{names[1]} - {names[0]}"), (np.abs(gap), f"|{names[0]} - {names[1]}|"))
+    forms = (
+        (gap, f"{names[0]} - {names[1]}"),
+        (-gap, f"{names[1]} - {names[0]}"),
+        (np.abs(gap), f"|{names[0]} - {names[1]}|"),
+    )
     if rows.sum() > 2 and np.any(column.values[rows] != 0):
         for numbers, text in forms:
             if np.all(np.abs(numbers - column.values)[rows] <= tolerance):
@@ -396,7 +419,9 @@ def _repeats(command: Column, column: Column) -> bool:
     return bool(slope) and bool(np.max(np.abs(v - slope * c - level)) <= COPY_SHARE * np.ptp(v))
 
 
-def _ask_what_is_left(table: ForeignTable, known: Mapping[str, Column], names: Sequence[str], taken: Mapping[str, str]) -> None:
+def _ask_what_is_left(
+    table: ForeignTable, known: Mapping[str, Column], names: Sequence[str], taken: Mapping[str, str]
+) -> None:
     """Ask where a column that is left over follows the commands too.
 
     Raises:
@@ -410,7 +435,9 @@ def _ask_what_is_left(table: ForeignTable, known: Mapping[str, Column], names: S
     ]
     if left:
         found = f"column {escaped(taken['value'])} and also {listed(left)}, which follow the commands alike"
-        raise ask_column(table, found, [choice({"value": name}, known) for name in (taken["value"], *left)], "one reading")
+        raise ask_column(
+            table, found, [choice({"value": name}, known) for name in (taken["value"], *left)], "one reading"
+        )
 
 
 def _ask_small(table: ForeignTable, command: Column, value: Column, known: Mapping[str, Column]) -> None:
@@ -431,6 +458,8 @@ def _ask_small(table: ForeignTable, command: Column, value: Column, known: Mappi
     slope, level = np.polyfit(c, v, 1)
     if np.std(v - slope * c - level) > LOOSE_SHARE * span:
         name = value.name.text
-        found = f"readings in column {escaped(name)} that span {span:.3g} {units[0].name} over {np.ptp(c):.6g} of commands"  # type: ignore[union-attr]
+        found = (
+            f"readings in column {escaped(name)} that span {span:.3g} {units[0].name} over {np.ptp(c):.6g} of commands"  # type: ignore[union-attr]
+        )
         candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS)]
-        raise ask_column(table, found, candidates, "positions, or deviations that are stated as such")
+        raise ask_column(table, found, candidates, AS_STATED, "deviations")

@@ -134,7 +134,14 @@ class FieldCells:
         return replace(self, table=replace(self.table, columns=columns)), plain
 
     def numbers(
-        self, field: str, low: float, high: float, *, optional: bool = False, default: float | None = None, what: str = ""
+        self,
+        field: str,
+        low: float,
+        high: float,
+        *,
+        optional: bool = False,
+        default: float | None = None,
+        what: str = "",
     ) -> list[float | None]:
         """Numbers of a field; an empty cell is the default where it may be empty.
 
@@ -154,7 +161,9 @@ class FieldCells:
                 values.append(value)
         return values
 
-    def whole(self, field: str, low: int, high: int, *, optional: bool = False, remedy: str = "correct the cell") -> list[int | None]:
+    def whole(
+        self, field: str, low: int, high: int, *, optional: bool = False, remedy: str = "correct the cell"
+    ) -> list[int | None]:
         """Whole numbers of a field; "200.0" is one."""
         values = self.numbers(field, low, high, optional=optional)
         for row, value in enumerate(values):
@@ -214,7 +223,7 @@ def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
 
 # --- times -----------------------------------------------------------------------------------------------------------
 def date_time(text: str) -> datetime.datetime | None:
-    """A date with a time, or a date; None for other texts. Without a zone it is UTC: this computer's is not the logger's."""
+    """A date with or without a time; None for other texts. Without a zone it is UTC, not this computer's."""
     text = _SLASHED_DATE.sub(r"\1-\2-\3T", _DOTTED_DATE.sub(_iso_date, text.strip(), count=1), count=1).rstrip("T")
     try:
         at = datetime.datetime.fromisoformat(text)
@@ -312,12 +321,16 @@ def _in_order(cells: FieldCells, seconds: list[float], is_local: bool, assumed: 
         if is_local and not moved and -SUMMER_TIME_S <= step < -0.25 * SUMMER_TIME_S:
             moved, seconds[row] = SUMMER_TIME_S, seconds[row] + SUMMER_TIME_S
             line = cells.table.lines[row]
-            assumed.append(f"time_s: the clock steps back in line {line}, as at the end of summer time: an hour added from there")
+            assumed.append(
+                f"time_s: the clock steps back in line {line}, as at the end of summer time: an hour added from there"
+            )
         elif step < 0:
             name, line = escaped(cells.columns["time_s"]), cells.table.lines[row]
             found = f"times in column {name} that step back by {-step:.6g} s"
             allowed = "times that do not decrease: rows sorted as they happened, as play remembers the order"
-            raise question(file=cells.table.file, line=line, found=found, allowed=allowed, candidates=[NO_TIME], code="cell")
+            raise question(
+                file=cells.table.file, line=line, found=found, allowed=allowed, candidates=[NO_TIME], code="cell"
+            )
     return seconds
 
 
@@ -330,7 +343,9 @@ def left_out(cells: FieldCells, statuses: Sequence[str], noun: str) -> list[str]
     listed = [f"{text} {count}" for text, count in counts.most_common(WORDS_SHOWN)]
     words = ", ".join(listed) + " ..." * (len(counts) > WORDS_SHOWN)
     count = sum(counts.values())
-    return [f"status: {count} {noun}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {words}"]
+    return [
+        f"status: {count} {noun}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {words}"
+    ]
 
 
 def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], noun: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from tvsbayes.errors import Candidate, InputError, Question, closest, escaped, question, refusal
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.cells import plain_column
+from tvsbayes.importing.cells import is_clock, plain_column
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Name, Unit, listed, name_of
 
@@ -41,6 +41,13 @@ class Column:
         finite = self.values[np.isfinite(self.values)]
         filled = sum(map(bool, self.cells))
         return len(finite) > NUMERIC_SHARE * filled and len(np.unique(finite)) > 1
+
+    @cached_property
+    def has_digits(self) -> bool:
+        """Whether most of its cells, of which some differ, are written with digits, though not as times."""
+        filled = [cell for cell in self.cells if cell]
+        written = sum(cell[:1].isdigit() or cell[:1] in "+-.,\u2212" for cell in filled)
+        return written > NUMERIC_SHARE * len(filled) and len(set(filled)) > 1 and not is_clock(filled)
 
     @property
     def whole(self) -> bool:
@@ -83,20 +90,28 @@ def check_stated(names: Sequence[str], stated: Mapping[str, str], fields: Sequen
 def choice(columns: Mapping[str, str], known: Mapping[str, Column], *options: str) -> Candidate:
     """The answer that names columns by field."""
     words = ", ".join(
-        f"{field} = {escaped(name)} ({', '.join(known[name].first)})" if name else f"no {field}" for field, name in columns.items()
+        f"{field} = {escaped(name)} ({', '.join(known[name].first)})" if name else f"no {field}"
+        for field, name in columns.items()
     )
     named = [word for field, name in columns.items() for word in ("--column", f"{field}={name}")]
     return Candidate(words, (*named, *options), {name: known[name].first for name in columns.values() if name})
 
 
-def ask_column(table: ForeignTable, found: str, candidates: Sequence[Candidate], allowed: str = "columns that are named") -> Question:
-    """The question which column is meant."""
-    return question(
-        file=table.file, line=table.first_line, found=found, allowed=allowed, candidates=candidates[:CANDIDATES_MAX], code="missing-column"
-    )
+def ask_column(
+    table: ForeignTable,
+    found: str,
+    candidates: Sequence[Candidate],
+    allowed: str = "columns that are named",
+    code: str = "missing-column",
+) -> Question:
+    """The question which column is meant, or what it holds."""
+    few = candidates[:CANDIDATES_MAX]
+    return question(file=table.file, line=table.first_line, found=found, allowed=allowed, candidates=few, code=code)
 
 
-def missing_column(table: ForeignTable, understood: Mapping[str, str], missing: Sequence[str], hint: str = "") -> InputError:
+def missing_column(
+    table: ForeignTable, understood: Mapping[str, str], missing: Sequence[str], hint: str = ""
+) -> InputError:
     """The refusal of a table in which no column can be a field."""
     known = ", ".join(f"{field} = {escaped(name)}" for field, name in understood.items()) or "nothing"
     found = f"no column that is surely {', '.join(missing)}; understood so far: {known}"

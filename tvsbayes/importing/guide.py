@@ -310,10 +310,10 @@ def _hypotheses(run: GuideRun, pixel: float, declination_deg: float) -> dict[str
 def _logged_pulse(
     run: GuideRun, runs: Sequence[GuideRun], pixel: float, declination_deg: float, file: str
 ) -> tuple[float, str]:
-    """Rate of the axis during a pulse, arcsec/s, with its source in words: the hypothesis that other statements bear out.
+    """Rate of the axis during a pulse, arcsec/s, and its source in words: the hypothesis that other statements support.
 
     Raises:
-        Question: hypotheses that differ, between which nothing decides; statements that disagree; a rate above sidereal.
+        Question: hypotheses that nothing decides between; statements that disagree; a rate above sidereal.
     """
     rates = _hypotheses(run, pixel, declination_deg)
     header, cosine = run.header, math.cos(math.radians(declination_deg))
@@ -344,7 +344,9 @@ def _logged_pulse(
             for name, rate in says.items()
             if rate <= PULSE_MAX * SIDEREAL_ARCSEC_PER_S
         ]
-        found = f"rates of a pulse of run {run.number}: " + ", ".join(f"{rate:.4g} arcsec/s ({name})" for name, rate in says.items())
+        found = f"rates of a pulse of run {run.number}: " + ", ".join(
+            f"{rate:.4g} arcsec/s ({name})" for name, rate in says.items()
+        )
         raise question(file=file, line=run.line, found=found, allowed=allowed, candidates=candidates, code="pulse-rate")
     return pulse, text
 
@@ -353,7 +355,9 @@ def _other_rates(run: GuideRun, runs: Sequence[GuideRun]) -> float | None:
     """The rate that the runs of a log state alike, arcsec/s: one hypothesis is the same at all declinations."""
     rows = []
     for other in runs:
-        if {"pixel_arcsec", "declination_deg", "x_rate"} <= other.header.keys() and abs(other.header["declination_deg"]) < 85:
+        if {"pixel_arcsec", "declination_deg", "x_rate"} <= other.header.keys() and abs(
+            other.header["declination_deg"]
+        ) < 85:
             rates = [*_hypotheses(other, other.header["pixel_arcsec"], other.header["declination_deg"]).values()]
             if len(rates) == 2:
                 rows.append(rates)
@@ -406,7 +410,14 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
         if time_s >= starts_s[0]
     ]
     readings = [
-        {"reading": k, "move": move, "value": None if v is None else round(v, 4), "u": 0.0, "status": status, "time_s": t}
+        {
+            "reading": k,
+            "move": move,
+            "value": None if v is None else round(v, 4),
+            "u": 0.0,
+            "status": status,
+            "time_s": t,
+        }
         for k, (t, move, v, status) in enumerate(rows)
     ]
     axis = {**PRIORS, **_search_of([time_s for time_s, *_ in rows])}
@@ -416,7 +427,13 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
 
 
 def _drive_move(number: int, time_s: float, rate: float) -> dict[str, Any]:
-    return {"move": number, "segment": number, "time_s": time_s, "command": round(rate * time_s, 6), "approach": "forward"}
+    return {
+        "move": number,
+        "segment": number,
+        "time_s": time_s,
+        "command": round(rate * time_s, 6),
+        "approach": "forward",
+    }
 
 
 def _search_of(times_s: Sequence[float]) -> dict[str, Any]:
@@ -455,7 +472,9 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
     if len(errors) != 1 or len(times) != 1:
         found = f"{len(times)} columns of times and {len(errors)} of a periodic error"
         remedy = "give a table with one column of each, as Time (s), PE (arcsec)"
-        raise refusal("missing-column", file=table.file, line=table.first_line, found=found, allowed="one of each", remedy=remedy)
+        raise refusal(
+            "missing-column", file=table.file, line=table.first_line, found=found, allowed="one of each", remedy=remedy
+        )
     time_unit, error_unit = known[times[0]].name.unit, known[errors[0]].name.unit
     scale_s = time_unit.scale if time_unit and time_unit.kind == "time" else 1.0
     scale = 3600.0 * error_unit.scale * error_unit.per_number if error_unit and error_unit.kind == "angle" else 1.0
@@ -474,10 +493,11 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
         for k, (t, e) in enumerate(pairs)
     ]
     axis: dict[str, Any] = {**PRIORS, **_search_of([t for t, _ in pairs])}
+    unit, where = "arcsec" if error_unit is None else error_unit.name, "ahead of" if sign > 0 else "behind"
     assumed = [
-        f"times in column {escaped(times[0])}, periodic error in column {escaped(errors[0])}, {'arcsec' if scale == 1 else error_unit.name}",  # type: ignore[union-attr]
+        f"times in column {escaped(times[0])}, periodic error in column {escaped(errors[0])}, {unit}",
         f"the drive turns at {rate:.6g} arcsec/s; --assume drive_arcsec_per_s=",
-        f"sign: a positive error is an axis {'ahead of' if sign > 0 else 'behind'} its drive; --assume pe_sign={-sign:g} says the other",
+        f"sign: a positive error is an axis {where} its drive; --assume pe_sign={-sign:g} says the other",
     ]
     if worm:
         axis = {**PRIORS, "periods_in": "seconds", "periods": [float(worm[1])]}

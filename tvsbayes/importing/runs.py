@@ -87,7 +87,11 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     else:
         rows = [(row, k) for k in range(len(runs)) for row in (rising if sides[k] > 0 else rising[::-1])]
         named = "forward runs rise, backward runs fall"
-        words = named if any(run.side for run in runs) else f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
+        words = (
+            named
+            if any(run.side for run in runs)
+            else f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
+        )
         remarks.append(f"runs: {len(runs)} columns ({listed(names)}), read one after the other; {words}")
     unit = next((run.name.unit for run in runs if run.name.unit), None)
     factors = [run.name.unit.in_units_of(unit) if run.name.unit and unit else 1.0 for run in runs]
@@ -96,7 +100,9 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
         remedy = "give all runs in one unit"
         raise refusal("csv", file=table.file, line=table.first_line, found=found, allowed="one unit", remedy=remedy)
     kind = "deviation" if any(run.name.has("deviation") for run in runs) else "reading"
-    bracket = f" ({unit.name})" if unit and unit.per_number == 1.0 else f" ({unit.per_number:g} {unit.name})" if unit else ""
+    bracket = (
+        f" ({unit.name})" if unit and unit.per_number == 1.0 else f" ({unit.per_number:g} {unit.name})" if unit else ""
+    )
     unknown = next((run.name.unknown for run in runs if run.name.unknown), "")
     reading = f"{kind}{bracket or (f' ({unknown})' if unknown else '')}"
     columns: dict[str, Sequence[object]] = {command: [table.columns[command][row] for row, _ in rows]}
@@ -155,7 +161,7 @@ def _runs(table: ForeignTable) -> list[Run]:
     for text, cells in table.columns.items():
         name = name_of(text.translate(_ARROWS))
         name = replace(name, text=text)
-        if not _numeric(cells) or name.has(*_NEVER) and not name.has("run") or name.has("u", "expanded"):
+        if not _numeric(cells) or (name.has(*_NEVER) and not name.has("run")) or name.has("u", "expanded"):
             continue
         signed = _SIGN.search(text)
         rising, falling = name.has("forward", "clockwise"), name.has("backward", "counterclockwise")
@@ -197,7 +203,11 @@ def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
     rest = [name_of(text) for text, cells in table.columns.items() if text not in names and _numeric(cells)]
     rest = [name for name in rest if all(table.columns[name.text])]
     for kind in ("command", "position", ""):
-        fit = [name for name in rest if (name.has(kind) if kind else not name.has("aside", "temperature", "time", "index", "u", "statistic"))]
+        fit = [
+            name
+            for name in rest
+            if (name.has(kind) if kind else not name.has("aside", "temperature", "time", "index", "u", "statistic"))
+        ]
         fit = [name for name in fit if not (kind and name.has("aside", "u", "temperature", "time"))]
         if len(fit) == 1:
             return fit[0].text
@@ -208,12 +218,25 @@ def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
     allowed = "one column of numbers"
     if not rest:
         remedy = "add the commanded positions as a column"
-        raise refusal("missing-column", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy)
+        raise refusal(
+            "missing-column", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy
+        )
     candidates = [
-        Candidate(f"commands in {escaped(name.text)}", ("--column", f"command={name.text}"), {name.text: table.columns[name.text][:3]})
+        Candidate(
+            f"commands in {escaped(name.text)}",
+            ("--column", f"command={name.text}"),
+            {name.text: table.columns[name.text][:3]},
+        )
         for name in rest
     ]
-    raise question(file=table.file, line=table.first_line, found=found, allowed=allowed, candidates=candidates, code="missing-column")
+    raise question(
+        file=table.file,
+        line=table.first_line,
+        found=found,
+        allowed=allowed,
+        candidates=candidates,
+        code="missing-column",
+    )
 
 
 def _order(table: ForeignTable, runs: Sequence[Run]) -> str:
@@ -236,7 +259,14 @@ def _order(table: ForeignTable, runs: Sequence[Run]) -> str:
         Candidate("the first run rising, the second falling, and so on", ("--runs", ALTERNATE)),
         Candidate("repeated readings of each stop", ("--runs", REPEATS)),
     ]
-    raise question(file=table.file, line=table.first_line, found=found, allowed="an order that is known", candidates=candidates, code="runs")
+    raise question(
+        file=table.file,
+        line=table.first_line,
+        found=found,
+        allowed="an order that is known",
+        candidates=candidates,
+        code="runs",
+    )
 
 
 def _agree(some: Sequence[Sequence[float]], others: Sequence[Sequence[float]]) -> bool:

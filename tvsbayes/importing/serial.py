@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from itertools import pairwise
 from typing import NamedTuple
 
 from tvsbayes.importing.table import Row, Rows
@@ -73,7 +74,9 @@ def paired_rows(text: str, file: str) -> Rows | None:
     if damaged:
         named = ", ".join(map(str, sorted(damaged)[:NAMED_MAX])) + " ..." * (len(damaged) > NAMED_MAX)
         one = len(damaged) == 1
-        notes.append(f"line{'' if one else 's'} {named} left out: lost, repeated or cut beside {'it' if one else 'them'}")
+        notes.append(
+            f"line{'' if one else 's'} {named} left out: lost, repeated or cut beside {'it' if one else 'them'}"
+        )
     return Rows([Row(body[0].line, head), *body], notes)
 
 
@@ -86,14 +89,16 @@ def _pairs(number: int, line: str) -> list[_Pair]:
         return []
     clock_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) if clock else None
     return [
-        _Pair(number, m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""), m["value"].replace(",", "."), clock_s)
+        _Pair(
+            number, m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""), m["value"].replace(",", "."), clock_s
+        )
         for m in found
     ]
 
 
 def _repeated_lines(lines: list[tuple[int, str]], pairs_of: dict[int, list[_Pair]]) -> set[int]:
     """Lines sent twice: equal to the line before, where lines seldom are."""
-    repeated = {n for (_, before), (n, line) in zip(lines, lines[1:], strict=False) if line == before and n in pairs_of}
+    repeated = {n for (_, before), (n, line) in pairwise(lines) if line == before and n in pairs_of}
     return repeated if len(repeated) <= REPEATED_SHARE * len(lines) else set()
 
 
@@ -133,7 +138,9 @@ def _blocks(stream: list[_Pair], usual: list[str]) -> tuple[list[dict[str, _Pair
             rows.append({**heads, **extras})
         else:
             values = [[pair for pair in block if pair.name == name] for name in repeats]
-            rows.extend({**heads, **extras, **dict(zip(repeats, parts, strict=True))} for parts in zip(*values, strict=False))
+            rows.extend(
+                {**heads, **extras, **dict(zip(repeats, parts, strict=True))} for parts in zip(*values, strict=False)
+            )
         block.clear()
         extras.clear()
 

@@ -123,7 +123,9 @@ def _monitored(text: str) -> tuple[dict[str, Series], list[str]]:
             step_s = SUMMER_TIME_S if is_summer else back_s + usual_s
             moved, time_s = moved + step_s, time_s + step_s
             why = ", as at the end of summer time" if is_summer else ""
-            notes.append(f"the clock steps back by {back_s:.6g} s in line {number}{why}: {step_s:.6g} s added from there")
+            notes.append(
+                f"the clock steps back by {back_s:.6g} s in line {number}{why}: {step_s:.6g} s added from there"
+            )
         series.append((time_s, float(match["value"])))
     named = {name: _series(values) for name, values in rows.items() if values}
     return named, [f"EPICS camonitor, {len(rows)} series, {left_out} lines without a number left out", *notes]
@@ -137,13 +139,17 @@ def _archived(text: str, file: str) -> tuple[dict[str, Series], list[str]]:
         for entry in content:
             meta, data = entry["meta"], entry["data"]
             name, unit = str(meta["name"]), str(meta.get("EGU", ""))
-            usable = [row for row in data if row.get("severity", 0) < INVALID and isinstance(row.get("val"), int | float)]
+            usable = [
+                row for row in data if row.get("severity", 0) < INVALID and isinstance(row.get("val"), int | float)
+            ]
             left_out += len(data) - len(usable)
             rows = [(float(row["secs"]) + 1e-9 * float(row.get("nanos", 0)), float(row["val"])) for row in usable]
             series[f"{name} ({unit})" if unit else name] = _series(rows)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         found, remedy = f"a file of another form ({escaped(str(error), 60)})", "retrieve it again as JSON"
-        raise refusal("kind", file=file, found=found, allowed="JSON of the archiver appliance", remedy=remedy) from error
+        raise refusal(
+            "kind", file=file, found=found, allowed="JSON of the archiver appliance", remedy=remedy
+        ) from error
     series = {name: values for name, values in series.items() if len(values.times_s)}
     return series, [f"EPICS archiver, {len(content)} series, {left_out} values that are invalid or no numbers left out"]
 
@@ -208,7 +214,12 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
 
 
 def _joined(
-    file: str, notes: Sequence[str], times_s: np.ndarray, commands: np.ndarray, values: np.ndarray, names: tuple[str, str]
+    file: str,
+    notes: Sequence[str],
+    times_s: np.ndarray,
+    commands: np.ndarray,
+    values: np.ndarray,
+    names: tuple[str, str],
 ) -> ForeignTable:
     """Commands and readings at the same times as a table, every n-th of many."""
     step = -(-len(values) // ROWS_KEPT)
@@ -314,7 +325,9 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     notes = [f"Klipper, {', '.join(map(escaped, names))}"]
     notes.append(f"{int((~inside).sum())} angles before the first step left out")
     angles_deg = readings.values * 360.0 / KLIPPER_TURN
-    return _joined(file, notes, readings.times_s[inside], counters[inside], angles_deg[inside], ("steps", "angle (deg)"))
+    return _joined(
+        file, notes, readings.times_s[inside], counters[inside], angles_deg[inside], ("steps", "angle (deg)")
+    )
 
 
 def _messages(data: bytes, file: str) -> Iterator[dict[str, Any]]:
@@ -346,12 +359,19 @@ def _checked(params: Mapping[str, Any], kind: str, file: str) -> np.ndarray:
     """
     try:
         with np.errstate(all="raise"):
-            rows = _queue(params) if kind == "stepq" else np.array([row[:2] for row in params["data"]], float).reshape(-1, 2)
+            rows = (
+                _queue(params)
+                if kind == "stepq"
+                else np.array([row[:2] for row in params["data"]], float).reshape(-1, 2)
+            )
         if not np.isfinite(rows).all() or np.abs(rows).max(initial=0.0) > 2.0**60:
             raise ValueError("numbers out of range")
         return rows
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, FloatingPointError) as error:
-        found, remedy = f"a message of another form ({escaped(str(error), 60)})", "log it with data_logger.py of this Klipper"
+        found, remedy = (
+            f"a message of another form ({escaped(str(error), 60)})",
+            "log it with data_logger.py of this Klipper",
+        )
         raise refusal("kind", file=file, found=found, allowed="its fields", remedy=remedy) from error
 
 
@@ -367,7 +387,9 @@ def _queue(params: Mapping[str, Any]) -> np.ndarray:
     clocks = n * interval + add * n * (n - 1) / 2
     start = np.cumsum(np.r_[-interval[:1] if len(interval) else 0.0, clocks[:-1]])[: len(n)]
     position = float(params.get("start_mcu_position", 0)) + np.cumsum(np.r_[0.0, count])[:-1]
-    return np.column_stack([first_s + start * per_clock_s, np.full(len(n), per_clock_s), interval, add, count, position])
+    return np.column_stack(
+        [first_s + start * per_clock_s, np.full(len(n), per_clock_s), interval, add, count, position]
+    )
 
 
 def _counters_at(queue: np.ndarray, times_s: np.ndarray) -> np.ndarray:
@@ -392,5 +414,3 @@ def _counters_at(queue: np.ndarray, times_s: np.ndarray) -> np.ndarray:
     steps += (clock_of(steps + 1) <= clocks + 0.5) & (steps < np.abs(count))
     first_step_s = float(np.min(queue[:, 0] + queue[:, 1] * queue[:, 2]))
     return np.where((latest >= 0) & (times_s >= first_step_s - EQUAL_S), position + np.sign(count) * steps, np.nan)
-
-

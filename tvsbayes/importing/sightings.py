@@ -92,10 +92,17 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
     counters = _counters(cells, units, assumed)
     rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
     angles: dict[str, list[float | None]] = {}
-    for name, low, high in zip((*ANGLES, "u_deg"), (-ANGLE_MAX_DEG, -ELEVATION_MAX_DEG, 0.0), (ANGLE_MAX_DEG, ELEVATION_MAX_DEG, U_MAX_DEG), strict=True):
+    for name, low, high in zip(
+        (*ANGLES, "u_deg"),
+        (-ANGLE_MAX_DEG, -ELEVATION_MAX_DEG, 0.0),
+        (ANGLE_MAX_DEG, ELEVATION_MAX_DEG, U_MAX_DEG),
+        strict=True,
+    ):
         if name in cells:
             scale = units[name].scale * units[name].per_number
-            angles[name] = [None if v is None else scale * v for v in cells.numbers(name, low / scale, high / scale, optional=True)]
+            angles[name] = [
+                None if v is None else scale * v for v in cells.numbers(name, low / scale, high / scale, optional=True)
+            ]
     if "u_deg" not in cells:
         u = U_DEG if wishes.u_deg is None else wishes.u_deg
         angles["u_deg"] = [u] * len(table)
@@ -142,7 +149,11 @@ def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understo
             claims[counter], claims[angle] = whole, [name for name in names if name not in whole]
     for role, names in claims.items():
         # Of two directions the one that was found.
-        found = [name for name in names if known[name].name.words and place_of(known[name].name.words, "observed") is not None]
+        found = [
+            name
+            for name in names
+            if known[name].name.words and place_of(known[name].name.words, "observed") is not None
+        ]
         names = found if len(found) == 1 and role in ANGLES else names
         if len(names) > 1:
             candidates = [choice({role: name}, known) for name in (*names, *([] if role in NEEDED else [""]))]
@@ -160,7 +171,11 @@ def field_of(column: Column) -> str | None:
     words, kind = name.words, name.unit.kind if name.unit else ""
     of_axis = [k for k, concept in enumerate(("azimuth", "elevation")) if place_of(words, concept) is not None]
     # "s" stands for seconds here.
-    if name.has("expanded") or (name.has("u") and (words != ("s",))) or (name.has("deviation") and kind == "angle" and len(of_axis) != 1):
+    if (
+        name.has("expanded")
+        or (name.has("u") and (words != ("s",)))
+        or (name.has("deviation") and kind == "angle" and len(of_axis) != 1)
+    ):
         return "u_deg"
     if name.has("temperature") or kind == "temperature":
         return "temperature_degC"
@@ -181,7 +196,11 @@ def field_of(column: Column) -> str | None:
 
 
 def _units(
-    cells: FieldCells, known: Mapping[str, Column], written: Mapping[str, Unit | None], wishes: SightingWishes, assumed: list[str]
+    cells: FieldCells,
+    known: Mapping[str, Column],
+    written: Mapping[str, Unit | None],
+    wishes: SightingWishes,
+    assumed: list[str],
 ) -> dict[str, Unit]:
     """Units of angles by field; whole counters have none.
 
@@ -214,7 +233,13 @@ def _units(
             if unit is None and limits[0] != "deg":
                 found = f"angles up to {largest:.4g} in column {escaped(column.name.text)}, without a unit"
                 raise _ask_angles(cells, column, found, limits)
-            if unit is not None and name == ANGLES[1] and largest * unit.scale > ELEVATION_MAX_DEG and stated is None and known[cells.columns[ANGLES[0]]].name.unit is None:
+            if (
+                unit is not None
+                and name == ANGLES[1]
+                and largest * unit.scale > ELEVATION_MAX_DEG
+                and stated is None
+                and known[cells.columns[ANGLES[0]]].name.unit is None
+            ):
                 found = f"elevations up to {largest:.4g} in column {escaped(column.name.text)}, without a unit"
                 raise _ask_angles(cells, column, found, [u for u in limits if u not in ("rad", "deg")])
             if unit is None:
@@ -228,7 +253,14 @@ def _units(
 def _ask_angles(cells: FieldCells, column: Column, found: str, units: Sequence[str] = ("deg", "rad")):
     first = {column.name.text: column.first}
     candidates = [Candidate(f"they are in {unit}", ("--angles", unit), first) for unit in units]
-    return question(file=cells.table.file, line=cells.table.first_line, found=found, allowed="angles of a known unit", candidates=candidates, code="unit")
+    return question(
+        file=cells.table.file,
+        line=cells.table.first_line,
+        found=found,
+        allowed="angles of a known unit",
+        candidates=candidates,
+        code="unit",
+    )
 
 
 def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) -> list[tuple[int, int]]:
@@ -239,12 +271,12 @@ def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) 
         scale = unit.scale * unit.per_number
         limit = COUNTER_MAX * STEP_DEG / scale
         of_encoders[name] = [round(scale / STEP_DEG * (v or 0.0)) for v in cells.numbers(name, -limit, limit)]
-        assumed.append(f"{name}: angles in {unit.name} as they stand, without whole turns, in steps of {STEP_DEG:g} deg")
+        assumed.append(
+            f"{name}: angles in {unit.name} as they stand, without whole turns, in steps of {STEP_DEG:g} deg"
+        )
     if len(of_encoders) == len(COUNTERS):
         return list(zip(*(of_encoders[name] for name in COUNTERS), strict=True))  # type: ignore[arg-type]
     if not of_encoders:
         return whole_counters(cells)
     columns = [of_encoders.get(name) or cells.whole(name, -COUNTER_MAX, COUNTER_MAX) for name in COUNTERS]
     return list(zip(*columns, strict=True))  # type: ignore[arg-type]
-
-

@@ -141,7 +141,8 @@ def unit_named(name: str) -> Unit:
 
 
 _PART = re.compile(
-    r"(?:x ?|\* ?)?(?:1 ?/ ?(?P<over>10+)|(?P<decimal>0?[.,]0*1)|10 ?\^? ?-(?P<power>\d)|1e-0?(?P<e>\d)) ?[x*]? ?(?P<unit>\S.*)"
+    r"(?:x ?|\* ?)?(?:1 ?/ ?(?P<over>10+)|(?P<decimal>0?[.,]0*1)|10 ?\^? ?-(?P<power>\d)|1e-0?(?P<e>\d))"
+    r" ?[x*]? ?(?P<unit>\S.*)"
 )
 
 
@@ -149,14 +150,27 @@ def parse_unit(text: str) -> Unit | None:
     """The unit that a whole text states, as in brackets: "mm", "1/100 mm", "Hundertstel mm", "mm/100"."""
     units, parts = _units()
     text = re.sub("[\u00b0\u00ba] ?(?=[cfCF]$)", "deg", text.strip())
-    text = {"\u00b0": "deg", "\u00ba": "deg", '"': "inch", "''": "arcsec", "\u2033": "arcsec", "'": "arcmin", "\u2032": "arcmin", "%": "percent"}.get(
-        text, text
-    )
+    text = {
+        "\u00b0": "deg",
+        "\u00ba": "deg",
+        '"': "inch",
+        "''": "arcsec",
+        "\u2033": "arcsec",
+        "'": "arcmin",
+        "\u2032": "arcmin",
+        "%": "percent",
+    }.get(text, text)
     key = " ".join(plain(text).replace("-", " ").replace("_", " ").strip(" .").split())
     if key in units:
         return units[key]
     if match := _PART.fullmatch(" ".join(plain(text).split())):
-        digits = len(match["over"]) - 1 if match["over"] else len(match["decimal"].rpartition(".")[2].rpartition(",")[2]) if match["decimal"] else int(match["power"] or match["e"])
+        digits = (
+            len(match["over"]) - 1
+            if match["over"]
+            else len(match["decimal"].rpartition(".")[2].rpartition(",")[2])
+            if match["decimal"]
+            else int(match["power"] or match["e"])
+        )
         unit = parse_unit(match["unit"])
         return unit and unit._replace(per_number=10.0**-digits)
     first, _, rest = key.partition(" ")
@@ -173,9 +187,21 @@ def parse_unit(text: str) -> Unit | None:
 
 _BRACKETS = re.compile(r"[(\[{]([^()\[\]{}]*)[)\]}]")
 _COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:[.,][0-9]+)?)\b|\b([23])\s*(?:x\s*)?(?:sd|s|std|stdev|stabw|sigma)\b")
-"""Coverage factor in the name of a column of expanded uncertainties (GUM, 6.2), or a multiple of a standard deviation."""
+"""Coverage factor in the name of a column of expanded uncertainties (GUM, 6.2), or a multiple of sd."""
 COVERAGE_USUAL = 2.0
-_KNOWN = ("command", "value", "position", "deviation", "u", "expanded", "time", "segment", "approach", "status", "moving")
+_KNOWN = (
+    "command",
+    "value",
+    "position",
+    "deviation",
+    "u",
+    "expanded",
+    "time",
+    "segment",
+    "approach",
+    "status",
+    "moving",
+)
 _KNOWN += ("resting", "temperature", "repeat", "index", "aside", "statistic", "run", "several", "forward", "backward")
 _KNOWN += ("clockwise", "counterclockwise")
 
@@ -244,7 +270,12 @@ def name_of(text: str) -> Name:
 def _is_unit_like(content: str) -> bool:
     """Whether brackets hold what can be a unit: no index, no word with another meaning."""
     words = words_of(content)
-    if not words or len(content) > 24 or all(word.isdigit() for word in words) or re.match(r"\s*[ijkn](\s*[,=]|\s*$)", content):
+    if (
+        not words
+        or len(content) > 24
+        or all(word.isdigit() for word in words)
+        or re.match(r"\s*[ijkn](\s*[,=]|\s*$)", content)
+    ):
         return False
     return not any(place_of(words, concept) is not None for concept in _KNOWN) and len(words) <= 3
 
@@ -254,7 +285,9 @@ def _unit_of_words(text: str, words: list[str]) -> tuple[Unit | None, list[str]]
     units, _ = _units()
     if "%" in text:
         return Unit("other", "other", 1.0), words
-    if (after := re.search(r"(?:\s/\s*|[,:]\s*|\sin\s+)([^,/:]+)$", text)) and (unit := parse_unit(after[1])) is not None:
+    if (after := re.search(r"(?:\s/\s*|[,:]\s*|\sin\s+)([^,/:]+)$", text)) and (
+        unit := parse_unit(after[1])
+    ) is not None:
         rest = words_of(text[: after.start()])
         if rest:
             return unit, [*rest, *_of_count(unit, after[1])]
@@ -274,7 +307,13 @@ def _unit_of_words(text: str, words: list[str]) -> tuple[Unit | None, list[str]]
     for place, word in enumerate(words):
         unit = units.get(word)
         clear = len(word) > 2 or word in ("mm", "um", "nm", "cm")
-        if unit is not None and clear and unit.kind in ("length", "angle") and not _is_direction(word) and word != "mil":
+        if (
+            unit is not None
+            and clear
+            and unit.kind in ("length", "angle")
+            and not _is_direction(word)
+            and word != "mil"
+        ):
             return unit, words[:place] + words[place + 1 :]
     return next((units[word] for word in words if word in units and units[word].kind == "count"), None), words
 

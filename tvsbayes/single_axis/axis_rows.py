@@ -17,8 +17,8 @@ import numpy as np
 from tvsbayes.errors import InputError, NothingToEstimate, listed
 from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
-from tvsbayes.statistics.wrapped import turn_jumps
 from tvsbayes.statistics.intervals import WithSd
+from tvsbayes.statistics.wrapped import turn_jumps
 
 SIDES = {"forward": 1, "backward": -1, "unknown": 0}
 DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
+import datetime
 import gzip
 import json
 
 import numpy as np
 import pytest
 
-from tvsbayes.errors import InputError
-from tvsbayes.single_axis.joined_series import (
-    KLIPPER_TURN,
-    Series,
-    camonitor_table,
-    command_at,
-    is_camonitor,
-    is_klipper,
-    klipper_table,
-)
+from tvsbayes.errors import InputError, Question
+from tvsbayes.importing.series import KLIPPER_TURN, epics_table, is_camonitor, is_klipper, klipper_table
 
 COMMAND, READ = "T:Axis1-PosAct", "T:ec0-s3-EL5002-CH1-PosAct"
 
@@ -43,38 +36,29 @@ def test_readings_get_the_command_of_their_time(names):
     """Interpolated in motion; one from outside of the commands' times is left out."""
     text = "\n".join(drive()).replace(COMMAND, names[0]).replace(READ, names[1])
     assert is_camonitor(text) and not is_camonitor("time_s,steps,angle\n0,1,2\n")
-    table = camonitor_table(text, "log", {})
+    table = epics_table(text, "log", {})
     assert list(table.columns) == ["time_s", *names] and len(table) == 21
     rows = np.array([[float(cell) for cell in table.columns[name]] for name in table.columns])
     assert rows[1][1:] == pytest.approx(100 + (rows[2][1:] - 5000) / 100, abs=1e-9)
     assert "20 commands interpolated in time, 1 readings outside left out" in table.kind
 
 
-def test_a_constant_command_is_held():
-    """Between two motions, 59 s apart, the command is constant and not interpolated."""
-    times = np.array([0.0, 0.1, 0.2, 0.3, 60.0, 60.1])
-    commands = Series(times, np.array([0.0, 1.0, 2.0, 3.0, 3.0, 9.0]))
-    values, interpolated = command_at(commands, np.array([0.15, 30.0, 60.05, 60.1, 0.1]))
-    assert values == pytest.approx([1.5, 3.0, 6.0, 9.0, 1.0], abs=1e-12) and interpolated == 2
-    jump = Series(np.array([0.0, 0.1, 0.2, 60.0]), np.array([0.0, 1.0, 2.0, 50.0]))
-    assert command_at(jump, np.array([30.0]))[0] == pytest.approx([2.0])
-
-
 def test_an_ambiguous_pair_is_asked_for():
     text = "\n".join(drive()).replace(COMMAND, "A").replace(READ, "B")
-    with pytest.raises(InputError, match=r"A \(201 values\), B \(22 values\)") as refused:
-        camonitor_table(text, "log", {})
-    assert "--column command=NAME --column value=NAME" in refused.value.remedy
-    assert list(camonitor_table(text, "log", {"command": "A", "value": "B"}).columns) == ["time_s", "A", "B"]
-    assert list(camonitor_table(text, "log", {"value": "B"}).columns) == ["time_s", "A", "B"]
+    with pytest.raises(Question, match=r"A \(201 values\), B \(22 values\)") as asked:
+        epics_table(text, "log", {})
+    ways = [candidate.options for candidate in asked.value.candidates]
+    assert ways == [("--column", f"command={c}", "--column", f"value={v}") for c, v in ("AB", "BA")]
+    assert list(epics_table(text, "log", {"command": "A", "value": "B"}).columns) == ["time_s", "A", "B"]
+    assert list(epics_table(text, "log", {"value": "B"}).columns) == ["time_s", "A", "B"]
     with pytest.raises(InputError, match="no such series"):
-        camonitor_table(text, "log", {"command": "C"})
+        epics_table(text, "log", {"command": "C"})
 
 
 def test_series_of_two_times_are_refused():
     lines = [line("m:VAL", k, k) for k in range(9)] + [line("m:RBV", 20 + k, k) for k in range(9)]
     with pytest.raises(InputError, match="no value of m:RBV between"):
-        camonitor_table("\n".join(lines), "log", {})
+        epics_table("\n".join(lines), "log", {})
 
 
 def klipper(steps: int = 4000) -> list[dict]:
@@ -132,7 +116,7 @@ def test_what_angle_calibrate_saves():
             ),
             "no angle after a step",
         ),
-        (json.dumps({"q": "stepq:x", "params": {"data": 3}}).encode(), "a queue of steps of another form"),
+        (json.dumps({"q": "stepq:x", "params": {"data": 3}}).encode(), "a message of another form"),
     ],
 )
 def test_broken_logs_of_klipper_are_refused(data, message):
@@ -140,10 +124,39 @@ def test_broken_logs_of_klipper_are_refused(data, message):
         klipper_table(data, "log")
 
 
-def test_a_command_logged_once_a_move_is_held_until_the_next():
-    """A setpoint every 10 s, the axis read 5 s later: no motion in between."""
-    times = np.arange(0.0, 50.0, 10.0)
-    commands = Series(times, np.array([0.0, 10.0, 20.0, 10.0, 0.0]))
-    values, interpolated = command_at(commands, times + 5.0)
-    np.testing.assert_array_equal(values, commands.values)
-    assert interpolated == 0
+@pytest.mark.parametrize("dwell_s", [1.5, 10.0])
+def test_a_command_logged_once_a_move_is_held_until_the_next(dwell_s):
+    """The axis is read in the middle of its dwell, where interpolation would put the command halfway to the next."""
+    rows = [(k, command) for k, command in enumerate([0.0, 10.0, 20.0, 10.0, 0.0, 10.0, 20.0])]
+    lines = [f"m:VAL 2026-03-01 10:00:{dwell_s * k % 60:09.6f} {c}" for k, c in rows if dwell_s * k < 59]
+    reads = [f"m:encoder 2026-03-01 10:00:{dwell_s * (k + 0.6) % 60:09.6f} {0.5 * c + 3}" for k, c in rows]
+    reads = reads[: len(lines) - 1]
+    table = epics_table("\n".join(lines + reads), "log", {})
+    steps, values = ([float(cell) for cell in table.columns[name]] for name in ("m:VAL", "m:encoder"))
+    assert len(steps) == len(reads) and values == pytest.approx([0.5 * step + 3 for step in steps], abs=1e-12)
+    assert "0 commands interpolated" in table.kind
+
+
+@pytest.mark.parametrize(("back_s", "added_s"), [(3580.0, 3600.0), (1.0, 21.0)])
+def test_a_clock_that_steps_back_goes_on(back_s, added_s):
+    """By an hour less the time between two lines at the end of summer time, else by what was lost; both are said."""
+    start = datetime.datetime(2026, 10, 25, 2, 50)
+    lines, shift_s = [], 0.0
+    for k in range(60):
+        shift_s = 20.0 + back_s if k >= 30 else 0.0
+        for name, later_s, value in (("m:VAL", 0.0, k % 7), ("m:encoder", 5.0, k % 7 + 0.25)):
+            at = start + datetime.timedelta(seconds=20.0 * k + later_s - shift_s)
+            lines.append(f"{name} {at.isoformat(' ')}.000000 {value}")
+    table = epics_table("\n".join(lines), "log", {})
+    times, steps, values = ([float(cell) for cell in column] for column in table.columns.values())
+    assert values == pytest.approx([step + 0.25 for step in steps]) and np.all(np.diff(times) > 0)
+    assert f"the clock steps back by {back_s:g} s in line 61" in table.kind and f"{added_s:g} s added" in table.kind
+
+
+def test_messages_that_would_expand_are_small():
+    """Four messages of 20 million steps: the counter at an angle's time is computed, no step is stored."""
+    bomb = {"first_clock": 0, "last_clock": 2 * 10**7 - 1, "first_step_time": 0.0, "last_step_time": 20.0}
+    messages = [{"q": "stepq:s", "params": {**bomb, "data": [[1, 19_999_999, 0]]}} for _ in range(4)]
+    messages.append({"q": "angle:a", "params": {"data": [[10.0, 5], [20.0, 7]]}})
+    table = klipper_table(b"\x03".join(json.dumps(message).encode() for message in messages), "log")
+    assert [float(cell) for cell in table.columns["steps"]] == pytest.approx([10_000_000, 19_999_999], abs=2)

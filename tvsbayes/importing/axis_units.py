@@ -1,0 +1,235 @@
+"""What a user states about a table of an axis; its readings and their standard uncertainties in one unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tvsbayes.errors import Candidate, escaped, question, refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.cells import FieldCells
+from tvsbayes.importing.columns import columns_of
+from tvsbayes.importing.words import Unit, name_of, parse_unit
+
+UNIT_SLOPE = 0.05
+"""Largest deviation from 1 of the slope of readings over commands, where both are taken to be in one unit."""
+ANGLE_SPAN = 360.0
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the user states about a table of an axis.
+
+    Attributes:
+        columns: column by field, "" for none.
+        units: unit by field, as text.
+        deviations: whether readings are actual less commanded position.
+        counts_per_turn: counts after which readings restart; 0: nowhere.
+        order: order of runs beside each other, one of `runs.ORDERS`.
+        coverage: coverage factor of the column of uncertainties.
+        status_ok: number of a status that means a good row.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    deviations: bool | None = None
+    counts_per_turn: float | None = None
+    order: str | None = None
+    coverage: float | None = None
+    status_ok: float | None = None
+
+
+def stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:
+    """The unit of a field that the user states.
+
+    Raises:
+        InputError: no unit, or none of its kind.
+    """
+    text = wishes.units.get(name)
+    if text is None:
+        return None
+    unit = parse_unit(text)
+    if unit is None and name == "value":
+        return Unit(text, "own", 1.0)
+    if unit is None:
+        allowed, remedy = "a unit such as mm, um, 1/100 mm, deg, arcsec, turn, s, ms", "name one of them"
+        raise refusal("usage", file=f"--unit {name}={escaped(text)}", found="no unit", allowed=allowed, remedy=remedy)
+    return unit
+
+
+def units_of(cells: FieldCells, written: Mapping[str, Unit | None], wishes: Wishes) -> dict[str, Unit | None]:
+    """Units of command, reading and u: stated, of the cells, or of the names.
+
+    Raises:
+        Question: a unit that nobody knows.
+    """
+    units: dict[str, Unit | None] = {}
+    for name in ("command", "value", "u", "time_s"):
+        if name not in cells:
+            continue
+        column = name_of(cells.columns[name])
+        unit = stated_unit(cells, name, wishes) or written.get(name) or column.unit
+        if unit is None and column.unknown and name != "command":
+            known = columns_of(cells.table)
+            own = [column.unknown] if name == "value" else []
+            usual = {"time_s": ("s", "ms", "min")}.get(name, ("mm", "um", "deg", "arcsec", "counts"))
+            found = f"unit {escaped(column.unknown)} of column {escaped(column.text)}, which is not known"
+            first = {column.text: known[column.text].first}
+            candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}"), first) for text in (*own, *usual)]
+            raise question(
+                file=cells.table.file,
+                line=cells.table.first_line,
+                found=found,
+                allowed="a unit that is known, or one that is stated",
+                candidates=candidates,
+                code="unit",
+            )
+        units[name] = unit
+    return units
+
+
+def in_one_unit(
+    cells: FieldCells,
+    commands: Sequence[float],
+    values: Sequence[float | None],
+    stated_u: Sequence[float],
+    units: Mapping[str, Unit | None],
+    wishes: Wishes,
+    assumed: list[str],
+) -> tuple[list[float | None], list[float], str | None]:
+    """Readings and their standard u in one unit, with its name."""
+    unit, command_unit = units["value"], units["command"]
+    if not wishes.deviations and len(set(values)) > 2 and list(values) == list(commands):
+        assumed.append("value: equals the command in every row: what was read, or the command again?")
+    if wishes.deviations:
+        factor = _deviation_factor(cells, unit, command_unit)
+        values = [None if d is None else rounded(c + factor * d) for c, d in zip(commands, values, strict=True)]
+        assumed.append("value: the command plus the deviation, because --deviations says so")
+        given, unit = unit or command_unit, command_unit or unit
+    else:
+        given = unit
+        if unit is not None and unit.per_number != 1.0:
+            values = [None if v is None else rounded(unit.per_number * v) for v in values]
+            assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
+            unit = unit.whole
+        elif unit is None and (unit := _unit_of_command(commands, values, command_unit)) is not None:
+            given = unit
+            how = "that of the commands, which the readings follow 1 to 1; --unit value=mm says another"
+            assumed.append(f"unit: {unit.name}, {how}")
+    if unit is None and _are_counts(cells.text("value")):
+        unit = given = Unit("counts", "count", 1.0)
+        assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
+    return list(values), _standard_u(cells, stated_u, units.get("u"), given, unit, wishes, assumed), unit and unit.name
+
+
+def rounded(number: float) -> float:
+    """A number without the last digits of its floating point."""
+    return float(f"{number:.13g}")
+
+
+def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit | None) -> float:
+    """Units of the command per unit of a deviation.
+
+    Raises:
+        Question: a unit that is missing.
+        InputError: units of two kinds.
+    """
+    if unit is None and command_unit is None:
+        return 1.0
+    table = cells.table
+    if command_unit is None or unit is None:
+        name, other = ("command", unit) if command_unit is None else ("value", command_unit)
+        found = f"no unit of column {escaped(cells.columns[name])} beside {other.name} of the other"  # type: ignore[union-attr]
+        usual = dict.fromkeys((other.name, *(("mm", "um") if other.kind == "length" else ("deg", "arcsec"))))  # type: ignore[union-attr]
+        candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}")) for text in usual]
+        raise question(
+            file=table.file, line=table.first_line, found=found, allowed="two units", candidates=candidates, code="unit"
+        )
+    factor = unit.in_units_of(command_unit)
+    if factor is None:
+        found, allowed = (
+            f"deviations in {unit.name} from commands in {command_unit.name}",
+            "deviations in a unit of the commands",
+        )
+        remedy = "add a column of positions, or of commands in the unit of the deviations"
+        raise refusal("unit", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy)
+    return factor
+
+
+def _unit_of_command(
+    commands: Sequence[float], values: Sequence[float | None], command_unit: Unit | None
+) -> Unit | None:
+    """The commands' unit of length or angle, where readings without one follow them 1 to 1."""
+    pairs = [(c, v) for c, v in zip(commands, values, strict=True) if v is not None]
+    if command_unit is None or command_unit.kind not in ("length", "angle") or len({c for c, _ in pairs}) < 2:
+        return None
+    slope = np.polyfit(*np.array(pairs).T, 1)[0]
+    return command_unit if abs(slope - 1.0) <= UNIT_SLOPE else None
+
+
+def _are_counts(cells: Sequence[str]) -> bool:
+    numbers = [float(cell) for cell in cells if NUMBER.fullmatch(cell)]
+    return bool(numbers) and all(n.is_integer() for n in numbers) and max(numbers) - min(numbers) > ANGLE_SPAN
+
+
+def _standard_u(
+    cells: FieldCells,
+    stated: Sequence[float],
+    unit: Unit | None,
+    reading: Unit | None,
+    result: Unit | None,
+    wishes: Wishes,
+    assumed: list[str],
+) -> list[float]:
+    """Standard uncertainties in the readings' unit.
+
+    Args:
+        cells: cells of the table.
+        stated: the numbers of the column.
+        unit: the column's unit.
+        reading: unit of the numbers that were read, which is that of u where its column states none.
+        result: unit of the readings written.
+        wishes: what the user states.
+        assumed: sentences, to which what was done is added.
+
+    Raises:
+        Question: the units of u and of the readings are of two kinds, or that of the readings is missing.
+    """
+    if "u" not in cells:
+        return list(stated)
+    name, table = cells.columns["u"], cells.table
+    unit = unit or reading
+    factor = 1.0 if unit is None else None if result is None else unit.in_units_of(result)
+    if factor is None:
+        found = (
+            f"u in {unit.name} in column {escaped(name)}, of readings in {result.name if result else 'an unnamed unit'}"  # type: ignore[union-attr]
+        )
+        usual = {"length": ("mm", "um"), "angle": ("deg", "arcsec")}.get(unit.kind, ()) if result is None else ()  # type: ignore[union-attr]
+        candidates = [
+            Candidate(f"readings in {text}", ("--unit", f"value={text}")) for text in dict.fromkeys((unit.name, *usual))
+        ]  # type: ignore[union-attr]
+        candidates = (candidates if result is None else []) + [Candidate("no column of u", ("--column", "u="))]
+        raise question(
+            file=table.file,
+            line=table.first_line,
+            found=found,
+            allowed="units of one kind",
+            candidates=candidates,
+            code="unit",
+        )
+    if factor != 1.0:
+        assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")  # type: ignore[union-attr]
+    coverage = wishes.coverage or name_of(name).coverage
+    if coverage is not None and coverage != 1.0:
+        how = f"over {coverage:g}; --assume coverage=NUMBER says another"
+        assumed.append(f"u: column {escaped(name)} is an expanded uncertainty, {how}")
+    return [rounded(u * factor / (coverage or 1.0)) for u in stated]
+
+
+def shown_units(units: Mapping[str, Unit | None], unit: str | None, cells: FieldCells) -> dict[str, str]:
+    """Units by field, as they are shown."""
+    shown = {name: u.name for name, u in units.items() if u is not None}
+    shown |= {"value": unit} if unit else {}
+    return shown | ({"time_s": shown.get("time_s", "s")} if "time_s" in cells else {})
