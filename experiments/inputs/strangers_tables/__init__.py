@@ -1,0 +1,1 @@
+"""Tables as strangers have them, drawn with a known truth, and what `import` makes of them."""

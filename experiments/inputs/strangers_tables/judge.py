@@ -1,0 +1,311 @@
+"""Is the folder that `import` writes what the table says? Are its questions answered by the commands that they print?"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import shutil
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from experiments.common.console import quietly
+from experiments.inputs.strangers_tables.kinds import Drawn
+from experiments.inputs.strangers_tables.measured import DOMAIN, SCALE, Reading, Truth
+
+SPELLED = {
+    "\u00b5m": "um",
+    "\u03bcm": "um",
+    "in": "inch",
+    "mil": "thou",
+    "rev": "turn",
+    "turns": "turn",
+    "counts": "count",
+}
+SPELLED |= {"0.01 mm": "1/100 mm", "0.001 mm": "1/1000 mm", "\u00b0": "deg", "degree": "deg"}
+"""Units as a folder may spell them."""
+ANSWERS_MAX, DEPTH_MAX = 12, 3
+"""Of one question, and questions that follow each other."""
+
+
+class Folder(NamedTuple):
+    """What was written: the unit, and readings that count, with the unit as the file has it."""
+
+    unit: str
+    readings: tuple[Reading, ...]
+
+
+class Verdict(NamedTuple):
+    """What became of a table."""
+
+    word: str
+    """right, guessed, asked, wrong, unanswered, refused, crash."""
+    why: str = ""
+    question: str = ""
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file by its names."""
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def sided(moves: Sequence[dict[str, str]]) -> Iterator[int]:
+    """The side from which each command was reached, by commands and stated approaches."""
+    side, before = 0, None
+    for row in moves:
+        command, approach = float(row["command"]), row["approach"]
+        first = before is None or before[0] != row["segment"]
+        rises = 0 if first or before is None else (command > before[1]) - (command < before[1])
+        if rises:
+            side = rises
+        elif first or approach:
+            side = {"forward": 1, "backward": -1}.get(approach, 0)
+        yield side
+        before = (row["segment"], command)
+
+
+def read_axis(folder: Path) -> Folder:
+    """An axis folder, without the package's own reader."""
+    unit = tomllib.loads((folder / "campaign.toml").read_text(encoding="utf-8"))["unit"]
+    moves = rows_of(folder / "moves.csv")
+    sides = list(sided(moves))
+    readings = []
+    for row in rows_of(folder / "readings.csv"):
+        if row["status"] == "ok" and row["value"]:
+            k = int(row["move"])
+            move = moves[k]
+            time_s = float(row.get("time_s") or move["time_s"])
+            u, segment = float(row["u"] or 0), int(move["segment"])
+            readings.append(Reading(float(move["command"]), float(row["value"]), sides[k], u, segment, time_s))
+    return Folder(SPELLED.get(unit, unit), tuple(readings))
+
+
+def read_sightings(folder: Path) -> Folder:
+    """A folder of a head."""
+    moves, readings = rows_of(folder / "moves.csv"), []
+    for row in rows_of(folder / "sightings.csv"):
+        move = moves[int(row["move"])]
+        pair = (int(move["pan_steps"]), int(move["tilt_steps"]), float(row["elevation_deg"]))
+        readings.append(Reading(0.0, float(row["azimuth_deg"]), u=float(row["u_deg"] or 0), pair=pair))
+    return Folder("deg", tuple(readings))
+
+
+def difference(truth: Truth, folder: Folder) -> str:
+    """The first thing that is not as the table says; empty where all is."""
+    if not folder.readings:
+        return "no reading"
+    if truth.unit is not None and DOMAIN.get(folder.unit) != DOMAIN[truth.unit]:
+        return f"unit {folder.unit} for {truth.unit}"
+    wrong = ""
+    for factor in factors(truth, folder):
+        found = compared(truth, folder, factor)
+        if not found:
+            return ""
+        wrong = wrong or found
+    if wrong.startswith("value") and truth.unit not in (None, folder.unit) and not compared(truth, folder, 1.0):
+        return f"unit {folder.unit} for {truth.unit}"
+    return wrong
+
+
+def factors(truth: Truth, folder: Folder) -> list[float]:
+    """Units of the table per unit of the folder that are right."""
+    if truth.unit is not None:
+        return [SCALE[folder.unit] / SCALE[truth.unit]]
+    if truth.meant and DOMAIN.get(folder.unit) == DOMAIN[truth.meant]:
+        return [1.0, SCALE[folder.unit] / SCALE[truth.meant]]
+    return [1.0]
+
+
+def compared(truth: Truth, folder: Folder, factor: float) -> str:
+    """The first difference, where a unit of the folder is `factor` units of the table."""
+    scales = [1.0]
+    if truth.command_unit in SCALE and folder.unit in SCALE:
+        # Commands may have been turned into the unit of the readings.
+        scales.append(SCALE[folder.unit] / SCALE[truth.command_unit])
+    wrongs = []
+    for scale in scales:
+        told = [r._replace(command=r.command * scale, value=r.value * factor, u=r.u * factor) for r in folder.readings]
+        wrongs.append(by_stops(truth, told) if truth.spread else in_order(truth, told))
+    return "" if "" in wrongs else wrongs[0]
+
+
+def in_order(truth: Truth, told: Sequence[Reading]) -> str:
+    """Every reading of the table once, in its order; `kept` of them where others may be left out."""
+    pairs: list[tuple[Reading, Reading]] = []
+    if truth.kept is None:
+        if len(told) != len(truth.readings):
+            return f"readings: {'fewer' if len(told) < len(truth.readings) else 'more'} than there are"
+        pairs = list(zip(truth.readings, told, strict=True))
+    else:
+        left = iter(truth.readings)
+        for reading in told:
+            # The same line twice is the same reading twice.
+            if pairs and not _one(truth, pairs[-1][0], reading):
+                continue
+            expected = next((r for r in left if not _one(truth, r, reading)), None)
+            if expected is None:
+                return "a reading that belongs to another command"
+            pairs.append((expected, reading))
+        if len(pairs) < truth.kept:
+            return "readings: fewer than are sound"
+    segment = pairs[0][1].segment
+    for expected, reading in pairs:
+        # A homing forgets the side.
+        forgotten = truth.segments == "any" and reading.segment != segment and reading.side == 0
+        if wrong := _one(truth, expected._replace(side=0) if forgotten else expected, reading):
+            return wrong
+        segment = reading.segment
+    if truth.segments == "exact" and truth.kept is None:
+        changes = [[b.segment != a.segment for a, b in zip(r, r[1:], strict=False)] for r in (truth.readings, told)]
+        if changes[0] != changes[1]:
+            return "homings"
+    return times(truth, pairs)
+
+
+def _one(truth: Truth, expected: Reading, reading: Reading) -> str:
+    """The difference between two readings."""
+    tolerance = 0.6 * truth.digit + 1e-9 * abs(expected.value)
+    if expected.pair is not None:
+        turn = (reading.value - expected.value + 180) % 360 - 180
+        counters = reading.pair is not None and reading.pair[:2] == expected.pair[:2]
+        if not counters or abs(turn) > tolerance or abs(reading.pair[2] - expected.pair[2]) > tolerance:
+            return "counters" if not counters else f"angles{_power(reading.value, expected.value)}"
+        # Without a column the importer states its default.
+        return "u" if expected.u and abs(reading.u - expected.u) > 0.03 * expected.u else ""
+    if abs(reading.command - expected.command) > 1e-9 * max(1.0, abs(expected.command)):
+        return f"command{_power(reading.command, expected.command)}"
+    if abs(reading.value - expected.value) > tolerance:
+        return f"value{_power(reading.value, expected.value)}"
+    if abs(reading.u - expected.u) > 0.03 * expected.u:
+        return f"u{_power(reading.u, expected.u)}"
+    unknown = reading.side == 0 and truth.answer == "either"
+    return "side" if expected.side and reading.side != expected.side and not unknown else ""
+
+
+def _power(found: float, expected: float) -> str:
+    """By how much it is off, if by a factor that names a unit."""
+    if not found or not expected:
+        return " for none" if found else " lost"
+    ratio = found / expected
+    known = {1000: "x 1000", 100: "x 100", 10: "x 10", 0.001: "/ 1000", 2: "x 2", 3600: "x 3600", 25.4: "x 25.4"}
+    return next((f" {text}" for value, text in known.items() if abs(ratio / value - 1) < 0.03), "")
+
+
+def by_stops(truth: Truth, told: Sequence[Reading]) -> str:
+    """Of each stop at least one reading, none from outside of its spread."""
+    number, seen = -1, set()
+    for reading in told:
+        while True:
+            stop = truth.readings[number] if number >= 0 else None
+            same = stop is not None and abs(reading.command - stop.command) < 1e-6
+            if same and abs(reading.value - stop.value) <= truth.spread:
+                if reading.side != stop.side and stop.side:
+                    return "side"
+                seen.add(number)
+                break
+            if same or number + 1 == len(truth.readings):
+                return "a reading in motion"
+            number += 1
+    return "" if len(seen) == len(truth.readings) else "stops: fewer than there are"
+
+
+def times(truth: Truth, pairs: Sequence[tuple[Reading, Reading]]) -> str:
+    """Times as the table states them, or none: then 0, 1, 2 ... are written."""
+    if not truth.clock:
+        return ""
+    stated, found = ([(r[k].time_s or 0.0) - (pairs[0][k].time_s or 0.0) for r in pairs] for k in (0, 1))
+    if all(abs(t - s) <= truth.clock for t, s in zip(found, stated, strict=True)):
+        return ""
+    return "" if all(t == round(t) and 0 <= t <= 2 * len(pairs) for t in found) else "times"
+
+
+def walk(document: Any) -> Iterator[str]:
+    """Command lines in a refusal: under keys of that name, else in backticks of its sentences."""
+    if isinstance(document, dict):
+        for key, value in document.items():
+            if key in ("command", "commands"):
+                yield from [value] if isinstance(value, str) else [v for v in value or () if isinstance(v, str)]
+            else:
+                yield from walk(value)
+    elif isinstance(document, list):
+        for value in document:
+            yield from walk(value)
+    elif isinstance(document, str):
+        yield from (text for text in re.findall(r"`([^`]+)`", document) if text.startswith("tvsbayes "))
+
+
+def answers(error: dict[str, Any], line: Sequence[str]) -> list[list[str]]:
+    """Command lines that answer a question; of a remedy that names options alone, the line with these."""
+    found = []
+    for text in dict.fromkeys(walk(error)):
+        try:
+            words = shlex.split(text)[1:]
+        except ValueError:
+            continue
+        if words[:1] == ["import"]:
+            found.append([*words, *(word for word in ("--yes", "--json") if word not in words)])
+    if not found:
+        for clause in re.split(r";|, or | or |, ", error.get("remedy") or ""):
+            option = re.search(r"(--[a-z-]+)(?: (\S.*))?$", clause.strip())
+            if option and "NAME" not in clause and "NUMBER" not in clause and "FOLDER" not in clause:
+                found.append([*line, option[1], *([option[2]] if option[2] else [])])
+    return found[:ANSWERS_MAX]
+
+
+def carried_out(line: Sequence[str], out: Path, truth: Truth) -> tuple[str, dict[str, Any]]:
+    """Run a command: "written", "refused" or "crash", with its document; a folder before it is gone."""
+    shutil.rmtree(out, ignore_errors=True)
+    try:
+        code, text, _ = quietly(*line)
+        document = json.loads(text)
+    except Exception as error:
+        return "crash", {"error": {"message": f"{type(error).__name__}: {error}"}}
+    if code == 0 and (out / "moves.csv").is_file():
+        return "written", document
+    return ("refused" if code in (2, 3) else "crash"), document
+
+
+def folder_difference(out: Path, truth: Truth) -> str:
+    """What is wrong with the folder."""
+    sighted = truth.readings[0].pair is not None
+    try:
+        return difference(truth, read_sightings(out) if sighted else read_axis(out))
+    except (OSError, KeyError, ValueError) as error:
+        return f"folder of another kind: {type(error).__name__}"
+
+
+def answered(error: dict[str, Any], line: Sequence[str], out: Path, truth: Truth, depth: int = 0) -> tuple[bool, bool]:
+    """Is there an answer, and does one lead to the right folder?"""
+    lines = answers(error, line)
+    for answer in lines:
+        state, document = carried_out(answer, out, truth)
+        if state == "written" and not folder_difference(out, truth):
+            return True, True
+        if state == "refused" and depth < DEPTH_MAX:
+            if answered(document.get("error", {}), answer, out, truth, depth + 1)[1]:
+                return True, True
+    return bool(lines), False
+
+
+def judge(drawn: Drawn, folder: Path) -> Verdict:
+    """Import a drawn table without an option, and compare; answer what is asked."""
+    path, out = folder / drawn.file.name, folder / "out"
+    path.write_bytes(drawn.file.data)
+    line = ["import", str(path), *drawn.words, "--to", str(out), "--yes", "--json"]
+    state, document = carried_out(line, out, drawn.truth)
+    if state == "crash":
+        return Verdict("crash", document.get("error", {}).get("message", "")[:200])
+    if state == "written":
+        why = folder_difference(out, drawn.truth)
+        if why:
+            return Verdict("wrong", why)
+        if drawn.truth.meant:
+            return Verdict("wrong", "a unit that nobody knows is replaced in silence")
+        return Verdict("guessed" if drawn.truth.answer == "ask" else "right")
+    error = document.get("error", {})
+    question = f"{error.get('code')}: {error.get('message', '')}".replace(str(folder), "")[:300]
+    has, right = answered(error, line, out, drawn.truth)
+    return Verdict("asked" if right else "unanswered" if has else "refused", question=question)

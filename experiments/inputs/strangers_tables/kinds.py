@@ -1,0 +1,281 @@
+"""Tables of one axis with a row for each reading."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import replace
+from decimal import Decimal
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments.inputs.strangers_tables import sheets, words
+from experiments.inputs.strangers_tables.measured import (
+    DIGITS,
+    DOMAIN,
+    LENGTH,
+    SCALE,
+    UNKNOWN_UNITS,
+    Axis,
+    Reading,
+    Sweep,
+    Truth,
+    chance,
+    decimal,
+    draw_axis,
+    pick,
+    sweeps,
+    unit_text,
+    with_unit,
+)
+from experiments.inputs.strangers_tables.sheets import Cell, File, Sheet
+
+START = datetime.datetime(2026, 3, 12, 9, 5, 10)
+
+
+class Drawn(NamedTuple):
+    """A table of a kind, and what it says."""
+
+    kind: str
+    file: File
+    truth: Truth
+    words: tuple[str, ...] = ("--axis",)
+
+
+def command_name(rng: np.random.Generator, axis: Axis, language: str) -> str:
+    """A name without its unit."""
+    if axis.command_unit == "step":
+        return pick(rng, words.STEPS[language])
+    if axis.command_unit == "turn":
+        return {"en": "Motor position", "de": "Motorstellung", "es": "Posición del motor", "fr": "Position du moteur"}[
+            language
+        ]
+    angle = DOMAIN[axis.command_unit] == "deg" and chance(rng, 0.7)
+    return pick(rng, (words.ANGLE_COMMAND if angle else words.COMMAND)[language])
+
+
+def reading_name(rng: np.random.Generator, axis: Axis, language: str) -> str:
+    """A name without its unit."""
+    angle = DOMAIN[axis.unit] == "deg"
+    return pick(rng, (words.ANGLE_READING if angle else words.LENGTH_READING)[language])
+
+
+def headed(rng: np.random.Generator, name: str, unit: str, language: str) -> str:
+    """With its unit; counters mostly without."""
+    return name if unit == "step" and chance(rng, 0.8) else with_unit(rng, name, unit, language)
+
+
+def read_all(rng: np.random.Generator, axis: Axis, sweep: Sweep) -> tuple[list[Decimal], list[Reading]]:
+    """Values as written, and as they are."""
+    values = [axis.value(stop.command, stop.side, rng) for stop in sweep.stops]
+    readings = [
+        Reading(float(stop.command), float(value), sweep.told_side(k))
+        for k, (stop, value) in enumerate(zip(sweep.stops, values, strict=True))
+    ]
+    return values, readings
+
+
+def truth_of(axis: Axis, readings: Sequence[Reading], **more: object) -> Truth:
+    """The truth of an axis read in its own units."""
+    command_unit = axis.command_unit
+    return replace(
+        Truth(tuple(readings), axis.unit, command_unit, axis.digit, ratio=axis.per_command, play=axis.play), **more
+    )
+
+
+def clock(rng: np.random.Generator, language: str, count: int) -> tuple[str, list[Cell], list[float]]:
+    """A column of times by its name, and seconds since the first."""
+    every = float(pick(rng, (5, 10, 20, 30, 60)))
+    seconds = np.round(np.cumsum(rng.uniform(0.7 * every, 1.3 * every, count)), 1)
+    seconds -= seconds[0]
+    if chance(rng, 0.35):
+        return pick(rng, words.SECONDS[language]), [decimal(s, 1) for s in seconds], list(map(float, seconds))
+    whole = [float(round(s)) for s in seconds]
+    moments = [START + datetime.timedelta(seconds=s) for s in whole]
+    form = "%Y-%m-%d %H:%M:%S" if chance(rng, 0.5) else "%H:%M:%S"
+    if language == "de" and chance(rng, 0.5):
+        form = "%d.%m.%Y %H:%M:%S"
+    return pick(rng, words.CLOCK[language]), [moment.strftime(form) for moment in moments], whole
+
+
+def u_column(rng: np.random.Generator, axis: Axis, language: str) -> tuple[str, Decimal, float]:
+    """Its name, the number that stands in it, and the standard uncertainty in the unit of the readings."""
+    expanded = chance(rng, 0.55)
+    name = pick(rng, (words.EXPANDED_U if expanded else words.STANDARD_U)[language])
+    same = [unit for unit in ("um", "thou", "mm", "arcsec", "mrad", "deg") if DOMAIN[unit] == DOMAIN[axis.unit]]
+    unit = axis.unit if chance(rng, 0.4) or not same else pick(rng, same)
+    standard = axis.scatter * rng.uniform(0.5, 1.5) * SCALE[axis.unit] / SCALE[unit]
+    cell = decimal((1 + expanded) * standard, max(0, 1 - int(np.floor(np.log10(standard)))))
+    text = with_unit(rng, name, unit, language) if name.isascii() else f"{name} ({unit_text(rng, unit, language)})"
+    # "U (k=2)_um" is nobody's.
+    if "(" in name or name[0].isdigit():
+        text = (
+            f"{name} ({unit_text(rng, unit, language)})"
+            if chance(rng, 0.7)
+            else f"{name} [{unit_text(rng, unit, language)}]"
+        )
+    return text, cell, float(cell) / (1 + expanded) * SCALE[unit] / SCALE[axis.unit]
+
+
+def long_sheet(rng: np.random.Generator, axis: Axis, language: str) -> tuple[Sheet, Truth]:
+    """A row for each reading, with further columns; nothing in them follows the commands."""
+    stated = chance(rng, 0.5)
+    sweep = sweeps(rng, axis.commands, stated)
+    values, readings = read_all(rng, axis, sweep)
+    count, more = len(readings), {}
+    columns: dict[str, Sequence[Cell]] = {}
+    truth = truth_of(axis, readings)
+    if chance(rng, 0.25):
+        more[pick(rng, words.NUMBER[language])] = [Decimal(k + 1) for k in range(count)]
+    if chance(rng, 0.3):
+        name, cells, seconds = clock(rng, language, count)
+        more[name] = cells
+        readings = [r._replace(time_s=s) for r, s in zip(readings, seconds, strict=True)]
+        truth = replace(truth, clock=1.1)
+    if chance(rng, 0.12):
+        name = pick(rng, words.CYCLE[language])
+        more[name] = [Decimal(stop.run // 2 + 1) for stop in sweep.stops]
+        truth = replace(truth, segments="any")
+    elif chance(rng, 0.08) and stated:
+        name = pick(rng, words.HOMING[language])
+        marks = [stop.run // 2 for stop in sweep.stops]
+        more[name] = [Decimal(mark + 1) for mark in marks]
+        readings = [r._replace(segment=mark) for r, mark in zip(readings, marks, strict=True)]
+    names = [headed(rng, command_name(rng, axis, language), axis.command_unit, language)]
+    columns[names[0]] = [stop.command for stop in sweep.stops]
+    if stated:
+        rising, falling = pick(rng, words.SIDES["all"] if chance(rng, 0.35) else words.SIDES[language])
+        sides = [Decimal(word) if word in ("1", "-1") else word for word in (rising, falling)]
+        columns[pick(rng, words.DIRECTION[language])] = [sides[stop.side < 0] for stop in sweep.stops]
+    columns[headed(rng, reading_name(rng, axis, language), axis.unit, language)] = values
+    after, readings = further_columns(rng, axis, language, sweep, values, readings)
+    columns |= after
+    items = list((more | columns).items())
+    if chance(rng, 0.15):
+        # The order of columns tells nothing.
+        items = [items[k] for k in rng.permutation(len(items))]
+    return sheets.columns_sheet(dict(items), language), replace(truth, readings=tuple(readings))
+
+
+def further_columns(
+    rng: np.random.Generator,
+    axis: Axis,
+    language: str,
+    sweep: Sweep,
+    values: Sequence[Decimal],
+    readings: Sequence[Reading],
+) -> tuple[dict[str, Sequence[Cell]], list[Reading]]:
+    """Columns to the right of the reading, and the readings with what these say of them."""
+    count, readings = len(readings), list(readings)
+    columns: dict[str, Sequence[Cell]] = {}
+    if chance(rng, 0.25):
+        name, cell, u = u_column(rng, axis, language)
+        columns[name] = [cell] * count
+        readings = [r._replace(u=u) for r in readings]
+    if chance(rng, 0.2) and DOMAIN[axis.command_unit] == DOMAIN[axis.unit]:
+        columns |= error_column(rng, axis, language, sweep, values)
+    if chance(rng, 0.25):
+        drift = np.cumsum(rng.normal(0, 0.02, count))
+        columns[pick(rng, words.TEMPERATURE[language])] = [decimal(20.3 + d, 2) for d in drift]
+    if chance(rng, 0.25):
+        middle = rng.uniform(5, 60)
+        columns[pick(rng, words.OTHER[language])] = [decimal(middle + d, 1) for d in rng.normal(0, 0.4, count)]
+    if chance(rng, 0.15):
+        columns[pick(rng, words.COMMENT[language])] = [pick(rng, words.REMARKS[language]) for _ in range(count)]
+    if chance(rng, 0.15):
+        name, good, bad = pick(rng, words.STATUS[language])
+        wrong = set(rng.choice(count, int(rng.integers(0, 3)), replace=False).tolist())
+        cells = [bad if k in wrong else good for k in range(count)]
+        columns[name] = [Decimal(cell) if cell.isdigit() else cell for cell in cells]
+        readings = [r for k, r in enumerate(readings) if k not in wrong]
+    return columns, readings
+
+
+def error_column(
+    rng: np.random.Generator, axis: Axis, language: str, sweep: Sweep, values: Sequence[Decimal]
+) -> dict[str, Sequence[Cell]]:
+    """Actual less target, or target less actual, in a unit of its own; beside the reading, so that it is no reading."""
+    small = "um" if axis.unit in LENGTH else "arcsec"
+    unit = axis.unit if chance(rng, 0.5) else small
+    sign = 1 if chance(rng, 0.8) else -1
+    scale = SCALE[axis.command_unit] / SCALE[axis.unit]
+    errors = [float(v) - scale * float(stop.command) for v, stop in zip(values, sweep.stops, strict=True)]
+    name = with_unit(rng, pick(rng, words.DEVIATION[language]), unit, language)
+    return {name: [decimal(sign * e * SCALE[axis.unit] / SCALE[unit], DIGITS[unit]) for e in errors]}
+
+
+def long_table(rng: np.random.Generator, language: str) -> Drawn:
+    """A row for each reading."""
+    sheet, truth = long_sheet(rng, draw_axis(rng), language)
+    return Drawn("a row for each reading", sheets.any_file(rng, sheet), truth)
+
+
+def unit_row(rng: np.random.Generator, language: str) -> Drawn:
+    """Names, and units in a row of their own below."""
+    axis = draw_axis(rng)
+    stated = chance(rng, 0.5)
+    sweep = sweeps(rng, axis.commands, stated)
+    values, readings = read_all(rng, axis, sweep)
+    form = pick(rng, ("{}", "({})", "[{}]"))
+    heads = [[command_name(rng, axis, language), reading_name(rng, axis, language)]]
+    command_unit = "" if axis.command_unit == "step" else form.format(unit_text(rng, axis.command_unit, language))
+    heads.append([command_unit, form.format(unit_text(rng, axis.unit, language))])
+    rows: list[list[Cell]] = [[stop.command, value] for stop, value in zip(sweep.stops, values, strict=True)]
+    if stated:
+        pair = pick(rng, words.SIDES[language])
+        heads = [[*heads[0], pick(rng, words.DIRECTION[language])], [*heads[1], ""]]
+        rows = [[*row, pair[stop.side < 0]] for row, stop in zip(rows, sweep.stops, strict=True)]
+    return Drawn(
+        "units in a row of their own", sheets.any_file(rng, Sheet(heads, rows, language)), truth_of(axis, readings)
+    )
+
+
+def two_sensors(rng: np.random.Generator, language: str) -> Drawn:
+    """Two columns follow the commands: a laser and an encoder. The first was meant."""
+    axis = draw_axis(rng)
+    stated = chance(rng, 0.5)
+    sweep = sweeps(rng, axis.commands, stated)
+    values, readings = read_all(rng, axis, sweep)
+    other = replace(axis, per_command=axis.per_command * (1 + rng.normal(0, 1e-3)), play=axis.play * rng.uniform(0, 2))
+    columns: dict[str, Sequence[Cell]] = {
+        headed(rng, command_name(rng, axis, language), axis.command_unit, language): [s.command for s in sweep.stops]
+    }
+    if stated:
+        pair = pick(rng, words.SIDES[language])
+        columns[pick(rng, words.DIRECTION[language])] = [pair[stop.side < 0] for stop in sweep.stops]
+    columns[headed(rng, reading_name(rng, axis, language), axis.unit, language)] = values
+    name = with_unit(rng, pick(rng, words.SECOND_SENSOR[language]), axis.unit, language)
+    columns[name] = [other.value(stop.command, stop.side, rng) for stop in sweep.stops]
+    truth = truth_of(axis, readings, answer="ask")
+    return Drawn(
+        "two columns follow the commands", sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth
+    )
+
+
+def unknown_unit(rng: np.random.Generator, language: str) -> Drawn:
+    """A unit in brackets that nobody knows: a division of somebody's dial."""
+    axis = draw_axis(rng, rotary=False, unit="1/100 mm")
+    sweep = sweeps(rng, axis.commands, False)
+    values, readings = read_all(rng, axis, sweep)
+    form = pick(rng, ("{} ({})", "{} [{}]"))
+    columns: dict[str, Sequence[Cell]] = {
+        headed(rng, command_name(rng, axis, language), axis.command_unit, language): [s.command for s in sweep.stops],
+        form.format(reading_name(rng, axis, language), pick(rng, UNKNOWN_UNITS)): values,
+    }
+    # Any answer that leaves the numbers as they are.
+    truth = truth_of(axis, readings, answer="ask", unit=None, meant=axis.unit)
+    return Drawn("a unit that nobody knows", sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)
+
+
+def no_unit(rng: np.random.Generator, language: str) -> Drawn:
+    """Steps and a reading without any unit."""
+    axis = draw_axis(rng)
+    sweep = sweeps(rng, axis.commands, False)
+    values, readings = read_all(rng, axis, sweep)
+    columns: dict[str, Sequence[Cell]] = {
+        pick(rng, words.STEPS[language]): [stop.command for stop in sweep.stops],
+        reading_name(rng, axis, language): values,
+    }
+    truth = truth_of(axis, readings, answer="either", unit=None, command_unit=None)
+    return Drawn("no unit at all", sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)

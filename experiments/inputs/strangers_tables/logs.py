@@ -1,0 +1,294 @@
+"""What programs write by themselves: telemetry, LabVIEW, names in remarks, serial monitors, EPICS, sightings."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import replace
+from decimal import Decimal
+
+import numpy as np
+
+from experiments.inputs.strangers_tables import sheets, words
+from experiments.inputs.strangers_tables.kinds import START, Drawn, command_name, read_all, reading_name, truth_of
+from experiments.inputs.strangers_tables.measured import (
+    ANGLE,
+    ASCII,
+    Axis,
+    Reading,
+    Sweep,
+    Truth,
+    chance,
+    decimal,
+    draw_axis,
+    pick,
+    sweeps,
+    unit_text,
+    with_unit,
+)
+from experiments.inputs.strangers_tables.sheets import Cell, File
+
+
+def telemetry(rng: np.random.Generator, language: str) -> Drawn:
+    """Rows ten times a second, also while the axis moves: those at rest are its readings."""
+    unit = pick(rng, ("deg", "mm", "count", "count"))
+    named = unit != "count" or chance(rng, 0.3)
+    digits, per_command = (0, 1.0) if unit == "count" else (2, 1 + rng.normal(0, 0.002))
+    step, play = (200, 12.0) if unit == "count" else (10, 0.4)
+    commands = tuple(Decimal(1000 * (unit == "count") + step * k) for k in range(int(rng.integers(5, 9))))
+    sweep = sweeps(rng, commands, False)
+    rows: list[tuple[Decimal, Decimal, int]] = []
+    readings, at = [], per_command * float(commands[0]) - 3 * play
+    for k, stop in enumerate(sweep.stops):
+        final = round(per_command * float(stop.command) - 0.5 * stop.side * play + rng.normal(0, 0.05 * play), digits)
+        speed = 0.15 * step
+        for _ in range(int(abs(final - at) / speed)):
+            at += speed if final > at else -speed
+            rows.append((stop.command, decimal(at, digits), 1))
+        rest = int(rng.integers(6, 20))
+        jitter = rng.integers(-1, 2, rest) * (0.1**digits) * chance(rng, 0.3)
+        rows += [(stop.command, decimal(final + d, digits), 0) for d in jitter]
+        at = final
+        readings.append(Reading(float(stop.command), final, sweep.told_side(k)))
+    count = len(rows)
+    moments = [START + datetime.timedelta(seconds=0.1 * k) for k in range(count)]
+    tail = pick(rng, ("", " (5)", "_1")) if unit == "count" else ""
+    columns: dict[str, Sequence[Cell]] = {
+        "timestamp": [m.isoformat(timespec="milliseconds") + "Z" for m in moments]
+        if chance(rng, 0.6)
+        else [decimal(0.1 * k, 1) for k in range(count)],
+        f"target pos{tail}" if not named else f"target_{ASCII[unit]}": [c for c, _, _ in rows],
+        f"pos{tail}" if not named else f"position_{ASCII[unit]}": [v for _, v, _ in rows],
+        f"load{tail}": [Decimal(int(x)) for x in rng.integers(0, 90, count)],
+        f"current{tail}": [Decimal(int(x)) for x in rng.integers(0, 4, count)],
+    }
+    if chance(rng, 0.6):
+        columns[f"temp{tail}"] = [Decimal(37)] * count
+    if chance(rng, 0.6):
+        columns[f"status{tail}"] = [Decimal(0)] * count
+    if chance(rng, 0.6):
+        columns[f"moving{tail}"] = [Decimal(m) for _, _, m in rows]
+    truth = Truth(tuple(readings), unit if named else None, None, 10.0**-digits, spread=1.5 * 10.0**-digits)
+    truth = replace(truth, answer="right" if named else "either", ratio=per_command, play=play)
+    return Drawn("telemetry, also in motion", sheets.any_file(rng, sheets.columns_sheet(columns, "en"), False), truth)
+
+
+def stage(rng: np.random.Generator, stated: bool = False) -> tuple[Axis, Sweep, list[Decimal], list[Reading]]:
+    """An axis in mm or degrees, driven in the same unit, and its readings."""
+    rotary = chance(rng, 0.3)
+    unit = "deg" if rotary else "mm"
+    axis = draw_axis(rng, rotary, unit, unit)
+    sweep = sweeps(rng, axis.commands, stated)
+    return axis, sweep, *read_all(rng, axis, sweep)
+
+
+def labview(rng: np.random.Generator, language: str) -> Drawn:
+    """The rows of an .lvm file, X_Value being the clock; sometimes with both headers above."""
+    axis, sweep, values, readings = stage(rng)
+    times = np.round(np.cumsum(rng.uniform(1.9, 2.1, len(values))), 3)
+    readings = [r._replace(time_s=float(t - times[0])) for r, t in zip(readings, times, strict=True)]
+    names = [command_name(rng, axis, language), reading_name(rng, axis, language)]
+    whole, comma = chance(rng, 0.3), language != "en" and chance(rng, 0.7)
+    named = whole or chance(rng, 0.7)
+    if named and not whole:
+        names = [f"{name} ({unit_text(rng, axis.unit, language)})" for name in names]
+    point = "," if comma else "."
+    lines = ["\t".join(["X_Value", *names, "Comment"])]
+    lines += [
+        "\t".join(f"{t:.6f}\t{stop.command:.6f}\t{value:.6f}\t".replace(".", point).split("\t"))
+        for t, stop, value in zip(times, sweep.stops, values, strict=True)
+    ]
+    if whole:
+        lines = lvm_headers(point, axis.unit, len(values)) + lines
+    truth = truth_of(axis, readings, clock=1.1)
+    if not named:
+        truth = replace(truth, unit=None, command_unit=None, answer="either")
+    data = sheets.encoded(rng, "\n".join(lines) + "\n")
+    return Drawn("LabVIEW", File("run.lvm" if whole else "run.txt", data), truth)
+
+
+def lvm_headers(point: str, unit: str, count: int) -> list[str]:
+    """The headers of a file with one clock and two channels."""
+    clock = f"09:05:10{point}1234567"
+    return [
+        *("LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab"),
+        *(f"Decimal_Separator\t{point}", "Multi_Headings\tNo", "X_Columns\tOne", "Time_Pref\tRelative"),
+        *("Operator\tlab", "Date\t2026/03/12", f"Time\t{clock}", "***End_of_Header***\t", "\t"),
+        *("Channels\t2\t\t", f"Samples\t{count}\t{count}\t", "Date\t2026/03/12\t2026/03/12\t"),
+        *(f"Time\t{clock}\t{clock}\t", f"Y_Unit_Label\t{unit}\t{unit}\t", "X_Dimension\tTime\tTime\t"),
+        *(f"X0\t0{point}0E+0\t0{point}0E+0\t", f"Delta_X\t1{point}0\t1{point}0\t", "***End_of_Header***\t\t\t"),
+    ]
+
+
+def remark_names(rng: np.random.Generator, language: str) -> Drawn:
+    """Names in the last line of remarks: numpy.savetxt, SPEC, rostopic, CS-Studio, gnuplot."""
+    axis, sweep, values, readings = stage(rng)
+    unit = ASCII[axis.unit]
+    style = pick(rng, ("savetxt", "savetxt", "spec", "rostopic", "databrowser", "gnuplot"))
+    pairs = list(zip(sweep.stops, values, strict=True))
+    truth, name = truth_of(axis, readings), "data.txt"
+    if style == "savetxt":
+        form = pick(rng, ("{:.18e}", "{:.6f}", "{:.4f}"))
+        between = pick(rng, (" ", " ", ",", "\t"))
+        names = pick(rng, (("commanded", "measured"), ("target", "actual"), ("cmd", "meas"), ("setpoint", "encoder")))
+        lines = [f"# {between.join(f'{n}_{unit}' for n in names)}"]
+        lines += [form.format(float(s.command)) + between + form.format(float(v)) for s, v in pairs]
+    elif style == "spec":
+        lines = ["#F scan.dat", "#D Thu Mar 12 09:05:10 2026", "", "#S 1 loopscan", "#N 3"]
+        lines += [f"#L Target_{unit}  Encoder_{unit}  Seconds"]
+        lines += [f"{s.command} {v} {1}" for s, v in pairs]
+        name = "scan.dat"
+    elif style == "rostopic":
+        lines = ["%time,field.header.seq,field.set_point,field.process_value,field.error"]
+        lines += [
+            f"{1773303074000000000 + 2000000000 * k},{k},{s.command},{v},{decimal(float(s.command) - float(v), 4)}"
+            for k, (s, v) in enumerate(pairs)
+        ]
+        truth = replace(truth, unit=None, command_unit=None, answer="either", clock=1.1)
+        readings = [r._replace(time_s=2.0 * k) for k, r in enumerate(readings)]
+        truth, name = replace(truth, readings=tuple(readings)), "echo.csv"
+    elif style == "databrowser":
+        lines = ["# Created by CS-Studio Databrowser", "#", "# Start Time : 2026-03-12 09:00:00", "#"]
+        lines += ["# Time\tm1.VAL [mm]\tm1.RBV [mm]".replace("mm", axis.unit)]
+        lines += [
+            f"{(START + datetime.timedelta(seconds=10 * k)).isoformat(' ')}.000000000\t{s.command}\t{v}"
+            for k, (s, v) in enumerate(pairs)
+        ]
+        readings = [r._replace(time_s=10.0 * k) for k, r in enumerate(readings)]
+        truth = replace(truth, readings=tuple(readings), clock=1.1)
+    else:
+        text = unit_text(rng, axis.unit, language)
+        heads = [f"{command_name(rng, axis, language)} ({text})", f"{reading_name(rng, axis, language)} ({text})"]
+        lines = ["# measured with the new dial", "# " + "\t".join(heads), *(f"{s.command}\t{v}" for s, v in pairs)]
+    return Drawn("names in a remark", File(name, sheets.encoded(rng, "\n".join(lines) + "\n")), truth)
+
+
+SERIAL_NAMES = (("Target", "Position"), ("target", "pos"), ("cmd", "enc"), ("Set", "Actual"), ("Step", "Angle"))
+
+
+def serial(rng: np.random.Generator, language: str) -> Drawn:
+    """Lines of a serial monitor: command and reading on one line or on two, with lines lost, repeated or cut."""
+    axis, sweep, values, readings = stage(rng)
+    command, value = pick(rng, SERIAL_NAMES)
+    sign = pick(rng, (": ", "=", ": "))
+    unit = pick(rng, (" {}", "_", "")).format(axis.unit)
+    if unit == "_":
+        value, unit = f"{value}_{ASCII[axis.unit]}", ""
+    named = bool(unit) or "_" in value
+    two = chance(rng, 0.6)
+    lines: list[str] = []
+    for stop, v in zip(sweep.stops, values, strict=True):
+        cells = [f"{command}{sign}{stop.command}", f"{value}{sign}{v}{unit}"]
+        lines += cells if two else [pick(rng, (", ", " ", "; ")).join(cells) if not lines else _as(lines[0], cells)]
+    damaged = two and chance(rng, 0.5)
+    truth = truth_of(axis, readings, command_unit=None)
+    if damaged:
+        lines = damage(rng, lines, sweep)
+        truth = replace(truth, kept=len(readings) - 4)
+    if chance(rng, 0.3):
+        lines = [
+            f"{(START + datetime.timedelta(seconds=k)).strftime('%H:%M:%S')}.000 -> {x}" for k, x in enumerate(lines)
+        ]
+    if chance(rng, 0.4):
+        lines = ["ready", *lines] if chance(rng, 0.7) else [*lines, "done"]
+    if not named:
+        truth = replace(truth, unit=None, answer="either")
+    kind = "serial monitor, lines lost, repeated or cut" if damaged else "serial monitor"
+    return Drawn(kind, File("monitor.txt", sheets.encoded(rng, "\n".join(lines) + "\n")), truth)
+
+
+def _as(first: str, cells: Sequence[str]) -> str:
+    """Two cells with what stands between those of the first line."""
+    return next(between for between in (", ", "; ", " ") if between in first.replace(": ", ":")).join(cells)
+
+
+def damage(rng: np.random.Generator, lines: list[str], sweep: Sweep) -> list[str]:
+    """One or two lines lost, repeated or cut short: none where the motion turns, which no reader could know."""
+    commands = [stop.command for stop in sweep.stops]
+    straight = [
+        k for k in range(2, len(commands) - 2) if (commands[k] - commands[k - 1]) * (commands[k + 1] - commands[k]) > 0
+    ]
+    for place in sorted(rng.choice(straight, int(rng.integers(1, 3)), replace=False).tolist(), reverse=True):
+        number = 2 * place + int(rng.integers(2))
+        what = pick(rng, ("lost", "lost", "repeated", "cut"))
+        if what == "lost":
+            del lines[number]
+        elif what == "repeated":
+            lines.insert(number, lines[number])
+        elif number % 2 and chance(rng, 0.5) and "." in lines[number][-5:]:
+            # Decimals are missing.
+            lines[number] = lines[number][:-2]
+        else:
+            lines[number] = lines[number][: int(rng.integers(2, max(3, len(lines[number]) // 2)))]
+    return lines
+
+
+def camonitor(rng: np.random.Generator, language: str) -> Drawn:
+    """Series of EPICS, a command and a reading after each; in some the clock steps back by an hour or some seconds."""
+    axis, sweep, values, readings = stage(rng)
+    record = pick(rng, ("M:axis", "BL7:m1", "T:Stage1"))
+    names = pick(rng, ((".VAL", ".RBV"), (".VAL", ".RBV"), ("-PosSet", "-PosAct"), (":Setpoint", ":Readback")))
+    step_back = pick(rng, (0.0, 0.0, 3600.0, 1.5))
+    every = float(pick(rng, (10, 20, 21)))
+    begin = datetime.datetime(2026, 10, 25, 2, 50)
+    change = every * len(values) * rng.uniform(0.3, 0.7)
+    lines = []
+    for k, (stop, value) in enumerate(zip(sweep.stops, values, strict=True)):
+        for name, late, cell in ((names[0], 0.0, stop.command), (names[1], 0.5 * every, value)):
+            second = every * k + late
+            moment = begin + datetime.timedelta(seconds=second - step_back * (second > change))
+            lines.append(f"{record + name:<30} {moment.isoformat(' ', timespec='microseconds')} {cell}  ")
+    # The time of a folder goes on; where a clock steps, nobody knows by how much to the second.
+    readings = [r._replace(time_s=every * k) for k, r in enumerate(readings)]
+    tolerance_s = 0.1 * readings[-1].time_s + every
+    truth = truth_of(
+        axis, readings, unit=None, command_unit=None, clock=tolerance_s, answer="either", kept=len(readings) - 2
+    )
+    kind = "EPICS, the clock steps back" if step_back else "EPICS"
+    return Drawn(kind, File("camonitor.txt", sheets.encoded(rng, "\n".join(lines) + "\n")), truth)
+
+
+def sightings(rng: np.random.Generator, language: str) -> Drawn:
+    """Counters of a head, and where it was found to point; sometimes without a unit."""
+    unit = pick(rng, ("deg",) * 4 + ("rad", "arcmin", "gon", "mrad"))
+    named = chance(rng, 0.75)
+    count = int(rng.integers(8, 30))
+    pan = rng.integers(-60, 60, count) * 50
+    tilt = rng.integers(0, 30, count) * 50
+    ratio = pick(rng, (0.02, 0.05, 0.03))
+    azimuth = 40 * chance(rng, 0.5) + ratio * pan + rng.normal(0, 0.01, count)
+    azimuth = azimuth % 360 if chance(rng, 0.5) else (azimuth + 180) % 360 - 180
+    elevation = 5 + ratio * tilt + rng.normal(0, 0.01, count)
+    digits = {"deg": 4, "rad": 7, "arcmin": 2, "gon": 4, "mrad": 3}[unit]
+    cells = [[decimal(a / ANGLE[unit], digits) for a in angles] for angles in (azimuth, elevation)]
+    names = pick(rng, words.AZIMUTH[language])
+    text = unit_text(rng, unit, language)
+    form = pick(rng, ("{} ({})", "{} [{}]", "{} / {}"))
+    if unit in ASCII and names[0].isascii() and names[1].isascii() and chance(rng, 0.25):
+        form, text = "{}_{}", ASCII[unit]
+    heads = [form.format(name, text) if named else name for name in names]
+    counters = pick(rng, words.PAN[language])
+    columns: dict[str, Sequence[Cell]] = {}
+    if chance(rng, 0.4):
+        columns[pick(rng, words.SECONDS[language])] = [decimal(12.0 * k, 1) for k in range(count)]
+    columns[counters[0]], columns[counters[1]] = [Decimal(int(n)) for n in pan], [Decimal(int(n)) for n in tilt]
+    columns[heads[0]], columns[heads[1]] = cells
+    u = 0.0
+    if chance(rng, 0.2):
+        small = pick(rng, ("arcsec", "deg"))
+        u_cell = Decimal("18") if small == "arcsec" else Decimal("0.005")
+        columns[with_unit(rng, "u", small, "en")] = [u_cell] * count
+        u = float(u_cell) * ANGLE[small]
+    if chance(rng, 0.2):
+        columns[pick(rng, words.TEMPERATURE[language])] = [decimal(t, 1) for t in rng.normal(12, 0.2, count)]
+    degrees = [tuple(float(c) * ANGLE[unit] for c in column) for column in cells]
+    readings = tuple(
+        Reading(0.0, a, u=u, pair=(int(p), int(t), e)) for p, t, a, e in zip(pan, tilt, *degrees, strict=True)
+    )
+    digit = 10.0**-digits * ANGLE[unit]
+    # Degrees are what all take an angle for; radians are not told from them by a reader that does not ask.
+    answer = "right" if named else "either" if unit == "deg" else "ask"
+    truth = Truth(readings, "deg", None, digit, answer, ratio=ratio)
+    kind = "sightings" if named else f"sightings without a unit, {'degrees' if unit == 'deg' else 'others'}"
+    file = sheets.any_file(rng, sheets.columns_sheet(columns, language))
+    return Drawn(kind, file, truth, ("--sightings",))

@@ -1,0 +1,272 @@
+"""True axes, what was read of them and in which order, and units as people write them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+LENGTH = {"nm": 1e-6, "um": 1e-3, "1/1000 mm": 1e-3, "1/100 mm": 0.01, "thou": 0.0254, "mm": 1.0, "cm": 10.0}
+LENGTH |= {"inch": 25.4}
+"""In mm."""
+ANGLE = {
+    "urad": np.degrees(1e-6),
+    "arcsec": 1 / 3600,
+    "mrad": np.degrees(1e-3),
+    "arcmin": 1 / 60,
+    "gon": 0.9,
+    "deg": 1.0,
+}
+ANGLE |= {"rad": np.degrees(1.0), "turn": 360.0}
+"""In degrees."""
+SCALE = {**LENGTH, **ANGLE, "count": 1.0, "step": 1.0}
+DOMAIN = {**dict.fromkeys(LENGTH, "mm"), **dict.fromkeys(ANGLE, "deg"), "count": "count", "step": "step"}
+WRITTEN: dict[str, tuple[str, ...]] = {
+    "nm": ("nm",),
+    "um": ("\u00b5m", "\u03bcm", "um", "micron", "microns"),
+    "1/1000 mm": ("1/1000 mm", "0.001 mm", "1/1000mm"),
+    "1/100 mm": ("1/100 mm", "0.01 mm", "1/100mm", "0,01 mm"),
+    "thou": ("thou", "mil", "mils", "0.001 in", "1/1000 in", '0.001"'),
+    "mm": ("mm", "mm", "mm", "millimeter"),
+    "cm": ("cm",),
+    "inch": ("in", "inch", "inches"),
+    "urad": ("\u00b5rad", "urad"),
+    "arcsec": ("arcsec", "\u2033", "arc-sec", "arcseconds"),
+    "mrad": ("mrad",),
+    "arcmin": ("arcmin", "\u2032"),
+    "gon": ("gon",),
+    "deg": ("deg", "\u00b0", "degrees"),
+    "rad": ("rad",),
+    "turn": ("rev", "turns", "revs", "turn"),
+    "count": ("counts", "cts"),
+    "step": ("steps",),
+}
+"""In English, and in symbols that all use."""
+LOCAL: dict[str, dict[str, tuple[str, ...]]] = {
+    "de": {
+        **{"deg": ("Grad", "°"), "inch": ("Zoll",), "1/100 mm": ("1/100 mm", "0,01 mm", "Hundertstel mm")},
+        **{"turn": ("Umdrehungen", "Umdr.", "U"), "arcsec": ("Bogensekunden", "Winkelsekunden")},
+        **{"count": ("Inkremente", "Inkr."), "step": ("Schritte",)},
+    },
+    "es": {"deg": ("grados", "°"), "inch": ("pulgadas", "pulg"), "turn": ("vueltas", "rev"), "step": ("pasos",)},
+    "fr": {"deg": ("degrés", "°"), "inch": ("pouces",), "turn": ("tours", "tr"), "step": ("pas",)},
+}
+ASCII = {
+    **{
+        name: name for name in ("nm", "um", "mm", "cm", "inch", "urad", "arcsec", "mrad", "arcmin", "gon", "deg", "rad")
+    },
+    **{"turn": "rev", "count": "counts", "thou": "thou", "step": "steps"},
+}
+"""What follows an underscore."""
+UNKNOWN_UNITS = ("div", "Skt", "Teilstriche", "parts", "divisions", "LSB", "Skalenteile", "ticks of dial", "puntos")
+DIGITS = {"nm": 0, "um": 1, "1/1000 mm": 1, "1/100 mm": 1, "thou": 2, "mm": 4, "cm": 5, "inch": 5, "urad": 1}
+DIGITS |= {"arcsec": 1, "mrad": 3, "arcmin": 3, "gon": 4, "deg": 4, "rad": 6, "turn": 6, "count": 0, "step": 0}
+"""Decimals that suit a reading of some micrometres, or of some arc seconds."""
+
+
+def pick[Item](rng: np.random.Generator, items: Sequence[Item]) -> Item:
+    """One of some."""
+    return items[int(rng.integers(len(items)))]
+
+
+def chance(rng: np.random.Generator, share: float) -> bool:
+    """True with this probability."""
+    return bool(rng.random() < share)
+
+
+def unit_text(rng: np.random.Generator, unit: str, language: str) -> str:
+    """A unit as somebody of this language writes it."""
+    local = LOCAL.get(language, {}).get(unit, ())
+    return pick(rng, local) if local and chance(rng, 0.5) else pick(rng, WRITTEN[unit])
+
+
+def with_unit(rng: np.random.Generator, name: str, unit: str, language: str) -> str:
+    """The head of a column with its unit."""
+    style = int(rng.integers(10))
+    if style >= 8 and unit in ASCII and name.isascii():
+        return f"{name.replace(' ', '_').replace('.', '')}_{ASCII[unit]}"
+    text = unit_text(rng, unit, language)
+    if style == 7 and text.isalpha() and len(text) > 1:
+        return f"{name} {text}" if chance(rng, 0.5) else f"{name}, {text}"
+    return (f"{name} ({text})", f"{name} [{text}]", f"{name} / {text}", f"{name} ({text})", f"{name} in {text}")[
+        style % 4 if language in ("es", "fr") else style % 5
+    ]
+
+
+class Reading(NamedTuple):
+    """One reading at rest, in the unit of the table."""
+
+    command: float
+    value: float
+    side: int = 0
+    """+1 where the command rose to it, -1 where it fell, 0 where the table does not tell."""
+    u: float = 0.0
+    segment: int = 0
+    time_s: float | None = None
+    pair: tuple[int, int, float] | None = None
+    """Of a head: counters of pan and tilt, and the elevation; `value` is the azimuth, deg."""
+
+
+Answer = Literal["right", "either", "ask"]
+"""What a careful importer does without an option: reads it, may do either, must ask."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the folder must hold.
+
+    Attributes:
+        readings: in the order of time.
+        unit: of the values; None where the table states none that a reader could know.
+        meant: unit of values whose unit is None, if there is one.
+        command_unit: of the commands; None where it states none.
+        digit: the last digit of a value.
+        answer: what is right without an option.
+        stops: values of one stop may differ by more than a digit (spread, same unit): telemetry at rest.
+        kept: how many of the readings must be there; the others may be left out.
+        clock: seconds by which its times may be off; 0 where the table states none.
+        segments: "exact", or "any" where a column of cycles may be taken for homings.
+        ratio: of the axis, unit per command.
+        play: of the axis, in the unit.
+    """
+
+    readings: tuple[Reading, ...]
+    unit: str | None
+    command_unit: str | None
+    digit: float
+    answer: Answer = "right"
+    spread: float = 0.0
+    kept: int | None = None
+    meant: str | None = None
+    clock: float = 0.0
+    segments: str = "exact"
+    ratio: float = 1.0
+    play: float = 0.0
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A geared axis, and how it is driven and read. Lengths in mm, angles in degrees."""
+
+    command_unit: str
+    unit: str
+    per_command: float
+    play: float
+    zero: float
+    scatter: float
+    commands: tuple[Decimal, ...]
+    """Of one sweep, rising."""
+
+    def value(self, command: Decimal, side: int, rng: np.random.Generator) -> Decimal:
+        """A reading as it is written down."""
+        true = self.per_command * float(command) + self.zero - 0.5 * side * self.play
+        return decimal(true + rng.normal(0.0, self.scatter), self.digits)
+
+    @property
+    def digits(self) -> int:
+        """Decimals of a reading."""
+        return DIGITS[self.unit]
+
+    @property
+    def digit(self) -> float:
+        """Its last digit."""
+        return 10.0**-self.digits
+
+
+def decimal(number: float, digits: int) -> Decimal:
+    """A number as it is written with these decimals."""
+    return Decimal(f"{number:.{digits}f}") + 0
+
+
+def draw_axis(
+    rng: np.random.Generator, rotary: bool | None = None, unit: str | None = None, command_unit: str | None = None
+) -> Axis:
+    """An axis with play of ten or more scatters, read over five to fourteen positions."""
+    rotary = chance(rng, 0.35) if rotary is None else rotary
+    count = int(rng.integers(5, 15))
+    if rotary:
+        unit = unit or pick(rng, ("deg", "deg", "deg", "arcmin", "gon", "mrad", "rad", "turn", "arcsec"))
+        others = ("step", "step", "deg", "deg", "deg", "gon", "mrad")
+        # Below a turn, so that nothing wraps.
+        travel_deg = pick(rng, (20.0, 30.0, 60.0, 90.0, 180.0)) * (0.02 if unit == "arcsec" else 1.0)
+        play_deg, scatter_deg = rng.uniform(0.03, 0.15), rng.uniform(0.001, 0.004)
+        travel, play, scatter = (x / ANGLE[unit] for x in (travel_deg, play_deg, scatter_deg))
+    else:
+        unit = unit or pick(rng, ("mm", "mm", "mm", "mm", "um", "1/100 mm", "inch", "thou", "cm"))
+        others = ("step", "step", "mm", "mm", "mm", "mm", "inch", "turn")
+        travel_mm = pick(rng, (5.0, 10.0, 50.0, 100.0, 200.0, 300.0)) * (0.1 if unit in ("um", "1/100 mm") else 1.0)
+        play_mm, scatter_mm = rng.uniform(0.02, 0.08), rng.uniform(0.001, 0.002)
+        travel, play, scatter = (x / LENGTH[unit] for x in (travel_mm, play_mm, scatter_mm))
+    command_unit = command_unit or pick(rng, others)
+    commands, per_command = _commands(rng, command_unit, unit, travel, count)
+    zero = rng.uniform(-0.4, 0.4) * play
+    axis = Axis(command_unit, unit, per_command, play, zero, scatter, commands)
+    # Dials and encoders resolve the play.
+    return axis if axis.digit < 0.2 * play else replace(axis, play=5 * axis.digit, scatter=0.5 * axis.digit)
+
+
+def _commands(
+    rng: np.random.Generator, command_unit: str, unit: str, travel: float, count: int
+) -> tuple[tuple[Decimal, ...], float]:
+    """Round positions over a travel, and the unit per command: near its nominal."""
+    error = 1 + rng.normal(0, 0.0015)
+    if DOMAIN[command_unit] == DOMAIN[unit]:
+        nominal = SCALE[command_unit] / SCALE[unit]
+    elif command_unit == "step":
+        nominal = travel / pick(rng, (2000, 5000, 8000, 20000, 32000))
+    else:
+        # Turns of a screw's motor.
+        nominal = pick(rng, (1.0, 2.0, 4.0, 5.0)) / LENGTH[unit]
+    span = travel / nominal
+    digits = 0 if command_unit == "step" or span > 5 * count else 1 if span > count else 3
+    step = max(decimal(span / (count - 1), digits), Decimal(1).scaleb(-digits))
+    begin = Decimal(0) if chance(rng, 0.7) else -step * (count // 2)
+    form = Decimal(1).scaleb(-int(rng.integers(digits, digits + 2))) if command_unit != "step" else Decimal(1)
+    return tuple((begin + step * k).quantize(form) for k in range(count)), nominal * error
+
+
+class Stop(NamedTuple):
+    """A command in the order of time, and the side from which it was reached."""
+
+    command: Decimal
+    side: int
+    run: int
+
+
+@dataclass
+class Sweep:
+    """How the positions follow each other."""
+
+    stops: list[Stop] = field(default_factory=list)
+    stated: bool = False
+    """Sides are those of a column of directions, or of runs side by side; else of the commands alone."""
+
+    def told_side(self, number: int) -> int:
+        """The side that the table tells of a reading, 0 where none."""
+        stop, before = self.stops[number], self.stops[number - 1] if number else None
+        if self.stated:
+            return stop.side
+        if before is None:
+            return 0
+        rises = (stop.command > before.command) - (stop.command < before.command)
+        return rises or self.told_side(number - 1)
+
+
+def sweeps(rng: np.random.Generator, commands: Sequence[Decimal], stated: bool) -> Sweep:
+    """Runs up and down; with directions stated also from one side alone, and ends approached from beyond."""
+    runs, stops = int(rng.integers(2, 5)), []
+    style = int(rng.integers(3)) if stated else 0
+    for run in range(runs):
+        up = [Stop(command, 1, 2 * run) for command in commands]
+        down = [Stop(command, -1, 2 * run + 1) for command in reversed(commands)]
+        if style == 0:
+            # To and fro without overrun: an end is read once.
+            stops += (up if run == 0 else up[1:]) + down[1:]
+        elif style == 1:
+            stops += up + down
+        else:
+            stops += up
+    return Sweep(stops, stated)

@@ -1,0 +1,236 @@
+"""Runs side by side: a row for each position, a column for each run; positions, averages or deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from decimal import Decimal
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments.inputs.strangers_tables import sheets, words
+from experiments.inputs.strangers_tables.kinds import Drawn, command_name, headed, truth_of
+from experiments.inputs.strangers_tables.measured import (
+    DIGITS,
+    SCALE,
+    Axis,
+    Reading,
+    Truth,
+    chance,
+    decimal,
+    draw_axis,
+    pick,
+    unit_text,
+    with_unit,
+)
+from experiments.inputs.strangers_tables.sheets import Cell, Sheet
+
+
+class Runs(NamedTuple):
+    """Runs over the same positions, in the order in which they were made."""
+
+    axis: Axis
+    sides: tuple[int, ...]
+    values: tuple[tuple[Decimal, ...], ...]
+    """Of each run, in the order of `axis.commands`."""
+
+    def readings(self, told: bool = True) -> list[Reading]:
+        """In the order of time: a rising run begins below, a falling one above."""
+        readings = []
+        for side, values in zip(self.sides, self.values, strict=True):
+            run = [Reading(float(c), float(v), side * told) for c, v in zip(self.axis.commands, values, strict=True)]
+            readings += run[::side]
+        return readings
+
+
+def draw_runs(rng: np.random.Generator, axis: Axis, sides: Sequence[int]) -> Runs:
+    """Every run is approached from beyond its first position."""
+    return Runs(axis, tuple(sides), tuple(tuple(axis.value(c, side, rng) for c in axis.commands) for side in sides))
+
+
+def side_by_side(
+    rng: np.random.Generator, runs: Runs, names: Sequence[str], language: str, unit_once: bool | None = None
+) -> Sheet:
+    """A row for each position, a column for each run; the unit at every head, or at the positions' alone."""
+    axis = runs.axis
+    position = headed(rng, command_name(rng, axis, language), axis.command_unit, language)
+    same = axis.unit == axis.command_unit and (chance(rng, 0.25) if unit_once is None else unit_once)
+    text = unit_text(rng, axis.unit, language)
+    form = pick(rng, ("{} ({})", "{} [{}]", "{} / {}"))
+    heads = [position, *(name if same else form.format(name, text) for name in names)]
+    rows: list[list[Cell]] = [list(row) for row in zip(axis.commands, *runs.values, strict=True)]
+    if chance(rng, 0.1):
+        rows.reverse()
+    if chance(rng, 0.2):
+        heads = [pick(rng, words.NUMBER[language]), *heads]
+        rows = [[Decimal(k + 1), *row] for k, row in enumerate(rows)]
+    return Sheet([heads], rows, language)
+
+
+def runs_with_words(rng: np.random.Generator, language: str) -> Drawn:
+    """Forward 1, Backward 1, Forward 2 ...: in pairs, all forward ones first, or one way alone."""
+    axis = draw_axis(rng)
+    pair = pick(rng, words.RUN_SIDES["all"] if chance(rng, 0.15) else words.RUN_SIDES[language])
+    pairs, style = int(rng.integers(1, 4)), rng.random()
+    sides = (1, -1) * pairs if style < 0.85 or pairs == 1 else (1,) * (pairs + 1)
+    order = [1 + sides[:k].count(side) for k, side in enumerate(sides)]
+    form = pick(rng, ("{} {}", "{} {}", "{}{}", "{} #{}", "{}_{}"))
+    if len(pair[0]) == 1:
+        form = pick(rng, (pick(rng, words.RUN[language]) + " {1} {0}", "{1} {0}", "{1}{0}"))
+    alone = len(sides) == 2 and chance(rng, 0.5)
+    names = [pair[side < 0] if alone else form.format(pair[side < 0], k) for side, k in zip(sides, order, strict=True)]
+    runs = draw_runs(rng, axis, sides)
+    sheet, truth = side_by_side(rng, runs, names, language), truth_of(axis, runs.readings())
+    return Drawn("runs side by side, with words of direction", sheets.any_file(rng, sheet), truth)
+
+
+def grouped_runs(rng: np.random.Generator, language: str) -> Drawn:
+    """Two lines of names: the run above, its directions below; and sometimes a third one with the units."""
+    axis = draw_axis(rng)
+    pair, pairs = pick(rng, words.RUN_SIDES[language]), int(rng.integers(2, 4))
+    runs = draw_runs(rng, axis, (1, -1) * pairs)
+    word = pick(rng, words.RUN[language])
+    below = side_by_side(rng, runs, list(pair) * pairs, language, unit_once=False)
+    first = len(below.heads[0]) - 2 * pairs
+    above = [""] * first
+    for k in range(pairs):
+        above += [f"{word} {k + 1}", f"{word} {k + 1}" if chance(rng, 0.2) else ""]
+    sheet = Sheet([above, below.heads[0]], below.rows, language)
+    return Drawn("two lines of names", sheets.any_file(rng, sheet), truth_of(axis, runs.readings()))
+
+
+def turning_runs(rng: np.random.Generator, language: str) -> Drawn:
+    """CW 1, CCW 1 ...: which of them rises is told by the order of the columns alone, the first rising."""
+    axis = draw_axis(rng, rotary=True)
+    pair, pairs = pick(rng, words.TURNS), int(rng.integers(1, 3))
+    names = [f"{word} {k + 1}" for k in range(pairs) for word in pair]
+    runs = draw_runs(rng, axis, (1, -1) * pairs)
+    sheet = side_by_side(rng, runs, names, language)
+    truth = truth_of(axis, runs.readings(), answer="either")
+    return Drawn("runs side by side, clockwise and not", sheets.any_file(rng, sheet), truth)
+
+
+def run_names(rng: np.random.Generator, language: str, count: int) -> list[str]:
+    """Run 1, Run 2 ..., or numbers alone."""
+    if chance(rng, 0.1):
+        return [f"ref_pos(i,{k + 1})" for k in range(count)]
+    if chance(rng, 0.12):
+        return [str(k + 1) for k in range(count)]
+    form = pick(rng, ("{} {}", "{} {}", "{}{}", "{} #{}", "{}_{}"))
+    word = pick(rng, words.RUN[language])
+    return [form.format(word, k + 1) for k in range(count)]
+
+
+def runs_without_words(rng: np.random.Generator, language: str) -> Drawn:
+    """Run 1, Run 2 ...: all rising; that they agree within their scatter tells it, and a careful reader may ask."""
+    axis = draw_axis(rng)
+    runs = draw_runs(rng, axis, (1,) * int(rng.integers(2, 6)))
+    sheet = side_by_side(rng, runs, run_names(rng, language, len(runs.sides)), language)
+    truth = truth_of(axis, runs.readings(), answer="either")
+    return Drawn("runs side by side, unnamed, all rising", sheets.any_file(rng, sheet), truth)
+
+
+def runs_to_and_fro(rng: np.random.Generator, language: str) -> Drawn:
+    """Run 1, Run 2 ...: every second one falls, which no name says."""
+    axis = draw_axis(rng)
+    runs = draw_runs(rng, axis, (1, -1) * int(rng.integers(1, 4)))
+    sheet = side_by_side(rng, runs, run_names(rng, language, len(runs.sides)), language)
+    truth = truth_of(axis, runs.readings(), answer="ask")
+    return Drawn("runs side by side, unnamed, to and fro", sheets.any_file(rng, sheet), truth)
+
+
+def deviations_of(runs: Runs, unit: str) -> list[list[Decimal]]:
+    """Actual less commanded position of every run, in a unit."""
+    axis = runs.axis
+    scale = SCALE[axis.command_unit] / SCALE[axis.unit]
+    digits = max(DIGITS[unit], 1)
+    return [
+        [
+            decimal((float(v) - scale * float(c)) * SCALE[axis.unit] / SCALE[unit], digits)
+            for c, v in zip(axis.commands, values, strict=True)
+        ]
+        for values in runs.values
+    ]
+
+
+def in_positions(runs: Runs, errors: Sequence[Sequence[Decimal]], unit: str, **more: object) -> Truth:
+    """The truth of deviations: command plus deviation, in the unit of the commands."""
+    axis = runs.axis
+    shift = SCALE[unit] / SCALE[axis.command_unit]
+    readings = []
+    for side, values in zip(runs.sides, errors, strict=True):
+        run = [Reading(float(c), float(c) + shift * float(v), side) for c, v in zip(axis.commands, values, strict=True)]
+        readings += run[::side]
+    digit = 10.0 ** -max(DIGITS[unit], 1) * shift
+    play = axis.play * SCALE[axis.unit] / SCALE[axis.command_unit]
+    return Truth(tuple(readings), axis.command_unit, axis.command_unit, digit, ratio=1.0, play=play, **more)
+
+
+def same_domain_axis(rng: np.random.Generator) -> tuple[Axis, str]:
+    """An axis driven in the unit of its positions, and a small unit of its deviations."""
+    rotary = chance(rng, 0.3)
+    unit = "deg" if rotary else pick(rng, ("mm", "mm", "inch"))
+    axis = draw_axis(rng, rotary, unit, unit)
+    small = ("arcsec", "arcsec", "mrad", "arcmin") if rotary else ("um", "um", "1/100 mm", "mm")
+    return axis, pick(rng, ("thou",) if axis.unit == "inch" else small)
+
+
+def deviations(rng: np.random.Generator, language: str) -> Drawn:
+    """A target, a direction and a deviation, or deviations of runs side by side: positions are nowhere."""
+    axis, unit = same_domain_axis(rng)
+    pair, pairs = pick(rng, words.RUN_SIDES[language]), int(rng.integers(1, 4))
+    runs = draw_runs(rng, axis, (1, -1) * pairs)
+    errors = deviations_of(runs, unit)
+    truth = in_positions(runs, errors, unit, answer="ask")
+    name = pick(rng, words.DEVIATION[language])
+    if chance(rng, 0.5):
+        names = [f"{name} {word} {k + 1}" for k in range(pairs) for word in pair]
+        form, text = pick(rng, ("{} ({})", "{} [{}]")), unit_text(rng, unit, language)
+        position = headed(rng, command_name(rng, axis, language), axis.command_unit, language)
+        rows: list[list[Cell]] = [list(row) for row in zip(axis.commands, *errors, strict=True)]
+        sheet = Sheet([[position, *(form.format(n, text) for n in names)]], rows, language)
+        return Drawn("deviations of runs side by side", sheets.any_file(rng, sheet), truth)
+    order = [list(zip(axis.commands, run, strict=True))[::side] for side, run in zip(runs.sides, errors, strict=True)]
+    words_of = pick(rng, words.SIDES[language])
+    columns: dict[str, Sequence[Cell]] = {
+        headed(rng, command_name(rng, axis, language), axis.command_unit, language): [
+            c for run in order for c, _ in run
+        ],
+        pick(rng, words.DIRECTION[language]): [
+            words_of[s < 0] for s, run in zip(runs.sides, order, strict=True) for _ in run
+        ],
+        with_unit(rng, name, unit, language): [v for run in order for _, v in run],
+    }
+    return Drawn("deviations alone", sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)
+
+
+def averages(rng: np.random.Generator, language: str) -> Drawn:
+    """The means of a laser's software: Target, Forward, Reverse, System, 2 Std Devn, Dead Zone."""
+    axis, small = same_domain_axis(rng)
+    runs = draw_runs(rng, axis, (1, -1))
+    errors = deviations_of(runs, small)
+    as_errors = chance(rng, 0.4)
+    text, small_text = unit_text(rng, axis.unit, "en"), unit_text(rng, small, "en")
+    form = pick(rng, ("{} ({})", "{} [{}]"))
+    sd = decimal(2 * axis.scatter * SCALE[axis.unit] / SCALE[small], DIGITS[small] + 1)
+    dead = [decimal(float(b) - float(f), DIGITS[small] + 1) for f, b in zip(*errors, strict=True)]
+    names, cells = ["Forward", "Reverse"], [list(run) for run in (errors if as_errors else runs.values)]
+    if system := chance(rng, 0.5):
+        names.append("System")
+        cells.append([decimal((float(f) + float(b)) / 2, 5) for f, b in zip(*cells, strict=True)])
+    units = [small_text if as_errors else text] * len(names) + [small_text] * 2
+    names = [*names, "2 Std Devn", pick(rng, ("Dead Zone", "Dead zone", "Reversal"))]
+    cells = [*cells, [sd] * len(dead), dead]
+    heads = [["Target", *names], [text, *units]]
+    if chance(rng, 0.7):
+        heads = [[form.format(name, unit) for name, unit in zip(*heads, strict=True)]]
+    rows = [list(row) for row in zip(axis.commands, *cells, strict=True)]
+    # The sd is written in its own unit, whatever the others have.
+    u = float(sd) / 2 * SCALE[small] / SCALE[axis.unit]
+    truth = truth_of(axis, [r._replace(u=u) for r in runs.readings()], answer="either" if system else "right")
+    if as_errors:
+        truth = in_positions(runs, errors, small, answer="ask")
+        truth = replace(truth, readings=tuple(r._replace(u=u) for r in truth.readings))
+    file = sheets.any_file(rng, Sheet(heads, rows, language))
+    return Drawn("averages of a laser, deviations" if as_errors else "averages of a laser", file, truth)
