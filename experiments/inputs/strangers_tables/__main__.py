@@ -40,8 +40,8 @@ WORDS = ("right", "guessed", "asked", "unanswered", "refused", "crash", "wrong")
 
 EXPLAINED = (
     "A careful reader reads a table (*right*), may ask where the order of runs, the unit or a further column that\n"
-    "follows the commands leaves it open (*either*), or has to (*ask*). *guessed*: right by luck, where it had to ask;\n"
-    "*unanswered*: no command that the question prints gives the right folder; *refused*: it prints none."
+    "follows the commands leaves it open (*either*), or has to (*ask*). *guessed*: right by luck, where it had to\n"
+    "ask; *unanswered*: no command that the question prints gives the right folder; *refused*: it prints none."
 )
 
 
