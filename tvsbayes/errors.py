@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -68,6 +68,57 @@ class InputError(TvsError):
     """A file, option or value that cannot be used as it is (exit 2)."""
 
     exit_code = 2
+
+
+class Candidate(NamedTuple):
+    """An answer to a question: what it says, the options that say it, and first values of the columns it is about."""
+
+    says: str
+    options: tuple[str, ...]
+    first: Mapping[str, Sequence[str]] = {}
+
+
+class Question(InputError):
+    """Input that can be read in several ways; each candidate's options say which (exit 2).
+
+    Attributes:
+        candidates: the answers.
+        commands: the complete command line of each, once the command that met the question has stated its own.
+    """
+
+    def __init__(self, code: str, message: str, *, candidates: Sequence[Candidate] = (), **place):
+        super().__init__(code, message, **place)
+        self.candidates = tuple(candidates)
+        self.commands: tuple[str, ...] = ()
+
+    def __reduce__(self):
+        make, arguments = super().__reduce__()
+        return partial(make, candidates=self.candidates), arguments
+
+    def asked_by(self, command: Sequence[str]) -> Question:
+        """The question with the command line of each answer; `command` is the one that met it, word by word."""
+        lines = [" ".join(map(typed, (*command, *candidate.options))) for candidate in self.candidates]
+        answers = [f"{c.says}: `{line}`" for c, line in zip(self.candidates, lines, strict=True)]
+        remedy = f"say which; {'; '.join(answers)}"
+        place = {name: getattr(self, name) for name in ("file", "line", "column", "found", "allowed")}
+        asked = Question(self.code, f"{self.message}; {remedy}", candidates=self.candidates, remedy=remedy, **place)
+        asked.commands = tuple(lines)
+        return asked
+
+
+def question(
+    *,
+    file: str,
+    found: str,
+    allowed: str,
+    candidates: Sequence[Candidate],
+    line: int | None = None,
+    code: str = "ambiguous",
+) -> Question:
+    """Build the `Question` whose message states the place, what was found and what is allowed."""
+    where = file + (f" line {line}" if line else "")
+    message = f"{where}: found {found}; allowed: {allowed}"
+    return Question(code, message, candidates=candidates, file=file, line=line, found=found, allowed=allowed)
 
 
 class NothingToEstimate(TvsError):

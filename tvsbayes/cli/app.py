@@ -14,7 +14,7 @@ import typer
 
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import styled
-from tvsbayes.errors import InputError, TvsError, escaped, refusal, typed
+from tvsbayes.errors import InputError, Question, TvsError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
 
 INTERRUPTED = 130
@@ -96,8 +96,14 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 def error_document(error: TvsError) -> dict[str, Any]:
     """The JSON document of an error."""
-    fields = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
+    fields: dict[str, Any] = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
     fields |= {"message": error.message, "found": error.found, "allowed": error.allowed, "remedy": error.remedy}
+    if isinstance(error, Question):
+        answers = zip(error.candidates, error.commands, strict=False)
+        fields["candidates"] = [
+            {"says": answer.says, "command": command, "first": {k: list(v) for k, v in answer.first.items()}}
+            for answer, command in answers
+        ]
     return {"error": fields}
 
 
