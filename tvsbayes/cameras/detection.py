@@ -114,8 +114,8 @@ class Detection:
         frames = " with ".join(frame_name(first, side) for side in CAMERAS)
         command = f"tvsbayes detect {typed(self.campaign.path or Path('CAMPAIGN'))} --overlay"
         return [
-            f"{off} of {off + ok} looks with a spot in both pictures lie off their epipolar line: pictures may be mixed "
-            "up (another moment, another direction, the other camera), or stereo.json is another pair's. Compare "
+            f"{off} of {off + ok} looks with a spot in both pictures lie off their epipolar line: pictures may be "
+            "mixed up (another moment, another direction, the other camera), or stereo.json is another pair's. Compare "
             f"{frames}; `{command}` draws what was found into results/overlay. Pair pictures anew in a new folder: "
             "`tvsbayes new OUT --pictures FOLDER` or `tvsbayes import BOOK.csv --to OUT --pictures FOLDER`"
         ]
