@@ -107,7 +107,13 @@ class Question(InputError):
 
 
 def question(
-    *, file: str, found: str, allowed: str, candidates: Sequence[Candidate], code: str, line: int | None = None
+    *,
+    file: str,
+    found: str,
+    allowed: str,
+    candidates: Sequence[Candidate],
+    line: int | None = None,
+    code: str = "ambiguous",
 ) -> Question:
     """Build the `Question` whose message states the place, what was found and what is allowed."""
     where = file + (f" line {line}" if line else "")

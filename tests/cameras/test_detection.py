@@ -231,8 +231,30 @@ def test_a_pair_off_its_epipolar_lines_is_refused(plain, tmp_path):
     folder = Folder(tmp_path / "c", looks=3)
     swapped = cv2.imread(str(folder.path / "frames" / "000010_right.png"))
     folder.put(1, "right", np.roll(swapped, 12, axis=0))
-    after = {spot.spot: spot.status for spot in detect(read_campaign(folder.path)).campaign.spots}
-    assert after == {0: "ok", 10: "epipolar", 20: "ok"}
+    found = detect(read_campaign(folder.path))
+    after = {spot.spot: spot.status for spot in found.campaign.spots}
+    assert after == {0: "ok", 10: "epipolar", 20: "ok"} and found.warnings == []
+
+
+def test_pictures_that_are_mixed_up_are_said(tmp_path):
+    """The right pictures of all looks but one are another look's."""
+    folder = Folder(tmp_path / "c", looks=6)
+    frames = folder.path / "frames"
+    right = sorted(frames.glob("*_right.png"))
+    pictures = [path.read_bytes() for path in right]
+    for path, other in zip(right[:-1], [*pictures[1:-1], pictures[0]], strict=True):
+        path.write_bytes(other)
+    found = detect(read_campaign(folder.path))
+    assert found.statuses["epipolar"] > found.statuses["ok"]
+    (warning,) = found.warnings
+    first = next(spot.spot for spot in found.campaign.spots if spot.status == "epipolar")
+    assert (
+        f"Compare frames/{first:06d}_left.png with" in warning
+        and f"detect {folder.path} --overlay" in warning
+        and "mixed up" in warning
+        and "--overlay" in warning
+    )
+    assert found.as_json()["warnings"] == [warning]
 
 
 def test_an_uncertain_calibration_widens_the_epipolar_tolerance(plain):

@@ -9,7 +9,7 @@ from support.drawn_pictures import SIZE, drawn, pairs
 from support.written_rows import spot_row
 
 from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
-from tvsbayes.errors import InputError
+from tvsbayes.errors import InputError, Question
 from tvsbayes.files.images import png_bytes, read_image
 
 
@@ -54,6 +54,22 @@ def test_numbers_too_sparse_for_moves_are_renumbered_and_reported(tmp_path):
     drawn(tmp_path, *pairs("_0930", "_0931", "_1015"))
     matched = pair_looks(views_of(tmp_path).views, None)
     assert [s.move for s in matched.spots] == [0, 1, 2] and matched.renumbered == (930, 1015)
+
+
+@pytest.mark.parametrize(
+    "form", ["{way}_exp{n:02d}_P{p}_{LR}.png", "{way}_{n:02d}_{p}_{LR}.png", "exp{n}_{p}_{LR}.png"]
+)
+def test_numbers_of_experiments_are_no_moves(tmp_path, form):
+    """A book says at which move a picture was taken, or the user that its number is a move's all the same."""
+    looks = [(way, n, p) for way in (("left", "up") if "{way}" in form else ("",)) for n in (1, 2, 3) for p in (1, 2)]
+    drawn(tmp_path, *(form.format(way=way, n=n, p=p, LR=side) for way, n, p in looks for side in "LR"))
+    views = views_of(tmp_path).views
+    assert len(views) == len(looks)
+    with pytest.raises(Question, match=r"import BOOK\.csv --to CAMPAIGN --relative --pictures FOLDER") as caught:
+        pair_looks(views, None)
+    assert [c.options for c in caught.value.candidates] == [("--pair", "order"), ("--pair", "number")]
+    assert len({spot.move for spot in pair_looks(views, None, matching="order").spots}) == len(looks)
+    assert {spot.move for spot in pair_looks(views, None, matching="number").spots} == {1, 2, 3}
 
 
 def test_rows_without_pictures_take_their_own(tmp_path):

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from support.drawn_pictures import drawn
 
-from tvsbayes.cameras.picture_pairs import Pairing, natural_order, paired_pictures
-from tvsbayes.errors import InputError
+from tvsbayes.cameras.picture_pairs import Pairing, natural_order, paired_pictures, read_folder
+from tvsbayes.errors import InputError, Question
 
 SIDES = ("left", "right")
 NAMES = {
@@ -76,9 +77,104 @@ def test_natural_order_is_numeric():
     assert sorted(["a10", "a9", "b1", "a2b"], key=natural_order) == ["a2b", "a9", "a10", "b1"]
 
 
-def test_documented_names_come_first(tmp_path):
-    write(tmp_path, ["left1.png", "right1.png", "cam0_1.png", "cam1_1.png", "old/left1.png"])
-    assert [picture.path.name for picture in paired_pictures(tmp_path, most=100)] == ["left1.png", "right1.png"]
+def test_pairs_in_the_folder_come_before_those_below(tmp_path):
+    """An old set in a folder below is left out, and named by the list of files without a camera."""
+    drawn(tmp_path, "left1.png", "right1.png")
+    drawn(tmp_path / "old", "left1.png", "right1.png")
+    found = read_folder(tmp_path, 100, 100)
+    assert [picture.path.relative_to(tmp_path).as_posix() for picture in found.used] == ["left1.png", "right1.png"]
+    assert found.unnamed == ("old/left1.png", "old/right1.png")
+
+
+DIRECTIONS = ("left", "right", "up", "down")
+LAB = {
+    "folders, letters": "{way}/exp{n:02d}_P{p}_{LR}.png",
+    "folders, words": "{way}/exp{n:02d}_P{p}_{side}.png",
+    "folders of directions and of cameras": "{way}/{side}/exp{n:02d}_P{p}.png",
+    "folders of cameras and of directions": "cam{LR}/{way}/exp{n:02d}_P{p}.png",
+    "prefix, camL": "{way}_exp{n:02d}_P{p}_cam{LR}.png",
+    "prefix, cam l": "{way}_exp{n:02d}_P{p}_cam_{lr}.png",
+    "prefix, Spanish": "{way}_{n:02d}_{p}_{izq}.png",
+    "prefix, numbers": "{way}_{n:02d}_{p}_cam{k}.png",
+    "prefix, words": "{way}_exp{n:02d}_P{p}_{side}.png",
+    "prefix below folders of cameras": "{side}_camera/{way}_exp{n:02d}_P{p}.png",
+    "prefix of one letter": "{W}_exp{n:02d}_P{p}_{side}.png",
+    "camera first": "cam{LR}_exp{n:02d}_P{p}_{way}.png",
+    "German": "{way}/Versuch{n}_{p}_{links}.png",
+    "a repeat R1": "{LR}_{way}_exp{n:02d}_R{p}.png",
+}
+CAMERA_WORDS = {
+    "left": {"LR": "L", "lr": "l", "side": "left", "izq": "izq", "k": 0, "links": "links"},
+    "right": {"LR": "R", "lr": "r", "side": "right", "izq": "der", "k": 1, "links": "rechts"},
+}
+
+
+def lab_name(form: str, side: str, way: str, n: int, p: int) -> str:
+    return form.format(way=way, W=way[0].upper(), n=n, p=p, **CAMERA_WORDS[side])
+
+
+@pytest.mark.parametrize("ways", (DIRECTIONS, ("left", "right")))
+@pytest.mark.parametrize("layout", LAB)
+def test_a_direction_is_no_camera(tmp_path, layout, ways):
+    """The paper's lab: four points of two experiments in every direction, or in those of pan alone."""
+    looks = [(way, n, p) for way in ways for n in (1, 2) for p in (1, 2, 3, 4)]
+    expected = [tuple(lab_name(LAB[layout], side, *look) for side in SIDES) for look in looks]
+    write(tmp_path, [name for pair in expected for name in pair])
+    assert pairs_of(tmp_path, Pairing(asks=True)) == sorted(expected)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        *(("gauche", "droite"), ("Gauche", "DROITE"), ("izquierda", "derecha"), ("linke", "rechte")),
+        *(("kamera_l", "kamera_r"), ("c\u00e1mara 1", "c\u00e1mara 2"), ("camera-3", "camera-4")),
+        *(("leftcam", "rightcam"), ("camL", "camR")),
+    ],
+)
+def test_words_of_cameras(tmp_path, left, right):
+    for number, form in enumerate(("{}/{}.png", "{}_{}.png", "{1}_{0}.png")):
+        folder = tmp_path / str(number)
+        expected = [tuple(form.format(side, f"{k:03d}") for side in (left, right)) for k in range(3)]
+        write(folder, [name for pair in expected for name in pair])
+        assert pairs_of(folder, Pairing(asks=True)) == sorted(expected)
+
+
+def test_files_of_one_camera_and_view_are_refused_by_name(tmp_path):
+    """Both are the left picture of view 1; a word of the camera within another word is none."""
+    write(tmp_path, ["left1.png", "cam0_1.png", "right1.png", "cam1_1.png", "bright_1.png"])
+    with pytest.raises(InputError, match=r"cam0_1\.png and left1\.png, cam1_1\.png and right1\.png: two pictures"):
+        paired_pictures(tmp_path, most=100)
+
+
+def test_one_direction_is_a_camera_only_without_up_and_down(tmp_path):
+    """Folders left and right alone are cameras; beside up and down each picture may hold both."""
+    write(tmp_path, [f"{way}/{k}.png" for way in ("left", "right") for k in range(3)])
+    assert pairs_of(tmp_path, Pairing(asks=True)) == [(f"left/{k}.png", f"right/{k}.png") for k in range(3)]
+    write(tmp_path, [f"up/{k}.png" for k in range(3)])
+    assert {picture.sides for picture in paired_pictures(tmp_path, 100)} == {SIDES}
+
+
+@pytest.mark.parametrize("way", ("numbered folders", "one letter", "number at the end", "two folders", "times"))
+def test_names_that_do_not_decide_are_asked(tmp_path, way):
+    """Each answer's patterns pair the files; one of them as the guess without a question."""
+    write(tmp_path, [name for pair in NAMES[way] for name in pair])
+    with pytest.raises(Question) as caught:
+        paired_pictures(tmp_path, 100, Pairing(asks=True))
+    for candidate, pairs in zip(caught.value.candidates, (NAMES[way], [p[::-1] for p in NAMES[way]]), strict=True):
+        (left, right) = candidate.options[1::2]
+        assert pairs_of(tmp_path, Pairing(globs=(left, right))) == sorted(pairs)
+
+
+def test_wide_pictures_named_by_directions_are_asked(tmp_path):
+    """Folders left and right of frames side by side: one pattern for both cameras says so."""
+    for way in ("left", "right"):
+        drawn(tmp_path / way, "1.png", "2.png", size=(6, 16))
+    with pytest.raises(Question) as caught:
+        read_folder(tmp_path, 100, 1000, Pairing(asks=True))
+    patterns = caught.value.candidates[0].options[1::2]
+    found = read_folder(tmp_path, 100, 1000, Pairing(globs=patterns, asks=True))
+    assert {picture.sides for picture in found.used} == {SIDES} and found.usual == dict.fromkeys(SIDES, (8, 6))
+    assert {picture.view for picture in found.used} == {"left/1", "left/2", "right/1", "right/2"}
 
 
 @pytest.mark.parametrize("names", (("image0.png", "image1.png"), ("wall.png", "floor.png", "sky.png"), ("a_1.png",)))

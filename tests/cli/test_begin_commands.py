@@ -111,6 +111,24 @@ def test_printed_commands_can_be_run_unchanged(say, tmp_path):
     assert [shlex.split(each) for each in commands] == [["tvsbayes", each, str(out)] for each in ("detect", "check")]
 
 
+def test_a_question_has_the_commands_that_answer_it(ask, say, tmp_path):
+    """Two folders without a word of a camera: the command of each answer runs as it is printed."""
+    for name in ("A", "B"):
+        drawn(tmp_path / "my pictures" / name, "1.png", "2.png", "3.png")
+    drawn(tmp_path / "my pictures" / "A", "4.jpg")
+    command = ("new", tmp_path / "mine", "--pictures", tmp_path / "my pictures")
+    code, text, log = say(*command)
+    assert code == 2 and not text and not (tmp_path / "mine").exists()
+    printed = re.findall(r"`(tvsbayes new .*?)`", log)
+    code, document = ask(*command)
+    answers = assert_error(document, "ambiguous")["candidates"]
+    assert [each["command"].replace(" --json", "") for each in answers] == printed
+    assert answers[1]["says"] == "B/1.png is the left camera's" and len(answers) == 2
+    code, text, _ = say(*shlex.split(printed[1])[1:])
+    assert code == 0 and "for example B/1.png and A/1.png: spot 0" in text
+    assert "not paired: A/4.jpg: no camera in the name" in text
+
+
 def test_renumbered_moves_are_reported(say, tmp_path):
     drawn(tmp_path / "pictures", *pairs("0930", "1015"))
     code, text, _ = say("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")

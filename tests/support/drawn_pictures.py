@@ -14,7 +14,7 @@ SIZE = (6, 8)
 def drawn(folder: Path, *names: str, size: tuple[int, int] = SIZE) -> None:
     """Pictures without two alike."""
     rng = np.random.default_rng(4)
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True, parents=True)
     for name in names:
         picture = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
         cv2.imwrite(str(folder / name), picture)

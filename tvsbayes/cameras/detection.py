@@ -74,6 +74,10 @@ PEDESTAL_DN = 8.0
 """Offset added to a difference of pictures, so that the noise of a dark background is not cut at 0."""
 
 
+MIXED_MIN = 3
+"""Fewest looks off their epipolar line that say that pictures are mixed up, where they are most."""
+
+
 @dataclass(frozen=True)
 class Detection:
     """The result of `detect`.
@@ -100,6 +104,22 @@ class Detection:
     median_sd_px: float | None
     lines: dict[str, tuple[AlternateLines, ...]]
 
+    @property
+    def warnings(self) -> list[str]:
+        """What to look at where most pairs are no images of one point."""
+        off, ok = self.statuses.get("epipolar", 0), self.statuses.get("ok", 0)
+        if off < MIXED_MIN or off <= ok:
+            return []
+        first = next(spot.spot for spot in self.campaign.spots if spot.status == "epipolar")
+        frames = " with ".join(frame_name(first, side) for side in CAMERAS)
+        command = f"tvsbayes detect {typed(self.campaign.path or Path('CAMPAIGN'))} --overlay"
+        return [
+            f"{off} of {off + ok} looks with a spot in both pictures lie off their epipolar line: pictures may be "
+            "mixed up (another moment, another direction, the other camera), or stereo.json is another pair's. Compare "
+            f"{frames}; `{command}` draws what was found into results/overlay. Pair pictures anew in a new folder: "
+            "`tvsbayes new OUT --pictures FOLDER` or `tvsbayes import BOOK.csv --to OUT --pictures FOLDER`"
+        ]
+
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes detect --json`."""
         refused = {status: count for status, count in self.statuses.items() if status != "ok"}
@@ -114,6 +134,7 @@ class Detection:
             "median_sd_px": self.median_sd_px,
             "noise": noise,
             "alternate_lines": {side: [asdict(n) for n in lines] for side, lines in self.lines.items()},
+            "warnings": self.warnings,
         }
 
 

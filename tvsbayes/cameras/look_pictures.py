@@ -20,13 +20,14 @@ from tvsbayes.cameras.picture_pairs import (
     Pairing,
     Picture,
     Size,
+    is_direction,
     natural_order,
     read_folder,
 )
-from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, IMAGE_PIXELS_MAX, PNG_SIGNATURE, decode_image, png_bytes
-from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Spot, frame_name
+from tvsbayes.instrument.campaign import CAMERAS, SPOTS, UNDETECTED, Spot, frame_name
 from tvsbayes.progress import Advance, unshown
 
 Matching = Literal["number", "order"]
@@ -53,6 +54,12 @@ class View:
         """Numbers in the name, in order."""
         return [int(number) for number in _NUMBER.findall(self.name)]
 
+    def is_of_experiment(self, position: int) -> bool:
+        """Whether one of its numbers counts experiments, not moves: exp01_P1."""
+        number = list(_NUMBER.finditer(self.name))[position]
+        word = re.search(r"([a-z]+)[ _.#-]*$", self.name[: number.start()].lower())
+        return word is not None and word[1] in SPOTS["experiment"].names.split()
+
     def without_number(self, position: int) -> str:
         """The name without one of its numbers: the rest may name the sheet."""
         number = list(_NUMBER.finditer(self.name))[position]
@@ -68,7 +75,7 @@ class ViewedFolder:
         views: pairs, in the natural order of their names.
         image_sizes: size of most pictures of the left and the right camera, px.
         unpaired: files without a picture of the other camera.
-        unnamed: files without a camera in their names that are not two pictures side by side.
+        unnamed: files without a camera in their names, or in folders below the pairs.
         other_size: files of another size than most.
         unread: files in formats that are not read.
     """
@@ -102,35 +109,42 @@ class PairedLooks:
     renumbered: tuple[int, int] | None = None
 
 
-def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
+def views_of(folder: Path, *, swap: bool = False, globs: tuple[str, str] | None = None) -> ViewedFolder:
     """Find the pairs of pictures in a folder.
 
     Args:
         folder: folder of the pictures; see `picture_pairs` for names.
         swap: the left camera's image is the right half of a wide picture.
+        globs: patterns of the pictures of the left and of the right camera.
 
     Raises:
         InputError: no folder, no pair, an unreadable picture.
+        Question: names do not say which camera took a picture.
     """
-    pictures = read_folder(folder, 2 * LOOKS_MAX, IMAGE_PIXELS_MAX, Pairing(swap))
-    unread = [path.name for path in sorted(pictures.folder.iterdir()) if path.suffix.lower() in OTHER_SUFFIXES]
+    pictures = read_folder(folder, 2 * LOOKS_MAX, IMAGE_PIXELS_MAX, Pairing(swap, globs, asks=True))
     by_view: dict[str, dict[str, Picture]] = {}
     for picture in pictures.used:
         by_view.setdefault(picture.view, {}).update(dict.fromkeys(picture.sides, picture))
     complete = {name: pair for name, pair in by_view.items() if len(pair) == 2}
     if not complete:
         found = f"no pair among {pictures.count} PNG and JPEG pictures"
-        remedy = "rename them so that one word names the camera and the rest of both names is the same"
+        remedy = "rename them so that one word names the camera and the rest of both names is the same; "
+        remedy += 'or name them by patterns: --left "cam_a/*.png" --right "cam_b/*.png"'
         allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
         place = escaped(str(folder), 200)
         raise refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
     return ViewedFolder(
         views=tuple(View(n, (complete[n]["left"], complete[n]["right"])) for n in sorted(complete, key=natural_order)),
         image_sizes=dict(pictures.usual),
-        unpaired=tuple(p.path.name for pair in by_view.values() if len(pair) == 1 for p in pair.values()),
+        unpaired=tuple(
+            p.path.relative_to(pictures.folder).as_posix()
+            for pair in by_view.values()
+            if len(pair) == 1
+            for p in pair.values()
+        ),
         unnamed=pictures.unnamed,
-        other_size=tuple(path.name for path in pictures.other_size),
-        unread=tuple(unread),
+        other_size=tuple(path.as_posix() for path in pictures.other_size),
+        unread=pictures.left_out(*OTHER_SUFFIXES),
     )
 
 
@@ -158,6 +172,7 @@ def pair_looks(
 
     Raises:
         InputError: neither numbers nor counts match.
+        Question: the numbers are those of experiments, and nothing says at which moves they were seen.
     """
     waiting = [spot.spot for spot in rows if spot.status == UNDETECTED and spot.u_left_px is None]
     if rows and not waiting:
@@ -168,6 +183,8 @@ def pair_looks(
     names, renumbered = [""] * len(views), None
     if slot is not None:
         stated, names = [view.numbers[slot] for view in views], [view.without_number(slot) for view in views]
+        if matching is None and _are_experiments(views, slot, names):
+            raise _question(views[0], stated[0])
         ranks = {number: rank for rank, number in enumerate(sorted(set(stated)))}
         numbers = stated
         if ids is None and max(stated) >= 2 * len(ranks) + SPARSE_MARGIN:
@@ -185,6 +202,28 @@ def pair_looks(
     used = set(numbers)
     without = tuple(move for move in (range(1 + max(used)) if moves is None else moves) if move not in used)
     return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, method, (), without, renumbered)
+
+
+def _are_experiments(views: Sequence[View], slot: int, names: Sequence[str]) -> bool:
+    """Whether numbers that repeat are those of experiments, by the word before them or a direction beside them."""
+    if len({view.numbers[slot] for view in views}) == len(views):
+        return False
+    directed = any(is_direction(word) for name in names for word in re.findall("[a-z]+", name.lower()))
+    return directed or any(view.is_of_experiment(slot) for view in views)
+
+
+def _question(view: View, number: int) -> InputError:
+    """The question at which moves pictures were seen whose numbers are those of experiments."""
+    return question(
+        file=escaped(str(view.pictures[0].path), 200),
+        found=f"numbers of experiments in the names ({number} in {escaped(view.name, 80)}), which repeat",
+        allowed="the number of the move, or a lab book that says at which move each picture was taken: `tvsbayes "
+        "import BOOK.csv --to CAMPAIGN --relative --pictures FOLDER`",
+        candidates=(
+            Candidate("a pair for every move, in the order of the names", ("--pair", "order")),
+            Candidate(f"{number} is the number of the move all the same", ("--pair", "number")),
+        ),
+    )
 
 
 def _differences(names: Sequence[str]) -> list[str]:

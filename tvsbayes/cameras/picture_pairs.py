@@ -1,25 +1,29 @@
 """Pictures of two cameras in a folder: the camera of each file, and the pairs.
 
-A view is one moment of both cameras; its name is the file name without the mark of the camera. The documented names
-(`NAMING`) are tried first. Recorders also number their cameras, `cam0_3` and `cam1_3`, put the mark in the middle of a
-name or twice, keep a folder for each view, or name pictures by the time. Each naming is tried in turn, the most
-explicit first, and used if the names form pairs. Links are not followed. Sizes come from headers; nothing is decoded.
+The word nearest the end of a file's name says which camera took it (`exp01_P1_L`, `camL_3`, `izq`, `cam0`), else the
+deepest folder that has one. Words that also name directions of motion (`left/`, `right_exp01`) give way to any other
+word of a camera, and beside `up` and `down` they are none. A view is one moment of both cameras: the rest of the name.
+The words are data, `data/words/pictures.toml`. Links are not followed. Sizes come from headers; nothing is decoded.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections import Counter
+import tomllib
+import unicodedata
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from itertools import takewhile
 from pathlib import Path
+from typing import NamedTuple
 
-from tvsbayes.errors import InputError, all_of, escaped, refusal
-from tvsbayes.files.disk import read_bytes
+from tvsbayes.errors import Candidate, InputError, all_of, escaped, listed, question, refusal
+from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size
-from tvsbayes.instrument.campaign import CAMERAS
+from tvsbayes.instrument.campaign import CAMERAS, SPOTS
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 OTHER_SUFFIXES = (".bmp", ".pgm", ".ppm", ".pnm", ".tif", ".tiff", ".webp")
@@ -28,31 +32,13 @@ SIDE_BY_SIDE_RATIO = 2.0
 """Least aspect ratio of a picture without a side in its name that counts as the images of both cameras."""
 Size = tuple[int, int]
 """Width and height, px."""
-NAMING = "left01.png with right01.png, 01_left.png with 01_right.png, or folders left/ and right/"
+NAMING = "left01.png with right01.png, 01_L.png with 01_R.png, or folders left/ and right/"
 """Names of the pictures of two cameras, for messages."""
-DEPTH_MAX = 3
-"""Number of levels of subfolders searched: set/left/, set/01/cam0/."""
+DEPTH_MAX = 8
+"""Number of levels of subfolders searched."""
 NUMBERED_PAIRS_MIN = 3
-"""Least number of pairs for which a number marks the camera: two frames may be named 0 and 1 by chance."""
-_SIDES = {"l": "left", "r": "right", "left": "left", "right": "right"}
-_DOCUMENTED = (
-    # left01, then 01_left, L01 or l_01, 01L or 01_l: a single letter counts only beside a digit or a separator.
-    re.compile(r"(?P<side>left|right)(?P<view>.*)", re.IGNORECASE | re.DOTALL),
-    re.compile(r"(?P<view>.*?)[ _.-]*(?P<side>left|right)", re.IGNORECASE | re.DOTALL),
-    re.compile(r"(?P<side>[lr])(?P<view>[ _.-]*[0-9].*)", re.IGNORECASE | re.DOTALL),
-    re.compile(r"(?P<view>.*[0-9])[ _.-]*(?P<side>[lr])", re.IGNORECASE | re.DOTALL),
-)
-_WORDS = re.compile("left|right", re.IGNORECASE)
-_LETTERS = re.compile(r"(?<![A-Za-z])[lLrR](?![A-Za-z])|(?<=[a-z0-9])[LR](?![A-Za-z])")
-_NUMBERS = (
-    *(
-        re.compile(rf"(?<![a-z]){word}[_ -]?0*([0-9]{{1,9}})(?![0-9])", re.IGNORECASE)
-        for word in ("camera", "cam", "c", "sensor", "image", "img")
-    ),
-    re.compile(r"[_-]0*([0-9]{1,9})$"),
-)
-_Key = tuple[str, str]
-"""A name without the marks of the camera, and their side of the pair."""
+"""Least number of pairs for which a bare number marks the camera: two frames may be named 0 and 1 by chance."""
+DUPLICATES_SHOWN = 3
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
@@ -77,11 +63,13 @@ class Pairing:
         swap: the left camera's image is the right half of a wide frame, or has the larger number or later folder.
         globs: patterns of the pictures of the left and of the right camera, below the folder.
         in_order: the first picture of the left camera belongs to the first of the right, for any names.
+        asks: pairs that names do not decide are asked about, not guessed.
     """
 
     swap: bool = False
     globs: tuple[str, str] | None = None
     in_order: bool = False
+    asks: bool = False
 
     @property
     def sides(self) -> tuple[str, str]:
@@ -119,14 +107,16 @@ class PictureFolder:
         used = set(self.used)
         return [picture.path.relative_to(self.folder) for picture in self.sizes if picture not in used]
 
+    def left_out(self, *suffixes: str) -> tuple[str, ...]:
+        """Files of these kinds that belong to no camera, relative to the folder, in order."""
+        known = {picture.path for picture in self.sizes}
+        names = [name for name in file_names(self.folder) if name.lower().endswith(suffixes)]
+        return tuple(sorted((name for name in names if self.folder / name not in known), key=natural_order))
+
     @property
     def unnamed(self) -> tuple[str, ...]:
-        """Pictures in the folder or beside its pairs that belong to no pair, relative to the folder, in order."""
-        known = {picture.path for picture in self.sizes}
-        folders = {self.folder, *(path.parent for path in known)}
-        names = [name for name in _names(self.folder) if name.lower().endswith(SUFFIXES)]
-        rest = [name for name in names if (path := self.folder / name).parent in folders and path not in known]
-        return tuple(sorted(rest, key=natural_order))
+        """Pictures without a camera, or in folders below a folder with pairs."""
+        return self.left_out(*SUFFIXES)
 
 
 def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_NAMED) -> PictureFolder:
@@ -157,6 +147,12 @@ def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_
             sizes[picture] = width // len(picture.sides), height
     if refused:
         raise all_of(refused)
+    if pairing.asks and pairing.globs is None and all(len(picture.sides) == 1 for picture in sizes):
+        wide = [picture for picture, (width, height) in sizes.items() if width >= SIDE_BY_SIDE_RATIO * height]
+        if wide and len(wide) == len(sizes):
+            raise _question(
+                folder, {p.path.relative_to(folder).as_posix(): Key(p.view, p.sides[0]) for p in wide}, True
+            )
     usual: dict[str, Size] = {}
     for side in CAMERAS:
         counts = Counter(size for picture, size in sizes.items() if side in picture.sides)
@@ -165,7 +161,10 @@ def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_
 
 
 def paired_pictures(folder: Path, most: int, pairing: Pairing = AS_NAMED) -> list[Picture]:
-    """The pictures of a folder, paired by the documented names if these form a pair, else by other marks, else wide.
+    """The pictures of a folder with their cameras: those in it if they form a pair, else with those in folders below.
+
+    Where no words form pairs, numbers beside a word or at the end, two folders, or the order of the names are guesses.
+    Without any, every picture may hold the images of both cameras.
 
     Args:
         folder: folder with pictures in it or in its subfolders.
@@ -175,107 +174,343 @@ def paired_pictures(folder: Path, most: int, pairing: Pairing = AS_NAMED) -> lis
     Raises:
         InputError: no readable folder, too many pictures, two of one camera and view, or none in a readable format;
             where pairs are stated, no two cameras or different numbers of pictures.
+        Question: `pairing.asks`, and pairs would be guessed.
     """
     folder = Path(folder)
     refuse = partial(refusal, file=escaped(str(folder), 200))
     if pairing.globs is not None or pairing.in_order:
         return _stated_pairs(folder, pairing, most, refuse)
-
-    def check_count(images: Sequence[object]) -> None:
-        if len(images) > most:
-            found, remedy = f"{len(images)} pictures", "move those that are not needed elsewhere"
-            raise refuse("size", found=found, allowed=f"at most {most}", remedy=remedy)
-
-    direct = [folder / entry.name for entry in _entries(folder) if _is_picture(entry)]
-    documented = [Picture(key[0], path, (key[1],)) for path in direct if (key := _documented(path.stem))]
-    documented = documented or _from_side_folders(folder)
-    check_count(documented or direct)
-    first_paths: dict[tuple[str, tuple[str, ...]], Path] = {}
-    for picture in documented:
-        first = first_paths.setdefault((picture.view, picture.sides), picture.path)
-        if first != picture.path:
-            found = f"{escaped(first.name)} and {escaped(picture.path.name)}, two pictures of one camera and view"
-            raise refuse("duplicate", found=found, allowed="one", remedy="keep one file per camera and view")
-    if any(count > 1 for count in Counter(picture.view for picture in documented).values()):
-        return documented
-    names = sorted(_names(folder), key=natural_order)
+    names = sorted(file_names(folder), key=natural_order)
     images = [name for name in names if name.lower().endswith(SUFFIXES)]
     others = [name for name in names if name.lower().endswith(OTHER_SUFFIXES)]
     if not images and others:
         found = f"{len(others)} pictures such as {escaped(others[0], 100)}"
         remedy = "convert them without loss, for example: mogrify -format png *" + Path(others[0]).suffix
         raise refuse("image", found=found, allowed="PNG or JPEG", remedy=remedy)
-    check_count(images)
-    by_marks = _paired_by_marks(folder, images, pairing.sides)
-    return by_marks or documented or [Picture(path.stem, path, pairing.sides) for path in direct]
+    direct = [name for name in images if "/" not in name]
+    for group in dict.fromkeys((tuple(direct), tuple(images))):
+        named = named_cameras(group, pairing.sides)
+        if _pairs(named):
+            break
+    if len(named or images) > most:
+        found, remedy = f"{len(named or images)} pictures", "move those that are not needed elsewhere"
+        raise refuse("size", found=found, allowed=f"at most {most}", remedy=remedy)
+    _refuse_twice(named, refuse)
+    if _pairs(named):
+        return _pictures(folder, named)
+    guessed = _guessed(images, named, pairing)
+    if guessed and pairing.asks:
+        raise _question(folder, guessed)
+    if guessed:
+        return _pictures(folder, guessed)
+    # Of one camera alone, or each of both: the size decides.
+    if named and len(named) == len(images):
+        return _pictures(folder, named)
+    return [Picture(_stem(name), folder / name, pairing.sides) for name in images]
 
 
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    """The entries of a folder, in natural order, without hidden ones."""
+def file_names(folder: Path, below: str = "", depth: int = 0) -> Iterator[str]:
+    """Files of a folder and its subfolders, relative to the outermost; hidden ones and links to folders are left out.
+
+    Raises:
+        InputError: the outermost folder cannot be read.
+    """
     try:
         entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
     except OSError as error:
+        if below:
+            return
         found, allowed = escaped(error.strerror or str(error)), "a readable folder"
         remedy, place = "name the folder of the pictures", escaped(str(folder), 200)
         raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
-    return sorted(entries, key=lambda entry: natural_order(entry.name))
-
-
-def _is_picture(entry: os.DirEntry[str]) -> bool:
-    return entry.name.lower().endswith(SUFFIXES)
-
-
-def _names(folder: Path, below: str = "", depth: int = 0) -> Iterator[str]:
-    """Files of a folder and its subfolders, relative to the outermost; links to folders are left out."""
-    try:
-        entries = _entries(folder)
-    except InputError:
-        # Subfolders that cannot be read are left out; the outermost folder was read before.
-        return
     for entry in entries:
         if not entry.is_dir(follow_symlinks=False):
             yield below + entry.name
         elif depth < DEPTH_MAX:
-            yield from _names(Path(entry.path), f"{below}{entry.name}/", depth + 1)
+            yield from file_names(Path(entry.path), f"{below}{entry.name}/", depth + 1)
 
 
-def _documented(stem: str) -> _Key | None:
-    """View and camera of a name without suffix that follows `NAMING`; None without a camera."""
-    matches = (match for pattern in _DOCUMENTED if (match := pattern.fullmatch(stem)))
-    return next(((match["view"], _SIDES[match["side"].lower()]) for match in matches), None)
+# --- words of cameras in a name --------------------------------------------------------------------------------------
+class Key(NamedTuple):
+    """A name without its camera, by which pictures pair; the camera; the name as it is shown."""
+
+    view: str
+    side: str
+    name: str = ""
 
 
-def _from_side_folders(folder: Path) -> list[Picture]:
-    """Pictures in folders that are named after their camera; views by file name."""
-    pictures = []
-    for entry in _entries(folder):
-        name = entry.name.lower()
-        matches = [side for side in CAMERAS if name.startswith(side) or name.endswith(side)]
-        side = _SIDES.get(name) or (matches[0] if len(matches) == 1 else None)
-        if side is None or not entry.is_dir(follow_symlinks=False):
-            continue
-        for path in (Path(picture.path) for picture in _entries(Path(entry.path)) if _is_picture(picture)):
-            key = _documented(path.stem)
-            pictures.append(Picture(key[0] if key and key[1] == side else path.stem, path, (side,)))
-    return pictures
+Named = Mapping[str, Key]
+"""Key of every file with a camera."""
+
+
+class _Mark(NamedTuple):
+    """A word of a camera in a path.
+
+    Attributes:
+        slot: where it stands: number of the part from the end, place in the part, whether it is a number.
+        side: "left", "right", "" for a direction that is no camera; digits of a number that stands for one.
+        rank: the higher is taken before the lower.
+        start, end: its place in the path.
+    """
+
+    slot: tuple[int, str, bool]
+    side: str
+    rank: int
+    start: int
+    end: int
+
+
+CAMERA, INSIDE, LETTER, DIRECTION, BESIDE_LETTERS = 5, 4, 3, 2, 1
+"""Ranks: beside a word of a camera; in a name, before no experiment; a letter; a direction; beside `u`, `d`."""
+_TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\dA-Za-z_]+")
+
+
+_EXPERIMENT = frozenset(SPOTS["experiment"].names.split())
+
+
+@cache
+def _words() -> dict[str, frozenset[str]]:
+    content = tomllib.loads((shipped_data() / "words" / "pictures.toml").read_text("utf-8"))
+    return {name: frozenset(" ".join(languages.values()).split()) for name, languages in content.items()}
+
+
+def _plain(name: str) -> str:
+    """A name without accents."""
+    return "".join(letter for letter in unicodedata.normalize("NFKD", name) if not unicodedata.combining(letter))
+
+
+def _stem(name: str) -> str:
+    return name[: name.rindex(".")]
+
+
+def _side_of(word: str) -> str:
+    """The side that a word names, alone or joined to another word: leftcam, camL; "" for none."""
+    words = _words()
+    for side in CAMERAS:
+        for own in words[side]:
+            rest = word.removeprefix(own) if word.startswith(own) else word.removesuffix(own)
+            joined = words["camera"] if len(own) == 1 else words["camera"] | words["picture"]
+            if word == own or (rest != word and rest in joined):
+                return side
+    return ""
+
+
+def is_direction(word: str) -> bool:
+    """Whether a word names a direction of motion: left, up."""
+    words = _words()
+    return len(word) > 1 and any(word in words[name] for name in (*CAMERAS, "direction"))
+
+
+def _marks(path: str, numbered: frozenset[str]) -> list[_Mark]:
+    """The words of cameras in a path without suffix; `numbered` words make a camera of the number behind them."""
+    words, marks, start = _words(), [], 0
+    parts = path.split("/")
+    for depth, part in zip(range(len(parts), 0, -1), parts, strict=True):
+        tokens = list(_TOKENS.finditer(part))
+        plain = [token.group().lower() for token in tokens]
+
+        def is_beside(k: int, tokens: Sequence[re.Match[str]] = tokens, part: str = part) -> bool:
+            """Whether only separators stand between a token and the next."""
+            return k + 1 < len(tokens) and not part[tokens[k].end() : tokens[k + 1].start()].strip(" _.-")
+
+        k, inner = 0, 0
+        while k < len(tokens):
+            word, size, rank, side, number = plain[k], 1, 0, _side_of(plain[k]), False
+            after = plain[k + 1] if is_beside(k) else ""
+            if word in numbered and after.isdigit():
+                side, size, rank, number = after, 2, CAMERA, True
+            elif word in words["camera"] and _side_of(after):
+                side, size, rank = _side_of(after), 2, CAMERA
+            elif side and after in words["camera"]:
+                size, rank = 2, CAMERA
+            elif side and word not in words[side] and len(word) < 8 and any(c in word for c in words["camera"]):
+                rank = CAMERA
+            elif side:
+                is_prefix = depth > 1 or k == 0 or after in _EXPERIMENT
+                rank = INSIDE if not is_prefix else LETTER if len(word) == 1 else DIRECTION
+            elif word in words["direction"]:
+                rank = DIRECTION
+            elif k == 0 and word in words["direction_letter"]:
+                rank = BESIDE_LETTERS
+            if rank:
+                inside = k > 0 and k + size < len(tokens)
+                place = f"{inner}" if inside else "last" if k else "first"
+                inner += inside
+                span = start + tokens[k].start(), start + tokens[k + size - 1].end()
+                marks.append(_Mark((depth, place, number), side, rank, *span))
+            k += size
+        start += len(part) + 1
+    return marks
+
+
+def named_cameras(
+    names: Sequence[str], sides: tuple[str, str] = CAMERAS, numbered: frozenset[str] | None = None
+) -> dict[str, Key]:
+    """View and camera of every file whose name or folder has a word of a camera that tells these files apart.
+
+    Args:
+        names: of files, relative to their folder.
+        sides: cameras of the smaller and the larger number.
+        numbered: words that make a camera of the number behind them; None: camera and its translations.
+    """
+    paths = {name: _plain(_stem(name)) for name in names}
+    numbered = _words()["camera"] if numbered is None else numbered
+    marks = {name: _marks(path, numbered) for name, path in paths.items()}
+    found: dict[tuple[int, str, bool], list[_Mark]] = defaultdict(list)
+    for mark in (mark for own in marks.values() for mark in own):
+        found[mark.slot].append(mark)
+    side_of: dict[tuple[int, str, bool], dict[str, str]] = {}
+    ranks: dict[tuple[int, str, bool], int] = {}
+    for slot, own in found.items():
+        values = {mark.side for mark in own if mark.side}
+        if slot[2]:
+            two = sorted({*map(int, values)})
+            side_of[slot] = {value: sides[two.index(int(value))] for value in values} if len(two) == 2 else {}
+        else:
+            directions = any(not mark.side and mark.rank == DIRECTION for mark in own)
+            side_of[slot] = {} if directions else {side: side for side in values}
+        ranks[slot] = BESIDE_LETTERS if any(mark.rank == BESIDE_LETTERS for mark in own) else CAMERA
+    telling = {slot for slot, of in side_of.items() if len({*of.values()}) == 2}
+    chosen: dict[str, _Mark] = {}
+    for name, own in marks.items():
+        usable = [mark for mark in own if mark.side and side_of[mark.slot]]
+        usable = [mark for mark in usable if mark.slot in telling] or usable
+        if usable:
+            chosen[name] = max(usable, key=lambda m: (min(m.rank, ranks[m.slot]), -m.slot[0], m.start))
+    camera = {name: side_of[mark.slot][mark.side] for name, mark in chosen.items()}
+    # Another word that agrees in every file says the camera once more: stereoLeft/imageL0.
+    contradicted = {
+        mark.slot
+        for name, own in marks.items()
+        for mark in own
+        if mark.slot in telling and mark.side and camera.get(name) != side_of[mark.slot][mark.side]
+    }
+    keys = {}
+    for name, mark in chosen.items():
+        again = [m for m in marks[name] if m.side and m.slot in telling - contradicted]
+        shown = _without(paths[name], {mark, *again})
+        keys[name] = Key(re.sub(r"\*[ _.-]+", "*", shown), camera[name], shown.replace("*", "").strip("/"))
+    return keys
+
+
+def _without(path: str, marks: set[_Mark]) -> str:
+    """A path with * for its marks and the separators before them."""
+    for mark in sorted(marks, key=lambda mark: -mark.start):
+        path = path[: mark.start].rstrip(" _.-") + "*" + path[mark.end :]
+    return path
+
+
+def _pairs(named: Named) -> int:
+    """Number of views with pictures of both cameras."""
+    return sum(count == 2 for count in Counter(view for view, _ in {key[:2] for key in named.values()}).values())
+
+
+def _refuse_twice(named: Named, refuse: Callable[..., InputError]) -> None:
+    """Refuse two files of one camera and view, by name."""
+    names: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, key in named.items():
+        names[key[:2]].append(name)
+    twice = [" and ".join(escaped(name, 80) for name in own) for own in names.values() if len(own) > 1]
+    if twice:
+        found = f"{listed(twice, DUPLICATES_SHOWN)}: two pictures of one camera and view"
+        raise refuse("duplicate", found=found, allowed="one", remedy="keep one file per camera and view")
+
+
+def _pictures(folder: Path, named: Named) -> list[Picture]:
+    """The pictures of views, each view under the name of its last picture where that is no other's."""
+    names = {key.view: key.name or key.view for key in named.values()}
+    shared = len({*names.values()}) < len(names)
+    return [Picture(key.view if shared else names[key.view], folder / name, (key.side,)) for name, key in named.items()]
+
+
+# --- guesses and questions -------------------------------------------------------------------------------------------
+def _guessed(images: Sequence[str], named: Named, pairing: Pairing) -> dict[str, Key]:
+    """Pairs by a number, by two folders, or in the order of the names of known cameras; empty without any."""
+    stems = {name: _stem(name) for name in images}
+    last = {name: match for name, stem in stems.items() if (match := re.search(r"[_-]0*([0-9]{1,9})$", stem))}
+    numbers = sorted({int(match[1]) for match in last.values()})
+    folders = sorted({stem.rpartition("/")[0] for stem in stems.values()}, key=natural_order)
+    guesses = [named_cameras(images, pairing.sides, _words()["perhaps"] | _words()["camera"])]
+    if len(numbers) == 2:
+        of_number = dict(zip(numbers, pairing.sides, strict=True))
+        guesses.append({n: Key(stems[n][: m.start()], of_number[int(m[1])]) for n, m in last.items()})
+    if len(folders) == 2:
+        of_folder = dict(zip(folders, pairing.sides, strict=True))
+        parts = {name: stem.rpartition("/") for name, stem in stems.items()}
+        guesses.append({name: Key(part[2], of_folder[part[0]]) for name, part in parts.items()})
+    for guess in guesses:
+        if _pairs(guess) >= NUMBERED_PAIRS_MIN:
+            return guess
+    left, right = ([name for name, key in named.items() if key.side == side] for side in CAMERAS)
+    return _in_order((left, right)) if len(left) == len(right) >= NUMBERED_PAIRS_MIN else {}
+
+
+def _in_order(groups: Sequence[Sequence[str]]) -> dict[str, Key]:
+    """Pair the first picture of the left camera with the first of the right one."""
+    views = [Path(name).stem for name in groups[0]]
+    views = views if len(set(views)) == len(views) else [f"pair {k}" for k in range(1, len(views) + 1)]
+    return {
+        name: Key(view, side)
+        for side, names in zip(CAMERAS, groups, strict=True)
+        for view, name in zip(views, names, strict=True)
+    }
+
+
+def _question(folder: Path, guessed: Named, wide: bool = False) -> InputError:
+    """The question which pictures are the left camera's, with the patterns that answer it."""
+    cameras = Counter(view for view, _ in {key[:2] for key in guessed.values()})
+    complete = {name: key for name, key in guessed.items() if wide or cameras[key.view] == 2}
+    groups = [[name for name, key in complete.items() if key.side == side] for side in CAMERAS]
+    globs = [_glob(folder, own) for own in groups]
+    first = [escaped(own[0], 80) if own else "none" for own in groups]
+    answers = [
+        Candidate(f"{first[k]} is the left camera's", ("--left", globs[k], "--right", globs[1 - k])) for k in (0, 1)
+    ]
+    found = f"names that do not say which camera took {first[0]} and which {first[1]}, or which belong together"
+    if wide:
+        found = f"{first[0]} and {first[1]}, twice as wide as high: of two cameras each, or of one"
+        pattern = f"**/*{Path(first[0]).suffix}"
+        both = Candidate("each holds the images of both", ("--left", pattern, "--right", pattern))
+        answers = [both, answers[0]]
+    allowed = f"{NAMING}; or patterns of both cameras, whose pictures then pair in the order of their names"
+    return question(file=escaped(str(folder), 200), found=found, allowed=allowed, candidates=answers)
+
+
+def _glob(folder: Path, names: Sequence[str]) -> str:
+    """A pattern of some pictures below a folder; a word to fill in where none fits."""
+
+    def common(texts: Sequence[str]) -> str:
+        return "".join(letters[0] for letters in takewhile(lambda own: len({*own}) == 1, zip(*texts, strict=False)))
+
+    files = [name.rpartition("/")[2] for name in names]
+    before, after = common(files), common([name[::-1] for name in files])[::-1]
+    folders = {name.rpartition("/")[0] for name in names}
+    pattern = "/".join([*folders, f"{before}*{after}"]).removeprefix("/") if len(folders) == 1 else "PATTERN"
+    matched = {path.relative_to(folder).as_posix() for path in folder.glob(pattern)}
+    return pattern if matched == {*names} else "PATTERN"
 
 
 def _stated_pairs(folder: Path, pairing: Pairing, most: int, refuse: Callable[..., InputError]) -> list[Picture]:
     """Pair pictures in the order of their names, the first of one camera with the first of the other.
 
-    The cameras are those of two patterns, else of two folders, else of the names.
+    The cameras are those of two patterns, else of the names, else of two folders. One pattern for both says that each
+    picture holds both.
     """
     if pairing.globs is not None:
         # A pattern that leaves the folder matches nothing.
         inside = [glob for glob in pairing.globs if not Path(glob).is_absolute() and ".." not in Path(glob).parts]
         matches = [[p.relative_to(folder).as_posix() for p in folder.glob(glob) if p.is_file()] for glob in inside]
         groups = [sorted(names, key=natural_order) for names in matches]
+        if pairing.globs[0] == pairing.globs[1] and groups and groups[0]:
+            return [Picture(_stem(name), folder / name, pairing.sides) for name in groups[0]]
     else:
-        names = sorted((n for n in _names(folder) if n.lower().endswith(SUFFIXES)), key=natural_order)
-        stems = [name[: name.rindex(".")] for name in names]
-        by_name = ([_by_words(stem) for stem in stems], [_by_letter(stem) for stem in stems])
-        keys = next((keys for keys in by_name if any(keys)), _by_folder(stems, pairing.sides))
-        groups = list(_by_side(names, keys).values())
+        names = sorted((n for n in file_names(folder) if n.lower().endswith(SUFFIXES)), key=natural_order)
+        named: Mapping[str, Key] = named_cameras(names, pairing.sides)
+        folders = sorted({name.rpartition("/")[0] for name in names}, key=natural_order)
+        if not named and len(folders) == 2:
+            of_folder = dict(zip(folders, pairing.sides, strict=True))
+            named = {name: Key(name, of_folder[name.rpartition("/")[0]]) for name in names}
+        groups = [[name for name, key in named.items() if key.side == side] for side in CAMERAS]
     counts = [len(group) for group in groups]
     if len(groups) < 2 or not all(counts):
         found = f"{' and '.join(str(count) for count in counts) or 'no'} pictures of the left and the right camera"
@@ -285,87 +520,4 @@ def _stated_pairs(folder: Path, pairing: Pairing, most: int, refuse: Callable[..
         found, allowed = f"{counts[0]} left and {counts[1]} right pictures", f"as many of both, together {most} at most"
         remedy = "take out those without their counterpart: pictures are paired by their order"
         raise refuse("size", found=found, allowed=allowed, remedy=remedy)
-    return _in_order(folder, groups)
-
-
-def _by_side(names: Sequence[str], keys: Sequence[_Key | None]) -> dict[str, list[str]]:
-    """Names of each camera."""
-    sided = [(name, key[1]) for name, key in zip(names, keys, strict=True) if key is not None]
-    return {side: [name for name, camera in sided if camera == side] for side in CAMERAS}
-
-
-def _in_order(folder: Path, groups: Sequence[Sequence[str]]) -> list[Picture]:
-    """Pair the first picture of the left camera with the first of the right one."""
-    views = [_view_name(Path(name).stem) for name in groups[0]]
-    views = views if len(set(views)) == len(views) else [f"pair {k}" for k in range(1, len(views) + 1)]
-    return [
-        Picture(view, folder / name, (side,))
-        for side, names in zip(CAMERAS, groups, strict=True)
-        for view, name in zip(views, names, strict=True)
-    ]
-
-
-def _paired_by_marks(folder: Path, images: Sequence[str], numbered: tuple[str, str]) -> list[Picture]:
-    """The pictures with a side, by the first method whose names form pairs; `numbered` are the sides of 0 and 1.
-
-    Where sides are known but no names match (times, for example), pictures are paired in order.
-    """
-    stems = [name[: name.rindex(".")] for name in images]
-    by_name = [[_by_words(stem) for stem in stems], [_by_letter(stem) for stem in stems]]
-    methods = [
-        *((keys, 1) for keys in by_name),
-        *((_by_number(stems, pattern, numbered), NUMBERED_PAIRS_MIN) for pattern in _NUMBERS),
-        (_by_folder(stems, numbered), NUMBERED_PAIRS_MIN),
-    ]
-    for keys, pairs_min in methods:
-        sided = [(key, name) for key, name in zip(keys, images, strict=True) if key is not None]
-        pictures_of_view = Counter(view for view, _ in {key for key, _ in sided})
-        if sum(count == 2 for count in pictures_of_view.values()) >= pairs_min:
-            return [Picture(_view_name(view), folder / name, (side,)) for (view, side), name in sided]
-    for keys in by_name:
-        left, right = _by_side(images, keys).values()
-        if len(left) == len(right) >= NUMBERED_PAIRS_MIN:
-            return _in_order(folder, (left, right))
-    return []
-
-
-def _view_name(key: str) -> str:
-    """The name of a view: the common part of the names of its pictures."""
-    return re.sub(r"\*+", "", key).strip("/_- ") or key
-
-
-def _key(stem: str, pattern: re.Pattern[str]) -> _Key | None:
-    """The stem without its marks, and their side; None for no side or both."""
-    sides = {_SIDES[match.group().lower()] for match in pattern.finditer(stem)}
-    return (pattern.sub("*", stem), sides.pop()) if len(sides) == 1 else None
-
-
-def _by_words(stem: str) -> _Key | None:
-    key = _key(stem, _WORDS)
-    # Names such as stereoLeft/imageL0 have two marks.
-    return None if key is None else (_LETTERS.sub("*", key[0]), key[1])
-
-
-def _by_letter(stem: str) -> _Key | None:
-    return _key(stem, _LETTERS)
-
-
-def _by_number(stems: Sequence[str], pattern: re.Pattern[str], sides: tuple[str, str]) -> list[_Key | None]:
-    """Sides by the last number that matches a pattern, where exactly two such numbers exist."""
-    last = [next(reversed(list(pattern.finditer(stem))), None) for stem in stems]
-    numbers = sorted({int(match[1]) for match in last if match is not None})
-    if len(numbers) != 2:
-        return [None] * len(stems)
-    return [
-        None if m is None else (f"{stem[: m.start()]}*{stem[m.end() :]}", sides[numbers.index(int(m[1]))])
-        for stem, m in zip(stems, last, strict=True)
-    ]
-
-
-def _by_folder(stems: Sequence[str], sides: tuple[str, str]) -> list[_Key | None]:
-    """Sides by the folder, where exactly two exist; equal names in both form a pair."""
-    parts = [stem.rpartition("/") for stem in stems]
-    folders = sorted({folder for folder, _, _ in parts}, key=natural_order)
-    if len(folders) != 2:
-        return [None] * len(stems)
-    return [(name, sides[folders.index(folder)]) for folder, _, name in parts]
+    return _pictures(folder, _in_order(groups))

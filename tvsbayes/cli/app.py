@@ -96,12 +96,13 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 def error_document(error: TvsError) -> dict[str, Any]:
     """The JSON document of an error."""
-    fields = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
+    fields: dict[str, Any] = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
     fields |= {"message": error.message, "found": error.found, "allowed": error.allowed, "remedy": error.remedy}
     if isinstance(error, Question):
+        answers = zip(error.candidates, error.commands, strict=False)
         fields["candidates"] = [
-            {"says": c.says, "first": {name: list(cells) for name, cells in c.first.items()}, "command": command}
-            for c, command in zip(error.candidates, error.commands or [None] * len(error.candidates), strict=True)
+            {"says": answer.says, "command": command, "first": {k: list(v) for k, v in answer.first.items()}}
+            for answer, command in answers
         ]
     return {"error": fields}
 

@@ -46,13 +46,19 @@ def new(
         str | None, typer.Option("--pair", help="number: in the name, that of the move; order: of the names.")
     ] = None,
     swap: Annotated[bool, typer.Option("--swap", help="Wide pictures hold the left camera's on the right.")] = False,
+    left: Annotated[
+        str | None, typer.Option("--left", help='Pictures of the left camera: "a/*.png"; as --right: side by side.')
+    ] = None,
+    right: Annotated[str | None, typer.Option("--right", help="Likewise of the right camera.")] = None,
     as_json: Json = False,
 ) -> None:
     """An empty campaign, explained in campaign.toml, and a rig file. With --pictures: its looks and their frames."""
     from tvsbayes.instrument.campaign import campaign_templates
 
     if pictures is None:
-        refuse_options("for pictures", "add --pictures FOLDER, or leave it out", pair=pair, swap=swap)
+        refuse_options(
+            "for pictures", "add --pictures FOLDER, or leave it out", pair=pair, swap=swap, left=left, right=right
+        )
     check_word("--mechanism", mechanism, WORDS, "name one of them")
     is_head = mechanism != WORDS[0]
     if sightings and not is_head:
@@ -70,7 +76,7 @@ def new(
         write_new(out, head_templates(sightings), f"{tables}, then `tvsbayes check` this folder", as_json)
         return
     if pictures is not None:
-        _with_pictures(out, pictures, pair, swap, as_json)
+        _with_pictures(out, pictures, pair, swap, stated_globs(left, right, swap), as_json)
         return
     next_steps = (
         "put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder\n"
@@ -80,7 +86,21 @@ def new(
     write_new(out, campaign_templates(), next_steps, as_json)
 
 
-def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_json: bool) -> None:
+def stated_globs(left: str | None, right: str | None, swap: bool) -> tuple[str, str] | None:
+    """The patterns of both cameras, as --left and --right state them."""
+    if (left is None) != (right is None):
+        remedy = 'give both: --left "cam_a/*.png" --right "cam_b/*.png"'
+        raise InputError("usage", "--left and --right: one of both is missing", remedy=remedy)
+    if left is None or right is None:
+        return None
+    if left != right:
+        refuse_options("of no use beside --left and --right", "leave it out, or exchange them", swap=swap)
+    return left, right
+
+
+def _with_pictures(
+    out: Path, folder: Path, pair: str | None, swap: bool, globs: tuple[str, str] | None, as_json: bool
+) -> None:
     """Add looks and frames of a folder of pictures to a new campaign or one without pictures."""
     from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
     from tvsbayes.instrument.campaign import campaign_templates, spots_bytes
@@ -88,7 +108,7 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     check_word("--pair", pair, ("number", "order"), "write --pair number or --pair order, or leave it out")
     moves_path = moves_file(out, folder)
     rows = _rows_of(out)
-    views = views_of(folder, swap=swap)
+    views = views_of(folder, swap=swap, globs=globs)
     moves = _moves_of(moves_path)
     numbers = None if moves_path is None else range(len(moves))
     paired = pair_looks(views.views, numbers, rows, pair)  # type: ignore[arg-type]
@@ -186,7 +206,7 @@ def _paired_text(
     method = "the number in the name" if pairs.matching == "number" else "the order of the names"
     lines = [f"{place}: {copied} pictures in frames/, {len(pairs.pictures)} looks in spots.csv, paired by {method}"]
     if first is not None:
-        left, right = (escaped(picture.path.name) for picture in first[1].pictures)
+        left, right = ("/".join(map(escaped, picture.path.parts[-2:])) for picture in first[1].pictures)
         move = next(spot.move for spot in pairs.spots if spot.spot == first[0])
         names = left if left == right else f"{left} and {right}"
         arrival = moves[move] if move < len(moves) else None
@@ -213,12 +233,16 @@ def _unpaired_lines(views: ViewedFolder, pairs: PairedLooks, rows: str) -> list[
     """Unpaired files and rows, a line for each kind."""
     files = {
         "without the picture of the other camera": views.unpaired,
-        "no camera in the name": views.unnamed,
+        "no camera in the name, or in a folder below the pairs": views.unnamed,
         f"not of {_sizes_px(views.image_sizes)} as most": views.other_size,
         "of a kind that is not read; save them as PNG of 8 bits": views.unread,
         "a second pair for its row": pairs.left_over,
     }
-    lines = [f"{first_names(names)}: {reason}" for reason, names in files.items() if names]
+    lines = [
+        f"{len(names)} files: " * (len(names) > 1) + f"{first_names(names)}: {reason}"
+        for reason, names in files.items()
+        if names
+    ]
     if pairs.without:
         lines.append(f"{rows} {listed(pairs.without, NAMES_LISTED)}: no pictures, which they need not have")
     return lines

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tvsbayes.cli.app import Json, finish, finite, missing_options, option_of, refuse_options, report_line
+from tvsbayes.cli.begin_commands import stated_globs
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
@@ -146,12 +147,8 @@ def _pairing(pair: str | None, left: str | None, right: str | None, swap: bool) 
     """The camera of each picture, by the options."""
     from tvsbayes.cameras.picture_pairs import Pairing
 
-    if (left is None) != (right is None):
-        remedy = 'give both: --left "cam_a/*.png" --right "cam_b/*.png"'
-        raise InputError("usage", "--left and --right: one of both is missing", remedy=remedy)
-    if left is not None and right is not None:
-        refuse_options("of no use beside --left and --right", "leave it out, or exchange them", swap=swap)
-        return Pairing(globs=(left, right), in_order=True)
+    if globs := stated_globs(left, right, swap):
+        return Pairing(swap, globs, in_order=True)
     return Pairing(swap=swap, in_order=pair == "order")
 
 

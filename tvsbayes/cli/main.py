@@ -42,7 +42,7 @@ from tvsbayes.cli.report_commands import calibrate, report
 from tvsbayes.cli.use_commands import locate, plan, steps_for, study
 from tvsbayes.cli.view_command import view
 from tvsbayes.cli.watch_command import watch
-from tvsbayes.errors import InputError, TvsError
+from tvsbayes.errors import InputError, Question, TvsError
 
 COMMANDS = (
     *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor, export),
@@ -78,6 +78,8 @@ def _run(arguments: list[str]) -> int:
         # Typer returns the code of its own Exit, into which it also turns Ctrl-C; commands return None.
         code = _commands()(arguments, prog_name="tvsbayes", standalone_mode=False) or 0
     except TvsError as error:
+        if isinstance(error, Question):
+            error = error.asked_by(["tvsbayes", *arguments])
         if wants_json:
             print_json(error_document(error))
         else:

@@ -266,6 +266,7 @@ def detection_text(detection: Detection) -> str:
         for side, gaps in detection.lines.items()
         for gap in gaps
     ]
+    lines += [f"warning: {text}" for text in detection.warnings]
     return terminal(table, f"method {detection.method}; {sd}noise: {noise}", *lines)
 
 

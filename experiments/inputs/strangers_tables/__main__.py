@@ -2,12 +2,13 @@
 
     python -m experiments.inputs.strangers_tables --n 2000 > experiments/inputs/strangers_tables/README.md
     python -m experiments.inputs.strangers_tables --seed 17 --show        # one table, its truth, what became of it
+    python -m experiments.inputs.strangers_tables --seed 17 --write DIR   # the file alone
 
-Table number i of 2000 is drawn by `numpy.random.default_rng(i)`: kind, language, names, units, layout, separators,
-encoding, further columns; its truth is the axis, what was read of it, in which order, in which unit and with which u.
-`import FILE --axis --to OUT --yes` (`--sightings` for a head) runs without a further option, and the folder must hold the
-truth to the last digit written. Where `import` asks instead (exit 2), the command lines that its question prints are
-run, and one of them must give the right folder. Tables that are wrong in silence go to `experiments/output`.
+Table i is drawn by `numpy.random.default_rng(i)`: kind, language, names, units, layout, separators, encoding, further
+columns. Its truth is what was read of an axis or a head, in which order, from which side, in which unit and with which
+u. `import FILE --axis --to OUT --yes` (`--sightings` for a head) runs without a further option, and the folder must
+hold the truth to the last digit written. Where `import` asks instead (exit 2), the command lines that its question
+prints are run, and one of them must give the right folder. Files that are wrong in silence go to `experiments/output`.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import parser
-from experiments.common.page import table
+from experiments.common.page import share, table
 from experiments.common.rows import ROOT
-from experiments.inputs.strangers_tables import kinds, logs, runs
+from experiments.inputs.strangers_tables import kinds, logs, runs, sheets
 from experiments.inputs.strangers_tables.judge import Verdict, judge
 from experiments.inputs.strangers_tables.kinds import Drawn
 from experiments.inputs.strangers_tables.measured import pick
@@ -36,6 +37,12 @@ DRAWS = {
 }
 """Weights of the kinds."""
 WORDS = ("right", "guessed", "asked", "unanswered", "refused", "crash", "wrong")
+
+EXPLAINED = (
+    "A careful reader reads a table (*right*), may ask where the order of runs, the unit or a further column that\n"
+    "follows the commands leaves it open (*either*), or has to (*ask*). *guessed*: right by luck, where it had to\n"
+    "ask; *unanswered*: no command that the question prints gives the right folder; *refused*: it prints none."
+)
 
 
 def drawn_table(seed: int) -> Drawn:
@@ -57,63 +64,77 @@ def show(seed: int) -> None:
     """Print a table, the truth and the verdict."""
     drawn, verdict = judged(seed)
     print(f"{seed}: {drawn.kind}; {drawn.file.name}; {' '.join(drawn.words)}")
-    data = drawn.file.data
-    for encoding in ("utf-16" if data[:1] in b"\xff\xfe" else "utf-8-sig", "cp1252") if data[:2] != b"PK" else ():
-        try:
-            print("\n".join(data.decode(encoding).splitlines()[:30]))
-            break
-        except UnicodeError:
-            continue
-    else:
-        import io
-
-        import openpyxl
-
-        for row in list(openpyxl.load_workbook(io.BytesIO(data)).active.values)[:30]:
-            print(row)
+    print("\n".join(sheets.lines_of(drawn.file)[:30]))
     truth = drawn.truth
-    print(f"truth: {len(truth.readings)} readings in {truth.unit}, commands in {truth.command_unit}, {truth.answer}")
+    print(f"truth: {len(truth.readings)} readings in {truth.unit}, commands in {truth.command_unit}: {truth.answer}")
     print(*truth.readings[:4], sep="\n")
     print(verdict)
 
 
-def page(first: int, n: int) -> None:
-    """Judge tables and print the page; those wrong in silence go to the folder of outputs."""
-    counts: dict[tuple[str, str], Counter] = defaultdict(Counter)
-    wrong: dict[tuple[str, str], list[int]] = defaultdict(list)
-    questions: Counter = Counter()
-    for seed in range(first, first + n):
-        drawn, verdict = judged(seed)
-        counts[drawn.kind, drawn.truth.answer][verdict.word] += 1
-        if verdict.word in ("wrong", "crash", "unanswered", "refused"):
-            wrong[verdict.word, f"{drawn.kind}: {verdict.why or verdict.question[:90]}"].append(seed)
-        if verdict.word == "wrong":
+class Tally:
+    """What became of many tables."""
+
+    def __init__(self) -> None:
+        self.counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+        self.reasons: dict[tuple[str, str], list[int]] = defaultdict(list)
+        self.questions: Counter[tuple[str, str]] = Counter()
+
+    def add(self, seed: int, drawn: Drawn, verdict: Verdict) -> None:
+        """Count a table; keep the file of one that is wrong in silence."""
+        self.counts[drawn.kind, drawn.truth.answer][verdict.word] += 1
+        if verdict.word in ("wrong", "crash"):
+            self.reasons[f"{verdict.word}: {verdict.why}", drawn.kind].append(seed)
             OUTPUT.mkdir(parents=True, exist_ok=True)
-            (OUTPUT / f"{seed}-{drawn.file.name}").write_bytes(drawn.file.data)
-        if verdict.question:
-            questions[drawn.kind, verdict.question.split(":")[0], verdict.word] += 1
-    rows = [
-        (kind, answer, counts[kind, answer].total(), *(counts[kind, answer][w] or "" for w in WORDS))
-        for kind, answer in sorted(counts)
-    ]
-    print("# Tables of strangers\n")
-    print(table(("kind", "careful answer", "drawn", *WORDS), rows))
-    clear = sum((c for (_, answer), c in counts.items() if answer == "right"), Counter())
-    print(
-        f"\nclear tables: {clear['right']} of {clear.total()} right without an option; {clear['wrong']} wrong in silence"
-    )
-    for (word, why), seeds in sorted(wrong.items(), key=lambda item: (item[0][0], -len(item[1]))):
-        print(f"- {word}: {why}: {len(seeds)}: {' '.join(map(str, seeds[:12]))}")
+            (OUTPUT / f"{seed}-{drawn.file.name.replace('.md', '.txt')}").write_bytes(drawn.file.data)
+        elif verdict.question:
+            self.questions[verdict.question, drawn.kind] += 1
+
+    def of(self, *answers: str) -> Counter[str]:
+        """Counts of the tables whose careful answer is one of these."""
+        return sum((c for (_, answer), c in self.counts.items() if answer in answers), Counter())
+
+    def page(self) -> None:
+        """Print it."""
+        every, clear = self.of("right", "either", "ask"), self.of("right")
+        print("# Tables of strangers\n\n`python -m experiments.inputs.strangers_tables`\n")
+        found = every["asked"] + every["right"] + every["guessed"]
+        print(
+            f"{every.total()} drawn tables: {every['wrong']} wrong in silence. Of {clear.total()} that state reading, "
+            f"unit and order {share(clear['right'], clear.total())} are right without an option. {found} are right at "
+            f"once, or by a command that the question prints.\n\n{EXPLAINED}\n"
+        )
+        rows = [(k, a, c.total(), *(c[word] or "" for word in WORDS)) for (k, a), c in sorted(self.counts.items())]
+        print(table(("kind", "careful", "drawn", *WORDS), rows))
+        if self.questions:
+            print("\n## What was asked\n")
+            print(table(("question", "kind", "tables"), [(*key, n) for key, n in self.questions.most_common()]))
+        if self.reasons:
+            print("\n## What was wrong\n")
+            rows = [(*key, len(s), " ".join(map(str, s[:8]))) for key, s in sorted(self.reasons.items())]
+            print(table(("reason", "kind", "tables", "numbers"), rows))
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Read the command line, and carry it out."""
     cli = parser(__doc__)
     cli.add_argument("--n", type=int, default=2000, help="how many tables (%(default)s)")
     cli.add_argument("--first", type=int, default=0, help="number of the first (%(default)s)")
     cli.add_argument("--seed", type=int, help="this table alone")
-    cli.add_argument("--show", action="store_true", help="print it, with its truth")
+    cli.add_argument("--show", action="store_true", help="print it, with its truth (what --seed does anyway)")
+    cli.add_argument("--write", type=Path, metavar="DIR", help="write the file of --seed into a folder")
     arguments = cli.parse_args()
-    if arguments.seed is not None:
-        show(arguments.seed)
+    if arguments.seed is None:
+        tally = Tally()
+        for seed in range(arguments.first, arguments.first + arguments.n):
+            tally.add(seed, *judged(seed))
+        tally.page()
+    elif arguments.write:
+        file = drawn_table(arguments.seed).file
+        arguments.write.mkdir(parents=True, exist_ok=True)
+        (arguments.write / file.name).write_bytes(file.data)
     else:
-        page(arguments.first, arguments.n)
+        show(arguments.seed)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Is the folder that `import` writes what the table says? Are its questions answered by the commands that they print?"""
+"""Is the folder that `import` writes what the table says, and do the commands that its questions print answer them?"""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import shlex
 import shutil
 import tomllib
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,8 @@ SPELLED = {
     "rev": "turn",
     "turns": "turn",
     "counts": "count",
+    **{"0.01 mm": "1/100 mm", "0.001 mm": "1/1000 mm", "\u00b0": "deg", "degree": "deg"},
 }
-SPELLED |= {"0.01 mm": "1/100 mm", "0.001 mm": "1/1000 mm", "\u00b0": "deg", "degree": "deg"}
 """Units as a folder may spell them."""
 ANSWERS_MAX, DEPTH_MAX = 12, 3
 """Of one question, and questions that follow each other."""
@@ -159,7 +160,7 @@ def in_order(truth: Truth, told: Sequence[Reading]) -> str:
             return wrong
         segment = reading.segment
     if truth.segments == "exact" and truth.kept is None:
-        changes = [[b.segment != a.segment for a, b in zip(r, r[1:], strict=False)] for r in (truth.readings, told)]
+        changes = [[b.segment != a.segment for a, b in pairwise(r)] for r in (truth.readings, told)]
         if changes[0] != changes[1]:
             return "homings"
     return times(truth, pairs)
@@ -170,9 +171,10 @@ def _one(truth: Truth, expected: Reading, reading: Reading) -> str:
     tolerance = 0.6 * truth.digit + 1e-9 * abs(expected.value)
     if expected.pair is not None:
         turn = (reading.value - expected.value + 180) % 360 - 180
-        counters = reading.pair is not None and reading.pair[:2] == expected.pair[:2]
-        if not counters or abs(turn) > tolerance or abs(reading.pair[2] - expected.pair[2]) > tolerance:
-            return "counters" if not counters else f"angles{_power(reading.value, expected.value)}"
+        if reading.pair is None or reading.pair[:2] != expected.pair[:2]:
+            return "counters"
+        if abs(turn) > tolerance or abs(reading.pair[2] - expected.pair[2]) > tolerance:
+            return f"angles{_power(reading.value, expected.value)}"
         # Without a column the importer states its default.
         return "u" if expected.u and abs(reading.u - expected.u) > 0.03 * expected.u else ""
     if abs(reading.command - expected.command) > 1e-9 * max(1.0, abs(expected.command)):
@@ -201,7 +203,7 @@ def by_stops(truth: Truth, told: Sequence[Reading]) -> str:
         while True:
             stop = truth.readings[number] if number >= 0 else None
             same = stop is not None and abs(reading.command - stop.command) < 1e-6
-            if same and abs(reading.value - stop.value) <= truth.spread:
+            if stop is not None and same and abs(reading.value - stop.value) <= truth.spread:
                 if reading.side != stop.side and stop.side:
                     return "side"
                 seen.add(number)
@@ -290,6 +292,13 @@ def answered(error: dict[str, Any], line: Sequence[str], out: Path, truth: Truth
     return bool(lines), False
 
 
+def asked(error: dict[str, Any]) -> str:
+    """What is asked, in short: the names of the questions, else the code of the refusal."""
+    questions = [q for q in error.get("questions") or () if isinstance(q, dict)]
+    names = [str(q.get("about") or q.get("name") or q.get("code") or q.get("question")) for q in questions]
+    return ", ".join(dict.fromkeys(names)) or str(error.get("code"))
+
+
 def judge(drawn: Drawn, folder: Path) -> Verdict:
     """Import a drawn table without an option, and compare; answer what is asked."""
     path, out = folder / drawn.file.name, folder / "out"
@@ -306,6 +315,6 @@ def judge(drawn: Drawn, folder: Path) -> Verdict:
             return Verdict("wrong", "a unit that nobody knows is replaced in silence")
         return Verdict("guessed" if drawn.truth.answer == "ask" else "right")
     error = document.get("error", {})
-    question = f"{error.get('code')}: {error.get('message', '')}".replace(str(folder), "")[:300]
+    question = asked(error)
     has, right = answered(error, line, out, drawn.truth)
     return Verdict("asked" if right else "unanswered" if has else "refused", question=question)

@@ -6,7 +6,7 @@ import datetime
 from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def read_all(rng: np.random.Generator, axis: Axis, sweep: Sweep) -> tuple[list[D
     return values, readings
 
 
-def truth_of(axis: Axis, readings: Sequence[Reading], **more: object) -> Truth:
+def truth_of(axis: Axis, readings: Sequence[Reading], **more: Any) -> Truth:
     """The truth of an axis read in its own units."""
     command_unit = axis.command_unit
     return replace(
@@ -123,7 +123,8 @@ def long_sheet(rng: np.random.Generator, axis: Axis, language: str) -> tuple[She
     stated = chance(rng, 0.5)
     sweep = sweeps(rng, axis.commands, stated)
     values, readings = read_all(rng, axis, sweep)
-    count, more = len(readings), {}
+    count = len(readings)
+    more: dict[str, Sequence[Cell]] = {}
     columns: dict[str, Sequence[Cell]] = {}
     truth = truth_of(axis, readings)
     if chance(rng, 0.25):

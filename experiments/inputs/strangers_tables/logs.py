@@ -14,6 +14,7 @@ from experiments.inputs.strangers_tables.kinds import START, Drawn, command_name
 from experiments.inputs.strangers_tables.measured import (
     ANGLE,
     ASCII,
+    Answer,
     Axis,
     Reading,
     Sweep,
@@ -240,7 +241,7 @@ def camonitor(rng: np.random.Generator, language: str) -> Drawn:
             lines.append(f"{record + name:<30} {moment.isoformat(' ', timespec='microseconds')} {cell}  ")
     # The time of a folder goes on; where a clock steps, nobody knows by how much to the second.
     readings = [r._replace(time_s=every * k) for k, r in enumerate(readings)]
-    tolerance_s = 0.1 * readings[-1].time_s + every
+    tolerance_s = (0.1 * len(readings) + 1) * every
     truth = truth_of(
         axis, readings, unit=None, command_unit=None, clock=tolerance_s, answer="either", kept=len(readings) - 2
     )
@@ -287,7 +288,7 @@ def sightings(rng: np.random.Generator, language: str) -> Drawn:
     )
     digit = 10.0**-digits * ANGLE[unit]
     # Degrees are what all take an angle for; radians are not told from them by a reader that does not ask.
-    answer = "right" if named else "either" if unit == "deg" else "ask"
+    answer: Answer = "right" if named else "either" if unit == "deg" else "ask"
     truth = Truth(readings, "deg", None, digit, answer, ratio=ratio)
     kind = "sightings" if named else f"sightings without a unit, {'degrees' if unit == 'deg' else 'others'}"
     file = sheets.any_file(rng, sheets.columns_sheet(columns, language))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
@@ -9,18 +10,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-LENGTH = {"nm": 1e-6, "um": 1e-3, "1/1000 mm": 1e-3, "1/100 mm": 0.01, "thou": 0.0254, "mm": 1.0, "cm": 10.0}
-LENGTH |= {"inch": 25.4}
+LENGTH = {
+    **{"nm": 1e-6, "um": 1e-3, "1/1000 mm": 1e-3, "1/100 mm": 0.01, "thou": 0.0254, "mm": 1.0, "cm": 10.0},
+    "inch": 25.4,
+}
 """In mm."""
 ANGLE = {
-    "urad": np.degrees(1e-6),
-    "arcsec": 1 / 3600,
-    "mrad": np.degrees(1e-3),
-    "arcmin": 1 / 60,
-    "gon": 0.9,
-    "deg": 1.0,
+    **{"urad": math.degrees(1e-6), "arcsec": 1 / 3600, "mrad": math.degrees(1e-3), "arcmin": 1 / 60, "gon": 0.9},
+    **{"deg": 1.0, "rad": math.degrees(1.0), "turn": 360.0},
 }
-ANGLE |= {"rad": np.degrees(1.0), "turn": 360.0}
 """In degrees."""
 SCALE = {**LENGTH, **ANGLE, "count": 1.0, "step": 1.0}
 DOMAIN = {**dict.fromkeys(LENGTH, "mm"), **dict.fromkeys(ANGLE, "deg"), "count": "count", "step": "step"}
@@ -62,8 +60,10 @@ ASCII = {
 }
 """What follows an underscore."""
 UNKNOWN_UNITS = ("div", "Skt", "Teilstriche", "parts", "divisions", "LSB", "Skalenteile", "ticks of dial", "puntos")
-DIGITS = {"nm": 0, "um": 1, "1/1000 mm": 1, "1/100 mm": 1, "thou": 2, "mm": 4, "cm": 5, "inch": 5, "urad": 1}
-DIGITS |= {"arcsec": 1, "mrad": 3, "arcmin": 3, "gon": 4, "deg": 4, "rad": 6, "turn": 6, "count": 0, "step": 0}
+DIGITS = {
+    **{"nm": 0, "um": 1, "1/1000 mm": 1, "1/100 mm": 1, "thou": 2, "mm": 4, "cm": 5, "inch": 5, "urad": 1},
+    **{"arcsec": 1, "mrad": 3, "arcmin": 3, "gon": 4, "deg": 4, "rad": 6, "turn": 6, "count": 0, "step": 0},
+}
 """Decimals that suit a reading of some micrometres, or of some arc seconds."""
 
 
@@ -189,7 +189,7 @@ def draw_axis(
     count = int(rng.integers(5, 15))
     if rotary:
         unit = unit or pick(rng, ("deg", "deg", "deg", "arcmin", "gon", "mrad", "rad", "turn", "arcsec"))
-        others = ("step", "step", "deg", "deg", "deg", "gon", "mrad")
+        others: tuple[str, ...] = ("step", "step", "deg", "deg", "deg", "gon", "mrad")
         # Below a turn, so that nothing wraps.
         travel_deg = pick(rng, (20.0, 30.0, 60.0, 90.0, 180.0)) * (0.02 if unit == "arcsec" else 1.0)
         play_deg, scatter_deg = rng.uniform(0.03, 0.15), rng.uniform(0.001, 0.004)

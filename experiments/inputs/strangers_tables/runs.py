@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -154,7 +154,7 @@ def deviations_of(runs: Runs, unit: str) -> list[list[Decimal]]:
     ]
 
 
-def in_positions(runs: Runs, errors: Sequence[Sequence[Decimal]], unit: str, **more: object) -> Truth:
+def in_positions(runs: Runs, errors: Sequence[Sequence[Decimal]], unit: str, **more: Any) -> Truth:
     """The truth of deviations: command plus deviation, in the unit of the commands."""
     axis = runs.axis
     shift = SCALE[unit] / SCALE[axis.command_unit]

@@ -116,8 +116,7 @@ def markdown(rng: np.random.Generator, sheet: Sheet) -> File:
     lines = [names, [rule] * len(names), *([number(cell, ".") for cell in row] for row in sheet.rows)]
     text = "\n".join(left + " | ".join(cells) + right for cells in lines) + "\n"
     title = "# Measurements\n\nTable 1, first day.\n\n" if chance(rng, 0.4) else ""
-    after = "\nMean values follow on the next page.\n" if chance(rng, 0.0) else ""
-    return File("report.md", encoded(rng, title + text + after))
+    return File("report.md", encoded(rng, title + text))
 
 
 def any_file(rng: np.random.Generator, sheet: Sheet, markdowns: bool = True) -> File:
@@ -130,3 +129,20 @@ def any_file(rng: np.random.Generator, sheet: Sheet, markdowns: bool = True) -> 
     if which < 0.17 and markdowns and len(sheet.heads) == 1:
         return markdown(rng, sheet)
     return text_file(rng, sheet)
+
+
+def lines_of(file: File) -> list[str]:
+    """A file for people to look at."""
+    data = file.data
+    if data.startswith(b"PK"):
+        import openpyxl
+
+        active = openpyxl.load_workbook(io.BytesIO(data)).active
+        assert active is not None
+        return [" | ".join("" if cell is None else str(cell) for cell in row) for row in active.values]
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16").splitlines()
+    try:
+        return data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        return data.decode("cp1252").splitlines()

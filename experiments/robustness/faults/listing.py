@@ -92,6 +92,17 @@ FAULTS = (
           "test_physical_values_are_scipys_quantiles"),
     Fault("the half-normal prior has the wrong tail", "parameter_space.half_normal", Argument("z", "-value"),
           "test_physical_values_are_scipys_quantiles"),
+    # Pictures: which camera, which look.
+    Fault("directions beside up and down are taken for cameras", "named_cameras", Local("directions", "False"),
+          "test_one_direction_is_a_camera_only_without_up_and_down"),
+    Fault("a direction before an experiment is taken for the camera", "picture_pairs._marks",
+          Local("is_prefix", "False"), "test_a_direction_is_no_camera"),
+    Fault("numbers of experiments in names of pictures are taken for moves", "_are_experiments", Returns("False"),
+          "test_numbers_of_experiments_are_no_moves"),
+    Fault("pairs of pictures that are guessed are not asked about", "paired_pictures", Local("guessed", "{}"),
+          "test_names_that_do_not_decide_are_asked"),
+    Fault("pictures that are mixed up are refused without a word", "Detection.warnings", Returns("[]"),
+          "test_pictures_that_are_mixed_up_are_said"),
     # The classic estimator and its uncertainty.
     Fault("left and right of the triangulated points are exchanged", "triangulate", Local("x", "-value"),
           "test_worked_example_of_the_paper"),
