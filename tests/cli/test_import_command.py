@@ -171,7 +171,7 @@ def test_with_a_closed_standard_input_no_question_is_asked(say, table, tmp_path,
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--angles", "gon"), "deg, rad"),
+        (("--angles", "furlong"), "deg, rad"),
         (("--column", "XL"), "u_left_px=XL"),
         (("--column", "uleft=XL"), "u_left_px"),
         (("--column", "u_left_px=X"), "did you mean XL|allowed: Nr"),
@@ -246,12 +246,13 @@ def test_readings_have_the_unit_of_their_column(ask, say, tmp_path, column, unit
     assert "0, 40000" in say("check", out)[1], "counters are no powers of ten"
 
 
-@pytest.mark.parametrize(("first", "titled"), [("Leadscrew test,,", True), ("steps,foo,bar", False)])
-def test_a_title_where_names_should_stand_is_called_one(ask, tmp_path, first, titled):
+@pytest.mark.parametrize(("first", "names"), [("Leadscrew test,,", "column 1"), ("steps,foo,bar", "foo")])
+def test_a_title_holds_no_names(ask, tmp_path, first, names):
     log = tmp_path / "log.csv"
-    log.write_text(f"{first}\n0,0,1\n5,1,1\n")
+    log.write_text(f"{first}\n0,0,1\n5,1,3\n")
     code, document = ask("import", log, "--axis", "--to", tmp_path / "mine")
-    assert code == 2 and ("is a title" in assert_error(document, "missing-column")["remedy"]) is titled
+    candidates = assert_error(document, "missing-column")["candidates"]
+    assert code == 2 and names in candidates[0]["first"]
 
 
 def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_path):

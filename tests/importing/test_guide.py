@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.errors import Question
 from tvsbayes.importing.guide import SIDEREAL_ARCSEC_PER_S, is_guide_log, read_runs, rows_of_run, run_rows
 
 PIXEL, DECLINATION, CALIBRATED, RATE_PX = 2.0, 40.0, 10.0, 3.0

@@ -19,7 +19,7 @@ from tvsbayes.cli.begin_commands import has_rows
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
-from tvsbayes.errors import InputError, Question, Reason, closest, escaped, refusal, typed
+from tvsbayes.errors import InputError, Reason, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
 from tvsbayes.files.disk import make_folder, read_bytes
 from tvsbayes.instrument.axes import sides_of
@@ -123,27 +123,6 @@ def import_(
     A campaign folder as FILE: a copy, corrected by the options that change its tables.
     """
     options = locals()
-    try:
-        _import(options)
-    except Question as asked:
-        raise asked.asked_by(_typed_command(options)) from None
-
-
-def _typed_command(options: Mapping[str, Any]) -> list[str]:
-    """The command line of these options, with --yes, to which an answer is added."""
-    words = ["tvsbayes", "import", str(options["file"])]
-    for name, parameter in inspect.signature(import_).parameters.items():
-        value, option = options[name], f"--{'format' if name == 'kind' else name.replace('_', '-')}"
-        if name in ("file", "as_json", "yes") or value == parameter.default:
-            continue
-        option = "--positions" if name == "deviations" and value is False else option
-        values = value if isinstance(value, list) else [value]
-        words += [option] if isinstance(value, bool) else [word for one in values for word in (option, str(one))]
-    return [*words, "--yes"]
-
-
-def _import(options: Mapping[str, Any]) -> None:
-    """Import a file by the options of `import_`."""
     from tvsbayes.instrument.corrections import Correction, flipped_axis, shift_of
     from tvsbayes.instrument.foreign_looks import SD_PX, Notation
 

@@ -79,7 +79,7 @@ def _run(arguments: list[str]) -> int:
         code = _commands()(arguments, prog_name="tvsbayes", standalone_mode=False) or 0
     except TvsError as error:
         if isinstance(error, Question):
-            error = error.asked_by(["tvsbayes", *arguments])
+            error = error.asked_by(["tvsbayes", *(word for word in arguments if word != "--json")])
         if wants_json:
             print_json(error_document(error))
         else:

@@ -308,7 +308,7 @@ def _take_value(
         taken["value"] = pool[0]
         if pool[0] in following:
             remarks.append(
-                f"value: column {escaped(pool[0])}, the only other that follows the commands; --column value= changes it"
+                f"value: column {escaped(pool[0])}, the only other following the commands; --column value= changes it"
             )
         unexplained = _set_aside(known, differences, taken, remarks)
         if unexplained and (not strong or not follows(command, known[pool[0]])):

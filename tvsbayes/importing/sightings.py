@@ -28,10 +28,12 @@ ANGLES = ("azimuth_deg", "elevation_deg")
 FIELDS = (*MOVE_FIELDS, *ANGLES, "u_deg", "status")
 """All fields that a table of sightings can have."""
 NEEDED = (*COUNTERS, *ANGLES)
-SPANS = {"rad": 2 * math.pi, "deg": 360.0, "gon": 400.0, "mrad": 2000 * math.pi, "arcmin": 21600.0, "arcsec": math.inf}
-"""Largest absolute angle in a unit, in the order in which the units are asked for."""
-ANGLE_MAX_DEG, ELEVATION_MAX_DEG = 1e6, 180.0
-U_MAX_DEG = 10.0
+TURNS_MAX = 3
+"""Turns of azimuth that a table may count."""
+UNITS_ASKED = ("mrad", "arcmin", "arcsec")
+"""Units of elevations beyond 90 deg, in the order in which they are asked for."""
+ANGLE_MAX_DEG, ELEVATION_MAX_DEG = 360.0 * TURNS_MAX, 90.0
+U_MAX_DEG = 30.0
 
 
 @dataclass(frozen=True)
@@ -225,29 +227,35 @@ def _units(
         elif unit is None and name == "u_deg":
             unit = units["azimuth_deg"]
         elif unit is None:
-            unit = stated
-            numbers = [abs(float(cell)) for cell in cells.text(name) if NUMBER.fullmatch(cell)]
-            unit = unit or units.get(ANGLES[0])
-            largest = max(numbers, default=0.0)
-            limits = [u for u, most in SPANS.items() if largest <= most]
-            if unit is None and limits[0] != "deg":
-                found = f"angles up to {largest:.4g} in column {escaped(column.name.text)}, without a unit"
-                raise _ask_angles(cells, column, found, limits)
-            if (
-                unit is not None
-                and name == ANGLES[1]
-                and largest * unit.scale > ELEVATION_MAX_DEG
-                and stated is None
-                and known[cells.columns[ANGLES[0]]].name.unit is None
-            ):
-                found = f"elevations up to {largest:.4g} in column {escaped(column.name.text)}, without a unit"
-                raise _ask_angles(cells, column, found, [u for u in limits if u not in ("rad", "deg")])
+            unit = stated or units.get(ANGLES[0])
+            possible = _possible_units(cells) if unit is None or name == ANGLES[1] else ["deg"]
+            both_unnamed = all(known[cells.columns[angle]].name.unit is None for angle in ANGLES)
+            if stated is None and both_unnamed and possible != ["deg"]:
+                raise _ask_angles(
+                    cells, column, f"angles in column {escaped(column.name.text)} without a unit", possible
+                )
             if unit is None:
                 unit = unit_named("deg")
                 assumed.append(f"angles: no unit in column {escaped(column.name.text)}, so deg; --angles says another")
         if unit is not None:
             units[name] = unit
     return units
+
+
+def _possible_units(cells: FieldCells) -> list[str]:
+    """Units in which angles without one lie within half a turn of elevation and some of azimuth; deg alone is usual.
+
+    Most elevations decide on degrees: a single one beyond 90 is a wrong cell.
+    """
+    azimuths, elevations = (
+        [abs(float(cell)) for cell in cells.text(name) if NUMBER.fullmatch(cell)] for name in ANGLES
+    )
+    if not elevations or not azimuths:
+        return ["deg"]
+    in_rad = max(elevations) <= math.pi / 2 and max(azimuths) <= 2 * math.pi * TURNS_MAX
+    in_deg = 2 * sum(e <= ELEVATION_MAX_DEG for e in elevations) > len(elevations)
+    larger = [unit for unit in UNITS_ASKED if max(elevations) * unit_named(unit).scale <= ELEVATION_MAX_DEG]
+    return ["rad", "deg"] if in_rad else ["deg"] if in_deg else larger or ["deg"]
 
 
 def _ask_angles(cells: FieldCells, column: Column, found: str, units: Sequence[str] = ("deg", "rad")):
