@@ -19,11 +19,11 @@ from experiments.common.command_line import act, parser
 from experiments.common.page import line
 from experiments.common.rows import append_row, output, read_rows
 from tvsbayes.results.records import plain
-from tvsbayes.single_axis.axis_campaign import AxisCampaign
+from tvsbayes.importing.guide import GuideRun, is_guide_log, read_runs, rows_of_run
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import summarise_axis
-from tvsbayes.single_axis.guide_log import GuideRun, is_guide_log, read_runs, readings_of_run
 from tvsbayes.single_axis.waves import WavePeriods
 
 ROWS = output(__file__, "guide_logs.jsonl")
@@ -40,14 +40,17 @@ NEAR = 0.03
 """Share of the published period within which a wave is the worm's."""
 
 
-def campaign_of(run: GuideRun, file: str) -> AxisCampaign:
+def campaign_of(run: GuideRun, runs: list[GuideRun], file: str) -> AxisCampaign:
     """What `import --axis --run N` writes."""
-    readings = readings_of_run(run, file, {})
-    if readings.drive is None or readings.drive.period_between is None:
-        raise SystemExit(f"{file}: no drive at constant rate, or too short")
-    stated = {name: AxisPrior(value, u) for name, (value, u) in readings.drive.priors.items()}
-    periods = WavePeriods((), (readings.drive.period_between,), True)
-    return AxisCampaign("arcsec", readings.moves, readings.readings, stated, {"rate": readings.drive.rate}, periods)
+    rows = rows_of_run(run, runs, file, {})
+    if "period_between" not in rows.axis:
+        raise SystemExit(f"{file}: too short a run")
+    stated = {name: AxisPrior(**rows.axis[name]) for name in ("per_command", "transmission_error")}
+    low, high = rows.axis["period_between"]
+    moves = tuple(AxisMove(**row) for row in rows.moves)
+    readings = tuple(Reading(**row) for row in rows.readings)
+    periods = WavePeriods((), ((low, high),), True)
+    return AxisCampaign("arcsec", moves, readings, stated, {"rate": rows.header["rate"]}, periods)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -55,11 +58,12 @@ def run(arguments: argparse.Namespace) -> None:
     done = {(row["file"], row["run"]) for row in read_rows(ROWS)}
     for file in sorted(arguments.folder.glob("*.txt"), reverse=True):
         text = file.read_text(encoding="utf-8", errors="replace")
-        for logged in read_runs(text, file.name) if is_guide_log(text) else ():
+        runs = read_runs(text, file.name) if is_guide_log(text) else []
+        for logged in runs:
             if len(logged.frames) < FRAMES_MIN or (file.name, logged.number) in done:
                 continue
             began = time.process_time()
-            result = fit_axis(campaign_of(logged, file.name), tier="importance")
+            result = fit_axis(campaign_of(logged, runs, file.name), tier="importance")
             summary = summarise_axis(result)
             row = {"file": file.name, "run": logged.number, "mount": logged.mount, "frames": summary.readings}
             row |= {"span_s": float(result.rows.time_s[-1] - result.rows.time_s[0]), "problems": list(summary.problems)}
