@@ -48,10 +48,6 @@ RESIDUALS_LISTED = 4096
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
 _SHOWN_LINES: set[str] = set()
 """Lines that `compile_for` has shown in this process: a command may call it several times."""
-INPUT_NAMES = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.json", "rig": "[rig]"}
-"""Names of the inputs of an estimate for the user."""
-
-
 def no_output(line: str) -> None:
     """Ignore a line: for callers without output."""
 
@@ -83,7 +79,7 @@ def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | 
     if not summary.headline_informed:
         return NothingToEstimate(
             "uninformed",
-            "the spots do not determine any effective ratio: they reduce its prior variance by less than a tenth",
+            "the looks do not determine any effective ratio: they reduce its prior variance by less than a tenth",
             remedy="observe stops before and after moves of both axes",
         )
     return None
@@ -461,11 +457,12 @@ def _why_not_stored(campaign: Campaign) -> str:
         )
     record = read_fit(path)
     hashes, stored = input_hashes(campaign), record.provenance
-    changed_inputs = [INPUT_NAMES[name] for name in INPUT_NAMES if stored.inputs.get(name) != hashes[name]]
+    files = {"moves": "moves.csv", "spots": campaign.looks_table.file, "stereo": "stereo.json", "rig": "[rig]"}
+    changed_inputs = [file for name, file in files.items() if stored.inputs.get(name) != hashes[name]]
     version = stored.versions["tvsbayes"]
     of_another = f"results/ are of tvsbayes {escaped(version, 40)}, with another model of the rig"
     is_another = version != provenance(hashes, 0).versions["tvsbayes"]
-    if is_another and changed_inputs == [INPUT_NAMES["rig"]]:
+    if is_another and changed_inputs == [files["rig"]]:
         return f"{of_another}, or of another [rig]"
     if changed_inputs:
         return f"results/ are of other {', '.join(changed_inputs)}"

@@ -399,7 +399,7 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
             "too-few-looks",
             f"{file}: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
             file=file,
-            remedy="look at more places, or detect the refused spots again",
+            remedy=looks.look_again,
         )
     watched = WatchedLooks(fit, looks)
     departures = watched.departures(seed)

@@ -311,6 +311,16 @@ class Campaign(Shown, WithStereo):
         return SPOTS if self.has_images else SIGHTINGS
 
     @property
+    def looks(self) -> str:
+        """What its looks are called: spots or sightings."""
+        return Path(self.looks_table.file).stem
+
+    @property
+    def look_again(self) -> str:
+        """What brings further usable looks, in words."""
+        return "look at more stops" + ", or detect the refused spots again" * self.has_images
+
+    @property
     def title(self) -> str:
         """The name in its header, else that of its folder; see `title_of`."""
         return title_of(self.header, self.path)
@@ -319,8 +329,7 @@ class Campaign(Shown, WithStereo):
         """Counts, and the looks with their counters."""
         ok = sum(spot.status == "ok" for spot in self.spots)
         kind = self.looks_table
-        looks = f"{len(self.spots)} {Path(kind.file).stem}"
-        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {looks} ({ok} ok)"
+        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} {self.looks} ({ok} ok)"
         counters = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
         columns = kind.required[2:]
         rows = [
