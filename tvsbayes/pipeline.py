@@ -48,6 +48,8 @@ RESIDUALS_LISTED = 4096
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
 _SHOWN_LINES: set[str] = set()
 """Lines that `compile_for` has shown in this process: a command may call it several times."""
+
+
 def no_output(line: str) -> None:
     """Ignore a line: for callers without output."""
 
@@ -418,15 +420,17 @@ def verify(
         progress: shows the progress.
 
     Raises:
-        InputError: a folder cannot be used, or there is no table or calibration of these data.
+        InputError: a folder cannot be used, the fresh readings or looks are those of the first, or there is no table or
+            calibration of these data.
         NotConverged: the fit is not accepted.
         NothingToEstimate: too few fresh readings or looks.
     """
-    from tvsbayes.instrument.campaign import Campaign
-    from tvsbayes.single_axis.axis_campaign import AxisCampaign
+    from tvsbayes.instrument.campaign import Campaign, refuse_same_looks
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_readings
 
     campaign, looks = (read_campaign(each) if isinstance(each, Path | str) else each for each in (folder, fresh))
     if isinstance(campaign, AxisCampaign) and isinstance(looks, AxisCampaign):
+        refuse_same_readings(campaign, looks)
         from tvsbayes.compensation.verification import verify_axis
 
         return verify_axis(campaign, looks, made=made, seed=seed, tell=tell, progress=progress)
@@ -436,6 +440,7 @@ def verify(
     from tvsbayes.comparison.verified_looks import accepted_calibration, verify_looks
 
     calibration = accepted_calibration(campaign)
+    refuse_same_looks(campaign, looks)
     with Job({FITTING: 1.0, "verification": 2.0}, progress) as job:
         joint = StoredOrFitted(campaign, tell, job.part(FITTING)).fit
         job.begin("verification")

@@ -20,7 +20,7 @@ from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_inf
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
-from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots, refuse_same_looks
 from tvsbayes.instrument.homing import homed
 from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
@@ -390,8 +390,10 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         seed: seed of the draws of noise scales and of the null distribution.
 
     Raises:
+        InputError: the looks are those of the campaign.
         NothingToEstimate: fewer than `LOOKS_MIN` usable looks.
     """
+    refuse_same_looks(fit.campaign, looks)
     usable = int(in_sight(looks).sum()) if ordered_spots(looks) else 0
     if usable < LOOKS_MIN:
         file = looks.looks_table.file

@@ -145,7 +145,9 @@ class JointFit(Shown):
             for of in TARGETS.values()
             if of.applies(moved)
         ]
-        return View(f"JointFit of {used} {self.campaign.looks}, {state}; mode and Laplace sd", ("quantity", "mode", "sd"), rows)
+        return View(
+            f"JointFit of {used} {self.campaign.looks}, {state}; mode and Laplace sd", ("quantity", "mode", "sd"), rows
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -93,7 +93,9 @@ def _off_deg(values: dict[str, float | complex], steps: np.ndarray, frames: np.n
     return -np.degrees(1.0) * np.stack([across, above], axis=1) / np.maximum(along.real, 0.5)[:, None]
 
 
-def _slope(values: dict[str, float | complex], names: Sequence[str], steps: np.ndarray, frames: np.ndarray) -> np.ndarray:
+def _slope(
+    values: dict[str, float | complex], names: Sequence[str], steps: np.ndarray, frames: np.ndarray
+) -> np.ndarray:
     """Derivatives of the residuals by the unknowns, shape (2 n, unknowns)."""
     off = [_off_deg(values | {name: values[name] + 1j * COMPLEX_STEP}, steps, frames).imag.ravel() for name in names]
     return np.stack(off, axis=1) / COMPLEX_STEP

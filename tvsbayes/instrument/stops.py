@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -18,6 +19,14 @@ from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTIONS, direction_
 from tvsbayes.instrument.campaign import Move
 
 SECONDS_PER_HOUR = 3600.0
+
+
+class SegmentMove(Protocol):
+    """A row of `moves.csv`, of a scanner or an axis."""
+
+    @property
+    def segment(self) -> int:
+        """Number of the homing before it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +101,36 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
     rests = zip(moves, rests_of(moves, axis), strict=True)
     observed_rests = dict.fromkeys(rest for move, rest in rests if move.move in observed)
     return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in observed_rests)
+
+
+LONE_RANGES, LONE_MOVES_MIN = 4.0, 8
+"""Distance of a lone command from the median, in ranges of four fifths of all, and least number of moves to judge."""
+
+
+def lone_commands(moves: Sequence[SegmentMove], commands: Sequence[float]) -> list[int]:
+    """Moves to a command that is far from all others and given once, as by a digit too many; not those of a homing.
+
+    Args:
+        moves: all moves in order.
+        commands: command or counter of each.
+    """
+    values, counts = np.array(commands, dtype=float), Counter(commands)
+    low, middle, high = np.percentile(values, [10, 50, 90])
+    if len(values) < LONE_MOVES_MIN or not high > low:
+        return []
+    far = np.abs(values - middle) > LONE_RANGES * (high - low)
+    homed = [True, *(a.segment != b.segment for a, b in pairwise(moves))]
+    return [k for k in np.flatnonzero(far).tolist() if counts[commands[k]] == 1 and not homed[k]]
+
+
+def lone_doubts(moves: Sequence[SegmentMove], commands: Sequence[float], column: str) -> list[str]:
+    """The moves of `lone_commands` in sentences."""
+    near = np.delete(np.array(commands, dtype=float), lone := lone_commands(moves, commands))
+    return [
+        f"{column} of move {k} is {commands[k]:.10g}, all others lie within {near.min():.10g} to {near.max():.10g}: "
+        "a digit too many? correct the cell in moves.csv, or take the move out with what was read at it"
+        for k in lone
+    ]
 
 
 FEW_STOPS = 12

@@ -153,7 +153,8 @@ def next_steps(summary: FitSummary, folder: str, causes: Sequence[Finding] = ())
     if summary.suspect_spots and (validation is None or f"single {summary.looks}" not in validation.cause):
         ids = listed(summary.suspect_spots, SPOTS_LISTED)
         steps.append(
-            f"Look at {summary.looks} {ids}, which disagree with all others, or fit with --robust, which leaves them out."
+            f"Look at {summary.looks} {ids}, which disagree with all others, or fit with --robust, which leaves them "
+            "out."
         )
     if summary.few_stops:
         directions = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())

@@ -250,6 +250,15 @@ FAULTS = (
           "test_repeats_at_one_stop_share_its_error"),
     Fault("a left-out reading is predicted on its other side", "AxisModel.left_out", Local("expected", "-value"),
           "test_rows_left_out_are_the_conditional_of_the_dense_gaussian"),
+    # Data that say less than they seem to.
+    Fault("a sensor's code is taken for a temperature", "conditions.FAR_K", Constant("1e12"),
+          "test_codes_of_a_sensor_are_doubted_where_neighbours_are_far"),
+    Fault("a campaign's own looks confirm it", "campaign.COPIED_SHARE", Constant("2.0"),
+          "test_looks_that_were_seen_before_are_refused"),
+    Fault("a term that sightings do not determine is fitted", "pointing_model.OWN_SHARE", Constant("-1.0"),
+          "test_least_squares_hold_what_one_axis_does_not_determine"),
+    Fault("a command with a digit too many is believed", "stops.LONE_RANGES", Constant("1e12"),
+          "test_a_command_with_a_digit_too_many_is_doubted"),
     # Compensation.
     Fault("corrections of both sides change places", "Correction.sent", Argument("side", "-value"),
           "test_both_sides_are_linear_between_lines_and_constant_beyond"),
