@@ -108,5 +108,5 @@ def test_readings_that_were_taken_before_are_refused():
 def test_temperatures_start_at_absolute_zero(tmp_path):
     moves = MOVES.replace("approach", "approach,temperature_degC").replace("forward", "forward,{}").replace("5,", "5,,")
     assert read_axis(folder(tmp_path / "a", moves=moves.format(-273.15))).moves[0].temperature_degC == -273.15
-    with pytest.raises(InputError, match="temperature_degC.*-273.15"):
+    with pytest.raises(InputError, match=r"temperature_degC.*-273\.15"):
         read_axis(folder(tmp_path / "b", moves=moves.format(-300)))

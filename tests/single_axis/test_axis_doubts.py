@@ -100,8 +100,8 @@ def test_a_command_with_a_digit_too_many_is_doubted():
     assert f"move {at} is {far:g}" in doubt and "a digit too many?" in doubt
     first = replace(whole, moves=tuple(replace(m, command=far) if m.approach else m for m in whole.moves))
     parked = replace(whole, moves=tuple(replace(m, command=far) if m.move in (at, at + 4) else m for m in whole.moves))
-    for campaign in (whole, first, parked):
-        assert not any(text.startswith("command of move") for text in doubts(campaign))
+    for sound in (whole, first, parked):
+        assert not any(text.startswith("command of move") for text in doubts(sound))
 
 
 def test_codes_of_a_thermometer_are_doubted():

@@ -321,7 +321,9 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
     """
     # An axis that the campaign never moved stays where it is.
     moved = np.ptp(calibration.range_steps, axis=1) > 0
-    run_up = tuple(RUN_UP * max(calibration.overshoot_steps[axis], 1) * int(m) for axis, m in zip(AXES, moved))
+    run_up = tuple(
+        RUN_UP * max(calibration.overshoot_steps[axis], 1) * int(m) for axis, m in zip(AXES, moved, strict=True)
+    )
     if not moved.any():
         what = "no axis was seen at two counters: nothing can have been aimed by the calibration"
         raise NothingToEstimate("no-correction", what, remedy="look before and after moves, then fit again")
