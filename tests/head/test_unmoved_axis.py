@@ -89,13 +89,13 @@ def fitted(tmp_path_factory):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("purpose", ["--verify", "--watch"])
+@pytest.mark.parametrize("purpose", [["--verify"], ["--watch", "--minutes", 1]])
 def test_plans_leave_the_unmoved_axis_where_it_is(ask, fitted, tmp_path, purpose):
-    code, _ = ask("plan", fitted, purpose, "-o", tmp_path / "looks.csv")
+    code, _ = ask("plan", fitted, *purpose, "-o", tmp_path / "looks.csv")
     assert code == 0
     steps = read_plan(tmp_path / "looks.csv", SIGHTING_HEAD)
     assert {step.tilt_steps for step in steps if step.action in ("home", "move")} == {0}
-    assert len({step.pan_steps for step in steps if step.action == "move"}) > 2
+    assert len({step.pan_steps for step in steps if step.action == "move"}) >= 2
 
 
 @pytest.mark.thorough

@@ -103,8 +103,8 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
     return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in observed_rests)
 
 
-LONE_RANGES, LONE_MOVES_MIN = 4.0, 8
-"""Distance of a lone command from the median, in ranges of four fifths of all, and least number of moves to judge."""
+LONE_RANGES, LONE_MOVES_MIN, LONE_MOST = 2.0, 8, 3
+"""Distance of a lone command from all others, in their range; least number of moves to judge; most lone ones."""
 
 
 def lone_commands(moves: Sequence[SegmentMove], commands: Sequence[float]) -> list[int]:
@@ -114,13 +114,17 @@ def lone_commands(moves: Sequence[SegmentMove], commands: Sequence[float]) -> li
         moves: all moves in order.
         commands: command or counter of each.
     """
-    values, counts = np.array(commands, dtype=float), Counter(commands)
-    low, middle, high = np.percentile(values, [10, 50, 90])
-    if len(values) < LONE_MOVES_MIN or not high > low:
+    if len(commands) < LONE_MOVES_MIN:
         return []
-    far = np.abs(values - middle) > LONE_RANGES * (high - low)
+    values, counts = np.array(commands, dtype=float), Counter(commands)
     homed = [True, *(a.segment != b.segment for a, b in pairwise(moves))]
-    return [k for k in np.flatnonzero(far).tolist() if counts[commands[k]] == 1 and not homed[k]]
+    outward = np.argsort(np.abs(values - np.median(values)), kind="stable")
+    for most in range(LONE_MOST, 0, -1):
+        near, far = np.sort(values[outward[:-most]]), outward[-most:]
+        gap = min(max(near[0] - values[k], values[k] - near[-1]) for k in far)
+        if gap > LONE_RANGES * (near[-1] - near[0]) > 0:
+            return sorted(k for k in far.tolist() if counts[commands[k]] == 1 and not homed[k])
+    return []
 
 
 def lone_doubts(moves: Sequence[SegmentMove], commands: Sequence[float], column: str) -> list[str]:

@@ -259,6 +259,8 @@ FAULTS = (
           "test_least_squares_hold_what_one_axis_does_not_determine"),
     Fault("a command with a digit too many is believed", "stops.LONE_RANGES", Constant("1e12"),
           "test_a_command_with_a_digit_too_many_is_doubted"),
+    Fault("compiled code under another function's name is run", "own_folder._seal", Reads("name", "''"),
+          "test_a_file_under_anothers_name_is_none"),
     # Compensation.
     Fault("corrections of both sides change places", "Correction.sent", Argument("side", "-value"),
           "test_both_sides_are_linear_between_lines_and_constant_beyond"),
