@@ -425,7 +425,8 @@ def verify(
         NotConverged: the fit is not accepted.
         NothingToEstimate: too few fresh readings or looks.
     """
-    from tvsbayes.instrument.campaign import Campaign, refuse_same_looks
+    from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.instrument.copies import refuse_same_looks
     from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_readings
 
     campaign, looks = (read_campaign(each) if isinstance(each, Path | str) else each for each in (folder, fresh))

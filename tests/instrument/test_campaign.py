@@ -18,10 +18,10 @@ from tvsbayes.instrument.campaign import (
     input_hashes,
     parse_spots,
     read_campaign,
-    refuse_same_looks,
     spots_bytes,
     write_campaign,
 )
+from tvsbayes.instrument.copies import refuse_same_looks
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.rig import RigTable
 

@@ -172,7 +172,8 @@ def compare(
     The gap between the two estimators term by term; with a later campaign B, what has changed since.
     """
     from tvsbayes.estimators.four_point import select_experiments
-    from tvsbayes.instrument.campaign import read_campaign, refuse_same_looks
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.copies import refuse_same_looks
 
     if other is not None:
         refuse_options("for one campaign: with B nothing is left out", "leave it out, or leave out B", by=by, seed=seed)

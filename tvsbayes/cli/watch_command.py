@@ -38,7 +38,8 @@ def watch(
     """
     if serve("watch", **locals()) or serve("watch", looks):
         return
-    from tvsbayes.instrument.campaign import read_campaign, refuse_same_looks
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.copies import refuse_same_looks
 
     known, new = read_campaign(campaign), read_campaign(looks)
     refuse_same_looks(known, new)

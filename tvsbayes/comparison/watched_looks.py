@@ -20,7 +20,8 @@ from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_inf
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
-from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots, refuse_same_looks
+from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.copies import refuse_same_looks
 from tvsbayes.instrument.homing import homed
 from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES

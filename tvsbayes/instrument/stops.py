@@ -103,12 +103,12 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
     return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in observed_rests)
 
 
-LONE_RANGES, LONE_MOVES_MIN, LONE_MOST = 2.0, 8, 3
-"""Distance of a lone command from all others, in their range; least number of moves to judge; most lone ones."""
+LONE_RANGES, LONE_MOVES_MIN = 4.0, 8
+"""Distance of a lone command from all others, in their range, and least number of moves to judge it."""
 
 
 def lone_commands(moves: Sequence[SegmentMove], commands: Sequence[float]) -> list[int]:
-    """Moves to a command that is far from all others and given once, as by a digit too many; not those of a homing.
+    """Moves to a command that is far from all others, as by a digit too many: one at most, and not that of a homing.
 
     Args:
         moves: all moves in order.
@@ -116,15 +116,12 @@ def lone_commands(moves: Sequence[SegmentMove], commands: Sequence[float]) -> li
     """
     if len(commands) < LONE_MOVES_MIN:
         return []
-    values, counts = np.array(commands, dtype=float), Counter(commands)
-    homed = [True, *(a.segment != b.segment for a, b in pairwise(moves))]
-    outward = np.argsort(np.abs(values - np.median(values)), kind="stable")
-    for most in range(LONE_MOST, 0, -1):
-        near, far = np.sort(values[outward[:-most]]), outward[-most:]
-        gap = min(max(near[0] - values[k], values[k] - near[-1]) for k in far)
-        if gap > LONE_RANGES * (near[-1] - near[0]) > 0:
-            return sorted(k for k in far.tolist() if counts[commands[k]] == 1 and not homed[k])
-    return []
+    values = np.array(commands, dtype=float)
+    far = int(np.argmax(np.abs(values - np.median(values))))
+    others = np.delete(values, far)
+    gap = max(others.min() - values[far], values[far] - others.max())
+    homed = far == 0 or moves[far].segment != moves[far - 1].segment
+    return [far] if gap > LONE_RANGES * np.ptp(others) > 0 and not homed else []
 
 
 def lone_doubts(moves: Sequence[SegmentMove], commands: Sequence[float], column: str) -> list[str]:

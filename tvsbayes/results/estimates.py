@@ -381,8 +381,8 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
 
     @property
     def looks(self) -> str:
-        """What the looks of the campaign are called; a fit of images has parameters of cameras."""
-        return "spots" if "focal_scale" in self.parameters else "sightings"
+        """What the looks of the campaign are called: only sightings determine where azimuth begins."""
+        return "sightings" if "azimuth_zero_deg" in self.parameters else "spots"
 
     @property
     def headline_informed(self) -> bool:

@@ -28,10 +28,11 @@ from tvsbayes.files.csv_kind import (
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC, refuse_copied
+from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.instrument.conditions import check_power, powered_on_s
+from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
 from tvsbayes.single_axis.waves import WavePeriods
 

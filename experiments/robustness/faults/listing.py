@@ -253,7 +253,7 @@ FAULTS = (
     # Data that say less than they seem to.
     Fault("a sensor's code is taken for a temperature", "conditions.FAR_K", Constant("1e12"),
           "test_codes_of_a_sensor_are_doubted_where_neighbours_are_far"),
-    Fault("a campaign's own looks confirm it", "campaign.COPIED_SHARE", Constant("2.0"),
+    Fault("a campaign's own looks confirm it", "copies.COPIED_SHARE", Constant("2.0"),
           "test_looks_that_were_seen_before_are_refused"),
     Fault("a term that sightings do not determine is fitted", "pointing_model.OWN_SHARE", Constant("-1.0"),
           "test_least_squares_hold_what_one_axis_does_not_determine"),
