@@ -381,8 +381,8 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
 
     @property
     def looks(self) -> str:
-        """What the looks of the campaign are called: only sightings determine where azimuth begins."""
-        return "sightings" if "azimuth_zero_deg" in self.parameters else "spots"
+        """What the looks of the campaign are called: cameras that see spots stand somewhere, sightings have none."""
+        return "spots" if "extrinsics.translation_mm.x" in self.parameters else "sightings"
 
     @property
     def headline_informed(self) -> bool:
