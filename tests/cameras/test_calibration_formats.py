@@ -13,7 +13,7 @@ from support.calibration_files import FOREIGN, plain, written
 from tvsbayes.cameras.assumed_covariance import Provenance, with_assumed_covariance
 from tvsbayes.cameras.calibration_containers import read_container
 from tvsbayes.cameras.calibration_export import exported
-from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, stereo_bytes
 

@@ -18,7 +18,7 @@ from support.calibration_files import FOREIGN, check_pair, listed, plain, read_j
 
 from tvsbayes.cameras.calibration_containers import read_container
 from tvsbayes.cameras.calibration_export import exported
-from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.cameras.lens_models import fitted_to_five
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data

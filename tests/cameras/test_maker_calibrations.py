@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.calibration_files import FOREIGN, check_pair
 
-from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.cameras.lens_models import fitted_to_five, kind_of
 from tvsbayes.errors import InputError
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.cameras.calibration_formats import Imported, read_calibration
+from tvsbayes.cameras.imported_calibration import Imported, read_calibration
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_vector
 
 FOREIGN = Path(__file__).parents[1] / "data" / "foreign"
