@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.head.urdf import HeadModel, head_joints, ratios_of
+from tvsbayes.head.urdf import HeadModel, ratios_of
+from tvsbayes.importing.urdf import head_joints
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.chains import HeadOptics
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
@@ -63,8 +64,8 @@ def test_terms_of_joints_are_those_of_the_chain():
     """Forward kinematics by hand: pan about z of its origin, tilt about y of the link on it."""
     head = head_joints(UNIT, "unit.urdf", BY_NAME)
     assert (head.names, head.sign) == ({"pan": "pan_joint", "tilt": "tilt_joint"}, {"pan": 1, "tilt": -1})
-    assert head.limits_deg("pan") is None
-    assert head.limits_deg("tilt") == pytest.approx((math.degrees(-0.5), math.degrees(1.2)))
+    assert head.limits_deg["pan"] is None
+    assert head.limits_deg["tilt"] == pytest.approx((math.degrees(-0.5), math.degrees(1.2)))
     assert head.terms["elevation_axis_offset_mm"] == pytest.approx(30.0, abs=1e-6)
     x, y, z = 0.002, -0.003, 0.1
     turn = np.array([[math.cos(z), -math.sin(z), 0], [math.sin(z), math.cos(z), 0], [0, 0, 1]])
@@ -91,7 +92,7 @@ def test_an_estimated_head_is_what_another_parser_reads():
     again = head_joints(data, "unit.urdf", BY_NAME)
     for name, off in OFF.items():
         assert again.terms[name] == pytest.approx(head.terms[name] + off, abs=1e-7), name
-    assert again.reduction("pan") == pytest.approx(-30 / 1.01) and again.reduction("tilt") == 20
+    assert again.reductions["pan"] == pytest.approx(-30 / 1.01) and again.reductions["tilt"] == 20
     lines, before = data.decode().splitlines(), UNIT.decode().splitlines()
     assert len([line for line in before if line not in lines]) == 5, "robot, two origins, one axis, one reduction"
     with pytest.raises(InputError, match="not applied twice"):

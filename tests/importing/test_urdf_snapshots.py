@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tvsbayes.head.urdf import HeadModel, head_joints, ratios_of
+from tvsbayes.head.urdf import HeadModel, ratios_of
+from tvsbayes.importing.urdf import head_joints
 
 DATA = Path(__file__).parents[1] / "data" / "urdf"
 UNIT = DATA.parents[1] / "head" / "unit.urdf"

@@ -32,7 +32,8 @@ from tvsbayes.head.foreign_sightings import (
     sightings_of_table,
 )
 from tvsbayes.head.pointing_model import pointing_model
-from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadJoints, HeadModel, head_joints, ratios_of
+from tvsbayes.head.urdf import HeadModel, ratios_of
+from tvsbayes.importing.urdf import URDF_BYTES_MAX, HeadJoints, head_joints
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import MOVES, SPOTS, input_hashes, read_campaign
 from tvsbayes.instrument.campaign_header import header_values, mechanism_key
@@ -234,7 +235,7 @@ def _urdf_files(
     tables = {"campaign.toml": ["[urdf]", *(toml_line(key, value) for key, value in joints.items())], "rig.toml": []}
     for axis, keys in LIMIT_KEYS.items() if steps_per_turn is not None else ():
         ratio = priors[f"degrees_per_step.{axis}"].value
-        if (limits := head.limits_deg(axis)) is not None:
+        if (limits := head.limits_deg[axis]) is not None:
             tables["rig.toml"] += [toml_line(key, round(end / ratio)) for key, end in zip(keys, limits, strict=True)]
     if tables["rig.toml"]:
         tables["rig.toml"].insert(0, "[positioner]")
