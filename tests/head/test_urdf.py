@@ -133,28 +133,3 @@ def test_without_a_model_there_are_properties():
     assert set(document["names"]) <= SIGHTING_HEAD.documented | set(TERMS)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "names", "message"),
-    [
-        (b"unit", b"unit", {"pan": "pn_joint"}, "did you mean pan_joint"),
-        (b"unit", b"unit", {"pan": "foot"}, "joint foot is fixed"),
-        (b"unit", b"unit", {"pan": "tilt_joint", "tilt": "pan_joint"}, "is not mounted on the pan joint"),
-        (b'<axis xyz="0 1 0"/>', b'<axis xyz="0 0 1"/>', {}, "axes that cross"),
-        (b'<axis xyz="0 1 0"/>', b'<axis xyz="1 0 0"/>', {}, "x looks ahead"),
-        (b'name="unit"', b'name="${name}"', {}, "run `xacro FILE"),
-        (b'<axis xyz="0 1 0"/>', b'<axis xyz="0 one 0"/>', {}, "finite numbers"),
-        (b'<?xml version="1.0"?>', b'<!DOCTYPE robot [<!ENTITY a "b">]>', {}, "DOCTYPE"),
-        (b"robot", b"sdf", {}, "SDF"),
-        (b"</robot>", b"", {}, "XML"),
-        (b"pan_joint", b"first", {}, None),
-        (b'"continuous"', b'"fixed"', {}, "joints that turn: tilt_joint"),
-    ],
-)
-def test_refusals_of_a_urdf_state_a_remedy(old, new, names, message):
-    data = UNIT.replace(old, new)
-    if message is None:
-        assert head_joints(data, "unit.urdf", BY_NAME).names["pan"] == "first", "the only two that turn"
-        return
-    with pytest.raises(InputError) as refused:
-        head_joints(data, "unit.urdf", {**BY_NAME, **names})
-    assert message in refused.value.message + (refused.value.remedy or "")

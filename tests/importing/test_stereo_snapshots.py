@@ -51,7 +51,8 @@ def imported(say, words, out) -> dict[str, object]:
     """What a command says beside its table, and the numbers it wrote."""
     code, text, error = say("stereo", *words, "-o", out)
     lines = f"{text}{error}".replace(str(out.parent), "").splitlines()
-    seen = {"code": code, "says": [line for line in lines if ": " in line and not line.startswith("note: for a better")]}
+    says = [line for line in lines if ": " in line and not line.startswith("note: for a better")]
+    seen = {"code": code, "says": says}
     return seen | (numbers(out) if out.is_file() else {})
 
 

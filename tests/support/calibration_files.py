@@ -62,7 +62,8 @@ def mistakes(mounted: Stereo) -> dict[str, dict[str, object]]:
     good, (x, y, z) = listed(mounted), mounted.T
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ mounted.R
     fundamental = np.linalg.solve(mounted.M2.T, essential @ np.linalg.inv(mounted.M1))
-    wide, four = {"D1": [0.1, 0, 0, 0], "D2": [0.1, 0, 0, 0], "distortion_model": "equidistant"}, [-0.02, 0.01, -5e-3, 0]
+    wide = {"D1": [0.1, 0, 0, 0], "D2": [0.1, 0, 0, 0], "distortion_model": "equidistant"}
+    four = [-0.02, 0.01, -5e-3, 0]
     others = dict.fromkeys(("M1", "D1", "M2", "D2", "image_size"))
     named = {"master": {"K": good["M1"], "D": good["D1"]}, "slave": {"K": good["M2"], "D": good["D2"]}}
     long = [[16300.0, 0, 640], [0, 16300, 360], [0, 0, 1]]

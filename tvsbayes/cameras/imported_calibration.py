@@ -82,13 +82,13 @@ def read_calibration(
         hint = "; ".join(doubts) or "look at R, T and the image size"
         found = "two cameras that do not see one board together"
         raise refusal("no-common-view", file=names, found=found, allowed="a pair", remedy=hint) from error
-    _check_determined(stereo, pair.places)
+    _check_determined(stereo, pair.places, doubts)
     good_to = f"all its sds together are correct within a factor of {GUESS_FACTOR:g}"
     notes = [*pair.notes, f"the file has no covariance: assumed from {stereo.assumed_from}; {good_to}"]
     return Imported(stereo, pair.source, (*notes, f"for a better one {ASSUMED_REMEDY}"), doubts)
 
 
-def _check_determined(stereo: Stereo, places: Mapping[str, str]) -> None:
+def _check_determined(stereo: Stereo, places: Mapping[str, str], doubts: Sequence[str]) -> None:
     """Refuse a pair whose pictures determine no such lens, by the user's file and key.
 
     Raises:
@@ -97,15 +97,16 @@ def _check_determined(stereo: Stereo, places: Mapping[str, str]) -> None:
     try:
         stereo_bytes(stereo)
     except InputError as error:
-        worst = STEREO_PARAMETER_NAMES[int(np.argmax(np.diag(stereo.parameter_covariance)))]
-        side = "1" if worst.startswith("left") else "2"
-        matrix, distortion = (getattr(stereo, f"{name}{side}") for name in "MD")
-        k1, k2, _, _, k3 = distortion
+        sds = np.sqrt(np.diag(stereo.parameter_covariance))
+        worst = STEREO_PARAMETER_NAMES[int(np.argmax(sds))]
+        side = "1" if "left" in worst else "2"
+        matrix, (k1, k2, _, _, k3) = (getattr(stereo, f"{name}{side}") for name in "MD")
         lens = f"k1 {k1:.4g}, k2 {k2:.4g}, k3 {k3:.4g} at fx {matrix[0, 0]:.5g} px"
+        remedy = f"is fx that of these pictures ({places[f'M{side}']})? calibrate again with k2 and k3 fixed at 0"
         raise refusal(
             "lens-model",
             file=places.get(f"D{side}", places[f"M{side}"]),
-            found=f"{lens}, which no views of a board determine",
+            found=f"{lens}, which no views of a board determine (sd of {worst}: {sds.max():.2g})",
             allowed="coefficients that the corners of pictures determine",
-            remedy=f"is fx that of these pictures ({places[f'M{side}']})? calibrate again with k2 and k3 fixed at 0",
+            remedy="; ".join([*doubts, remedy]),
         ) from error

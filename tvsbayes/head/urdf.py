@@ -49,7 +49,7 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
     if np.max(np.abs(axis - tilt.axis)) > SAME:
         edits += _element(head.urdf, tilt, "axis", {"xyz": axis})
     for name, value in reductions.items():
-        if (tag := head.urdf.reduction_tag(head.names[name])) is not None:
+        if (tag := head.urdf.reduction(head.names[name])) is not None:
             edits.append(_Edit(tag.end, tag.content_end, f"{value:.12g}".encode()))
     data = head.urdf.data
     edits += [
@@ -107,9 +107,8 @@ def _origin(urdf: Urdf, joint: Tag, turn: Rotation, shift_m: np.ndarray) -> list
 
 def ratios_of(head: HeadJoints, steps_per_turn: float) -> dict[str, float]:
     """Nominal degrees per step, from the transmissions and the motors' steps per turn."""
-    return {
-        f"degrees_per_step.{axis}": FULL_TURN_DEG / (steps_per_turn * abs(head.reductions[axis] or 1.0)) for axis in AXES
-    }
+    turns = {axis: abs(head.reductions[axis] or 1.0) for axis in AXES}
+    return {f"degrees_per_step.{axis}": FULL_TURN_DEG / (steps_per_turn * turns[axis]) for axis in AXES}
 
 
 UNSAID = (

@@ -23,8 +23,7 @@ from tvsbayes.files.csv_table import NUMBER
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-URDF_BYTES_MAX = 32 * 1024 * 1024
-ELEMENTS_MAX = 200_000
+URDF_BYTES_MAX, TAGS_MAX = 10 * 1024 * 1024, 400_000
 MOVING = ("revolute", "continuous")
 WORDS = {"pan": ("pan", "yaw", "azimuth"), "tilt": ("tilt", "pitch", "elevation")}
 """Parts of names by which joints are found where the user names none."""
@@ -36,7 +35,7 @@ NUMBER_MAX, REDUCTION_MIN = 1e6, 1e-6
 SAME = 1e-12
 """Change of a number below which its text is kept, and length of an axis that has no direction."""
 PROPERTY = "xacro:property"
-DEPTH_MAX, LISTED = 100, 20
+DEPTH_MAX, LISTED, TEXT_MAX = 100, 20, 100
 _LEAN = "azimuth_axis_tilt_deg"
 
 
@@ -76,7 +75,7 @@ class Tag:
             return np.array(default)
         words = text.split()
         if len(words) != len(default) or not all(NUMBER.fullmatch(w) and abs(float(w)) <= NUMBER_MAX for w in words):
-            allowed = f"{len(default)} finite numbers of at most {NUMBER_MAX:g}"
+            allowed = f"{len(default)} finite number{'s' * (len(default) > 1)} up to {NUMBER_MAX:g}"
             raise tag.refuse(f"{part} {attribute} {shown(text)}", allowed, "correct the numbers of the joint")
         return np.array(words, float)
 
@@ -102,7 +101,7 @@ class Tag:
         """Axis of a joint: unit vector in its frame, shape (3,)."""
         axis = self.numbers("axis", "xyz", (1.0, 0.0, 0.0))
         if not np.linalg.norm(axis) > SAME:
-            raise (self.first("axis") or self).refuse("an axis of length 0", "a direction", "write xyz as a unit vector")
+            raise (self.first("axis") or self).refuse("an axis of length 0", "a direction", "write a unit vector")
         return axis / np.linalg.norm(axis)
 
     def limits(self) -> tuple[float, float] | None:
@@ -124,43 +123,20 @@ class Urdf:
     root: Tag
 
     def listed(self, kind: str) -> dict[str, Tag]:
-        """Elements of a kind directly below `robot`, by name.
+        """Elements of a kind directly below `robot`, by name."""
+        return {tag.attributes.get("name", ""): tag for tag in self.root.children if tag.name == kind}
 
-        Raises:
-            InputError: two joints have one name.
-        """
-        found: dict[str, Tag] = {}
-        for tag in self.root.children:
-            name = tag.attributes.get("name", "")
-            if tag.name == kind == "joint" and name in found:
-                remedy = f"remove one of both, or give it a name of its own; the other is in line {found[name].line}"
-                raise tag.refuse(f"a second joint {shown(name)}", "one joint of each name", remedy)
-            if tag.name == kind:
-                found[name] = tag
-        return found
-
-    def reduction_tag(self, joint: str) -> Tag | None:
+    def reduction(self, joint: str) -> Tag | None:
         """`mechanicalReduction` of the transmission of a joint, None where none is stated."""
         tags = (tag for tag in self.listed("transmission").values() if tag.named("joint", "name") == joint)
         return next((tag.first("mechanicalReduction") for tag in tags), None)
-
-    def reduction(self, joint: str) -> float | None:
-        """The number in it."""
-        if (tag := self.reduction_tag(joint)) is None:
-            return None
-        text = tag.text.strip()
-        if not NUMBER.fullmatch(text) or not REDUCTION_MIN <= abs(float(text)) <= NUMBER_MAX:
-            allowed = f"a number from {REDUCTION_MIN:g} to {NUMBER_MAX:g}, of either sign"
-            remedy = "state turns of the motor for one of the joint, or remove the element"
-            raise tag.refuse(f"mechanicalReduction {shown(text)}", allowed, remedy)
-        return float(text)
 
 
 def read_urdf(data: bytes, file: str) -> Urdf:
     """Parse a URDF.
 
     Raises:
-        InputError: not XML, a document type declaration, no robot, or an unexpanded xacro.
+        InputError: not XML, a document type declaration, no robot, an unexpanded xacro, or two joints of one name.
     """
     # Without a mark the declaration is ASCII in all other encodings.
     declared = re.match(rb"\s*<\?xml[^>]*?\sencoding\s*=\s*[\"']([\w.-]+)", data)
@@ -171,21 +147,18 @@ def read_urdf(data: bytes, file: str) -> Urdf:
     except (LookupError, ValueError) as error:
         found, remedy = f"text that is not {escaped(encoding)}", "save it as UTF-8"
         raise refusal("urdf", file=file, found=found, allowed="XML", remedy=remedy) from error
-    text = re.sub(r"\A(\s*<\?xml[^>]*?\sencoding\s*=\s*[\"'])[\w.-]+", r"\1UTF-8", text)
-    return _parsed(text.encode(), file)
-
-
-def _parsed(data: bytes, file: str) -> Urdf:
+    data = re.sub(r"\A(\s*<\?xml[^>]*?\sencoding\s*=\s*[\"'])[\w.-]+", r"\1UTF-8", text).encode()
+    if text.count("<") > TAGS_MAX:
+        found, remedy = f"more than {TAGS_MAX // 2} elements", "give a URDF file"
+        raise refusal("size", file=file, found=found, allowed="a plain URDF", remedy=remedy)
     parser = expat.ParserCreate("utf-8")
-    path = [Tag("", {}, file, 0, 0, 0)]
-    top, elements = path[0], 0
+    top = Tag("", {}, file, 0, 0, 0)
+    path = [top]
 
     def refuse(found: str, allowed: str, remedy: str) -> InputError:
         return refusal("urdf", file=file, line=parser.CurrentLineNumber, found=found, allowed=allowed, remedy=remedy)
 
     def begin(name: str, attributes: dict[str, str]) -> None:
-        nonlocal elements
-        elements += 1
         at = parser.CurrentByteIndex
         # A ">" inside quotes does not end the tag.
         close = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""").match(data, at)
@@ -194,9 +167,8 @@ def _parsed(data: bytes, file: str) -> Urdf:
             raise refuse("xacro that is not expanded", "a plain URDF", "run `xacro FILE > head.urdf`, and give that")
         if path[-1] is top and name != "robot":
             raise refuse(f"<{escaped(name)}>", "<robot>", "give a URDF; an SDF or MJCF converts to one")
-        if len(path) > DEPTH_MAX or elements > ELEMENTS_MAX:
-            found = f"more than {ELEMENTS_MAX} elements, or {DEPTH_MAX} in each other"
-            raise refuse(found, "a plain URDF", "give a URDF file")
+        if len(path) > DEPTH_MAX:
+            raise refuse(f"more than {DEPTH_MAX} elements in each other", "a plain URDF", "give a URDF file")
         tag = Tag(name, attributes, file, parser.CurrentLineNumber, at, close.end() if close else at)
         path[-1].children.append(tag)
         path.append(tag)
@@ -204,18 +176,24 @@ def _parsed(data: bytes, file: str) -> Urdf:
     def end(_: str) -> None:
         path.pop().content_end = parser.CurrentByteIndex
 
-    def text(words: str) -> None:
-        path[-1].text += words if len(path[-1].text) < 100 else ""
+    def text_part(words: str) -> None:
+        path[-1].text += words if len(path[-1].text) < TEXT_MAX else ""
 
     def doctype(*_: object) -> None:
         raise refuse("a document type", "a URDF without one", "remove the lines of <!DOCTYPE>")
 
     parser.StartElementHandler, parser.EndElementHandler = begin, end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = text, doctype
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = text_part, doctype
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
         raise refuse(escaped(str(error)), "XML", "give a URDF file") from error
+    first: dict[str, Tag] = {}
+    for tag in (child for child in top.children[0].children if child.name == "joint"):
+        other = first.setdefault(name := tag.attributes.get("name", ""), tag)
+        if other is not tag:
+            remedy = f"remove one of both, or give it a name of its own; the first is in line {other.line}"
+            raise tag.refuse(f"a second joint {shown(name)}", "one joint of each name", remedy)
     return Urdf(data, top.children[0])
 
 
@@ -286,7 +264,8 @@ def head_joints(data: bytes, file: str, names: Mapping[str, str | None]) -> Head
     chosen, joints = _named(urdf, names, file), urdf.listed("joint")
     pan, tilt = (joints[chosen[axis]] for axis in WORDS)
     between = _between(joints, pan, tilt, file)
-    first = pan.rotation
+    # The place of the pan joint changes no term; a correction keeps it.
+    first, _ = pan.rotation, pan.shift_m
     joint_frame = first * between[0] * tilt.rotation
     pan_axis, tilt_axis = first.apply(pan.axis), joint_frame.apply(tilt.axis)
     beam = joint_frame.apply([1.0, 0.0, 0.0])
@@ -332,8 +311,19 @@ def head_joints(data: bytes, file: str, names: Mapping[str, str | None]) -> Head
         ends = joint.limits()
         low, high = sorted(math.degrees(sign[axis] * end) for end in ends or (0.0, 0.0))
         limits[axis] = None if ends is None else (low, high)
-    reductions = {axis: urdf.reduction(name) for axis, name in chosen.items()}
+    reductions = {axis: _reduction(urdf.reduction(name)) for axis, name in chosen.items()}
     return HeadJoints(urdf, chosen, terms, sign, height_m, between, reductions, limits)
+
+
+def _reduction(tag: Tag | None) -> float | None:
+    if tag is None:
+        return None
+    text = tag.text.strip()
+    if not NUMBER.fullmatch(text) or not REDUCTION_MIN <= abs(float(text)) <= NUMBER_MAX:
+        allowed = f"a number from {REDUCTION_MIN:g} to {NUMBER_MAX:g}, of either sign"
+        remedy = "state turns of the motor for one of the joint, or remove the element"
+        raise tag.refuse(f"mechanicalReduction {shown(text)}", allowed, remedy)
+    return float(text)
 
 
 def _refused(file: str, found: str, allowed: str, remedy: str) -> InputError:

@@ -13,39 +13,12 @@ import pytest
 from support.calibration_files import FOREIGN, check_pair
 
 from tvsbayes.cameras.imported_calibration import read_calibration
-from tvsbayes.cameras.lens_models import fitted_to_five, kind_of
 from tvsbayes.errors import InputError
+from tvsbayes.importing.stereo import foreign_pair, read_files
+from tvsbayes.importing.stereo_lenses import fitted_to_five, kind_of
+from tvsbayes.instrument.stereo_pair import Stereo
 
 SMALL = (640, 480)
-
-
-@pytest.mark.parametrize(
-    "name, source, size",
-    (
-        ("depthai/calib.json", "depthai", None),
-        ("realsense/enumerate.txt", "realsense", SMALL),
-        ("realsense/objects.txt", "realsense", None),
-        ("realsense/intrinsics.json", "realsense", None),
-        ("boofcv/stereo.yaml", "boofcv", None),
-        ("zed/SN1.conf", "zed", (1920, 1080)),
-    ),
-)
-def test_the_pair_of_every_maker(name, source, size):
-    """Chains of sockets in cm, R by rows or by columns in m, the pose from right to left, components in mm."""
-    calibration = read_calibration([FOREIGN / name], size)
-    assert calibration.source == source
-    # Of a ZED the same pixels in the middle of larger pictures.
-    check_pair(calibration.stereo, size=size or SMALL, shift_px=(640.0, 300.0) if source == "zed" else (0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    "name, sizes",
-    (("zed/SN1.conf", "1920x1080, 1280x720, 672x376"), ("realsense/enumerate.txt", "640x480, 320x240")),
-)
-@pytest.mark.parametrize("stated", (None, (800, 600)))
-def test_the_size_of_the_pictures_is_asked_for(name, sizes, stated):
-    with pytest.raises(InputError, match=rf"pictures of {sizes} px.*--image-size"):
-        read_calibration([FOREIGN / name], stated)
 
 
 def changed(name: str, **new: object) -> str:
@@ -145,3 +118,94 @@ def test_a_lens_described_from_pixels_to_rays_is_fitted():
 )
 def test_names_of_lens_models(name, kind):
     assert kind_of(name) == kind
+
+
+SAME = {
+    "opencv_other_names/pair.yml": "opencv",
+    "opencv_other_names/pair2.yml": "opencv",
+    "opencv_other_names/pair3.yml": "opencv",
+    "opencv_xml/pair.xml": "opencv",
+    "plain_json/pair.json": "opencv",
+    "ros_message_dump/left.yaml ros_message_dump/right.yaml": "ros",
+    "ros_message_dump/right.yaml ros_message_dump/left.yaml": "ros",
+    "euroc_sensor_pair/cam0.yaml euroc_sensor_pair/cam1.yaml": "euroc",
+    "kalibr_chain/camchain.yaml": "kalibr",
+    "kalibr_imu/camchain-imucam.yaml": "kalibr",
+    "vins_fusion/cam0.yaml vins_fusion/cam1.yaml vins_fusion/euroc_stereo.yaml": "euroc",
+    "orb_slam3/o.yaml": "orb-slam",
+    "caliscope/c.toml": "opencv",
+    "matlab_json/c.json": "matlab",
+    "poses_in_world/c.json": "opencv",
+    "pasted_messages/both.yaml": "ros",
+    "bouguet/Calib_Results_stereo.mat": "opencv",
+    "depthai/calib.json": "depthai",
+    "realsense/enumerate.txt": "realsense",
+    "realsense/objects.txt": "realsense",
+    "realsense/intrinsics.json": "realsense",
+    "boofcv/stereo.yaml": "boofcv",
+    "mrcal/left.cameramodel mrcal/right.cameramodel": "mrcal",
+    "mrcal/right.cameramodel mrcal/left.cameramodel": "mrcal",
+    "basalt/calibration.json": "basalt",
+    "metashape/cameras.xml": "metashape",
+    "npy": "opencv",
+    "npy_txt": "opencv",
+}
+FIFTH = ("orb_slam3", "caliscope", "matlab_json", "poses_in_world", "pasted_messages", "bouguet", "mrcal")
+
+
+@pytest.mark.parametrize("names", SAME)
+def test_the_same_pair_in_the_files_of_every_program(names):
+    """Chains of sockets, quaternions, poses in a body or a world, R by rows or columns; lengths in m, cm and mm."""
+    files = read_files([FOREIGN / name for name in names.split()])
+    sizes = SMALL if names.startswith(("npy", "realsense/enum")) else None
+    pair = foreign_pair(files, sizes, 1000.0 if "metashape" in names else None, {})
+    assert pair.source == SAME[names]
+    stereo = Stereo(**pair.values, parameter_covariance=np.zeros((24, 24)), rms_px=0.0)
+    check_pair(stereo, *((0.01, -0.02) if names.startswith(FIFTH) else ()))
+    assert {"M1", "M2", "R", "T"} <= set(pair.places)
+
+
+@pytest.mark.parametrize("name", ("kalibr_results/results-cam.txt", "ost_ini/ost.txt"))
+def test_texts_of_few_digits(name):
+    """Both print six to eight decimals: R to 1e-6, T to 1e-3 mm."""
+    pair = foreign_pair(read_files([FOREIGN / name]), SMALL, None, {})
+    good = foreign_pair(read_files([FOREIGN / "kalibr_chain" / "camchain.yaml"]), None, None, {})
+    for field, tolerance in {"M1": 1e-9, "D1": 1e-9, "M2": 1e-9, "D2": 1e-9, "R": 1e-6, "T": 1e-3}.items():
+        np.testing.assert_allclose(pair.values[field], good.values[field], atol=tolerance)
+    assert pair.made["fixed_intrinsics"] is ("ost" in name)
+
+
+NEW = {
+    "a camera of Metashape without a pose": ("metashape/cameras.xml", "transform>", "reference>", "two cameras"),
+    "skew of Metashape": ("metashape/cameras.xml", "<b1>", "<b2>1</b2><b1>", "b2, k4"),
+    "another lens of calib.io": ("calibio/stereo.json", "CameraModelOpenCV", "CameraModelKB", "CameraModelKB"),
+    "a tail of mrcal": ("mrcal/left.cameramodel", "0.01, 0, 0, 0,", "0.01, 0.5, 0.3, 0.2,", "five coefficients miss"),
+    "other poses of mrcal": ("mrcal/left.cameramodel", "'extrinsics'", "'extrinsic'", "take it again from there"),
+    "another quaternion": ("basalt/calibration.json", '"qw"', '"w"', "take it again from there"),
+    "Kalibr's omni": ("kalibr_results/results-cam.txt", "DistortedPinhole", "Omni", "the model omni"),
+    "no pose of Kalibr": ("kalibr_results/results-cam.txt", "baseline T_1_0", "T_0_1", "no R T"),
+    "ost without a size": ("ost_ini/ost.txt", "width\n640", "width\n", "--image-size"),
+}
+
+
+@pytest.mark.parametrize("kind", NEW)
+def test_broken_files_of_other_programs_name_what_is_wrong(tmp_path, kind):
+    name, old, new, word = NEW[kind]
+    text = (FOREIGN / name).read_text()
+    assert old in text
+    path = tmp_path / name.split("/")[1]
+    path.write_text(text.replace(old, new) if "mrcal" not in name else text.replace(old, new, 1))
+    files = [path, FOREIGN / "mrcal" / "right.cameramodel"] if "mrcal" in name else [path]
+    size = SMALL if "kalibr" in name else None
+    with pytest.raises(InputError, match=word):
+        foreign_pair(read_files(files), size, 1000.0, {})
+
+
+def test_a_scale_of_metashape_is_metres(tmp_path):
+    text = (FOREIGN / "metashape" / "cameras.xml").read_text()
+    path = tmp_path / "c.xml"
+    path.write_text(text.replace('<scale locked="true">1</scale>', "<scale>0.5</scale>"))
+    assert foreign_pair(read_files([path]), None, None, {}).values["T"][0] == pytest.approx(-59.3)
+    path.write_text(text)
+    with pytest.raises(InputError, match="in a unit of the project"):
+        foreign_pair(read_files([path]), None, None, {})
