@@ -195,5 +195,3 @@ def test_one_ros_file_is_not_a_pair(mounted, tmp_path):
     for some in (paths[:1], [paths[0], paths[0]]):
         with pytest.raises(InputError, match=r"calibration of one camera|no stereo pair"):
             read_calibration(some)
-
-

@@ -23,6 +23,8 @@ SAMPLES = (
     *("kalibr_results/results-cam.txt", "ost_ini/ost.txt", "metashape/cameras.xml", "mrcal/right.cameramodel"),
     *("npy/R.npy", "npy_txt/R.txt", "halcon/camparL.dat", "fisheye_advice/fisheye.yaml"),
 )
+
+
 def refused_or_read(paths: list[Path]) -> bool:
     try:
         read_calibration(paths, (640, 480), unit_mm=1000.0)

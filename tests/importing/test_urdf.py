@@ -63,7 +63,7 @@ def test_a_number_is_what_xml_says(text):
 @pytest.mark.parametrize("encoding", ("utf-16", "utf-16-be", "utf-8-sig", "iso-8859-1", "cp1252"))
 def test_other_encodings_are_written_back_as_utf_8(encoding):
     name = "t\u00fcrm" if encoding != "utf-16-be" else "turm"
-    text = UNIT.decode().replace("tilt_joint", f"tilt_{name}").replace("<?xml version=\"1.0\"?>\n", "")
+    text = UNIT.decode().replace("tilt_joint", f"tilt_{name}").replace('<?xml version="1.0"?>\n', "")
     start = "\ufeff" * encoding.endswith("-be") + f'<?xml version="1.0" encoding="{encoding.removesuffix("-sig")}"?>\n'
     head = head_joints((start.replace("-be", "") + text).encode(encoding), "head.urdf", BY_NAME)
     written = corrected(head)

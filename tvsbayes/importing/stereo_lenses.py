@@ -46,10 +46,12 @@ def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, 
         size: width and height of the picture, px.
         kind: kind of the other model.
     """
-    pixels = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 2)
+    pixels: np.ndarray = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 2)
     target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    rays: np.ndarray = target
+    reprojected = pixels
     if kind == "inverse":
-        rays, reprojected = projected(target, np.eye(3), distortion), pixels
+        rays = projected(target, np.eye(3), distortion)
     elif kind == "fisheye":
         four = distortion.reshape(4, 1)
         rays = cv2.fisheye.undistortPoints(pixels[:, None], matrix, four).reshape(-1, 2)

@@ -174,8 +174,8 @@ def _rows(text: str) -> list[Any] | None:
     if not re.fullmatch(r"(?:[0-9eE+\-.,\s]++|#[^\n]*+)++", text) or sum(map(text.count, ", \n")) > ENTRIES_MAX:
         return None
     rows = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
-    rows = [[number(word) for word in row] for row in rows if row]
-    return None if not rows or any(None in row for row in rows) else rows
+    numbers = [[number(word) for word in row] for row in rows if row]
+    return None if not numbers or any(None in row for row in numbers) else numbers
 
 
 def _xml(text: str, file: str) -> dict[str, Any]:

@@ -128,8 +128,9 @@ def numbers_of(value: Any) -> np.ndarray | None:
         if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
             # BoofCV states the rotation of a pose in the same table as its shift.
             shift, turn = numbers_of([value[axis] for axis in "xyz"]), numbers_of(value.get("rotation"))
-            posed = shift is not None and turn is not None and turn.size == 9
-            return np.c_[turn.reshape(3, 3), shift.ravel()] if posed else shift
+            if shift is None or turn is None or turn.size != 9:
+                return shift
+            return np.c_[turn.reshape(3, 3), shift.ravel()]
         return None
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return None
