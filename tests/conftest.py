@@ -91,7 +91,10 @@ def shared_traces():
     """Processes share traced and compiled functions: one waits for a function that the other compiles."""
     from support.compiled_once import sharing
 
+    from tvsbayes.model.compilation_cache import use_compilation_cache
+
     with sharing(Path(os.environ["JAX_COMPILATION_CACHE_DIR"])):
+        use_compilation_cache()
         yield
 
 

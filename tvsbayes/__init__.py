@@ -1,4 +1,4 @@
-"""tvsbayes: estimates the motion of a beam per motor step of a geared laser positioner, with its uncertainty.
+"""tvsbayes: what one motor step of a geared, stepper-driven mechanism does, with its uncertainty.
 
 From a campaign folder to a robot:
 

@@ -48,8 +48,6 @@ RESIDUALS_LISTED = 4096
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
 _SHOWN_LINES: set[str] = set()
 """Lines that `compile_for` has shown in this process: a command may call it several times."""
-INPUT_NAMES = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.json", "rig": "[rig]"}
-"""Names of the inputs of an estimate for the user."""
 
 
 def no_output(line: str) -> None:
@@ -83,7 +81,7 @@ def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | 
     if not summary.headline_informed:
         return NothingToEstimate(
             "uninformed",
-            "the spots do not determine any effective ratio: they reduce its prior variance by less than a tenth",
+            "the looks do not determine any effective ratio: they reduce its prior variance by less than a tenth",
             remedy="observe stops before and after moves of both axes",
         )
     return None
@@ -422,15 +420,18 @@ def verify(
         progress: shows the progress.
 
     Raises:
-        InputError: a folder cannot be used, or there is no table or calibration of these data.
+        InputError: a folder cannot be used, the fresh readings or looks are those of the first, or there is no table or
+            calibration of these data.
         NotConverged: the fit is not accepted.
         NothingToEstimate: too few fresh readings or looks.
     """
     from tvsbayes.instrument.campaign import Campaign
-    from tvsbayes.single_axis.axis_campaign import AxisCampaign
+    from tvsbayes.instrument.copies import refuse_same_looks
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_readings
 
     campaign, looks = (read_campaign(each) if isinstance(each, Path | str) else each for each in (folder, fresh))
     if isinstance(campaign, AxisCampaign) and isinstance(looks, AxisCampaign):
+        refuse_same_readings(campaign, looks)
         from tvsbayes.compensation.verification import verify_axis
 
         return verify_axis(campaign, looks, made=made, seed=seed, tell=tell, progress=progress)
@@ -440,6 +441,7 @@ def verify(
     from tvsbayes.comparison.verified_looks import accepted_calibration, verify_looks
 
     calibration = accepted_calibration(campaign)
+    refuse_same_looks(campaign, looks)
     with Job({FITTING: 1.0, "verification": 2.0}, progress) as job:
         joint = StoredOrFitted(campaign, tell, job.part(FITTING)).fit
         job.begin("verification")
@@ -461,11 +463,12 @@ def _why_not_stored(campaign: Campaign) -> str:
         )
     record = read_fit(path)
     hashes, stored = input_hashes(campaign), record.provenance
-    changed_inputs = [INPUT_NAMES[name] for name in INPUT_NAMES if stored.inputs.get(name) != hashes[name]]
+    files = {"moves": "moves.csv", "spots": campaign.looks_table.file, "stereo": "stereo.json", "rig": "[rig]"}
+    changed_inputs = [file for name, file in files.items() if stored.inputs.get(name) != hashes[name]]
     version = stored.versions["tvsbayes"]
     of_another = f"results/ are of tvsbayes {escaped(version, 40)}, with another model of the rig"
     is_another = version != provenance(hashes, 0).versions["tvsbayes"]
-    if is_another and changed_inputs == [INPUT_NAMES["rig"]]:
+    if is_another and changed_inputs == [files["rig"]]:
         return f"{of_another}, or of another [rig]"
     if changed_inputs:
         return f"results/ are of other {', '.join(changed_inputs)}"

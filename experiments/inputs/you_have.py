@@ -247,7 +247,8 @@ KINDS = (
     ),
     Kind(
         "A stereo calibration of ROS, Kalibr or EuRoC",
-        "A file, or one for each camera. Kalibr's camchain is one file, read likewise.",
+        "A file, or one for each camera. Kalibr's camchain is one file, read likewise; so are mrcal's `.cameramodel`, "
+        "and the files of\nBasalt, calib.io and Metashape.",
         (
             Command("stereo --import left.yaml --import right.yaml -o ros.json", 6),
             Command("stereo --import cam0.yaml --import cam1.yaml -o euroc.json", 6),

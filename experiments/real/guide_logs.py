@@ -18,8 +18,8 @@ import numpy as np
 from experiments.common.command_line import act, parser
 from experiments.common.page import line
 from experiments.common.rows import append_row, output, read_rows
-from tvsbayes.results.records import plain
 from tvsbayes.importing.guide import GuideRun, is_guide_log, read_runs, rows_of_run
+from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior

@@ -26,7 +26,7 @@ from tvsbayes.cameras.assumed_covariance import (
 from tvsbayes.cameras.boards import Board, View
 from tvsbayes.cameras.bundle_adjustment import bundle_adjustment
 from tvsbayes.cameras.calibration_export import exported
-from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data

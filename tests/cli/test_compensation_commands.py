@@ -85,6 +85,9 @@ def test_too_few_readings_give_no_verdict(ask, folder, tmp_path):
     write_axis(few, tmp_path / "few")
     code, document = ask("verify", folder, tmp_path / "few")
     assert code == 3 and document["verdict"] == "CANNOT TELL"
+    code, document = ask("verify", folder, folder)
+    assert code == 2
+    assert_error(document, "same-looks")
 
 
 @pytest.mark.parametrize("line", [("compensate", PAPER_TWIN, "--to", "csv"), ("plan", "--verify")])

@@ -104,7 +104,7 @@ def test_the_first_compilation_is_announced(tmp_path, capsys, monkeypatch):
     compile_for(report_line)
     assert capsys.readouterr().err == "", "several steps of a command ask for the cache"
     monkeypatch.setattr("tvsbayes.pipeline._SHOWN_LINES", set())
-    (tmp_path / "jit_fit-cache").touch()
+    (tmp_path / "compiled" / "jit_fit").touch()
     compile_for(report_line)
     assert capsys.readouterr().err == ""
 

@@ -23,7 +23,7 @@ from tvsbayes.comparison.watched_looks import (
     powers,
     watch,
 )
-from tvsbayes.errors import NothingToEstimate
+from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.instrument.campaign import Campaign, write_campaign
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
@@ -96,6 +96,14 @@ def test_a_planted_change_is_named(mounted_rig, mixed_fit, truth, changed, what,
     assert part.what == what and len({other.what for other in test.moved}) == len(test.moved)
     # Linear in the change: a tenth of it beside four u.
     assert part.value == pytest.approx(size, abs=4 * part.u + 0.1 * size)
+
+
+def test_looks_of_the_campaign_are_refused(mixed_fit):
+    """All of them, or more than half: they agree with it whatever has happened since."""
+    campaign = mixed_fit.campaign
+    for looks in (campaign, replace(campaign, spots=campaign.spots[::2])):
+        with pytest.raises(InputError, match=r"spots\.csv of the first folder"):
+            watch(mixed_fit, looks)
 
 
 def test_nothing_has_moved(mounted_rig, mixed_fit, truth, monkeypatch):

@@ -26,6 +26,13 @@ def test_a_sealed_file_round_trips(folder):
     assert sorted(p.name for p in folder.path.iterdir()) == ["a", "empty"], "nothing temporary stays"
 
 
+def test_a_file_under_anothers_name_is_none(folder):
+    folder.write("a", b"content")
+    folder.write("b", b"other")
+    (folder.path / "a").rename(folder.path / "b")
+    assert folder.read("b") is None
+
+
 @pytest.mark.parametrize("place", [0, len(MAGIC) - 1, len(MAGIC), len(MAGIC) + 31, len(MAGIC) + 32, -1])
 def test_one_wrong_byte_is_detected(folder, place):
     folder.write("a", b"content")

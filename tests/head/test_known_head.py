@@ -12,7 +12,7 @@ import yaml
 from support.commands import assert_error
 
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.head.urdf import head_joints
+from tvsbayes.importing.urdf import head_joints
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.refusals import refusal
 from support.small_campaign import small_campaign
 from support.written_rows import move_row
 
@@ -20,6 +21,7 @@ from tvsbayes.instrument.campaign import (
     spots_bytes,
     write_campaign,
 )
+from tvsbayes.instrument.copies import refuse_same_looks
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.rig import RigTable
 
@@ -223,3 +225,14 @@ def test_records_are_hashable_and_small():
         small_campaign().spots[0].u_left_px = 1.0  # type: ignore[misc]
     assert len({*small_campaign().spots, *small_campaign().spots}) == len(small_campaign().spots)
     assert Spot.__slots__
+
+
+def test_looks_that_were_seen_before_are_refused():
+    """The folder itself, a copy with other ids, and a part of it; new looks beside a few old ones are taken."""
+    known = small_campaign()
+    again = tuple(dataclasses.replace(s, spot=s.spot + 100) for s in known.spots)
+    for looks in (known.spots, again, known.spots[:2]):
+        assert refusal(lambda looks=looks: refuse_same_looks(known, dataclasses.replace(known, spots=looks)))
+    ok = [s for s in known.spots if s.status == "ok"]
+    new = tuple(dataclasses.replace(s, u_left_px=s.u_left_px + 0.25) for s in ok[1:])
+    refuse_same_looks(known, dataclasses.replace(known, spots=(ok[0], *new)))

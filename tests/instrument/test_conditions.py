@@ -12,7 +12,14 @@ from tvsbayes.errors import InputError
 from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.campaign import MOVES, Move, parse_moves
 from tvsbayes.instrument.campaign_header import parse_header
-from tvsbayes.instrument.conditions import interpolated, kelvin, powered_on_s, unseen_shifts, warm_minutes
+from tvsbayes.instrument.conditions import (
+    interpolated,
+    kelvin,
+    powered_on_s,
+    temperature_doubts,
+    unseen_shifts,
+    warm_minutes,
+)
 from tvsbayes.instrument.parameters import CREEP_NAMES, RIG_PRIORS, ZERO_SHIFT_NAMES, Prior, names_of
 
 HEAD = 'format = "tvsbayes-campaign/1"\n'
@@ -67,6 +74,27 @@ def test_temperatures_are_interpolated_in_time_and_counted():
     assert interpolated(moves) == 2 and interpolated(moves_at([0.0, 1.0])) == 0
     np.testing.assert_allclose(kelvin(moves_at([0.0, 0.0, 0.0], [20.0, None, 22.0])), [0.0, 1.0, 2.0], rtol=1e-12)
     assert not kelvin(moves_at([0.0, 9.0], [20.0, None])).any()
+
+
+def test_codes_of_a_sensor_are_doubted_where_neighbours_are_far():
+    """85 and -127 are what a DS18B20 gives when it did not measure; a kiln at 85 degC is one."""
+    times = [10.0 * k for k in range(7)]
+    power_on, disconnected = temperature_doubts(moves_at(times, [85.0, 21.0, None, -127.0, -127.0, 22.5, 85.0]))
+    assert "moves 0, 6 is 85" in power_on and "others are 21 to 22.5" in power_on
+    assert "moves 3, 4 is -127" in disconnected and "interpolated" in disconnected
+    assert temperature_doubts(moves_at(times, [80.0, 83.0, 85.0, 85.0, 86.0, None, 84.0])) == []
+    assert temperature_doubts(moves_at(times)) == []
+    # Never another value: nothing was measured at all.
+    assert len(temperature_doubts(moves_at(times, [-127.0] * 7))) == 1
+
+
+@pytest.mark.parametrize("degC", ["-273.16", "-300", "nan"])
+def test_below_absolute_zero_is_refused(degC):
+    moves = [replace(moves_at([0.0])[0], temperature_degC=-273.15, pan_approach="left", tilt_approach="up")]
+    data = MOVES.content(moves)
+    assert list(parse_moves(data)) == moves
+    with pytest.raises(InputError, match="temperature_degC"):
+        parse_moves(data.replace(b"-273.15", degC.encode()))
 
 
 def test_the_temperature_column_round_trips_where_present():

@@ -34,9 +34,9 @@ def answer(hits: int = 1, traces: int = 0, log: str = "") -> subprocess.Complete
 def test_the_folder_is_made_for_its_user_alone(folder):
     assert use_compilation_cache() and cache_folder() == folder
     assert os.name != "posix" or folder.stat().st_mode & 0o777 == 0o700
-    assert jax.config.jax_compilation_cache_dir == str(folder)
+    assert jax.config.jax_compilation_cache_dir == str(folder / "compiled")
     assert Traces.used.folder.path == folder / "traced"
-    (folder / "jit_fit-cache").touch()
+    (folder / "compiled" / "jit_fit").touch()
     assert not use_compilation_cache()
 
 
@@ -78,7 +78,38 @@ def test_what_one_process_leaves_the_next_one_takes(folder, monkeypatch, tmp_pat
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     state = cache_state()
     assert state.used and state.remedy == "" and str(folder) in state.found
-    assert len(list(folder.glob("*-cache"))) == len(list((folder / "traced").iterdir())) == 1
+    assert len(list((folder / "compiled").iterdir())) == len(list((folder / "traced").iterdir())) == 1
+
+
+def values_of(folder: Path) -> tuple[str, str]:
+    """What two functions of one signature give in a process with this cache, and what it prints on stderr."""
+    code = (
+        "import jax, numpy as np\n"
+        "from tvsbayes.model.compilation_cache import use_compilation_cache\n"
+        "use_compilation_cache()\n"
+        "hits = []\n"
+        "jax.monitoring.register_event_listener(lambda event, **_: hits.append('cache_hits' in event))\n"
+        "x = np.arange(3.0)\n"
+        "print(jax.jit(lambda x: x + 1)(x), jax.jit(lambda x: x * 5)(x), jax.jit(lambda x: x[:2])(x), sum(hits))\n"
+    )
+    environment = {**os.environ, "TVSBAYES_CACHE": str(folder), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    return done.stdout.strip(), done.stderr
+
+
+def test_exchanged_damaged_and_foreign_entries_are_compiled_again(tmp_path):
+    """JAX's own cache runs what lies under a function's name: here x * 5 for x + 1, without a word."""
+    right = "[1. 2. 3.] [ 0.  5. 10.] [0. 1.]"
+    assert values_of(tmp_path)[0] == f"{right} 0"
+    places = sorted((tmp_path / "compiled").iterdir())
+    whole = [place.read_bytes() for place in places]
+    assert len(places) == 3 and values_of(tmp_path) == (f"{right} 3", "")
+    for harmed in ([*whole[1:], whole[0]], [data[:-9] for data in whole], [b"", b"PK\x03\x04", whole[2][:-1] + b"\0"]):
+        for place, data in zip(places, harmed, strict=True):
+            place.write_bytes(data)
+        assert values_of(tmp_path) == (f"{right} 0", "")
+        # And stored again.
+        assert [len(place.read_bytes()) for place in places] == [len(data) for data in whole]
 
 
 @pytest.mark.parametrize(

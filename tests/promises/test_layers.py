@@ -41,8 +41,9 @@ MODEL = {"model", "estimators", "posterior", "assessment", "coordinates", "compa
 BESIDE_THE_TWIN = {"calibration", "metrology", "results", "inference", *MODEL}
 """What the digital twin shares no formula with, nor with the mirrors of the instrument."""
 JAX_FREE_PACKAGES = (
-    *("errors", "progress", "display", "files", "importing", "instrument", "head", "calibration", "metrology", "results"),
-    *("inference", "single_axis", "twin", "coordinates", "compensation", "positioner", "acquisition", "report"),
+    *("errors", "progress", "display", "files", "importing", "instrument", "head", "calibration", "metrology"),
+    *("results", "inference", "single_axis", "twin", "coordinates", "compensation", "positioner", "acquisition"),
+    "report",
 )
 JAX_FREE_MODULES = (
     *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from support.axes import campaign, runs
+from support.refusals import refusal
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign_header import mechanism_key
-from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis, write_axis
+from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis, refuse_same_readings, write_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 
 TOML = 'format = "tvsbayes-axis/1"\nunit = "deg"\n'
@@ -90,3 +93,20 @@ def test_the_hash_covers_the_data_alone(tmp_path):
     assert axis_hashes(one) == axis_hashes(other)
     third = read_axis(folder(tmp_path / "c", TOML + "[axis]\nbacklash = { value = 0.0, u = 0.2 }\n"))
     assert axis_hashes(one)["axis"] != axis_hashes(third)["axis"]
+
+
+def test_readings_that_were_taken_before_are_refused():
+    """Coarse readings may repeat in value: then their times are others."""
+    moves = runs(1)
+    known = campaign(moves, [round(0.01 * m.command, 1) for m in moves], 0.002)
+    refuse = refusal(lambda: refuse_same_readings(known, replace(known, readings=known.readings[3:])))
+    assert refuse.code == "same-looks" and refuse.file == "readings.csv"
+    later = replace(known, moves=tuple(replace(m, time_s=m.time_s + 3600.0) for m in known.moves))
+    refuse_same_readings(known, later)
+
+
+def test_temperatures_start_at_absolute_zero(tmp_path):
+    moves = MOVES.replace("approach", "approach,temperature_degC").replace("forward", "forward,{}").replace("5,", "5,,")
+    assert read_axis(folder(tmp_path / "a", moves=moves.format(-273.15))).moves[0].temperature_degC == -273.15
+    with pytest.raises(InputError, match=r"temperature_degC.*-273\.15"):
+        read_axis(folder(tmp_path / "b", moves=moves.format(-300)))

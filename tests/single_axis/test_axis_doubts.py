@@ -88,3 +88,25 @@ def test_simulated_axes_raise_no_doubt(seed):
     moves = random_moves(seed, 40, 4) if seed % 2 else runs(2)
     axis = drawn(seed, moves, per_command=AxisPrior(0.01, 1e-6), backlash=AxisPrior(0.0, 1.0)).campaign
     assert data_doubts(axis, rows_of(axis)) == []
+
+
+def test_a_command_with_a_digit_too_many_is_doubted():
+    """Read or not; a homing far from the work is none, nor is a place that the axis returns to."""
+    whole = logged()
+    at = len(whole.moves) // 2 + 3
+    far = 10 * max(m.command for m in whole.moves)
+    typed = replace(whole, moves=tuple(replace(m, command=far) if m.move == at else m for m in whole.moves))
+    [doubt] = [text for text in doubts(typed) if text.startswith("command of move")]
+    assert f"move {at} is {far:g}" in doubt and "a digit too many?" in doubt
+    first = replace(whole, moves=tuple(replace(m, command=far) if m.approach else m for m in whole.moves))
+    parked = replace(whole, moves=tuple(replace(m, command=far) if m.move in (at, at + 4) else m for m in whole.moves))
+    for sound in (whole, first, parked):
+        assert not any(text.startswith("command of move") for text in doubts(sound))
+
+
+def test_codes_of_a_thermometer_are_doubted():
+    whole = logged()
+    cold = replace(
+        whole, moves=tuple(replace(m, temperature_degC=-127.0 if m.move == 4 else 21.0) for m in whole.moves)
+    )
+    assert [text for text in doubts(cold) if text.startswith("temperature_degC of moves 4 is -127")]

@@ -46,7 +46,7 @@ def caching_in(folder: str | Path, at_once: bool = False) -> Iterator[None]:
     Others find none, or `at_once` what lies there.
     """
     import jax
-    from jax.experimental.compilation_cache import compilation_cache
+    from jax._src import compilation_cache
 
     from tvsbayes.model.compiled import Traces
 
@@ -56,6 +56,7 @@ def caching_in(folder: str | Path, at_once: bool = False) -> Iterator[None]:
         "jax_persistent_cache_min_entry_size_bytes",
     )
     before = {name: jax.config.values[name] for name in names}
+    kept = compilation_cache._cache, compilation_cache._cache_initialized
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TVSBAYES_CACHE", str(folder))
         patch.setattr(Traces, "used", Traces(Path(folder) / "traced") if at_once else None)
@@ -63,6 +64,7 @@ def caching_in(folder: str | Path, at_once: bool = False) -> Iterator[None]:
     for name, value in before.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
+    compilation_cache._cache, compilation_cache._cache_initialized = kept
 
 
 @pytest.fixture(scope="module")

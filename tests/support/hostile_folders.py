@@ -31,7 +31,7 @@ from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.assessment.fitted_calibration import calibration_of_draws
 from tvsbayes.calibration.calibration_file import calibration_bytes, read_draws
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.errors import TvsError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.files.documents import parse_toml

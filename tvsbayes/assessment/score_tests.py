@@ -114,7 +114,7 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
         return (order >= row).astype(float)
 
     def place(row: int) -> str:
-        return f"from spot {spots[row].spot} on (move {spots[row].move})"
+        return f"from {fit.campaign.looks[:-1]} {spots[row].spot} on (move {spots[row].move})"
 
     few, many = rows(CHANGE_POINTS), rows(2 * CHANGE_POINTS)
     places = tuple(map(place, few))
@@ -318,8 +318,8 @@ def _single_spots(fit: JointFit, common: _Common) -> _Tested:
     worst = int(np.argmin(chances))
     return _Tested(
         log_p=float(chances[worst] + np.log(len(spots))),
-        name="single spots disagree with all others",
-        where=f"most of all spot {spots[worst].spot}",
+        name=f"single {fit.campaign.looks} disagree with all others",
+        where=f"most of all {fit.campaign.looks[:-1]} {spots[worst].spot}",
         chi2=float(distances[worst]),
         dof=int(dof[worst]),
         shift_sd=0.0,

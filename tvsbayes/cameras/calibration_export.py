@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from tvsbayes.cameras.calibration_containers import MATRIX_TAG
 from tvsbayes.instrument.stereo_pair import Stereo
 
 MM_PER_M = 1000.0
+MATRIX_TAG = "!!opencv-matrix"
 Format = Literal["opencv", "ros"]
 EXPORT_NAMES: dict[Format, tuple[str, str]] = {
     "opencv": ("intrinsics.yml", "extrinsics.yml"),

@@ -22,7 +22,7 @@ TARGET_MISSED = 1
 """Exit code of a complete command whose limit or target is not met."""
 app = typer.Typer(
     name="tvsbayes",
-    help="What one motor step of a geared laser positioner does to the beam, and how sure that is.",
+    help="What one motor step of a geared, stepper-driven mechanism does, and how sure that is.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,

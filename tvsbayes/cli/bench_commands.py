@@ -226,7 +226,7 @@ def _provenance(
 
 def _keys_by_field(keys: list[str] | None) -> dict[str, str]:
     """Names of entries by field, from --key."""
-    from tvsbayes.cameras.calibration_formats import KEY_FIELDS
+    from tvsbayes.importing.stereo import KEY_FIELDS
 
     names = {}
     for text in keys or []:
@@ -242,7 +242,8 @@ def _imported(
     paths: list[Path], image_size: str | None, import_unit: str | None, stated: Provenance, keys: Mapping[str, str]
 ) -> PrintedPair:
     """A calibration of another program, or a `stereo.json`."""
-    from tvsbayes.cameras.calibration_formats import UNITS_MM, read_calibration
+    from tvsbayes.cameras.imported_calibration import read_calibration
+    from tvsbayes.importing.stereo import UNITS_MM
     from tvsbayes.report.command_text import stereo_text
 
     unit_mm = None if import_unit is None else UNITS_MM.get(import_unit)

@@ -173,6 +173,7 @@ def compare(
     """
     from tvsbayes.estimators.four_point import select_experiments
     from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.copies import refuse_same_looks
 
     if other is not None:
         refuse_options("for one campaign: with B nothing is left out", "leave it out, or leave out B", by=by, seed=seed)
@@ -187,6 +188,8 @@ def compare(
         return
     folders = [campaign] if other is None else [campaign, other]
     data = [read_campaign(folder) for folder in folders]
+    if other is not None:
+        refuse_same_looks(*data)
     if other is None and data[0].rig.mechanism.sightings:
         refuse_options("for spots; of sightings positions are left out", "write --by positions", by=by, seed=seed)
         _compare_pointing(data[0], as_json)

@@ -24,10 +24,11 @@ from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
-from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadJoints, HeadModel, head_joints, ratios_of
+from tvsbayes.head.urdf import HeadModel, ratios_of
 from tvsbayes.importing.columns import table_document, table_lines
 from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.sightings import FIELDS, SightingWishes, sighting_rows
+from tvsbayes.importing.urdf import URDF_BYTES_MAX, HeadJoints, head_joints
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, input_hashes, read_campaign
 from tvsbayes.instrument.campaign_header import header_values, mechanism_key
@@ -233,7 +234,7 @@ def _urdf_files(
     tables = {"campaign.toml": ["[urdf]", *(toml_line(key, value) for key, value in joints.items())], "rig.toml": []}
     for axis, keys in LIMIT_KEYS.items() if steps_per_turn is not None else ():
         ratio = priors[f"degrees_per_step.{axis}"].value
-        if (limits := head.limits_deg(axis)) is not None:
+        if (limits := head.limits_deg[axis]) is not None:
             tables["rig.toml"] += [toml_line(key, round(end / ratio)) for key, end in zip(keys, limits, strict=True)]
     if tables["rig.toml"]:
         tables["rig.toml"].insert(0, "[positioner]")

@@ -9,9 +9,11 @@ from __future__ import annotations
 import functools
 import gc
 import io
+import logging
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable
 
 try:
@@ -119,6 +121,10 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # XLA reports a compilation of more than two minutes, as on a small computer, as an error for its authors.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # Warnings and logs of libraries are for programmers, who ask for them by `python -W`.
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        logging.getLogger().addHandler(logging.NullHandler())
     # A command ends after seconds: the collector's passes over the objects of JAX take a twentieth of them.
     gc.set_threshold(*GC_THRESHOLDS)
     # A closed stream (`2>&-`) is None; the next file would get its number, and libraries would write errors into it.

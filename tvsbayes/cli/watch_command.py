@@ -39,8 +39,10 @@ def watch(
     if serve("watch", **locals()) or serve("watch", looks):
         return
     from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.copies import refuse_same_looks
 
     known, new = read_campaign(campaign), read_campaign(looks)
+    refuse_same_looks(known, new)
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, WATCHING: 1.0}, progress) as job:
         fitted = StoredOrFitted(known, report_line, job.part(FITTING)).fit

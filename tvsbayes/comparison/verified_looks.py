@@ -316,10 +316,23 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
     """Plan the fewest looks that verify a calibration: greedy choice of stops for each axis, visited together.
 
     Raises:
-        NothingToEstimate: the nominal counters are those of the calibration: there is nothing to verify.
+        NothingToEstimate: the nominal counters are those of the calibration, or no axis ever moved: there is nothing to
+            verify.
     """
-    run_up = tuple(RUN_UP * max(calibration.overshoot_steps[axis], 1) for axis in AXES)
-    axes = [_axis_stops(campaign, calibration, k, run_up[k]) for k in range(2)]
+    # An axis that the campaign never moved stays where it is.
+    moved = np.ptp(calibration.range_steps, axis=1) > 0
+    run_up = tuple(
+        RUN_UP * max(calibration.overshoot_steps[axis], 1) * int(m) for axis, m in zip(AXES, moved, strict=True)
+    )
+    if not moved.any():
+        what = "no axis was seen at two counters: nothing can have been aimed by the calibration"
+        raise NothingToEstimate("no-correction", what, remedy="look before and after moves, then fit again")
+    axes = [
+        _axis_stops(campaign, calibration, k, run_up[k])
+        if moved[k]
+        else _AxisStops([VerifyStop(float(calibration.range_steps[k, 0]), 1)], 0.0)
+        for k in range(2)
+    ]
     count = max(LOOKS_MIN, *(len(axis.stops) for axis in axes))
     # The axis that needs fewer stops repeats them: every look measures both axes.
     pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)

@@ -21,6 +21,7 @@ from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.copies import refuse_same_looks
 from tvsbayes.instrument.homing import homed
 from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
@@ -390,8 +391,10 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         seed: seed of the draws of noise scales and of the null distribution.
 
     Raises:
+        InputError: the looks are those of the campaign.
         NothingToEstimate: fewer than `LOOKS_MIN` usable looks.
     """
+    refuse_same_looks(fit.campaign, looks)
     usable = int(in_sight(looks).sum()) if ordered_spots(looks) else 0
     if usable < LOOKS_MIN:
         file = looks.looks_table.file
@@ -399,7 +402,7 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
             "too-few-looks",
             f"{file}: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
             file=file,
-            remedy="look at more places, or detect the refused spots again",
+            remedy=looks.look_again,
         )
     watched = WatchedLooks(fit, looks)
     departures = watched.departures(seed)

@@ -145,7 +145,9 @@ class JointFit(Shown):
             for of in TARGETS.values()
             if of.applies(moved)
         ]
-        return View(f"JointFit of {used} spots, {state}; mode and Laplace sd", ("quantity", "mode", "sd"), rows)
+        return View(
+            f"JointFit of {used} {self.campaign.looks}, {state}; mode and Laplace sd", ("quantity", "mode", "sd"), rows
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -259,7 +261,7 @@ def fit(
         if not problem.free.any():
             raise NothingToEstimate(
                 "nothing-free",
-                "every parameter is stated as exactly known (u = 0), the cameras included",
+                "every parameter is stated as exactly known (u = 0)" + ", the cameras included" * campaign.has_images,
                 file="campaign.toml",
                 remedy="state a u above 0 for the parameters to be estimated",
             )
@@ -334,11 +336,12 @@ def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " 
     """Mark the ordered spots that the fit uses; one that the lens model cannot undistort has no line of sight."""
     used = np.array([spot.spot not in without for spot in ordered_spots(campaign)], dtype=bool) & in_sight(campaign)
     if used.sum() < SMALLEST_CAMPAIGN:
+        file, looks = campaign.looks_table.file, campaign.looks
         raise NothingToEstimate(
-            "too-few-spots",
-            f"spots.csv: {used.sum()} spots can be used; the joint fit needs at least {SMALLEST_CAMPAIGN}",
-            file="spots.csv",
-            remedy="observe more stops, or detect the refused spots again",
+            f"too-few-{looks}",
+            f"{file}: {used.sum()} {looks} can be used; the joint fit needs at least {SMALLEST_CAMPAIGN}",
+            file=file,
+            remedy=campaign.look_again,
         )
     return used
 
@@ -453,7 +456,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     looks = max(float(np.sum(used * problem.dof)), 1.0)
     misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
     if misfit > MISFIT_LIMIT:
-        problems += (f"the spots miss the fitted beams by {misfit:.0f} times their stated uncertainty",)
+        problems += (f"the {campaign.looks} miss the fitted beams by {misfit:.0f} times their stated uncertainty",)
     return JointFit(
         campaign=campaign,
         space=problem.space,

@@ -29,12 +29,21 @@ from tvsbayes.estimators.spot_pattern import (
     table_findings,
 )
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import PIXEL_SDS, UNDETECTED, Campaign, Spot, ordered_spots, pixels_of, stereo_spots
-from tvsbayes.instrument.conditions import interpolated
+from tvsbayes.instrument.campaign import (
+    MOVES,
+    PIXEL_SDS,
+    UNDETECTED,
+    Campaign,
+    Spot,
+    ordered_spots,
+    pixels_of,
+    stereo_spots,
+)
+from tvsbayes.instrument.conditions import interpolated, temperature_doubts
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.sightings import SIGHTINGS, sighted_deg, sightings_of
 from tvsbayes.instrument.stereo_pair import SHORTEST_BASELINE_MM, baseline_doubt, pair_doubts, triangulate
-from tvsbayes.instrument.stops import observed_stops, separation
+from tvsbayes.instrument.stops import lone_doubts, observed_stops, separation
 from tvsbayes.results.records import Record
 
 RATIOS_TRIED, RATIO_SDS = 61, 3.0
@@ -65,6 +74,16 @@ def _misspelt(campaign: Campaign, looks: str, file: str, most: int) -> list[Find
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
     said = f"{looks} {listed(misspelt, most)} are left out: their status is not spelt ok, in small letters"
     return [Finding("status", said, file=file)] if misspelt else []
+
+
+def _move_findings(campaign: Campaign) -> list[Finding]:
+    """Find temperatures that no sensor measured, and counters with a digit too many."""
+    findings = doubts("temperature", temperature_doubts(campaign.moves), MOVES.file)
+    for axis in AXES:
+        column = f"{axis}_steps"
+        lone = lone_doubts(campaign.moves, [getattr(move, column) for move in campaign.moves], column)
+        findings += doubts("lone-counter", lone, MOVES.file)
+    return findings
 
 
 def sighting_findings(campaign: Campaign) -> tuple[Finding, ...]:
@@ -132,12 +151,13 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     Returns:
         Findings, certain ones and doubts; `Finding.sentence` is printed.
     """
+    of_moves = _move_findings(campaign)
     if not campaign.has_images:
-        return sighting_findings(campaign)
+        return (*of_moves, *sighting_findings(campaign))
     points_mm = campaign.usable_points_mm if points_mm is None else points_mm
     spots = stereo_spots(campaign.spots)
     ok = [spot for spot in spots if spot.status == "ok"]
-    findings = _misspelt(campaign, "spots", "spots.csv", SPOTS_LISTED)
+    findings = [*of_moves, *_misspelt(campaign, "spots", "spots.csv", SPOTS_LISTED)]
     stray = [s.spot for s in spots if s.status == UNDETECTED and s.u_left_px is not None]
     if stray:
         named = listed(stray, SPOTS_LISTED)

@@ -313,7 +313,7 @@ def shipped_data() -> Path:
     return packaged if packaged.is_dir() else Path(str(resources.files("tvsbayes"))).resolve().parent / "data"
 
 
-def _array_of(content: bytes, name: str) -> np.ndarray:
+def array_of(content: bytes, name: str) -> np.ndarray:
     """Read the array of an .npy; anything but numbers and text of exactly the header's size raises ValueError."""
     import numpy as np
 
@@ -332,16 +332,24 @@ def _array_of(content: bytes, name: str) -> np.ndarray:
 
 
 def read_arrays(path: Path, bytes_max: int) -> dict[str, np.ndarray]:
-    """Read the arrays of an .npz, by name; every size is checked against the header before memory is allocated.
+    """Read the arrays of an .npz; see `arrays_of`.
+
+    Raises:
+        InputError: as `read_bytes`.
+        ValueError: as `arrays_of`.
+    """
+    return arrays_of(read_bytes(path, bytes_max), bytes_max)
+
+
+def arrays_of(data: bytes, bytes_max: int) -> dict[str, np.ndarray]:
+    """The arrays of an .npz, by name; every size is checked against the header before memory is allocated.
 
     `numpy.load` alone can expand 0.5 kB to gigabytes: by entries of no width, and by bzip2 members, which zipfile
     unpacks without a limit whatever size they state (experiments/robustness/hostile.md).
 
     Raises:
-        InputError: as `read_bytes`.
         ValueError: not an .npz of plain numbers and text as NumPy writes it, or above `bytes_max`, packed or unpacked.
     """
-    data = read_bytes(path, bytes_max)
     arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -356,7 +364,7 @@ def read_arrays(path: Path, bytes_max: int) -> dict[str, np.ndarray]:
                 name = member.filename.removesuffix(".npy")
                 if name in arrays:
                     raise ValueError(f"{escaped(name)} twice")
-                arrays[name] = _array_of(content, escaped(name))
+                arrays[name] = array_of(content, escaped(name))
     except ValueError:
         raise
     except (OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:

@@ -1,8 +1,8 @@
 """A folder that only its user can have written, with sealed files that may be executed later.
 
-A file begins with a magic number and the SHA-256 of its content. It is read only where file and folder belong to the
-user of this process and nobody else may write them (POSIX; Windows separates users' folders by itself). A cache that
-cannot be read or written is no error: the caller computes its content again.
+A file begins with a magic number and the SHA-256 of its name and content: one under another's name is none. It is read
+only where file and folder belong to the user of this process and nobody else may write them (POSIX; Windows separates
+users' folders by itself). A cache that cannot be read or written is no error: the caller computes its content again.
 """
 
 from __future__ import annotations
@@ -14,8 +14,12 @@ import stat
 from dataclasses import dataclass
 from pathlib import Path
 
-MAGIC = b"tvsbayes sealed 1\n"
+MAGIC = b"tvsbayes sealed 2\n"
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+def _seal(name: str, content: bytes) -> bytes:
+    return MAGIC + hashlib.sha256(name.encode() + b"\n" + content).digest()
 
 
 def _others_may_change(status: os.stat_result) -> bool:
@@ -76,12 +80,12 @@ class OwnFolder:
         except OSError:
             return None
         seal, content = data[: len(MAGIC) + 32], data[len(MAGIC) + 32 :]
-        intact = len(data) <= self.file_bytes_max and seal == MAGIC + hashlib.sha256(content).digest()
+        intact = len(data) <= self.file_bytes_max and seal == _seal(name, content)
         return content if intact else None
 
     def write(self, name: str, content: bytes) -> bool:
         """Write a sealed file, completely or not at all; True where it was written."""
-        data = MAGIC + hashlib.sha256(content).digest() + content
+        data = _seal(name, content) + content
         if self.make() or len(data) > self.file_bytes_max:
             return False
         temporary = self.path / f".{secrets.token_hex(8)}.tmp"

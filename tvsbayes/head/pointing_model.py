@@ -25,6 +25,9 @@ COMPLEX_STEP = 1e-20
 RATIO_KNOWN = 1e-4
 """Relative u below which a ratio is held fixed (encoder on the axis); elevation zero and both flexures act alike."""
 RATIOS = tuple(f"degrees_per_step.{axis}" for axis in AXES)
+ZEROS = ("azimuth_zero_deg", "elevation_zero_deg")
+OWN_SHARE = 1e-6
+"""Share of an unknown's effect on the sightings that no earlier unknown has: with less it is not determined."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,6 +40,7 @@ class PointingModel(Shown):
         standard_error: from the scatter of the residuals.
         residual_deg: observed minus predicted along azimuth and elevation on the sphere, shape (n, 2), in time order.
         known: ratios and terms that were held fixed.
+        undetermined: those of `known` that the sightings cannot separate from others, as where an axis never moved.
     """
 
     names: tuple[str, ...]
@@ -44,6 +48,7 @@ class PointingModel(Shown):
     standard_error: np.ndarray
     residual_deg: np.ndarray
     known: dict[str, float]
+    undetermined: tuple[str, ...] = ()
 
     @property
     def rms_deg(self) -> float:
@@ -67,7 +72,9 @@ class PointingModel(Shown):
             name: {"value": float(value), "standard_error": float(error)}
             for name, value, error in zip(self.names, self.value, self.standard_error, strict=True)
         }
-        return {"kind": "pointing-model", "terms": terms, "sightings": len(self.residual_deg), "rms_deg": self.rms_deg}
+        held = {name: self.known[name] for name in self.undetermined}
+        counts = {"sightings": len(self.residual_deg), "rms_deg": self.rms_deg}
+        return {"kind": "pointing-model", "terms": terms, "undetermined": held, **counts}
 
 
 def _steps(campaign: Campaign, rows: Sequence[Sighting]) -> np.ndarray:
@@ -86,8 +93,32 @@ def _off_deg(values: dict[str, float | complex], steps: np.ndarray, frames: np.n
     return -np.degrees(1.0) * np.stack([across, above], axis=1) / np.maximum(along.real, 0.5)[:, None]
 
 
+def _slope(
+    values: dict[str, float | complex], names: Sequence[str], steps: np.ndarray, frames: np.ndarray
+) -> np.ndarray:
+    """Derivatives of the residuals by the unknowns, shape (2 n, unknowns)."""
+    off = [_off_deg(values | {name: values[name] + 1j * COMPLEX_STEP}, steps, frames).imag.ravel() for name in names]
+    return np.stack(off, axis=1) / COMPLEX_STEP
+
+
+def _determined(names: Sequence[str], slope: np.ndarray) -> tuple[str, ...]:
+    """The unknowns whose effect is not a combination of the effects of earlier ones, ratios and zeros being first."""
+    first = (*RATIOS, *ZEROS)
+    own = np.zeros((len(slope), 0))
+    kept = set()
+    for name in sorted(names, key=lambda name: name not in first):
+        effect = slope[:, names.index(name)]
+        rest = effect - own @ (own.T @ effect)
+        # Twice is enough (Kahan): the first projection leaves rounding errors of the size of the effect.
+        rest -= own @ (own.T @ rest)
+        if np.linalg.norm(rest) > OWN_SHARE * np.linalg.norm(effect):
+            own = np.column_stack([own, rest / np.linalg.norm(rest)])
+            kept.add(name)
+    return tuple(name for name in names if name in kept)
+
+
 def pointing_model(campaign: Campaign) -> PointingModel:
-    """Fit ratios and terms by least squares.
+    """Fit ratios and terms by least squares; those that the sightings do not determine keep their stated values.
 
     Args:
         campaign: campaign of a head, with sightings.
@@ -104,18 +135,17 @@ def pointing_model(campaign: Campaign) -> PointingModel:
     rows = sightings_of(ordered_spots(campaign))
     terms = [term.name for term in HEAD_TERMS.values()]
     values: dict[str, float | complex] = {name: priors[name].value for name in (*RATIOS, *terms)}
-    names = tuple(n for n in values if priors[n].u > (RATIO_KNOWN * abs(priors[n].value) if n in RATIOS else 0.0))
+    unknown = tuple(n for n in values if priors[n].u > (RATIO_KNOWN * abs(priors[n].value) if n in RATIOS else 0.0))
     steps, angles = _steps(campaign, rows), sighted_deg(rows)
-    # A single counter of an axis determines its zero but no ratio.
-    names = tuple(n for n in names if n not in RATIOS or len(np.unique(steps[:, RATIOS.index(n)])) > 1)
-    if 2 * len(rows) <= len(names):
+    if 2 * len(rows) <= len(unknown):
         raise NothingToEstimate(
             "too-few-sightings",
-            f"{len(rows)} sightings are fewer than {len(names)} unknowns ask for",
+            f"{len(rows)} sightings are fewer than {len(unknown)} unknowns ask for",
             file=SIGHTINGS.file,
             remedy="sight more directions",
         )
     frames = tangent_frames(angles)
+    names = _determined(unknown, _slope(values, unknown, steps, frames))
     if "azimuth_zero_deg" in names:
         # Start on the turn nearest to the prior.
         zero = priors["azimuth_zero_deg"].value
@@ -124,10 +154,7 @@ def pointing_model(campaign: Campaign) -> PointingModel:
     errors = np.ones(len(names))
     for _ in range(STEPS_MAX):
         off = _off_deg(values, steps, frames).real.ravel()
-        slope = np.stack(
-            [_off_deg(values | {n: values[n] + 1j * COMPLEX_STEP}, steps, frames).imag.ravel() for n in names], axis=1
-        )
-        slope = slope / COMPLEX_STEP
+        slope = _slope(values, names, steps, frames)
         # Columns are scaled: a ratio acts over thousands of steps, a term by its own angle.
         size = np.linalg.norm(slope, axis=0)
         change = np.linalg.lstsq(slope / size, -off, rcond=None)[0]
@@ -141,4 +168,4 @@ def pointing_model(campaign: Campaign) -> PointingModel:
     residual = _off_deg(values, steps, frames).real
     fitted = np.array([float(np.real(values[n])) for n in names])
     known = {n: float(np.real(v)) for n, v in values.items() if n not in names}
-    return PointingModel(names, fitted, errors, residual, known)
+    return PointingModel(names, fitted, errors, residual, known, tuple(n for n in unknown if n not in names))

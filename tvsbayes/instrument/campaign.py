@@ -53,8 +53,8 @@ UNDETECTED = "undetected"
 """Status of a look whose pictures wait for `detect`."""
 PIXEL_SD_MIN, PIXEL_SD_MAX = 1e-4, 100.0
 """Limits of the standard uncertainty of a centre, px."""
-TEMPERATURE_MAX = 1000.0
-"""Largest absolute temperature of a machine, degC."""
+TEMPERATURES_DEGC = (-273.15, 1000.0)
+"""Range of temperatures of a machine, from absolute zero."""
 APERTURE_MAX_DEG = 360.0
 """Largest absolute aperture reading."""
 # Distance outside the image allowed for a centroid, in image sizes: half a spot at the edge, not a wrong file.
@@ -146,7 +146,7 @@ class Move:
         float | None,
         Column(
             "optional: of the machine; its zeros shift with it. Empty cells are interpolated in time",
-            *(-TEMPERATURE_MAX, TEMPERATURE_MAX),
+            *TEMPERATURES_DEGC,
             group="temperature",
             names="temperature temp temperatur temperatura",
         ),
@@ -311,6 +311,16 @@ class Campaign(Shown, WithStereo):
         return SPOTS if self.has_images else SIGHTINGS
 
     @property
+    def looks(self) -> str:
+        """What its looks are called: spots or sightings."""
+        return Path(self.looks_table.file).stem
+
+    @property
+    def look_again(self) -> str:
+        """What brings further usable looks, in words."""
+        return "look at more stops" + ", or detect the refused spots again" * self.has_images
+
+    @property
     def title(self) -> str:
         """The name in its header, else that of its folder; see `title_of`."""
         return title_of(self.header, self.path)
@@ -319,8 +329,7 @@ class Campaign(Shown, WithStereo):
         """Counts, and the looks with their counters."""
         ok = sum(spot.status == "ok" for spot in self.spots)
         kind = self.looks_table
-        looks = f"{len(self.spots)} {Path(kind.file).stem}"
-        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {looks} ({ok} ok)"
+        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} {self.looks} ({ok} ok)"
         counters = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
         columns = kind.required[2:]
         rows = [

@@ -11,10 +11,15 @@ from typing import Protocol
 
 import numpy as np
 
+from tvsbayes.errors import listed
 from tvsbayes.files.documents import Keys
 from tvsbayes.instrument.parameters import CREEP_NAMES, Prior, names_of
 
 SECONDS_PER_MINUTE = 60.0
+SENSOR_CODES = {85.0: "after power-on, before it has measured", -127.0: "where it is disconnected"}
+"""degC that a DS18B20 (data sheet, and its Arduino library) gives when it did not measure."""
+FAR_K = 20.0
+"""Difference to the temperatures before and after from which such a value was not measured."""
 
 
 class TimedMove(Protocol):
@@ -95,6 +100,27 @@ def interpolated(moves: Sequence[TimedMove]) -> int:
     """Number of moves without a temperature where others have one."""
     recorded = sum(move.temperature_degC is not None for move in moves)
     return len(moves) - recorded if recorded else 0
+
+
+def temperature_doubts(moves: Sequence[TimedMove]) -> list[str]:
+    """Temperatures that are codes of a sensor: the nearest others before and after are far, or there are none."""
+    known = [(row, move.temperature_degC) for row, move in enumerate(moves) if move.temperature_degC is not None]
+    rows = np.array([row for row, degC in known if degC not in SENSOR_CODES], dtype=int)
+    measured = np.array([degC for _, degC in known if degC not in SENSOR_CODES], dtype=float)
+    sentences = []
+    for code, when in SENSOR_CODES.items():
+        doubted = []
+        for row in (row for row, degC in known if degC == code):
+            after = int(np.searchsorted(rows, row))
+            if np.all(np.abs(measured[max(after - 1, 0) : after + 1] - code) > FAR_K):
+                doubted.append(row)
+        if doubted:
+            others = f"; others are {measured.min():g} to {measured.max():g}" if len(measured) else ""
+            sentences.append(
+                f"temperature_degC of moves {listed(doubted, 5)} is {code:g}, what a DS18B20 gives {when}{others}: "
+                "empty these cells, which are then interpolated in time"
+            )
+    return sentences
 
 
 def unseen_shifts(moves: Sequence[TimedMove], priors: Mapping[str, Prior]) -> tuple[str, ...]:

@@ -262,6 +262,8 @@ VIEW_DEG_MIN, VIEW_DEG_MAX, TURN_DEG_MAX = 2.0, 150.0, 20.0
 """Field of view of a lens described by five coefficients; largest angle between two cameras of one scene."""
 SHAPE_SHARE_MAX = 0.005
 """Largest relative difference of the aspect ratios of two picture sizes: rounding to whole pixels."""
+FOLD_MIN = 1e-12
+"""Least coefficient of a radial distortion that can fold in a picture."""
 FOCAL_TIMES_MAX = 1.5
 """Largest ratio of the focal lengths of two cameras of one kind."""
 TANGENTIAL_MAX = 0.01
@@ -440,7 +442,8 @@ def fold_radius(distortion: np.ndarray) -> float:
     Smallest positive root of d/dr of r (1 + k1 r^2 + k2 r^4 + k3 r^6).
     """
     k1, k2, _, _, k3 = np.asarray(distortion, float).ravel()
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    # Smaller coefficients would fold at 1e4 and beyond, and overflow.
+    roots = np.roots(np.where(np.abs(series := np.array([7 * k3, 5 * k2, 3 * k1, 1.0])) < FOLD_MIN, 0.0, series))
     real = [root.real for root in roots if abs(root.imag) < 1e-9 * abs(root) and root.real > 0]
     return math.sqrt(min(real)) if real else math.inf
 

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -18,6 +19,14 @@ from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTIONS, direction_
 from tvsbayes.instrument.campaign import Move
 
 SECONDS_PER_HOUR = 3600.0
+
+
+class SegmentMove(Protocol):
+    """A row of `moves.csv`, of a scanner or an axis."""
+
+    @property
+    def segment(self) -> int:
+        """Number of the homing before it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +101,37 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
     rests = zip(moves, rests_of(moves, axis), strict=True)
     observed_rests = dict.fromkeys(rest for move, rest in rests if move.move in observed)
     return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in observed_rests)
+
+
+LONE_RANGES, LONE_MOVES_MIN = 4.0, 8
+"""Distance of a lone command from all others, in their range, and least number of moves to judge it."""
+
+
+def lone_commands(moves: Sequence[SegmentMove], commands: Sequence[float]) -> list[int]:
+    """Moves to a command that is far from all others, as by a digit too many: one at most, and not that of a homing.
+
+    Args:
+        moves: all moves in order.
+        commands: command or counter of each.
+    """
+    if len(commands) < LONE_MOVES_MIN:
+        return []
+    values = np.array(commands, dtype=float)
+    far = int(np.argmax(np.abs(values - np.median(values))))
+    others = np.delete(values, far)
+    gap = max(others.min() - values[far], values[far] - others.max())
+    homed = far == 0 or moves[far].segment != moves[far - 1].segment
+    return [far] if gap > LONE_RANGES * np.ptp(others) > 0 and not homed else []
+
+
+def lone_doubts(moves: Sequence[SegmentMove], commands: Sequence[float], column: str) -> list[str]:
+    """The moves of `lone_commands` in sentences."""
+    near = np.delete(np.array(commands, dtype=float), lone := lone_commands(moves, commands))
+    return [
+        f"{column} of move {k} is {commands[k]:.10g}, all others lie within {near.min():.10g} to {near.max():.10g}: "
+        "a digit too many? correct the cell in moves.csv, or take the move out with what was read at it"
+        for k in lone
+    ]
 
 
 FEW_STOPS = 12

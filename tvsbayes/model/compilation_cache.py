@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src import compilation_cache as internals
+from jax._src.compilation_cache_interface import CacheInterface
 from jaxtyping import Array, Float
 from platformdirs import user_cache_path
 
@@ -25,6 +28,10 @@ from tvsbayes.model.compiled import Traces, compiled
 VARIABLE = "TVSBAYES_CACHE"
 TRIAL_SECONDS_MAX = 120.0
 """Time limit of a process that compiles one small function."""
+COMPILED = "compiled"
+"""Folder of compiled functions in the cache folder, beside that of their traces."""
+FILE_BYTES_MAX, BYTES_MAX = 2**28, 2**30
+"""Largest size of a compiled function, and of all; those used longest ago are removed."""
 REJECTED = "Machine type used for XLA:CPU compilation doesn't match"
 """XLA's log message when it refuses its own code on the machine that compiled it."""
 
@@ -45,6 +52,31 @@ def own_cache_folder() -> OwnFolder:
     return folder
 
 
+class SealedCache(CacheInterface):
+    """Compiled functions in sealed files.
+
+    JAX's own cache runs whatever lies under a function's name: code of another function, if files are exchanged. A
+    damaged file it never replaces.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder
+        self.folder = OwnFolder(folder, FILE_BYTES_MAX, BYTES_MAX)
+
+    def get(self, key: str) -> bytes | None:
+        """Return what was stored under this key, None where that is missing or damaged."""
+        return self.folder.read(key)
+
+    def put(self, key: str, value: bytes) -> None:
+        """Store a compiled function; where that fails, the next process compiles again."""
+        self.folder.write(key, value)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is stored."""
+        return not self._path.is_dir() or next(self._path.iterdir(), None) is None
+
+
 def use_compilation_cache() -> bool:
     """Keep traces and compiled functions in `cache_folder`, unless others may write into it.
 
@@ -56,12 +88,19 @@ def use_compilation_cache() -> bool:
     folder = own_cache_folder()
     if folder.fault():
         return True
-    jax.config.update("jax_compilation_cache_dir", str(folder.path))
+    cache = SealedCache(folder.path / COMPILED)
+    cache.folder.make()
+    jax.config.update("jax_compilation_cache_dir", str(cache.folder.path))
     # Small functions are cached too: a command compiles some dozens, which takes seconds in all.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    # What cannot be loaded after all, as of another library, is compiled again; it is no concern of the user.
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
+    # JAX has no public way to give it another cache than its own (0.10 to 0.12).
+    internals.reset_cache()
+    internals._cache, internals._cache_initialized = cache, True
     Traces.used = Traces(folder.path / "traced")
-    return next(folder.path.glob("*-cache"), None) is None
+    return cache.empty
 
 
 @dataclass(frozen=True)
@@ -121,6 +160,6 @@ def cache_state() -> CacheState:
     if answer["traces"]:
         remedy = f"pip install flatbuffers; remove {place / 'traced'} if it is not yours"
         return CacheState(False, f"compiled functions are used, their traces not: {place}", remedy)
-    entries = list(place.glob("*-cache"))
+    entries = list((place / COMPILED).glob("*"))
     size = sum(entry.stat().st_size for entry in entries) / 1e6
     return CacheState(True, f"used: {len(entries)} functions, {size:.0f} MB in {place}")

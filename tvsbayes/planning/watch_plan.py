@@ -145,9 +145,10 @@ class WatchDesigns:
 
     @cached_property
     def _run_up(self) -> np.ndarray:
-        """Compute the run-up (pan, tilt) that takes up the play by the fit, steps."""
+        """Compute the run-up (pan, tilt) that takes up the play by the fit, steps; none of an axis that never moves."""
         physical = physical_at(self.z, self.fit.space).value
-        return run_up_steps(physical, physical[BACKLASH_COLUMNS])
+        moves = [len({getattr(move, f"{axis}_steps") for move in self.campaign.moves}) > 1 for axis in AXES]
+        return np.where(moves, run_up_steps(physical, physical[BACKLASH_COLUMNS]), 0)
 
     @cached_property
     def _limits(self) -> np.ndarray:

@@ -17,7 +17,9 @@ from tvsbayes.report.parameter_words import sentence_in_words
 from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 from tvsbayes.results.metrology_tables import BudgetTable
 
-SPOTS_REMEDY = "look at those spots, or fit with --robust"
+LOOKS = ("spots", "sightings")
+"""What looks are called, by instrument."""
+SPOTS_REMEDY = "look at those {looks}, or fit with --robust"
 """Remedy for single spots that disagree, which no factor on u covers."""
 REMEDIES = {
     "the cameras moved": "fix the cameras and measure again, or fit the looks before and after as two campaigns",
@@ -29,7 +31,10 @@ REMEDIES = {
     "stops depend on the step phase": "use full steps, or more current: microsteps are not even",
     "stops depend on the length": "let the axis settle longer before each look, or arrive by moves of one length",
     "the sheets disagree": "check that every sheet is flat, stands still and has the right name in spots.csv",
-    "single spots disagree": f"{SPOTS_REMEDY}, which leaves them out by name",
+    **{
+        f"single {looks} disagree": f"{SPOTS_REMEDY.format(looks=looks)}, which leaves them out by name"
+        for looks in LOOKS
+    },
 }
 """Remedies by the beginning of the failed test's name."""
 ANY_REMEDY = "find the cause in the section Validation of the report, correct it and measure again"
@@ -73,8 +78,10 @@ def verdict_line(summary: FitSummary) -> str:
     if not summary.explained:
         return "verdict: NOT CONVERGED, use none of these numbers"
     if (validation := failed(summary)) is not None:
-        only_spots = not validation.widens and validation.cause.startswith("single spots disagree")
-        return f"verdict: VALIDATION FAILED, {factor_text(validation)}" + f": {SPOTS_REMEDY}" * only_spots
+        looks = summary.looks
+        only_looks = not validation.widens and validation.cause.startswith(f"single {looks} disagree")
+        helps = f": {SPOTS_REMEDY.format(looks=looks)}" * only_looks
+        return f"verdict: VALIDATION FAILED, {factor_text(validation)}{helps}"
     unmoved = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
     validation = summary.validation
     if not summary.converged:
@@ -82,7 +89,7 @@ def verdict_line(summary: FitSummary) -> str:
     elif summary.answer == "rough":
         verdict = ROUGH
     elif validation is None or not validation.tests:
-        verdict = "usable; too few spots to look for model errors"
+        verdict = f"usable; too few {summary.looks} to look for model errors"
     else:
         verdict = (
             f"usable; no sign of a model error in {len(validation.tests)} tests (least p {validation.tests[0].p:.2g})"
@@ -98,11 +105,8 @@ def noise_line(summary: FitSummary) -> str | None:
     if USUAL_SCALE[0] <= scale <= USUAL_SCALE[1]:
         return None
     worse = "larger" if scale > 1 else "smaller"
-    looks, stated = "the spots", "su and sv of spots.csv say"
-    # A fit of images has parameters of cameras.
-    if "focal_scale" not in summary.parameters:
-        looks, stated = "sightings", "u_deg of sightings.csv says"
-    said = f"{looks} scatter {scale:.2g} times as much as {stated}"
+    stated = {"spots": "su and sv of spots.csv say", "sightings": "u_deg of sightings.csv says"}[summary.looks]
+    said = f"the {summary.looks} scatter {scale:.2g} times as much as {stated}"
     return f"{said}; the fit allows for it: state {worse} ones if you know them"
 
 
@@ -146,10 +150,11 @@ def next_steps(summary: FitSummary, folder: str, causes: Sequence[Finding] = ())
     if (validation := failed(summary)) is not None:
         action = remedy(validation)
         steps.append(f"{validation.cause}: {action}.")
-    if summary.suspect_spots and (validation is None or "single spots" not in validation.cause):
+    if summary.suspect_spots and (validation is None or f"single {summary.looks}" not in validation.cause):
         ids = listed(summary.suspect_spots, SPOTS_LISTED)
         steps.append(
-            f"Look at spots {ids}, which disagree with all others, or fit with --robust, which leaves them out."
+            f"Look at {summary.looks} {ids}, which disagree with all others, or fit with --robust, which leaves them "
+            "out."
         )
     if summary.few_stops:
         directions = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())

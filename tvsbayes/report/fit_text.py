@@ -66,9 +66,9 @@ def fit_text(
     lines += [f"set by sum: {weak.text}" for weak in summary.weak_directions if weak.of_sums]
     lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
     if summary.excluded_spots:
-        lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
+        lines.append(f"excluded {summary.looks}: {', '.join(map(str, summary.excluded_spots))}")
     if summary.suspect_spots:
-        lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
+        lines.append(f"{suspect_line(summary)}; look at them, or fit with --robust")
     # Where the model fails, the residual scatter is not noise.
     if failed(summary) is None and (noise := noise_line(summary)) is not None:
         lines.append(noise)
@@ -162,14 +162,14 @@ def unconverged_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str
     quantities = (QUANTITIES[name] for name in PARAMETERS if name in summary.parameters)
     rows = [[q.label, f"{summary.parameters[q.name].value:.4g}", q.unit_text] for q in quantities]
     table = TableView("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
-    suspects = suspect_line(summary.suspect_spots) if summary.suspect_spots else None
+    suspects = suspect_line(summary) if summary.suspect_spots else None
     message = NotConverged.of(summary.problems, "").message
     return terminal(message, table, suspects, *(f"cause: {finding.message}" for finding in causes))
 
 
-def suspect_line(spots: Sequence[int]) -> str:
-    """Spots that disagree with the others, at most `SPOTS_LISTED` ids."""
-    return f"spots that disagree with all others: {listed(spots, SPOTS_LISTED)}"
+def suspect_line(summary: FitSummary) -> str:
+    """Looks that disagree with the others, at most `SPOTS_LISTED` ids."""
+    return f"{summary.looks} that disagree with all others: {listed(summary.suspect_spots, SPOTS_LISTED)}"
 
 
 def few_stops_line(counts: Mapping[str, int], estimator: str) -> str:
@@ -187,7 +187,7 @@ def validation_lines(validation: Validation) -> list[str]:
     tests = validation.tests
     if validation.passed:
         if not tests:
-            return ["validation: too few spots to look for model errors"]
+            return ["validation: too few looks to test for model errors"]
         least = f"least p {tests[0].p:.2g} ({tests[0].name})"
         return [
             f"validation: no sign of a model error in {len(tests)} tests, {least}; errors of the same shape as "

@@ -50,6 +50,8 @@ def pointing_table(model: PointingModel, joint: Mapping[str, tuple[float, float]
         if joint is not None:
             row += [concise(*joint[name]), f"{error / joint[name][1]:.2g}" if joint[name][1] > 0 else ""]
         rows.append(row)
+    blank = [""] * (0 if joint is None else 2)
+    rows += [[name_in_words(name), "not determined", *blank] for name in model.undetermined]
     columns = ["term", "least squares (se)", *(["joint (sd)", "se / sd"] if joint is not None else [])]
     sizes = f"{two_digits(model.rms_deg)} deg = {two_digits(3600 * model.rms_deg)} arcsec"
     caption = f"pointing model without gears, {len(model.residual_deg)} sightings; RMS on the sphere {sizes}"

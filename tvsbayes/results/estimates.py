@@ -380,6 +380,11 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
         return self.converged or self.sampling is not None
 
     @property
+    def looks(self) -> str:
+        """What the looks of the campaign are called: cameras that see spots stand somewhere, sightings have none."""
+        return "spots" if "extrinsics.translation_mm.x" in self.parameters else "sightings"
+
+    @property
     def headline_informed(self) -> bool:
         """Whether the data informed any effective ratio."""
         return any(e is not None and e.informed for e in self.effective.values())

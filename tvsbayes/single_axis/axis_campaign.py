@@ -28,10 +28,11 @@ from tvsbayes.files.csv_kind import (
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.instrument.campaign import MOVES, SPOTS
+from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.instrument.conditions import check_power, powered_on_s
+from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
 from tvsbayes.single_axis.waves import WavePeriods
 
@@ -48,7 +49,6 @@ PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that define waves."""
 PERIODS_MAX, RANGES_MAX = 8, 4
 """Largest numbers of stated and of unknown periods; each period adds two sampled coordinates."""
-TEMPERATURE_MAX = 1000.0
 _MOVE = replace(MOVES["move"], names="")
 
 
@@ -82,7 +82,7 @@ class AxisMove:
         float | None,
         Column(
             "optional: of the axis; the readings' zero shifts with it. Empty cells are interpolated in time",
-            *(-TEMPERATURE_MAX, TEMPERATURE_MAX),
+            *TEMPERATURES_DEGC,
             group="temperature",
             names="temperature temp temperatur temperatura",
         ),
@@ -404,6 +404,16 @@ def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
         "axis": axis.encode(),
     }
     return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+
+
+def refuse_same_readings(known: AxisCampaign, new: AxisCampaign) -> None:
+    """Refuse fresh readings that are copies of readings of the folder; see `refuse_copied`."""
+
+    def rows(campaign: AxisCampaign) -> list[tuple[object, ...]]:
+        at = campaign.moves
+        return [(at[r.move].time_s, at[r.move].command, r.value) for r in campaign.readings if r.status == "ok"]
+
+    refuse_copied(rows(known), rows(new), READINGS.file)
 
 
 class AxisStop(NamedTuple):

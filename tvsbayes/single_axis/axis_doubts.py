@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.errors import listed
+from tvsbayes.instrument.conditions import temperature_doubts
+from tvsbayes.instrument.stops import lone_doubts
 from tvsbayes.results.estimates import CONFLICT_LIMIT
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading
 from tvsbayes.single_axis.axis_parameters import axis_priors
@@ -34,9 +36,10 @@ LINE_SLOPE = float(np.sqrt(12.0))
 
 def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """Doubts about the data, in sentences."""
-    sentences = []
+    sentences = temperature_doubts(campaign.moves)
     if rows.in_motion:
-        return _warnings_in_motion(campaign, rows)
+        return sentences + _warnings_in_motion(campaign, rows)
+    sentences += lone_doubts(campaign.moves, [move.command for move in campaign.moves], "command")
     legs = rows.legs
     zero_steps = (legs.step == 0) & ~legs.first
     unmoved = [int(m) for m in rows.move if zero_steps[m]]

@@ -22,7 +22,7 @@ import numpy as np
 from experiments.common.command_line import parser
 from experiments.common.page import share, table
 from experiments.common.rows import ROOT
-from experiments.inputs.strangers_tables import kinds, logs, runs, sheets
+from experiments.inputs.strangers_tables import kinds, logs, reports, runs, sheets
 from experiments.inputs.strangers_tables.judge import Verdict, judge
 from experiments.inputs.strangers_tables.kinds import Drawn
 from experiments.inputs.strangers_tables.measured import pick
@@ -30,10 +30,13 @@ from experiments.inputs.strangers_tables.words import LANGUAGES
 
 OUTPUT = ROOT / "experiments" / "output" / "strangers_tables"
 DRAWS = {
-    **{kinds.long_table: 32, kinds.unit_row: 6, kinds.two_sensors: 4, kinds.unknown_unit: 2, kinds.no_unit: 2},
-    **{runs.runs_with_words: 16, runs.grouped_runs: 5, runs.turning_runs: 2, runs.runs_without_words: 4},
-    **{runs.runs_to_and_fro: 2, runs.deviations: 7, runs.averages: 4},
-    **{logs.telemetry: 3, logs.labview: 4, logs.remark_names: 6, logs.serial: 6, logs.camonitor: 2, logs.sightings: 7},
+    **{kinds.long_table: 38, kinds.unit_row: 6, kinds.two_sensors: 4, kinds.unknown_unit: 2, kinds.no_unit: 2},
+    **{runs.runs_with_words: 18, runs.grouped_runs: 6, runs.turning_runs: 1.5, runs.runs_without_words: 3},
+    **{runs.runs_to_and_fro: 2, runs.deviations: 6, runs.averages: 4},
+    **{logs.telemetry: 3, logs.labview: 4, logs.remark_names: 6, logs.serial: 6, logs.camonitor: 2, logs.sightings: 8},
+    **{reports.tolerances: 5, reports.wrapped: 2, reports.sheet_with_means: 2, reports.blocks: 1.5},
+    **dict.fromkeys((reports.positions_across, reports.two_axes, reports.numbered_sensors, reports.repeats), 1),
+    **dict.fromkeys((reports.steps_and_target, reports.json_lines, reports.piezo), 1),
 }
 """Weights of the kinds."""
 WORDS = ("right", "guessed", "asked", "unanswered", "refused", "crash", "wrong")

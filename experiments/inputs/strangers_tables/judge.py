@@ -274,7 +274,9 @@ def folder_difference(out: Path, truth: Truth) -> str:
     """What is wrong with the folder."""
     sighted = truth.readings[0].pair is not None
     try:
-        return difference(truth, read_sightings(out) if sighted else read_axis(out))
+        folder = read_sightings(out) if sighted else read_axis(out)
+        wrongs = [difference(one, folder) for one in (truth, *truth.also)]
+        return "" if "" in wrongs else wrongs[0]
     except (OSError, KeyError, ValueError) as error:
         return f"folder of another kind: {type(error).__name__}"
 

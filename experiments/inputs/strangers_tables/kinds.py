@@ -43,22 +43,18 @@ class Drawn(NamedTuple):
     words: tuple[str, ...] = ("--axis",)
 
 
-def command_name(rng: np.random.Generator, axis: Axis, language: str) -> str:
-    """A name without its unit."""
-    if axis.command_unit == "step":
-        return pick(rng, words.STEPS[language])
-    if axis.command_unit == "turn":
-        return {"en": "Motor position", "de": "Motorstellung", "es": "Posición del motor", "fr": "Position du moteur"}[
-            language
-        ]
-    angle = DOMAIN[axis.command_unit] == "deg" and chance(rng, 0.7)
-    return pick(rng, (words.ANGLE_COMMAND if angle else words.COMMAND)[language])
-
-
-def reading_name(rng: np.random.Generator, axis: Axis, language: str) -> str:
-    """A name without its unit."""
-    angle = DOMAIN[axis.unit] == "deg"
-    return pick(rng, (words.ANGLE_READING if angle else words.LENGTH_READING)[language])
+def names_of(rng: np.random.Generator, axis: Axis, language: str) -> tuple[str, str]:
+    """Names of command and reading, without units."""
+    steps, angles = axis.command_unit == "step", DOMAIN[axis.unit] == "deg"
+    if axis.geared:
+        return pick(rng, words.MOTOR[language]), pick(rng, words.OUTPUT[language])
+    if not steps and axis.command_unit != "turn" and chance(rng, 0.3):
+        return pick(rng, words.PAIRS[language])
+    if steps or axis.command_unit == "turn":
+        command = pick(rng, (words.STEPS if steps else words.MOTOR)[language])
+    else:
+        command = pick(rng, (words.ANGLE_COMMAND if angles and chance(rng, 0.7) else words.COMMAND)[language])
+    return command, pick(rng, (words.ANGLE_READING if angles else words.LENGTH_READING)[language])
 
 
 def headed(rng: np.random.Generator, name: str, unit: str, language: str) -> str:
@@ -84,19 +80,28 @@ def truth_of(axis: Axis, readings: Sequence[Reading], **more: Any) -> Truth:
     )
 
 
-def clock(rng: np.random.Generator, language: str, count: int) -> tuple[str, list[Cell], list[float]]:
-    """A column of times by its name, and seconds since the first."""
+def clock(rng: np.random.Generator, language: str, count: int) -> tuple[dict[str, Sequence[Cell]], list[float]]:
+    """Columns of times by their names, and seconds since the first."""
     every = float(pick(rng, (5, 10, 20, 30, 60)))
     seconds = np.round(np.cumsum(rng.uniform(0.7 * every, 1.3 * every, count)), 1)
     seconds -= seconds[0]
     if chance(rng, 0.35):
-        return pick(rng, words.SECONDS[language]), [decimal(s, 1) for s in seconds], list(map(float, seconds))
+        return {pick(rng, words.SECONDS[language]): [decimal(s, 1) for s in seconds]}, list(map(float, seconds))
     whole = [float(round(s)) for s in seconds]
     moments = [START + datetime.timedelta(seconds=s) for s in whole]
-    form = "%Y-%m-%d %H:%M:%S" if chance(rng, 0.5) else "%H:%M:%S"
+    name, style = pick(rng, words.CLOCK[language]), rng.random()
+    if style < 0.2:
+        date = {"en": "Date", "de": "Datum", "es": "Fecha", "fr": "Date"}[language]
+        name = {"en": "Time", "de": "Uhrzeit", "es": "Hora", "fr": "Heure"}[language]
+        form = "%Y-%m-%d" if language == "en" else "%d.%m.%Y" if language == "de" else "%d/%m/%Y"
+        days: list[Cell] = [moment.strftime(form) for moment in moments]
+        return {date: days, name: [moment.strftime("%H:%M:%S") for moment in moments]}, whole
+    form = "%Y-%m-%d %H:%M:%S" if style < 0.6 else "%H:%M:%S"
     if language == "de" and chance(rng, 0.5):
         form = "%d.%m.%Y %H:%M:%S"
-    return pick(rng, words.CLOCK[language]), [moment.strftime(form) for moment in moments], whole
+    if language == "en" and chance(rng, 0.2):
+        form = "%I:%M:%S %p"
+    return {name: [moment.strftime(form) for moment in moments]}, whole
 
 
 def u_column(rng: np.random.Generator, axis: Axis, language: str) -> tuple[str, Decimal, float]:
@@ -130,8 +135,8 @@ def long_sheet(rng: np.random.Generator, axis: Axis, language: str) -> tuple[She
     if chance(rng, 0.25):
         more[pick(rng, words.NUMBER[language])] = [Decimal(k + 1) for k in range(count)]
     if chance(rng, 0.3):
-        name, cells, seconds = clock(rng, language, count)
-        more[name] = cells
+        timed, seconds = clock(rng, language, count)
+        more |= timed
         readings = [r._replace(time_s=s) for r, s in zip(readings, seconds, strict=True)]
         truth = replace(truth, clock=1.1)
     if chance(rng, 0.12):
@@ -143,14 +148,19 @@ def long_sheet(rng: np.random.Generator, axis: Axis, language: str) -> tuple[She
         marks = [stop.run // 2 for stop in sweep.stops]
         more[name] = [Decimal(mark + 1) for mark in marks]
         readings = [r._replace(segment=mark) for r, mark in zip(readings, marks, strict=True)]
-    names = [headed(rng, command_name(rng, axis, language), axis.command_unit, language)]
-    columns[names[0]] = [stop.command for stop in sweep.stops]
+    command, reading = names_of(rng, axis, language)
+    columns[headed(rng, command, axis.command_unit, language)] = [stop.command for stop in sweep.stops]
     if stated:
         rising, falling = pick(rng, words.SIDES["all"] if chance(rng, 0.35) else words.SIDES[language])
         sides = [Decimal(word) if word in ("1", "-1") else word for word in (rising, falling)]
         columns[pick(rng, words.DIRECTION[language])] = [sides[stop.side < 0] for stop in sweep.stops]
-    columns[headed(rng, reading_name(rng, axis, language), axis.unit, language)] = values
-    after, readings = further_columns(rng, axis, language, sweep, values, readings)
+    cells: list[Cell] = list(values)
+    # A position that was passed, or not read.
+    empty = {int(rng.integers(1, count - 1))} if chance(rng, 0.08) else set()
+    for k in empty:
+        cells[k] = pick(rng, ("", "", "n/a", "NaN", "-", "--", "#N/A"))
+    after, readings = further_columns(rng, axis, language, sweep, values, readings, empty)
+    columns[headed(rng, reading, axis.unit, language)] = cells
     columns |= after
     items = list((more | columns).items())
     if chance(rng, 0.15):
@@ -166,6 +176,7 @@ def further_columns(
     sweep: Sweep,
     values: Sequence[Decimal],
     readings: Sequence[Reading],
+    gone: set[int],
 ) -> tuple[dict[str, Sequence[Cell]], list[Reading]]:
     """Columns to the right of the reading, and the readings with what these say of them."""
     count, readings = len(readings), list(readings)
@@ -174,7 +185,7 @@ def further_columns(
         name, cell, u = u_column(rng, axis, language)
         columns[name] = [cell] * count
         readings = [r._replace(u=u) for r in readings]
-    if chance(rng, 0.2) and DOMAIN[axis.command_unit] == DOMAIN[axis.unit]:
+    if chance(rng, 0.2) and DOMAIN[axis.command_unit] == DOMAIN[axis.unit] and not axis.geared:
         columns |= error_column(rng, axis, language, sweep, values)
     if chance(rng, 0.25):
         drift = np.cumsum(rng.normal(0, 0.02, count))
@@ -189,8 +200,8 @@ def further_columns(
         wrong = set(rng.choice(count, int(rng.integers(0, 3)), replace=False).tolist())
         cells = [bad if k in wrong else good for k in range(count)]
         columns[name] = [Decimal(cell) if cell.isdigit() else cell for cell in cells]
-        readings = [r for k, r in enumerate(readings) if k not in wrong]
-    return columns, readings
+        gone = gone | wrong
+    return columns, [r for k, r in enumerate(readings) if k not in gone]
 
 
 def error_column(
@@ -208,7 +219,7 @@ def error_column(
 
 def long_table(rng: np.random.Generator, language: str) -> Drawn:
     """A row for each reading."""
-    sheet, truth = long_sheet(rng, draw_axis(rng), language)
+    sheet, truth = long_sheet(rng, draw_axis(rng, variety=True), language)
     return Drawn("a row for each reading", sheets.any_file(rng, sheet), truth)
 
 
@@ -219,7 +230,7 @@ def unit_row(rng: np.random.Generator, language: str) -> Drawn:
     sweep = sweeps(rng, axis.commands, stated)
     values, readings = read_all(rng, axis, sweep)
     form = pick(rng, ("{}", "({})", "[{}]"))
-    heads = [[command_name(rng, axis, language), reading_name(rng, axis, language)]]
+    heads = [list(names_of(rng, axis, language))]
     command_unit = "" if axis.command_unit == "step" else form.format(unit_text(rng, axis.command_unit, language))
     heads.append([command_unit, form.format(unit_text(rng, axis.unit, language))])
     rows: list[list[Cell]] = [[stop.command, value] for stop, value in zip(sweep.stops, values, strict=True)]
@@ -239,13 +250,14 @@ def two_sensors(rng: np.random.Generator, language: str) -> Drawn:
     sweep = sweeps(rng, axis.commands, stated)
     values, readings = read_all(rng, axis, sweep)
     other = replace(axis, per_command=axis.per_command * (1 + rng.normal(0, 1e-3)), play=axis.play * rng.uniform(0, 2))
+    command, reading = names_of(rng, axis, language)
     columns: dict[str, Sequence[Cell]] = {
-        headed(rng, command_name(rng, axis, language), axis.command_unit, language): [s.command for s in sweep.stops]
+        headed(rng, command, axis.command_unit, language): [s.command for s in sweep.stops]
     }
     if stated:
         pair = pick(rng, words.SIDES[language])
         columns[pick(rng, words.DIRECTION[language])] = [pair[stop.side < 0] for stop in sweep.stops]
-    columns[headed(rng, reading_name(rng, axis, language), axis.unit, language)] = values
+    columns[headed(rng, reading, axis.unit, language)] = values
     name = with_unit(rng, pick(rng, words.SECOND_SENSOR[language]), axis.unit, language)
     columns[name] = [other.value(stop.command, stop.side, rng) for stop in sweep.stops]
     truth = truth_of(axis, readings, answer="ask")
@@ -260,9 +272,10 @@ def unknown_unit(rng: np.random.Generator, language: str) -> Drawn:
     sweep = sweeps(rng, axis.commands, False)
     values, readings = read_all(rng, axis, sweep)
     form = pick(rng, ("{} ({})", "{} [{}]"))
+    command, reading = names_of(rng, axis, language)
     columns: dict[str, Sequence[Cell]] = {
-        headed(rng, command_name(rng, axis, language), axis.command_unit, language): [s.command for s in sweep.stops],
-        form.format(reading_name(rng, axis, language), pick(rng, UNKNOWN_UNITS)): values,
+        headed(rng, command, axis.command_unit, language): [s.command for s in sweep.stops],
+        form.format(reading, pick(rng, UNKNOWN_UNITS)): values,
     }
     # Any answer that leaves the numbers as they are.
     truth = truth_of(axis, readings, answer="ask", unit=None, meant=axis.unit)
@@ -276,7 +289,7 @@ def no_unit(rng: np.random.Generator, language: str) -> Drawn:
     values, readings = read_all(rng, axis, sweep)
     columns: dict[str, Sequence[Cell]] = {
         pick(rng, words.STEPS[language]): [stop.command for stop in sweep.stops],
-        reading_name(rng, axis, language): values,
+        names_of(rng, axis, language)[1]: values,
     }
     truth = truth_of(axis, readings, answer="either", unit=None, command_unit=None)
     return Drawn("no unit at all", sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)

@@ -10,7 +10,7 @@ from decimal import Decimal
 import numpy as np
 
 from experiments.inputs.strangers_tables import sheets, words
-from experiments.inputs.strangers_tables.kinds import START, Drawn, command_name, read_all, reading_name, truth_of
+from experiments.inputs.strangers_tables.kinds import START, Drawn, names_of, read_all, truth_of
 from experiments.inputs.strangers_tables.measured import (
     ANGLE,
     ASCII,
@@ -88,7 +88,7 @@ def labview(rng: np.random.Generator, language: str) -> Drawn:
     axis, sweep, values, readings = stage(rng)
     times = np.round(np.cumsum(rng.uniform(1.9, 2.1, len(values))), 3)
     readings = [r._replace(time_s=float(t - times[0])) for r, t in zip(readings, times, strict=True)]
-    names = [command_name(rng, axis, language), reading_name(rng, axis, language)]
+    names = list(names_of(rng, axis, language))
     whole, comma = chance(rng, 0.3), language != "en" and chance(rng, 0.7)
     named = whole or chance(rng, 0.7)
     if named and not whole:
@@ -159,7 +159,7 @@ def remark_names(rng: np.random.Generator, language: str) -> Drawn:
         truth = replace(truth, readings=tuple(readings), clock=1.1)
     else:
         text = unit_text(rng, axis.unit, language)
-        heads = [f"{command_name(rng, axis, language)} ({text})", f"{reading_name(rng, axis, language)} ({text})"]
+        heads = [f"{names_of(rng, axis, language)[0]} ({text})", f"{names_of(rng, axis, language)[1]} ({text})"]
         lines = ["# measured with the new dial", "# " + "\t".join(heads), *(f"{s.command}\t{v}" for s, v in pairs)]
     return Drawn("names in a remark", File(name, sheets.encoded(rng, "\n".join(lines) + "\n")), truth)
 
@@ -252,7 +252,8 @@ def camonitor(rng: np.random.Generator, language: str) -> Drawn:
 def sightings(rng: np.random.Generator, language: str) -> Drawn:
     """Counters of a head, and where it was found to point; sometimes without a unit."""
     unit = pick(rng, ("deg",) * 4 + ("rad", "arcmin", "gon", "mrad"))
-    named = chance(rng, 0.75)
+    # Nobody leaves out that angles are gon.
+    named = unit == "gon" or chance(rng, 0.75)
     count = int(rng.integers(8, 30))
     pan = rng.integers(-60, 60, count) * 50
     tilt = rng.integers(0, 30, count) * 50

@@ -59,7 +59,7 @@ ASCII = {
     **{"turn": "rev", "count": "counts", "thou": "thou", "step": "steps"},
 }
 """What follows an underscore."""
-UNKNOWN_UNITS = ("div", "Skt", "Teilstriche", "parts", "divisions", "LSB", "Skalenteile", "ticks of dial", "puntos")
+UNKNOWN_UNITS = ("div", "Skt", "Teilstriche", "parts", "divisions", "Strich", "Skalenteile", "graduations", "puntos")
 DIGITS = {
     **{"nm": 0, "um": 1, "1/1000 mm": 1, "1/100 mm": 1, "thou": 2, "mm": 4, "cm": 5, "inch": 5, "urad": 1},
     **{"arcsec": 1, "mrad": 3, "arcmin": 3, "gon": 4, "deg": 4, "rad": 6, "turn": 6, "count": 0, "step": 0},
@@ -131,6 +131,7 @@ class Truth:
         segments: "exact", or "any" where a column of cycles may be taken for homings.
         ratio: of the axis, unit per command.
         play: of the axis, in the unit.
+        also: other truths that are as good.
     """
 
     readings: tuple[Reading, ...]
@@ -145,6 +146,7 @@ class Truth:
     segments: str = "exact"
     ratio: float = 1.0
     play: float = 0.0
+    also: tuple[Truth, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,8 @@ class Axis:
     scatter: float
     commands: tuple[Decimal, ...]
     """Of one sweep, rising."""
+    geared: bool = False
+    """The command is a motor's, before gears that change it by far."""
 
     def value(self, command: Decimal, side: int, rng: np.random.Generator) -> Decimal:
         """A reading as it is written down."""
@@ -182,7 +186,11 @@ def decimal(number: float, digits: int) -> Decimal:
 
 
 def draw_axis(
-    rng: np.random.Generator, rotary: bool | None = None, unit: str | None = None, command_unit: str | None = None
+    rng: np.random.Generator,
+    rotary: bool | None = None,
+    unit: str | None = None,
+    command_unit: str | None = None,
+    variety: bool = False,
 ) -> Axis:
     """An axis with play of ten or more scatters, read over five to fourteen positions."""
     rotary = chance(rng, 0.35) if rotary is None else rotary
@@ -202,8 +210,17 @@ def draw_axis(
         travel, play, scatter = (x / LENGTH[unit] for x in (travel_mm, play_mm, scatter_mm))
     command_unit = command_unit or pick(rng, others)
     commands, per_command = _commands(rng, command_unit, unit, travel, count)
-    zero = rng.uniform(-0.4, 0.4) * play
-    axis = Axis(command_unit, unit, per_command, play, zero, scatter, commands)
+    zero, geared = rng.uniform(-0.4, 0.4) * play, False
+    if variety:
+        if command_unit in ("step", "turn"):
+            # Readings that fall, or begin anywhere.
+            per_command *= 1 if chance(rng, 0.8) else -1
+            zero += travel * rng.uniform(-2, 2) * chance(rng, 0.3)
+        elif command_unit == unit == "deg" and chance(rng, 0.15):
+            geared = True
+            ratio = pick(rng, (2, 5, 10, 36, 50, 100))
+            per_command, commands = per_command / ratio, tuple(command * ratio for command in commands)
+    axis = Axis(command_unit, unit, per_command, play, zero, scatter, commands, geared)
     # Dials and encoders resolve the play.
     return axis if axis.digit < 0.2 * play else replace(axis, play=5 * axis.digit, scatter=0.5 * axis.digit)
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.inputs.strangers_tables import sheets, words
-from experiments.inputs.strangers_tables.kinds import Drawn, command_name, headed, truth_of
+from experiments.inputs.strangers_tables.kinds import Drawn, headed, names_of, truth_of
 from experiments.inputs.strangers_tables.measured import (
     DIGITS,
     SCALE,
@@ -54,7 +54,7 @@ def side_by_side(
 ) -> Sheet:
     """A row for each position, a column for each run; the unit at every head, or at the positions' alone."""
     axis = runs.axis
-    position = headed(rng, command_name(rng, axis, language), axis.command_unit, language)
+    position = headed(rng, names_of(rng, axis, language)[0], axis.command_unit, language)
     same = axis.unit == axis.command_unit and (chance(rng, 0.25) if unit_once is None else unit_once)
     text = unit_text(rng, axis.unit, language)
     form = pick(rng, ("{} ({})", "{} [{}]", "{} / {}"))
@@ -69,8 +69,8 @@ def side_by_side(
 
 
 def runs_with_words(rng: np.random.Generator, language: str) -> Drawn:
-    """Forward 1, Backward 1, Forward 2 ...: in pairs, all forward ones first, or one way alone."""
-    axis = draw_axis(rng)
+    """Forward 1, Backward 1, Forward 2 ...: in pairs, all that rise first, or one way alone."""
+    axis = draw_axis(rng, variety=True)
     pair = pick(rng, words.RUN_SIDES["all"] if chance(rng, 0.15) else words.RUN_SIDES[language])
     pairs, style = int(rng.integers(1, 4)), rng.random()
     sides = (1, -1) * pairs if style < 0.85 or pairs == 1 else (1,) * (pairs + 1)
@@ -82,6 +82,14 @@ def runs_with_words(rng: np.random.Generator, language: str) -> Drawn:
     names = [pair[side < 0] if alone else form.format(pair[side < 0], k) for side, k in zip(sides, order, strict=True)]
     runs = draw_runs(rng, axis, sides)
     sheet, truth = side_by_side(rng, runs, names, language), truth_of(axis, runs.readings())
+    if len(sides) > 2 and -1 in sides and chance(rng, 0.2):
+        # All that rise first: by the numbers, or as they stand, is one.
+        first = len(sheet.heads[0]) - len(sides)
+        places = [*range(first), *(first + k for side in (1, -1) for k, s in enumerate(sides) if s == side)]
+        sheet.heads = [[head[k] for k in places] for head in sheet.heads]
+        sheet.rows = [[row[k] for k in places] for row in sheet.rows]
+        standing = Runs(axis, sides[::2] + sides[1::2], runs.values[::2] + runs.values[1::2])
+        truth = replace(truth, also=(truth_of(axis, standing.readings()),))
     return Drawn("runs side by side, with words of direction", sheets.any_file(rng, sheet), truth)
 
 
@@ -187,14 +195,14 @@ def deviations(rng: np.random.Generator, language: str) -> Drawn:
     if chance(rng, 0.5):
         names = [f"{name} {word} {k + 1}" for k in range(pairs) for word in pair]
         form, text = pick(rng, ("{} ({})", "{} [{}]")), unit_text(rng, unit, language)
-        position = headed(rng, command_name(rng, axis, language), axis.command_unit, language)
+        position = headed(rng, names_of(rng, axis, language)[0], axis.command_unit, language)
         rows: list[list[Cell]] = [list(row) for row in zip(axis.commands, *errors, strict=True)]
         sheet = Sheet([[position, *(form.format(n, text) for n in names)]], rows, language)
         return Drawn("deviations of runs side by side", sheets.any_file(rng, sheet), truth)
     order = [list(zip(axis.commands, run, strict=True))[::side] for side, run in zip(runs.sides, errors, strict=True)]
     words_of = pick(rng, words.SIDES[language])
     columns: dict[str, Sequence[Cell]] = {
-        headed(rng, command_name(rng, axis, language), axis.command_unit, language): [
+        headed(rng, names_of(rng, axis, language)[0], axis.command_unit, language): [
             c for run in order for c, _ in run
         ],
         pick(rng, words.DIRECTION[language]): [

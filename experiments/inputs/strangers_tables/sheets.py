@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -49,6 +50,8 @@ def number(cell: Cell, point: str, form: str = "plain") -> str:
         text = f"+{text}"
     if form == "minus":
         text = text.replace("-", "\u2212")
+    if form == "exponent" and "." in text:
+        text = f"{cell:.9E}"
     return text.replace(".", point)
 
 
@@ -63,16 +66,20 @@ def text_file(rng: np.random.Generator, sheet: Sheet) -> File:
     """Text with separators, in an encoding of this language."""
     point = "," if sheet.language != "en" and chance(rng, 0.75) else "."
     separator = pick(rng, (";", ";", "\t") if point == "," else (",", ",", ";", "\t", "|"))
-    form = pick(rng, ("plain",) * 12 + ("plus", "minus"))
+    form, all_quoted = pick(rng, ("plain",) * 20 + ("plus", "minus", "exponent")), chance(rng, 0.05)
+    separator = "," if all_quoted and chance(rng, 0.5) else separator
     stream = io.StringIO()
+    if chance(rng, 0.02):
+        stream.write(f"sep={separator}\n")
     for line in sheet.above:
         # As a spreadsheet exports it: a label and its text in two cells.
         stream.write(line.replace(": ", separator) + "\n" if separator != "," and chance(rng, 0.3) else line + "\n")
-    writer = csv.writer(stream, delimiter=separator, lineterminator="\n")
-    # Quotes only where they are needed, as spreadsheets write them; some write all.
-    if chance(rng, 0.05):
-        writer = csv.writer(stream, delimiter=separator, lineterminator="\n", quoting=csv.QUOTE_ALL)
-    writer.writerows([*sheet.heads, *([number(cell, point, form) for cell in row] for row in sheet.rows)])
+    csv.register_dialect(
+        "stranger", delimiter=separator, lineterminator="\n", quoting=csv.QUOTE_ALL if all_quoted else csv.QUOTE_MINIMAL
+    )
+    writer = csv.writer(stream, "stranger")
+    empty = [""] * int(rng.integers(1, 4)) * chance(rng, 0.03)
+    writer.writerows([*sheet.heads, *([number(cell, point, form) for cell in row] + empty for row in sheet.rows)])
     return File(f"log.{pick(rng, ('csv', 'csv', 'txt', 'dat'))}", encoded(rng, stream.getvalue()))
 
 
@@ -95,12 +102,18 @@ def workbook(rng: np.random.Generator, sheet: Sheet) -> File:
     assert active is not None
     as_text = chance(rng, 0.1)
     point = "," if sheet.language != "en" else "."
-    for line in (*([above] for above in sheet.above), *sheet.heads):
-        active.append(line)
+    heads = sheet.heads
+    if chance(rng, 0.15):
+        # Names on two lines of their cell.
+        heads = [[name.replace(" (", "\n(").replace(" [", "\n[") for name in head] for head in heads]
+    # The table begins somewhere below and to the right.
+    left = [None] * int(rng.integers(1, 3)) * chance(rng, 0.12)
+    above: list[list[str]] = [[line] for line in sheet.above]
+    for line in [*([[]] * 2 if left else []), *above, *heads]:
+        active.append([*left, *line])
     for row in sheet.rows:
-        active.append(
-            [cell if isinstance(cell, str) else number(cell, point) if as_text else float(cell) for cell in row]
-        )
+        cells = [cell if isinstance(cell, str) else number(cell, point) if as_text else float(cell) for cell in row]
+        active.append([*left, *(None if cell == "" else cell for cell in cells)])
     if chance(rng, 0.2):
         book.create_sheet("Sheet2")
     stream = io.BytesIO()
@@ -119,10 +132,70 @@ def markdown(rng: np.random.Generator, sheet: Sheet) -> File:
     return File("report.md", encoded(rng, title + text))
 
 
+def with_index(rng: np.random.Generator, sheet: Sheet) -> None:
+    """A first column without a name that counts the rows, as a data frame is saved."""
+    sheet.heads = [["", *head] for head in sheet.heads]
+    sheet.rows = [[Decimal(k), *row] for k, row in enumerate(sheet.rows)]
+
+
+def other_case(rng: np.random.Generator, sheet: Sheet) -> None:
+    """Names without a space before the unit, or in capitals."""
+    if chance(rng, 0.5):
+        sheet.heads = [[name.replace(" (", "(").replace(" [", "[") for name in head] for head in sheet.heads]
+    else:
+        sheet.heads = [[_capitals(name) for name in head] for head in sheet.heads]
+
+
+def _capitals(name: str) -> str:
+    """Capitals up to the unit: "mm" is never "MM"."""
+    begin = re.search(r"[(\[/_,]| in |\bmm$", name)
+    word = name if begin is None else name[: begin.start()]
+    # u is no U.
+    return name if len(word.strip()) == 1 else word.upper() + name[len(word) :]
+
+
+def blank_rows(rng: np.random.Generator, sheet: Sheet) -> None:
+    """Empty rows between others."""
+    for place in sorted(rng.choice(len(sheet.rows), 2, replace=False).tolist(), reverse=True):
+        sheet.rows.insert(place, [""] * len(sheet.rows[0]))
+
+
+def mean_row(rng: np.random.Generator, sheet: Sheet) -> None:
+    """Means below the columns."""
+    label = {"en": ("Mean", "Average"), "de": ("Mittelwert", "MW"), "es": ("Media", "Promedio"), "fr": ("Moyenne",)}
+    row: list[Cell] = [pick(rng, label[sheet.language])]
+    for cells in list(zip(*sheet.rows, strict=True))[1:]:
+        numbers = [float(cell) for cell in cells if isinstance(cell, Decimal)]
+        row.append(Decimal(f"{np.mean(numbers):.3f}") if len(numbers) == len(cells) else "")
+    sheet.rows.append(row)
+
+
+def names_again(rng: np.random.Generator, sheet: Sheet) -> None:
+    """The names at the top of another page."""
+    sheet.rows.insert(len(sheet.rows) // 2, list(sheet.heads[0]))
+
+
+def units_in_cells(rng: np.random.Generator, sheet: Sheet) -> None:
+    """10.002 mm in each cell of a column, and no unit at its head."""
+    for k, name in enumerate(sheet.heads[0]):
+        found = re.fullmatch(r"(.*\w)\s*[(\[](mm|\u00b5m|cm|inch|deg|\u00b0|gon|mrad|in)[)\]]", name)
+        if found and all(isinstance(row[k], Decimal) for row in sheet.rows):
+            sheet.heads[0][k] = found[1]
+            space = "" if found[2] == "\u00b0" else " "
+            point = "," if sheet.language != "en" else "."
+            for row in sheet.rows:
+                row[k] = number(row[k], point) + space + found[2]
+
+
+QUIRKS = (with_index, other_case, other_case, blank_rows, mean_row, names_again, units_in_cells)
+
+
 def any_file(rng: np.random.Generator, sheet: Sheet, markdowns: bool = True) -> File:
     """Mostly text, a workbook, or Markdown."""
     if not sheet.above and chance(rng, 0.3):
         sheet.above = preamble(rng, sheet.language)
+    if len(sheet.heads) == 1 and chance(rng, 0.25):
+        pick(rng, QUIRKS)(rng, sheet)
     which = rng.random()
     if which < 0.12:
         return workbook(rng, sheet)

@@ -230,3 +230,49 @@ AZIMUTH = {
     "es": (("Azimut", "Elevación"), ("Azimut", "Altura"), ("Az medido", "El medido")),
     "fr": (("Azimut", "Élévation"), ("Azimut", "Site"), ("Azimut", "Hauteur")),
 }
+MOTOR = {
+    "en": ("Motor angle", "Motor position", "Motor shaft angle", "Input shaft"),
+    "de": ("Motorwinkel", "Motorstellung", "Antriebswinkel"),
+    "es": ("Ángulo del motor", "Posición del motor"),
+    "fr": ("Angle moteur", "Position du moteur"),
+}
+"""Commands before the gears."""
+OUTPUT = {
+    "en": ("Output angle", "Table angle", "Measured output angle"),
+    "de": ("Abtriebswinkel", "Tischwinkel", "Gemessener Winkel"),
+    "es": ("Ángulo de salida", "Ángulo medido"),
+    "fr": ("Angle de sortie", "Angle mesuré"),
+}
+PAIRS = {
+    "en": (
+        *(("cmd", "fb"), ("PosCmd", "PosFbk"), ("x_ref", "x_meas"), ("Goal Position", "Present Position")),
+        *(("Nominal", "Actual"), ("targetPos", "measuredPos"), ("DEMAND", "FEEDBACK"), ("desired", "measured")),
+        *(("X nominal", "X actual"), ("commanded", "observed"), ("SET", "READ"), ("set point", "process value")),
+        *(("Move to", "Caliper"), ("Destination", "Height gauge"), ("Ref. position", "Meas. position"), ("SP", "PV")),
+    ),
+    "de": (
+        *(("X_soll", "X_ist"), ("Soll", "Ist"), ("Nennwert", "Istwert"), ("SOLL", "IST"), ("Führungsgröße", "Istwert")),
+        *(
+            ("Sollmaß", "Istmaß"),
+            ("Zielwert", "Messschieber"),
+            ("Sollstellung", "Iststellung"),
+            ("Fahre auf", "Messuhr"),
+        ),
+    ),
+    "es": (
+        *(("nominal", "real"), ("Valor objetivo", "Valor medido"), ("Consigna", "Valor real"), ("Teórica", "Medida")),
+        *(("Posición de destino", "Calibre"), ("Mando", "Lectura del reloj")),
+    ),
+    "fr": (
+        *(("théorique", "réel"), ("Valeur cible", "Valeur lue"), ("Consigne", "Recopie"), ("Nominal", "Réel")),
+        *(("Position de destination", "Pied à coulisse"), ("Commande", "Mesure"), ("Théorique", "Relevée")),
+    ),
+}
+"""Names of command and reading that belong together."""
+MEANS = {
+    "en": ("Mean forward", "Mean backward", "Mean", "Std dev"),
+    "de": ("Mittelwert vor", "Mittelwert zurück", "Mittelwert", "Standardabweichung"),
+    "es": ("Media ida", "Media vuelta", "Media", "Desviación típica"),
+    "fr": ("Moyenne aller", "Moyenne retour", "Moyenne", "Écart-type"),
+}
+"""Of a sheet of runs: both sides, all, scatter."""

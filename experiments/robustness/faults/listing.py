@@ -45,8 +45,10 @@ class Fault:
 
 FAULTS = (
     # Heads: their URDF, and what is watched of them.
-    Fault("the azimuth zero of a URDF has the wrong sign", "urdf._head_joints", Reads("azimuth", "-value"),
+    Fault("the azimuth zero of a URDF has the wrong sign", "urdf.head_joints", Reads("azimuth", "-value"),
           "test_terms_of_joints_are_those_of_the_chain"),
+    Fault("a quaternion of a calibration turns the other way", "stereo_programs._homogeneous", Reads("w", "-value"),
+          "test_the_same_pair_in_the_files_of_every_program"),
     Fault("a correction is applied to a model that has it", "HeadModel.urdf", Never("before"),
           "test_an_estimated_head_is_what_another_parser_reads"),
     # Mirrors, gears, cameras: the model.
@@ -250,6 +252,17 @@ FAULTS = (
           "test_repeats_at_one_stop_share_its_error"),
     Fault("a left-out reading is predicted on its other side", "AxisModel.left_out", Local("expected", "-value"),
           "test_rows_left_out_are_the_conditional_of_the_dense_gaussian"),
+    # Data that say less than they seem to.
+    Fault("a sensor's code is taken for a temperature", "conditions.FAR_K", Constant("1e12"),
+          "test_codes_of_a_sensor_are_doubted_where_neighbours_are_far"),
+    Fault("a campaign's own looks confirm it", "copies.COPIED_SHARE", Constant("2.0"),
+          "test_looks_that_were_seen_before_are_refused"),
+    Fault("a term that sightings do not determine is fitted", "pointing_model.OWN_SHARE", Constant("-1.0"),
+          "test_least_squares_hold_what_one_axis_does_not_determine"),
+    Fault("a command with a digit too many is believed", "stops.LONE_RANGES", Constant("1e12"),
+          "test_a_command_with_a_digit_too_many_is_doubted"),
+    Fault("compiled code under another function's name is run", "own_folder._seal", Reads("name", "''"),
+          "test_a_file_under_anothers_name_is_none"),
     # Compensation.
     Fault("corrections of both sides change places", "Correction.sent", Argument("side", "-value"),
           "test_both_sides_are_linear_between_lines_and_constant_beyond"),

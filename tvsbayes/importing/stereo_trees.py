@@ -1,83 +1,87 @@
-"""Read containers of calibrations by their content: YAML, XML and JSON (OpenCV's too), TOML, .npz, MATLAB's .mat.
+"""Files of calibrations as trees of tables, lists and numbers: YAML, XML, JSON, TOML, .npz, .npy, .mat, plain rows.
 
-`maker_calibrations` reads the printed text of camera makers' programs.
-
-Every container becomes nested maps, lists and numbers, as `Keys` with file and line. OpenCV's matrices stay maps of
-rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619).
-General libraries read the formats instead, with limits: bytes, entries (aliases expanded), depth; no entities, pickles.
+A container is recognised by its content; what programs print is read by `stereo_programs`. Every tree is a `Keys` with
+file and lines. OpenCV's matrices stay tables of rows, cols, data. OpenCV's FileStorage has had memory errors on hostile
+files (CVE-2019-5063, -5064; opencv #28619): general libraries read the formats instead, with limits on bytes, entries
+(aliases expanded) and depth; no entities, no pickles.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import re
 import struct
 import subprocess
 import sys
-import zipfile
 import zlib
 from collections.abc import Callable, Iterable
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from tvsbayes.cameras.maker_calibrations import printed_values
 from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.files.disk import array_of, arrays_of
 from tvsbayes.files.documents import Keys, parse_json, parse_toml
 from tvsbayes.files.foreign_table import text_of
+from tvsbayes.importing.stereo_programs import printed_trees
 
-MATRIX_TAG = "!!opencv-matrix"
-CONTAINER_BYTES_MAX = 4 * 1024 * 1024
+PACKED = struct.error, zlib.error
+TREE_BYTES_MAX = 4 * 1024 * 1024
 ENTRIES_MAX = 200_000
 DEPTH_MAX = 12
 LIMITS_TEXT, TRIM_REMEDY = f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
 _FORMATS_TEXT = (
-    "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .mat of MATLAB up to version 7, a ZED's SN*.conf,"
-    " what rs-enumerate-devices -c prints"
+    "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .npy, .mat of MATLAB up to version 7, a ZED's "
+    "SN*.conf, what rs-enumerate-devices -c prints"
 )
 REWRITE_REMEDY = "write it as its own program does"
 _TEXT_REMEDY = "name a calibration file; from Python save the matrices by numpy.savez, not as pickles or pictures"
 MAT_SECONDS_MAX = 60.0
+_DAMAGE = ArithmeticError, AttributeError, LookupError, MemoryError, OSError, TypeError, ValueError, *PACKED
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
 """MAT-file 5: length of the header, and type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
 
 
-def read_container(data: bytes, file: str) -> list[Keys]:
-    """Read the top map of a calibration file; several where it contains messages of several cameras.
+def read_trees(data: bytes, file: str) -> list[Keys]:
+    """Read the top table of a calibration file; several where it contains those of several cameras.
 
     Raises:
         InputError: too large, unknown, damaged, or above the limits; with file and line.
     """
-    if len(data) > CONTAINER_BYTES_MAX:
-        found, allowed = f"{len(data)} bytes", f"at most {CONTAINER_BYTES_MAX} bytes"
+    if len(data) > TREE_BYTES_MAX:
+        found, allowed = f"{len(data)} bytes", f"at most {TREE_BYTES_MAX} bytes"
         raise refusal("size", file=file, found=found, allowed=allowed, remedy="remove what is not needed")
     for magic, reader in _BINARY.items():
         if data.startswith(magic):
             try:
                 values = reader(data)
-            except (ValueError, TypeError, KeyError, OSError, zlib.error, zipfile.BadZipFile, NotImplementedError) as e:
-                raise container_error(file, None, str(e), "write it again with its program") from e
-            except (MemoryError, RecursionError, struct.error, IndexError, AttributeError, OverflowError) as e:
-                raise container_error(file, None, "a damaged file", "write it again with its program") from e
-            return [Keys(_plain_values(values, file), file, "")]
+            except _DAMAGE as error:
+                found = str(error) if isinstance(error, ValueError) else "a damaged file"
+                raise container_error(file, None, found, "write it again with its program") from error
+            values = values if isinstance(values, dict) else {PurePath(file).stem: values}
+            return [Keys(_plain(values, file), file, "")]
     text = text_of(data, file, _FORMATS_TEXT, _TEXT_REMEDY).text
     try:
-        printed = printed_values(text)
-    except ValueError as error:
-        raise container_error(file, None, str(error), "take the file as the camera's program wrote it") from error
-    if printed is not None:
-        return [Keys(_plain_values(printed, file), file, text)]
-    first = text.lstrip()[:1]
-    if first == "<":
-        return [Keys(_plain_values(_xml(text, file), file), file, "")]
-    if first == "{":
+        printed = printed_trees(text)
+    except (ValueError, ArithmeticError) as error:
+        found, *remedy = map(str, error.args)
+        raise container_error(file, None, found, *remedy or ["take the file as the program wrote it"]) from error
+    if printed:
+        return [Keys(_plain(values, file), file, text) for values in printed]
+    if (rows := _rows(text)) is not None:
+        return [Keys(_plain({PurePath(file).stem: rows}, file), file, text)]
+    if text.lstrip().startswith("<"):
+        return [Keys(_plain(_xml(text, file), file), file, "")]
+    if re.match(r"\s*\{\s*[\"}]", text):
+        if text.count(",") > ENTRIES_MAX:
+            raise container_error(file, None, LIMITS_TEXT, TRIM_REMEDY)
         return [parse_json(text.encode(), file)]
     if re.match(r"(\s|#.*\n)*(\[[\w.\"-]+\]\s*(#.*)?$|[\w.-]+\s*=)", text, re.MULTILINE):
         return [parse_toml(text.encode(), file)]
-    return [Keys(_plain_values(document, file), file, text) for document in _yaml(text, file)]
+    return [Keys(_plain(document, file), file, text) for document in _yaml(text, file)]
 
 
 def container_error(file: str, line: int | None, found: str, remedy: str = REWRITE_REMEDY) -> InputError:
@@ -85,8 +89,8 @@ def container_error(file: str, line: int | None, found: str, remedy: str = REWRI
     return refusal("container", file=file, line=line, found=escaped(found, 120), allowed=_FORMATS_TEXT, remedy=remedy)
 
 
-def _plain_values(value: Any, file: str) -> Any:
-    """Reduce a value to maps, lists, numbers and text, within the limits."""
+def _plain(value: Any, file: str) -> Any:
+    """Reduce a value to tables, lists, numbers and text, within the limits."""
     count = 0
 
     def plain(value: Any, depth: int) -> Any:
@@ -109,15 +113,6 @@ def _plain_values(value: Any, file: str) -> Any:
     return plain(value, 0)
 
 
-def _npz(data: bytes) -> dict[str, Any]:
-    """Arrays of NumPy's archive, without pickles."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > CONTAINER_BYTES_MAX:
-            raise ValueError(f"an archive of more than {CONTAINER_BYTES_MAX} bytes")
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
-
-
 _MAT_PROGRAM = """
 import io, json, sys
 import numpy as np
@@ -137,7 +132,7 @@ json.dump(plain(loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True
 
 
 def _mat(data: bytes) -> dict[str, Any]:
-    """Variables of a MAT-file of version 5 (saved by -v6 or -v7); structures become maps.
+    """Variables of a MAT-file of version 5 (saved by -v6 or -v7); structures become tables.
 
     `scipy.io.loadmat` ends in a segmentation fault on some damaged files: they are read in a separate process.
     """
@@ -147,9 +142,9 @@ def _mat(data: bytes) -> dict[str, Any]:
         kind, size = struct.unpack(f"{order}II", data[offset : offset + 8])
         if kind == _MAT_COMPRESSED:
             packed = data[offset + 8 : offset + 8 + size]
-            unpacked += len(zlib.decompressobj().decompress(packed, CONTAINER_BYTES_MAX + 1))
-        if unpacked > CONTAINER_BYTES_MAX:
-            raise ValueError(f"variables of more than {CONTAINER_BYTES_MAX} bytes")
+            unpacked += len(zlib.decompressobj().decompress(packed, TREE_BYTES_MAX + 1))
+        if unpacked > TREE_BYTES_MAX:
+            raise ValueError(f"variables of more than {TREE_BYTES_MAX} bytes")
         offset += 8 + size
     command = [sys.executable, "-I", "-c", _MAT_PROGRAM]
     try:
@@ -164,8 +159,9 @@ def _hdf5(data: bytes) -> dict[str, Any]:
     raise ValueError("an HDF5 file (MATLAB's -v7.3 is one): save it with save(..., '-v7')")
 
 
-_BINARY: dict[bytes, Callable[[bytes], dict[str, Any]]] = {
-    b"PK\x03\x04": _npz,
+_BINARY: dict[bytes, Callable[[bytes], Any]] = {
+    b"PK\x03\x04": lambda data: arrays_of(data, TREE_BYTES_MAX),
+    b"\x93NUMPY": lambda data: array_of(data, "the file"),
     b"MATLAB 5.0": _mat,
     b"\x89HDF": _hdf5,
     b"MATLAB 7.3": _hdf5,
@@ -173,12 +169,23 @@ _BINARY: dict[bytes, Callable[[bytes], dict[str, Any]]] = {
 """Readers by the first bytes of a file."""
 
 
+def _rows(text: str) -> list[Any] | None:
+    """Rows of numbers, as `numpy.savetxt` writes them; None for any other text, and beyond the limits."""
+    if not re.fullmatch(r"(?:[0-9eE+\-.,\s]++|#[^\n]*+)++", text) or sum(map(text.count, ", \n")) > ENTRIES_MAX:
+        return None
+    rows = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    numbers = [[number(word) for word in row] for row in rows if row]
+    return None if not numbers or any(None in row for row in numbers) else numbers
+
+
 def _xml(text: str, file: str) -> dict[str, Any]:
-    """OpenCV's XML: elements by name, matrices as maps of rows, cols, data."""
+    """Elements by name with their attributes; several of one name as a list; words that are numbers as numbers."""
     from xml.etree import ElementTree
 
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
         raise container_error(file, None, "a document type or entity")
+    if text.count("<") > ENTRIES_MAX:
+        raise container_error(file, None, LIMITS_TEXT, TRIM_REMEDY)
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
@@ -188,21 +195,32 @@ def _xml(text: str, file: str) -> dict[str, Any]:
     def value(element: Any, depth: int) -> Any:
         if depth > DEPTH_MAX:
             raise container_error(file, None, f"elements nested deeper than {DEPTH_MAX}")
-        if len(element):
-            listed = all(child.tag == "_" for child in element)
-            children = [value(child, depth + 1) for child in element]
-            return children if listed else dict(zip((child.tag for child in element), children, strict=True))
-        words = (element.text or "").split()
-        numbers = [_number(word) for word in words]
-        if not words or None in numbers:
-            return (element.text or "").strip().strip('"')
-        return numbers if len(numbers) > 1 or element.tag == "data" else numbers[0]
+        stated = {key: _word(text) for key, text in element.attrib.items() if key != "type_id"}
+        if len(element) or stated:
+            if len(element) and all(child.tag == "_" for child in element):
+                return [value(child, depth + 1) for child in element]
+            found: dict[str, list[Any]] = {}
+            for child in element:
+                found.setdefault(child.tag, []).append(value(child, depth + 1))
+            if root.tag == "opencv_storage" and (twice := [tag for tag, items in found.items() if len(items) > 1]):
+                raise container_error(file, None, f"{shown(twice[0])} twice", "remove one of them")
+            inner = {tag: items[0] if len(items) == 1 else items for tag, items in found.items()}
+            return stated | inner | ({} if len(element) else {"value": _word(element.text or "")})
+        return _word(element.text or "", listed=element.tag == "data")
 
     content = value(root, 0)
     return content if isinstance(content, dict) else {root.tag: content}
 
 
-def _number(word: str) -> int | float | None:
+def _word(text: str, listed: bool = False) -> Any:
+    """Numbers of a text, a single one alone unless `listed`; or the text."""
+    numbers = [number(word) for word in text.split()]
+    if not numbers or None in numbers:
+        return text.strip().strip('"')
+    return numbers if len(numbers) > 1 or listed else numbers[0]
+
+
+def number(word: str) -> int | float | None:
     """A finite number in a text, else None."""
     if not NUMBER.fullmatch(word) or not math.isfinite(float(word)):
         return None
@@ -228,19 +246,20 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
         return {key: loader.construct_object(part, deep=True) for key, (_, part) in zip(keys, node.value, strict=True)}
 
     def scalar(loader: Any, node: Any) -> Any:
-        number = None if node.style in ("'", '"', "|", ">") else _number(node.value)
-        return node.value if number is None else number
+        found = None if node.style in ("'", '"', "|", ">") else number(node.value)
+        return node.value if found is None else found
 
-    Loader.yaml_constructors = {"tag:yaml.org,2002:map": mapping, "tag:yaml.org,2002:str": scalar}
-    for kind in ("int", "float", "bool", "null", "timestamp", "merge", "value"):
-        Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = scalar
-    for kind in ("seq", "python/tuple"):
-        Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = yaml.SafeLoader.construct_yaml_seq
-    for kind in ("opencv-matrix", "opencv-nd-matrix"):
-        Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = mapping
-    Loader.yaml_constructors[None] = yaml.SafeLoader.construct_undefined
-    # OpenCV's header is not a YAML directive; separators of ROS' dumps start empty documents.
+    sequence, tag = yaml.SafeLoader.construct_yaml_seq, "tag:yaml.org,2002:"
+    Loader.yaml_constructors = {None: yaml.SafeLoader.construct_undefined}
+    for kinds, constructor in (
+        ("map opencv-matrix opencv-nd-matrix", mapping),
+        ("str int float bool null timestamp merge value", scalar),
+        ("seq python/tuple", sequence),
+    ):
+        Loader.yaml_constructors |= {f"{tag}{kind}": constructor for kind in kinds.split()}
+    # OpenCV's header is not a YAML directive; what mrcal packs of its corners is no YAML.
     body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
+    body = re.sub(r"'optimization_inputs':\s*b'[^']*',?", lambda match: "\n" * match.group().count("\n"), body)
     try:
         _check_limits(yaml.parse(body, Loader=Loader), file)
         documents = list(yaml.load_all(body, Loader=Loader))
@@ -252,17 +271,20 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
     except (RecursionError, ValueError) as error:
         raise container_error(file, None, "YAML that is nested too deeply") from error
     distinct: list[dict[str, Any]] = []
-    for document in documents or [None]:
-        if not isinstance(document, dict) and (document or not distinct):
-            raise container_error(file, 1, shown(document) if document else "nothing", "name a calibration file")
+    for document in documents:
+        # Separators of ROS' dumps start empty documents.
+        if document and not isinstance(document, dict):
+            raise container_error(file, 1, shown(document), "name a calibration file")
         plain = {key: value for key, value in (document or {}).items() if key != "header"}
         if plain and plain not in distinct:
             distinct.append(plain)
+    if not distinct:
+        raise container_error(file, 1, "nothing", "name a calibration file")
     return distinct
 
 
 def _check_limits(events: Iterable[Any], file: str) -> None:
-    """Check depth and number of entries before any object is built; `_plain_values` counts expanded aliases."""
+    """Check depth and number of entries before any object is built; `_plain` counts expanded aliases."""
     depth = count = 0
     for event in events:
         name, line = type(event).__name__, event.start_mark.line + 1
