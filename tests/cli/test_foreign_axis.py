@@ -227,7 +227,7 @@ MISTAKES = {
         "jump by about 1000 counts",
         "--counts-per-turn N",
     ),
-    "times that run back": ("t,steps,angle\n0,0,1\n2,1,2\n1,2,3\n", (), "times that do not decrease", "--column time_s="),
+    "times that run back": ("t,steps,angle\n0,0,1\n2,1,2\n1,2,3\n", (), "times that do not decrease", "time_s="),
     "names alone": ("steps,mm\n", (), "no rows below the names", "with the data"),
     "an unknown format": (TABLE, ("--format", "phd"), "--format phd", "phd2"),
     "a table as a guide log": (TABLE, ("--format", "phd2"), "no run with frames", "holds guiding"),
@@ -246,7 +246,7 @@ MISTAKES = {
     "an angle sensor alone": ('{"q": "angle:a", "params": {"data": [[1, 2]]}}\x03', (), "angle:a", "data_logger.py"),
     "minutes beyond 60": ("steps;angle\n0;1\u00b061'00\"\n1;2\u00b000'00\"\n", (), 'found "1', "correct the cell"),
     "two notations in a column": ("steps;angle\n0;1 mm\n1;2 deg\n", (), 'found "1 mm"', "correct the cell"),
-    "a guide log without --axis": (night(99), None, "a guide log of PHD2 or KStars, which is of one axis", "with --axis"),
+    "a guide log without --axis": (night(99), None, "PHD2 or KStars, which is of one axis", "with --axis"),
     "camonitor without --axis": (WRITTEN["camonitor"], None, "a log of EPICS", "with --axis"),
 }
 
