@@ -92,6 +92,10 @@ def _is_remark(line: str) -> bool:
 
 def _divided(body: Sequence[tuple[int, str]], separator: str, file: str) -> list[Row]:
     """Cells of the lines."""
+    if body and body[0][1].count(separator) > ABOVE_MAX * COLUMNS_MAX:
+        allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
+        found = f"{body[0][1].count(separator) + 1} columns"
+        raise refusal("size", file=file, line=body[0][0], found=found, allowed=allowed, remedy=remedy)
     if separator == " ":
         return [Row(number, line.split()) for number, line in body]
     reader = csv.reader((line for _, line in body), delimiter=separator, skipinitialspace=True, strict=True)

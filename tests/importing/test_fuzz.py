@@ -1,0 +1,101 @@
+"""Damaged tables and logs of every kind: rows, a question or a refusal; nothing else, and little memory."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from importing.samples import KEYS, sample
+from support.damaged_files import damaged, few
+
+from tvsbayes.cli.axis_import import FileOptions, import_readings
+from tvsbayes.errors import InputError
+from tvsbayes.importing.reader import read_foreign
+from tvsbayes.importing.sightings import SightingWishes, sighting_rows
+from tvsbayes.importing.workbook import CELLS_MAX
+
+MEMORY_BYTES = 300 * 2**20
+"""For a file below 10 MB."""
+FILES = {
+    key: content.encode() if isinstance(content, str) else content
+    for key, (_, content, words) in ((key, sample(key)) for key in KEYS)
+    if "--urdf" not in words
+}
+
+
+def imported(path, folder):
+    """Import a file as an axis and as sightings; whether it was refused."""
+    refused = 0
+    try:
+        import_readings(path, folder / "out", {}, None, FileOptions(), yes=True, as_json=True)
+    except InputError as error:
+        assert error.remedy or error.message
+        refused += 1
+    try:
+        sighting_rows(read_foreign(path), SightingWishes())
+    except InputError:
+        refused += 1
+    return refused
+
+
+@few(200)
+@given(damaged(FILES))
+def test_damaged_files_are_read_or_refused(tmp_path_factory, case):
+    name, data = case
+    folder = tmp_path_factory.mktemp("damaged")
+    path = folder / "file"
+    path.write_bytes(data)
+    imported(path, folder)
+
+
+FLOODS = {
+    "many columns": ("a," * 3_000_000).encode(),
+    "one long line": b"1" * 9_000_000,
+    "many rows": b"steps,reading\n" + b"1,2\n" * 50_000,
+    "brackets": b"[" * 5_000_000,
+    "pairs": b"x: 1\n" * 60_000,
+    "names": b"(" * 1_000_000 + b",b\n1,2\n3,4\n",
+    "messages": b'{"q": "stepq:s", "params": {"data": [' + b"[1,1,1]," * 500_000 + b"[1,1,1]]}}\x03",
+    "camonitor": b"M:axis 2026-03-01 10:00:00.000000 1\n" * 50_000,
+}
+
+
+MEASURED = """
+import resource, sys
+from pathlib import Path
+from importing.test_fuzz import FLOODS, imported
+folder = Path(sys.argv[1])
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for name, data in FLOODS.items():
+    (folder / "flood").write_bytes(data)
+    imported(folder / "flood", folder)
+    print(name, 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before))
+"""
+
+
+@pytest.mark.thorough
+def test_floods_take_little_memory(tmp_path):
+    """In a process of its own, whose largest size counts."""
+    tests = Path(__file__).parents[1]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tests.parent), str(tests)))}
+    command = [sys.executable, "-c", MEASURED, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    rows = [line.rsplit(" ", 1) for line in done.stdout.splitlines()]
+    assert done.returncode == 0 and len(rows) == len(FLOODS), done.stderr
+    assert all(int(used) < MEMORY_BYTES for _, used in rows), rows
+
+
+@pytest.mark.parametrize("corner", ["XFD1048576", "A1048576"])
+def test_a_sheet_with_a_far_corner_is_refused(tmp_path, corner):
+    """A reader would fill the rectangle to the last cell: more than the largest area or number of rows."""
+    import openpyxl
+
+    book = openpyxl.Workbook()
+    book.active["A1"], book.active[corner] = "steps", 1
+    book.save(tmp_path / "far.xlsx")
+    with pytest.raises(InputError, match=f"{CELLS_MAX} cells"):
+        read_foreign(tmp_path / "far.xlsx")
