@@ -16,6 +16,7 @@ from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import styled
 from tvsbayes.errors import InputError, Question, TvsError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.packages import own_version
 
 INTERRUPTED = 130
 TARGET_MISSED = 1
@@ -32,9 +33,7 @@ app = typer.Typer(
 
 def _print_version(requested: bool) -> None:
     if requested:
-        from importlib.metadata import version
-
-        _print(f"tvsbayes {version('tvsbayes')}")
+        _print(f"tvsbayes {own_version()}")
         raise typer.Exit
 
 

@@ -26,7 +26,7 @@ from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.instrument.mechanisms import MECHANISMS
-from tvsbayes.pipeline import StoredOrFitted
+from tvsbayes.pipeline import StoredOrFitted, inputs_of
 from tvsbayes.pipeline import verify as verified
 from tvsbayes.progress import Job
 
@@ -107,7 +107,8 @@ def compensate(
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
         compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
-    document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **plain(provenance(axis_hashes(data), seed))}
+    origin = plain(provenance(axis_hashes(data), seed, results.fit_id))
+    document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **origin}
     files: dict[str, str] = {}
     if out is not None:
         write_atomically(out, file_text(compensation, data).encode())
@@ -172,12 +173,13 @@ def verify(
     correction; of a scanner or head the counters that steps-for or the header gave, and the looks there. The
     most probable of: applied, not applied, applied twice, wrong sign, another machine.
     """
-    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
+    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256
+    from tvsbayes.comparison.verified_looks import accepted_calibration
     from tvsbayes.compensation.verification import stored_compensation
-    from tvsbayes.instrument.campaign import input_hashes, read_campaign
+    from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
-    from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign, read_axis
 
     mechanism = _two_axis_mechanism(campaign)
     if mechanism is not _two_axis_mechanism(fresh):
@@ -192,9 +194,11 @@ def verify(
     with waiting() as progress:
         new, distance = fresh if made is None else read_axis(fresh), distance_mm or 1000.0
         result = verified(known, new, made=made, distance_mm=distance, seed=seed, tell=report_line, progress=progress)
-    inputs = axis_hashes(known) if isinstance(known, AxisCampaign) else input_hashes(known)
-    table = content_sha256(calibration_json(load_calibration(campaign))) if made is None else made.digest
-    document = {"format": VERIFICATION_FORMAT, "inputs": inputs, "table": table, **result.as_json()}
+    if isinstance(known, AxisCampaign):
+        table = stored_compensation(known).digest
+    else:
+        table = content_sha256(calibration_json(accepted_calibration(known)))
+    document = {"format": VERIFICATION_FORMAT, "inputs": inputs_of(known), "table": table, **result.as_json()}
     keep(document, output_place(campaign, "results") / "verification.json")
     for remark in result.remarks if as_json else ():
         report_line(f"warning: {remark}")

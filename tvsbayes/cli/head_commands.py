@@ -305,7 +305,7 @@ def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: boo
 
     def make(job: Job) -> Document:
         data = read_campaign(folder)
-        record = StoredOrFitted(data, report_line, job.part(FITTING)).record
+        record = StoredOrFitted(data, report_line, job.part(FITTING)).reported.record
         job.begin(DRAWING)
         return head_document(data, record, issue, check_campaign(data).warnings)
 

@@ -171,16 +171,22 @@ class PageContent:
 
     def _document(self, job: Job) -> Document:
         """Gather evidence for a document; fits first where results are missing."""
-        from tvsbayes.calibration.calibration_file import load_calibration
         from tvsbayes.report.evidence import gather
         from tvsbayes.report.scanner_document import report_document
 
-        limits = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
-        self.record = StoredOrFitted(self.data, report_line, job.part(FITTING)).record
+        self.record, calibration, ratios = StoredOrFitted(self.data, report_line, job.part(FITTING)).reported
         job.begin(GATHERING)
         warnings = campaign_contents(self.campaign, self.data)["warnings"]
-        calibration = load_calibration(self.campaign)
-        self.evidence = gather(self.data, self.record, calibration, range_mm=self.range_mm, doubts=warnings, **limits)
+        self.evidence = gather(
+            self.data,
+            self.record,
+            calibration,
+            range_mm=self.range_mm,
+            ratios_deg_per_step=ratios,
+            limit_deg_per_step=self.limit_deg_per_step,
+            limit_mm=self.limit_mm,
+            doubts=warnings,
+        )
         job.begin(DRAWING)
         return report_document(self.evidence, self.issue)
 

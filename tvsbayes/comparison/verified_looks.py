@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.calibration.aiming import Direction, mirror_angles
-from tvsbayes.calibration.calibration_file import stored_calibration
+from tvsbayes.calibration.calibration_file import calibration_of_arrays
 from tvsbayes.calibration.optics import beam_components, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
@@ -29,7 +29,7 @@ from tvsbayes.compensation.verification import (
     other_axis,
     size_of,
 )
-from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.errors import InputError, NothingToEstimate, Reason
 from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
@@ -43,7 +43,7 @@ from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
-from tvsbayes.results.records import stored_document
+from tvsbayes.results.store import stored_fit
 from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
@@ -74,16 +74,17 @@ def accepted_calibration(campaign: Campaign) -> Calibration:
         InputError: there is none for these data, or it is damaged.
         NotConverged: the fit is not accepted.
     """
-    document = stored_document(campaign, "fit.json", FIT_FORMATS, input_hashes(campaign))
-    calibration = stored_calibration(campaign)
-    if document is None or calibration is None:
+    stored = stored_fit(campaign, input_hashes(campaign))
+    calibration = None if isinstance(stored, Reason) else calibration_of_arrays(stored.arrays)
+    if isinstance(stored, Reason) or calibration is None:
         raise InputError(
             "missing-file",
             "results/ hold no calibration of these data: nothing can have been aimed with it",
             file="results/fit.json",
             remedy="run `tvsbayes fit`, aim by `tvsbayes steps-for` or the header, and look there",
         )
-    refuse_answer(answer_of(document), SURER)
+    stored.keys.word("format", FIT_FORMATS)
+    refuse_answer(answer_of(stored.keys), SURER)
     return calibration
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from tvsbayes.compensation.correction import Correction, Cycles, cycles
 from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, Origin, Wish, checked, number
 from tvsbayes.compensation.periodic_error import drive_compensation, known_waves, strongest_period
 from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.files.packages import own_version
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import Compensation, SidePromise, TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
@@ -394,7 +394,7 @@ def compensate(
 def _origin(campaign: AxisCampaign) -> Origin:
     digest = hashlib.sha256("".join(sorted(axis_hashes(campaign).values())).encode()).hexdigest()
     name = campaign.path.name if campaign.path else "a campaign"
-    return Origin(f"tvsbayes {version('tvsbayes')} of {name}", digest)
+    return Origin(f"tvsbayes {own_version()} of {name}", digest)
 
 
 def file_text(made: Compensation, campaign: AxisCampaign) -> str:
