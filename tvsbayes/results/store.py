@@ -79,7 +79,7 @@ def write_fit(
         InputError: the folder cannot be written; the files are then those of before.
     """
     fit, draws = json.dumps(document, indent=1, allow_nan=False).encode(), io.BytesIO()
-    tie = {"fit_id": document["fit_id"], "inputs": json.dumps(document["inputs"])}
+    tie = {"fit_id": document["fit_id"], "inputs_sha256": json.dumps(document["inputs"])}
     np.savez(draws, allow_pickle=False, **{name: np.asarray(array) for name, array in {**arrays, **tie}.items()})
     make_folder(folder)
     write_together(folder, {DRAWS: draws.getvalue(), POSTERIOR: posterior, FIT: fit})
