@@ -15,7 +15,7 @@ import typer
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import styled
 from tvsbayes.errors import InputError, Question, TvsError, escaped, refusal, typed
-from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.disk import make_folder, write_atomically, write_folder
 from tvsbayes.files.packages import own_version
 
 INTERRUPTED = 130
@@ -154,8 +154,7 @@ CAMERAS = ("stereo.json",)
 
 def write_new(out: Path, files: Mapping[str, bytes], next_steps: str, as_json: bool) -> None:
     """Write the files of an empty campaign into a new folder, and print them with the next steps."""
-    make_folder(out, empty=True, but=CAMERAS)
-    write_files(out, files)
+    write_folder(out, files, but=CAMERAS)
     text = f"{escaped(str(out), 200)}: {', '.join(files)}\nnext: {next_steps}"
     finish({"campaign": str(out), "files": list(files)}, text, as_json)
 

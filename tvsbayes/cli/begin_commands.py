@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import CAMERAS, Json, check_word, finish, refuse_options, write_files, write_new
+from tvsbayes.cli.app import CAMERAS, Json, check_word, finish, refuse_options, write_new
 from tvsbayes.cli.instruments import INSTRUMENTS
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.understood_columns import first_names
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes, write_atomically, write_folder
 from tvsbayes.instrument.mechanisms import WORDS
 from tvsbayes.progress import Job
 
@@ -114,8 +114,7 @@ def _with_pictures(
     paired = pair_looks(views.views, numbers, rows, pair)  # type: ignore[arg-type]
     _refuse_other_size(out, views)
     if not (out / "campaign.toml").is_file():
-        make_folder(out, empty=True, but=CAMERAS)
-        write_files(out, campaign_templates())
+        write_folder(out, campaign_templates(), but=CAMERAS)
     if moves_path is None:
         write_atomically(out / "moves.csv", _blank_moves(1 + max(spot.move for spot in paired.spots)))
     elif moves_path.parent != out:

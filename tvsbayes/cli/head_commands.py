@@ -20,7 +20,7 @@ from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped, refusal, typed
 from tvsbayes.files.csv_kind import templates
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
@@ -94,9 +94,7 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
     document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
 
     def write() -> list[str]:
-        if kind is SIGHTING_HEAD:
-            make_folder(to, empty=True)
-        write_files(to, files)
+        (write_folder if kind is SIGHTING_HEAD else write_files)(to, files)
         return [escaped(str(to), 200)]
 
     def outcome(written: list[str]) -> dict[str, Any]:
@@ -132,8 +130,7 @@ def import_sightings(
     document |= {"sightings": len(sightings), "ok": ok, "campaign": str(to)}
 
     def write() -> list[str]:
-        to.mkdir(parents=True, exist_ok=True)
-        return write_files(to, contents.files)
+        return (write_folder if contents.is_new else write_files)(to, contents.files)
 
     return Import(lines, document, write, f"`tvsbayes check {typed(to)}`", ", or correct it with --column")
 
@@ -151,9 +148,10 @@ class ImportedHead:
 
 @dataclass(frozen=True)
 class _SightingFiles:
-    """Files of a head by name, and the assumptions in words."""
+    """Files of a head by name, whether their folder is new, and the assumptions in words."""
 
     files: dict[str, bytes]
+    is_new: bool
     assumed: list[str]
 
 
@@ -187,7 +185,7 @@ def _sighting_files(rows: ImportedHead, to: Path, table: str) -> _SightingFiles:
     files = dict(templates) if is_new else {}
     files |= with_priors(current, priors) if priors else {}
     files |= {MOVES.file: MOVES.content(rows.moves), SIGHTINGS.file: SIGHTINGS.content(rows.sightings)}
-    return _SightingFiles(files, [text for text in rows.assumed if text.partition(":")[0] not in stated])
+    return _SightingFiles(files, is_new, [text for text in rows.assumed if text.partition(":")[0] not in stated])
 
 
 def _joints_of(folder: Path) -> HeadJoints | None:

@@ -21,7 +21,7 @@ from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.errors import InputError, Reason, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
-from tvsbayes.files.disk import make_folder, read_bytes
+from tvsbayes.files.disk import make_folder, read_bytes, write_folder
 from tvsbayes.instrument.axes import sides_of
 
 if TYPE_CHECKING:
@@ -344,11 +344,10 @@ def _corrected_campaign(folder: Path, to: Path, correction: Correction, options:
     document = {"assumed": list(changed.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
 
     def write() -> list[str]:
-        make_folder(to, empty=True)
         copied = [name for name in ("campaign.toml", "stereo.json", HEAD_URDF) if (folder / name).is_file()]
         contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in copied}
         contents |= {"moves.csv": moves_bytes(moves), campaign.looks_table.file: looks_bytes(campaign)}
-        return write_files(to, contents)
+        return write_folder(to, contents)
 
     return Import(lines, document | {"campaign": str(to)}, write, f"`tvsbayes check {typed(to)}`")
 
@@ -423,12 +422,14 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
     """Write the tables, and templates of the other files of a campaign where they are missing."""
     from tvsbayes.instrument.campaign import campaign_templates, moves_bytes, spots_bytes
 
-    if not (to / "campaign.toml").is_file():
-        make_folder(to, empty=True, but=CAMERAS)
-        write_files(to, campaign_templates())
+    # Another import may have filled it since the question.
+    _check_no_rows(to, looks)
     contents = {} if looks.moves is None else {"moves.csv": moves_bytes(looks.moves)}
     contents |= {} if looks.spots is None else {"spots.csv": spots_bytes(looks.spots)}
-    return write_files(to, contents)
+    if (to / "campaign.toml").is_file():
+        return write_files(to, contents)
+    write_folder(to, campaign_templates() | contents, but=CAMERAS)
+    return [str(to / name) for name in contents]
 
 
 def _mapping_lines(table: ForeignTable, mapping: ColumnMapping, notation: Notation, looks: ForeignLooks) -> list[str]:

@@ -189,6 +189,8 @@ def flush_folder(folder: Path, disk: Flushing = os) -> None:
 
 OTHER_PLACE = "name another place or free this one"
 NEW_FOLDER = "a new or empty folder"
+UNFINISHED = re.compile(r"\.new\.[0-9a-f]{12}\.tmp$")
+"""What a killed `new_folder` leaves in an existing folder."""
 
 
 def unwritable(path: Path, error: OSError, allowed: str, remedy: str) -> InputError:
@@ -318,7 +320,7 @@ def make_folder(folder: Path, *, empty: bool = False, but: Collection[str] = ())
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        occupied = empty and any(path.name not in but for path in folder.iterdir())
+        occupied = empty and any(path.name not in but and not UNFINISHED.match(path.name) for path in folder.iterdir())
     except OSError as error:
         raise unwritable(folder, error, NEW_FOLDER, "name another") from error
     if occupied:
@@ -369,6 +371,14 @@ def new_folder(to: Path, *, but: Collection[str] = ()) -> Iterator[Path]:
             raise
         # It names the place beside.
         raise unwritable(to, OSError(error.found), NEW_FOLDER, "name another") from error
+
+
+def write_folder(to: Path, files: Mapping[str, bytes], *, but: Collection[str] = ()) -> list[str]:
+    """Write files by name into a new folder, all or none; arguments and errors as of `new_folder`. Returns paths."""
+    with new_folder(to, but=but) as prepared:
+        for name, data in files.items():
+            write_atomically(prepared / name, data)
+    return [str(Path(to) / name) for name in files]
 
 
 def _move_into(prepared: Path, to: Path) -> None:

@@ -31,7 +31,7 @@ from tvsbayes.files.csv_kind import (
     unique,
 )
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_toml, toml_line
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign_header import parse_header
@@ -554,15 +554,12 @@ def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
 
 
 def write_campaign(campaign: Campaign, folder: Path) -> None:
-    """Write the four files of a campaign into a new or empty folder.
+    """Write the four files of a campaign into a new or empty folder, all or none.
 
     Raises:
-        InputError: the folder is not empty or cannot be written; `campaign_bytes` refuses (then nothing is written).
+        InputError: the folder is not empty or cannot be written, or `campaign_bytes` refuses.
     """
-    folder, files = Path(folder), campaign_bytes(campaign)
-    make_folder(folder, empty=True)
-    for name, data in files.items():
-        write_atomically(folder / name, data)
+    write_folder(Path(folder), campaign_bytes(campaign))
 
 
 def input_hashes(campaign: Campaign) -> dict[str, str]:

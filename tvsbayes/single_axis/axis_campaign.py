@@ -26,7 +26,7 @@ from tvsbayes.files.csv_kind import (
     unique,
 )
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import header_values
@@ -378,19 +378,25 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
     return ("\n".join([*lines, "[axis]", *_axis_table_lines(campaign)]) + "\n").encode()
 
 
-def write_axis(campaign: AxisCampaign, folder: Path) -> None:
-    """Write the three files into a new or empty folder; reading them returns the same campaign.
+def axis_bytes(campaign: AxisCampaign) -> dict[str, bytes]:
+    """The three files; reading them returns the same campaign.
 
     Raises:
-        InputError: the folder is not empty or cannot be written, or `read_axis` would refuse the files (then nothing is
-            written).
+        InputError: `read_axis` would refuse them.
     """
     contents = axis_moves_bytes(campaign.moves), readings_bytes(campaign.readings), axis_toml(campaign)
     files = dict(zip(_FILES, contents, strict=True))
     _parse_files(files, None)
-    make_folder(Path(folder), empty=True)
-    for name, data in files.items():
-        write_atomically(Path(folder) / name, data)
+    return files
+
+
+def write_axis(campaign: AxisCampaign, folder: Path) -> None:
+    """Write the three files into a new or empty folder, all or none.
+
+    Raises:
+        InputError: the folder is not empty or cannot be written, or `axis_bytes` refuses.
+    """
+    write_folder(Path(folder), axis_bytes(campaign))
 
 
 def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:

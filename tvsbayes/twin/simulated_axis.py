@@ -16,8 +16,8 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.files.disk import write_atomically
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, write_axis
+from tvsbayes.files.disk import write_folder
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, axis_bytes
 from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors, kind_of
 from tvsbayes.single_axis.waves import SECOND, WANDER, WavePeriods
 from tvsbayes.twin.gear_errors import kelvin_of, zero_shift
@@ -106,8 +106,8 @@ class SimulatedAxis(Shown):
 
     def write(self, folder: Path) -> None:
         """Write the campaign folder with `truth.json`."""
-        write_axis(self.campaign, folder)
-        write_atomically(folder / "truth.json", json.dumps(self.truth.as_json(), indent=1, allow_nan=False).encode())
+        truth = json.dumps(self.truth.as_json(), indent=1, allow_nan=False).encode()
+        write_folder(folder, {"truth.json": truth, **axis_bytes(self.campaign)})
 
 
 def _drawn(name: str, prior: AxisPrior, rng: np.random.Generator) -> float:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.disk import write_folder
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, stereo_spots, with_pixels
 from tvsbayes.instrument.conditions import powered_on_s
@@ -78,9 +78,7 @@ class SimulatedCampaign(Shown):
 
     def write(self, folder: str | Path) -> None:
         """Write the campaign folder and its truth.json."""
-        make_folder(Path(folder), empty=True)
-        for name, data in self.files().items():
-            write_atomically(Path(folder) / name, data)
+        write_folder(Path(folder), self.files())
 
 
 @dataclass(frozen=True)
