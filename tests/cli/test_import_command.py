@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import math
+import os
 import shlex
 import shutil
 from dataclasses import replace
@@ -365,3 +366,33 @@ def test_cameras_may_come_first(ask, table, tmp_path):
     (tmp_path / "other" / "notes.txt").write_text("mine")
     code, document = ask("import", table, "--to", tmp_path / "other", "--yes")
     assert code == 2 and assert_error(document, "occupied")["found"] == "a folder with files"
+
+
+TRACKS = [f"step,reading_mm\n{''.join(f'{c},{scale * c + 0.01 * (c > 0):.3f}{chr(10)}' for c in (0, 100, 200, 300))}"
+          for scale in (0.01, 0.02)]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("tables", "options"), [([TABLE, TABLE.replace("200", "300")], ()), (TRACKS, ("--axis",))], ids=["scanner", "axis"]
+)
+def test_of_two_imports_into_one_new_folder_one_wins_whole(say, tmp_path, monkeypatch, tables, options):
+    """The second begins and ends while the first is about to show its folder."""
+    names, rename, done = ["first.csv", "second.csv"], os.rename, []
+    for name, text in zip(names, tables, strict=True):
+        (tmp_path / name).write_text(text)
+
+    def run(name: str, out: Path) -> int:
+        return say("import", tmp_path / name, "--to", out, "--yes", *options)[0]
+
+    def late(source, target):
+        if not done:
+            done.append(None)
+            done[0] = run("second.csv", tmp_path / "mine")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", late)
+    assert run("first.csv", tmp_path / "mine") == 2 and done == [0]
+    monkeypatch.undo()
+    assert run("second.csv", tmp_path / "alone") == 0
+    mine, alone = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("mine", "alone"))
+    assert mine == alone

@@ -175,7 +175,8 @@ def test_another_model_of_an_old_version_is_read_in_python_alone(tmp_path, fit_i
     with pytest.raises(InputError) as caught:
         load_calibration(folder)
     # The draws of this test are no calibration: that is found only in files that are taken.
-    assert (caught.value.code, caught.value.found) == (("stale-results", reason) if fit_id else ("no-calibration", None))
+    expected = ("stale-results", reason) if fit_id else ("no-calibration", None)
+    assert (caught.value.code, caught.value.found) == expected
 
 
 def test_two_fits_of_a_folder_are_refused_and_two_folders_are_not(mine, say, tmp_path):

@@ -196,6 +196,18 @@ FAULTS = (
           Returns("value.replace('.', '') if commas else value"), "test_every_notation_gives_the_same_table"),
     Fault("a file is renamed before it is on the disk", "written_whole", Call("fsync", "None"),
           "test_interrupted_write_leaves_the_old_file_whole"),
+    Fault("a second import puts its files among those of the first", "disk._move_into",
+          Keyword("exist_ok", "True"), "test_of_two_writers_of_a_new_folder_one_wins_whole"),
+    # Results that belong together.
+    Fault("a fit takes draws of another id", "store._of_one_fit", Returns("True"),
+          "test_files_of_two_fits_are_not_taken_together"),
+    Fault("fit.json is written before its draws", "store.write_fit",
+          Call("write_together", "write_together(arg0, dict(reversed(arg1.items())))"),
+          "test_a_process_that_ends_between_two_files_leaves_no_fit_that_is_taken"),
+    Fault("two processes fit into one folder at once", "store.sole_writer", Never("is_alone"),
+          "test_two_fits_of_a_folder_are_refused_and_two_folders_are_not"),
+    Fault("Python takes the fit of data that were edited since", "pipeline._loaded", Local("inputs", "None"),
+          "test_python_refuses_the_fit_of_edited_data"),
     Fault("an output replaces the data of a campaign", "app.check_output", Never("is_input"),
           "test_no_output_replaces_the_data_of_a_campaign"),
     # Acquisition: light, positions, lost events.
