@@ -13,7 +13,7 @@ import json
 import os
 import platform
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 FIT, DRAWS, POSTERIOR, CHAIN, LOCK = "fit.json", "draws.npz", "posterior.nc", "chain.npz", "fit.lock"
 INPUT_NAMES = {
-    **{"moves": "moves.csv", "spots": "spots.csv", "readings": "readings.csv", "stereo": "stereo.json"},
-    **{"rig": "[rig]", "axis": "[axis]"},
+    **{"moves": ("moves.csv",), "spots": ("spots.csv", "sightings.csv"), "readings": ("readings.csv",)},
+    **{"stereo": ("stereo.json",), "rig": ("[rig]",), "axis": ("[axis]",)},
 }
-"""Names of the inputs of an estimate for the user."""
+"""Names of the inputs of an estimate for the user: files of which a campaign has one, or a table."""
 MODELS = ("rig", "axis")
 """Inputs whose canonical text another version writes in another way."""
 AGAIN = "run `tvsbayes fit` on the folder again"
@@ -102,7 +102,7 @@ def read_fit_files(place: Path, inputs: Mapping[str, str] | None, *, other_model
         interrupted = "results/ hold only an interrupted chain (`tvsbayes fit --resume`)"
         return Reason(interrupted if (place / CHAIN).exists() else "there are no results/ yet", AGAIN)
     keys = parse_json(read_bytes(place / FIT, JSON_BYTES_MAX), f"results/{FIT}")
-    if inputs is not None and (why := _other_inputs(keys, inputs, other_models)):
+    if inputs is not None and (why := _other_inputs(place.parent, keys, inputs, other_models)):
         return Reason(why, AGAIN)
     if not (place / DRAWS).exists():
         return Reason(f"results/ lack {DRAWS}", AGAIN)
@@ -128,7 +128,7 @@ def damaged_draws(reason: object, allowed: str = "arrays as `tvsbayes fit` write
     return refusal("damaged-results", file=f"results/{DRAWS}", found=found, allowed=allowed, remedy=AGAIN)
 
 
-def _other_inputs(keys: Keys, inputs: Mapping[str, str], other_models: bool) -> str:
+def _other_inputs(campaign: Path, keys: Keys, inputs: Mapping[str, str], other_models: bool) -> str:
     """Which inputs the results have not, in words; "" where they are of these inputs."""
     stored, versions = (keys.values.get(key) for key in ("inputs", "versions"))
     hashes, version = (value if isinstance(value, dict) else {} for value in (stored, versions))
@@ -138,8 +138,9 @@ def _other_inputs(keys: Keys, inputs: Mapping[str, str], other_models: bool) -> 
         if other_models and "fit_id" not in keys.values:
             return ""
         model, words = changed[0], f"results/ are of tvsbayes {escaped(str(made_by), 40)}, with another model of the"
-        return f"{words} {model}, or of another {INPUT_NAMES[model]}"
-    return f"results/ are of other {', '.join(INPUT_NAMES[name] for name in changed)}" if changed else ""
+        return f"{words} {model}, or of another [{model}]"
+    names = [next((n for n in INPUT_NAMES[k] if (campaign / n).exists()), INPUT_NAMES[k][0]) for k in changed]
+    return f"results/ are of other {', '.join(names)}" if names else ""
 
 
 def _of_one_fit(keys: Keys, arrays: Mapping[str, np.ndarray]) -> bool:
@@ -175,9 +176,10 @@ def sole_writer(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            (folder / LOCK).unlink(missing_ok=True)
-            if is_new and not any(folder.iterdir()):
-                folder.rmdir()
+            with suppress(OSError):
+                (folder / LOCK).unlink()
+                if is_new and not any(folder.iterdir()):
+                    folder.rmdir()
     finally:
         os.close(descriptor)
 
