@@ -251,7 +251,8 @@ class _Reader:
         said = lens.get(kind, f"a lens of {values.size} coefficients")
         if not fitted.error_px <= ERROR_MAX_PX:
             miss = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "an undetermined amount"
-            raise entry.refuse("lens", lens=said, miss=miss, most=ERROR_MAX_PX)
+            convert = words()["programs"]["convert"].get(self.source, "")
+            raise entry.refuse("lens", lens=said, miss=miss, most=ERROR_MAX_PX, convert=convert)
         self.notes.append(f"{entry.place}: {said}, fitted to five coefficients within {fitted.error_px:.2g} px")
         return fitted.distortion
 

@@ -179,7 +179,7 @@ def _kalibr_text(text: str) -> list[Values]:
 def _ost_text(text: str) -> list[Values]:
     """ost.txt of ROS' camera_calibration: the numbers of camera_info, one camera after the other."""
     trees = []
-    for part in re.split(r"^\s*\[image\]\s*$", text, flags=re.MULTILINE)[1:]:
+    for part in re.split(r"^[ \t]*\[image\][ \t]*$", text, flags=re.MULTILINE)[1:]:
         found = re.findall(r"^([a-z ]+)\n((?:[\d.eE+\- \t]+\n?)+)", part, re.MULTILINE)
         blocks = {name: _numbers(rows) for name, rows in found}
         values: Values = {f"image_{key}": int(blocks[key][0]) for key in ("width", "height") if blocks.get(key)}
@@ -195,11 +195,11 @@ def _halcon_text(text: str) -> list[Values]:
 
 
 _PRINTED: tuple[tuple[re.Pattern[str], Callable[[str], list[Values]]], ...] = (
-    (re.compile(r"^\s*\[LEFT_CAM_\w+\]\s*$", re.MULTILINE | re.IGNORECASE), _zed_text),
+    (re.compile(r"^[ \t]*\[LEFT_CAM_\w+\]\s*$", re.MULTILINE | re.IGNORECASE), _zed_text),
     (re.compile(rf'Intrinsic of "[^"\n]+" / [0-9]+x[0-9]|{_OBJECT}.*{_OBJECT}', re.DOTALL), _realsense_text),
     (re.compile(r"\A\s*Calibration results\s*\n=+\s*\n"), _kalibr_text),
     (re.compile(r"\A\s*# oST version"), _ost_text),
-    (re.compile(r"^\s*ParGroup: Cam\d|^# Used representation type", re.MULTILINE), _halcon_text),
+    (re.compile(r"^[ \t]*ParGroup: Cam\d|^# Used representation type", re.MULTILINE), _halcon_text),
 )
 
 
