@@ -25,8 +25,8 @@ from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import array_of, arrays_of
 from tvsbayes.files.documents import Keys, parse_json, parse_toml
-from tvsbayes.files.foreign_table import text_of
 from tvsbayes.importing.stereo_programs import printed_trees
+from tvsbayes.importing.text import text_of
 
 PACKED = struct.error, zlib.error
 TREE_BYTES_MAX = 4 * 1024 * 1024
