@@ -195,12 +195,12 @@ def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path
 
 
 def test_words_that_exclude_looks_are_reported_and_foreign_words_for_good_are_known(ask, table, tmp_path):
-    rows = [f"{pan},0,640,360,500,360,{word}" for pan, word in enumerate(("gut", "gültig", "oui", "fine", "mal", "ok"))]
-    table.write_text("\n".join(["pan,tilt,XL,YL,XR,YR,state", *rows, "9,0,,,,,fine"]) + "\n", encoding="utf-8")
+    rows = [f"{pan},0,640,360,500,360,{word}" for pan, word in enumerate(("gut", "gültig", "oui", "odd", "mal", "ok"))]
+    table.write_text("\n".join(["pan,tilt,XL,YL,XR,YR,state", *rows, "9,0,,,,,odd"]) + "\n", encoding="utf-8")
     code, document = ask("import", table, "--to", tmp_path / "mine", "--yes")
-    assert code == 0 and "status: 3 looks left out by column state: fine 2, mal 1" in document["assumed"]
+    assert code == 0 and "status: 3 looks left out by column state: odd 2, mal 1" in document["assumed"]
     spots = (tmp_path / "mine" / "spots.csv").read_text(encoding="utf-8").splitlines()[1:]
-    assert [line.rpartition(",")[2] for line in spots] == ["ok", "ok", "ok", "fine", "refused: mal", "ok", "fine"]
+    assert [line.rpartition(",")[2] for line in spots] == ["ok", "ok", "ok", "odd", "refused: mal", "ok", "odd"]
     log = tmp_path / "log.csv"
     log.write_text("steps,deg,quality\n0,0.1,bien\n9,0.2,hit\n18,0.3,\n")
     remarks = ask("import", log, "--to", tmp_path / "axis", "--axis")[1]["assumed"]

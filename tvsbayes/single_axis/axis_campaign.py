@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,7 +31,6 @@ from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import header_values
-from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
@@ -41,6 +41,11 @@ Approach = Literal["forward", "backward", "unknown"]
 """Forward means an increasing command, for either sign of the unit per command."""
 COMMAND_MAX = 1e12
 """Largest absolute command or reading."""
+DEGREES = {
+    **{"deg": 1.0, "rad": math.degrees(1.0), "mrad": math.degrees(1e-3), "urad": math.degrees(1e-6)},
+    **{"arcmin": 1 / 60, "arcsec": 1 / 3600, "gon": 0.9},
+}
+"""Units of angle of readings, in deg."""
 TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
 """One turn in each unit of angle."""
 _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
@@ -49,25 +54,20 @@ PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that define waves."""
 PERIODS_MAX, RANGES_MAX = 8, 4
 """Largest numbers of stated and of unknown periods; each period adds two sampled coordinates."""
-_MOVE = replace(MOVES["move"], names="")
 
 
 @dataclass(frozen=True, slots=True)
 class AxisMove:
     """A row of `moves.csv`: the command AFTER the move; `approach` in the first row of a segment, else empty."""
 
-    move: Annotated[int, _MOVE]
-    # A run of a scanner is an experiment; a run of an axis is the moves between two homings.
-    segment: Annotated[int, replace(MOVES["segment"], names=MOVES["segment"].names + " run lauf durchlauf")]
+    move: Annotated[int, MOVES["move"]]
+    segment: Annotated[int, MOVES["segment"]]
     time_s: Annotated[float, MOVES["time_s"]]
     command: Annotated[
         float,
         Column(
             "absolute counter or commanded position AFTER the move; decimals allowed",
             *(-COMMAND_MAX, COMMAND_MAX),
-            names="command commanded cmd counter steps step counts target goal position pos microsteps microstep "
-            "mikroschritte mikroschritt usteps ustep micropasos micropas schritte soll sollwert zahler pasos contador "
-            "consigna posicion pas consigne setpoint nominal demand pulse pwm sollposition sollwinkel",
         ),
     ]
     approach: Annotated[
@@ -75,7 +75,6 @@ class AxisMove:
         Column(
             "in the first row of a segment: `forward` (rising command), `backward` or `unknown`; empty elsewhere",
             rule=first_of_segment,
-            names=MOVES["pan_approach"].names + " direction dir richtung direccion",
         ),
     ] = ""
     temperature_degC: Annotated[
@@ -84,7 +83,6 @@ class AxisMove:
             "optional: of the axis; the readings' zero shifts with it. Empty cells are interpolated in time",
             *TEMPERATURES_DEGC,
             group="temperature",
-            names="temperature temp temperatur temperatura",
         ),
     ] = None
 
@@ -105,9 +103,6 @@ class Reading:
             "does)",
             *(-COMMAND_MAX, COMMAND_MAX),
             rule=filled_where_ok("give the value, or say why there is none"),
-            names="value reading read measured encoder angle ist istwert messwert winkel lesung lectura medida valor "
-            "angulo codificador lecture mesure codeur autocollimator actual feedback dial gauge indicator istposition "
-            "istwinkel",
         ),
     ] = None
     u: Annotated[
@@ -116,7 +111,6 @@ class Reading:
             "standard uncertainty; empty or 0 where unknown: readings repeated at one move then determine it, else "
             "the scatter of stops includes it",
             *(0.0, COMMAND_MAX),
-            names=" ".join(["u", *sorted(SPREAD - {"s"})]),
         ),
     ] = 0.0
     status: Annotated[
