@@ -23,9 +23,9 @@ import numpy as np
 
 from experiments.common.command_line import print_only
 from experiments.common.console import console, quietly
+from experiments.common.paper_lab import LABS, write_lab
 from experiments.common.rigs import mounted_rig
 from experiments.common.rows import ROOT
-from experiments.paper.lab import LABS, write_lab
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.plan import PlanBuilder, write_plan
 from tvsbayes.instrument.protocols import four_point_protocol
