@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, check_word, is_interactive, refuse_options, write_files
+from tvsbayes.cli.app import Json, check_word, is_interactive, refuse_options
 from tvsbayes.cli.begin_commands import stated_globs
 from tvsbayes.cli.confirmed_import import Import
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.errors import InputError, Reason, closest, escaped, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
-from tvsbayes.files.disk import make_folder, read_bytes, write_folder
+from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.instrument.axes import sides_of
 
 if TYPE_CHECKING:

@@ -195,7 +195,8 @@ def _booked(
     ]
     looks = zip(spots, rows.lines, rows.pictures, strict=True)
     book = [
-        BookRow(s.spot, line, names, written[k], directions.get(k) or "") for k, (s, line, names) in enumerate(looks)
+        BookRow(s.spot, line, names, written[k] or "", directions.get(k) or "")
+        for k, (s, line, names) in enumerate(looks)
     ]
     return pictures_of_book(book, folder, file, globs)
 
