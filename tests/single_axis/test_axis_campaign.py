@@ -110,3 +110,23 @@ def test_temperatures_start_at_absolute_zero(tmp_path):
     assert read_axis(folder(tmp_path / "a", moves=moves.format(-273.15))).moves[0].temperature_degC == -273.15
     with pytest.raises(InputError, match=r"temperature_degC.*-273\.15"):
         read_axis(folder(tmp_path / "b", moves=moves.format(-300)))
+
+
+def test_an_absolute_encoder_is_read_written_and_hashed(tmp_path):
+    plain = read_axis(folder(tmp_path / "a"))
+    kept = read_axis(folder(tmp_path / "b", TOML + "[axis]\nabsolute = true\n"))
+    assert kept.absolute and not plain.absolute
+    assert axis_hashes(kept)["axis"] != axis_hashes(plain)["axis"]
+    write_axis(kept, tmp_path / "c")
+    assert read_axis(tmp_path / "c").absolute
+    off = read_axis(folder(tmp_path / "d", TOML + "[axis]\nabsolute = false\n"))
+    assert axis_hashes(off) == axis_hashes(plain)
+
+
+@pytest.mark.parametrize(
+    ("line", "column"),
+    [("absolute = 1", "axis.absolute"), ("absolute = true\nhome_sd = { value = 0.1, u = 1.0 }", "axis.home_sd")],
+)
+def test_an_absolute_encoder_has_no_scatter_of_homings(tmp_path, line, column):
+    error = refusal(lambda: read_axis(folder(tmp_path / "a", TOML + f"[axis]\n{line}\n")))
+    assert error.column == column

@@ -57,13 +57,13 @@ def filter_rows(
         functions: jax.numpy or numpy.
     """
     xp, pairs = functions, (len(spots.valid), 2)
-    home = xp.where(spots.homed, (HOME_SD_DEG * np.pi / 180) ** 2, 0.0)[:, None]
+    home = xp.where(spots.homed, (HOME_SD_DEG * np.pi / 180) ** 2, 0.0)
     segment = xp.broadcast_to(spots.new_segment[:, None], pairs)
     drawn = xp.where(spots.redraw, stop_variance, 0.0)
     return FilterRows(
         residual=xp.asarray(residual),
         load=xp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
-        keep=xp.where(xp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
+        keep=xp.where(xp.concatenate([spots.redraw, spots.new_zero, segment], axis=1), 0.0, 1.0),
         variance=xp.concatenate([drawn, home + drift_variance, xp.where(segment, 1.0, 0.0)], axis=1),
     )
 

@@ -48,7 +48,8 @@ class RigTable:
     does not state the period that a name needs, its default is 0, fixed.
     `harmonic_period_deg` maps "pan" and "tilt", where declared, to the periods of the transmission error in
     degrees of the output, 1 to `PERIODS_MAX` different ones: `FULL_TURN_DEG` for the wheel, less for pinion and teeth.
-    `harmonic_deg` belongs to the first period, `harmonic_amplitude_deg.<axis>.<number>` to each.
+    `harmonic_deg` belongs to the first period, `harmonic_amplitude_deg.<axis>.<number>` to each. `absolute` names the
+    axes whose encoders keep their zero over a homing.
 
     Raises:
         InputError: harmonics or amplitudes of an axis without their period.
@@ -58,6 +59,7 @@ class RigTable:
     aperture_convention: Literal["in-plane", "azimuth"] = "in-plane"
     harmonic_period_deg: dict[str, tuple[float, ...]] = field(default_factory=dict)
     mechanism: Mechanism = TWO_MIRROR
+    absolute: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         priors = {**self.mechanism.priors, **self.priors}
@@ -274,7 +276,7 @@ def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping
         raise table.refuse(name, "missing-period", allowed, _period_remedy(name), found)
 
 
-_OWN_KEYS = ("aperture_convention", "mechanism", "prior")
+_OWN_KEYS = ("aperture_convention", "mechanism", "absolute", "prior")
 """Keys of `[rig]` without a value and a u."""
 
 
@@ -319,7 +321,8 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
     if key in table and "aperture_zero_deg" not in mechanism.documented:
         raise table.refuse(key, "unknown-key", "no aperture", "leave it out: a head has no receiver", f"the name {key}")
     azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
-    return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg, mechanism)
+    absolute = table.some_words("absolute", AXES) if "absolute" in table else ()
+    return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg, mechanism, absolute)
 
 
 def rig_table_toml(table: RigTable) -> str:
@@ -346,7 +349,10 @@ def rig_table_toml(table: RigTable) -> str:
     declared = map(entry, _names_at("rig", kind))
     omitted = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
     priors = (entry(name) for name in _names_at("rig.prior", kind) if name not in {*PERIODIC_NAMES, *omitted})
-    return "\n".join(["[rig]", *declared, *periods, toml_line(*own), "[rig.prior]", *priors, *periodic]) + "\n"
+    absolute = [toml_line("absolute", list(table.absolute))] if table.absolute else []
+    return (
+        "\n".join(["[rig]", *declared, *periods, toml_line(*own), *absolute, "[rig.prior]", *priors, *periodic]) + "\n"
+    )
 
 
 COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}

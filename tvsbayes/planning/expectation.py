@@ -278,7 +278,7 @@ def design_arrays(
     # Half the moves, rounded up: arrays of moves have twice the size of those of looks.
     count = len(look_moves)
     size = bucket(max(count, (len(moves) + 1) // 2), SMALLEST_DESIGN, DESIGN_GROWTH)
-    redraw_arrays = redraws(moves, look_moves, homed_from)
+    redraw_arrays = redraws(moves, look_moves, homed_from, rig.table.absolute)
     return CampaignArrays(
         move_arrays(moves, 2 * size),
         SpotArrays(
@@ -293,6 +293,7 @@ def design_arrays(
             redraw=padded(redraw_arrays.redraw, size, False, bool),
             redraw_mix=padded(redraw_arrays.redraw_mix, size),
             new_segment=padded(redraw_arrays.new_segment, size, False, bool),
+            new_zero=padded(redraw_arrays.new_zero, size, False, bool),
             homed=padded(redraw_arrays.homed, size, False, bool),
             hours=padded(redraw_arrays.hours, size),
             tangents=None if rig.has_images else padded(np.zeros((count, 2, 3)), size),

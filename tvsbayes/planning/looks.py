@@ -210,8 +210,9 @@ def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer)
             redraw=jnp.ones((1, 2), dtype=bool),
             redraw_mix=jnp.where(pair.side[None, :, None] * np.array([-1.0, 1.0]) > 0, 1.0, 0.0),
             new_segment=jnp.ones(1, dtype=bool),
-            homed=jnp.zeros(1, dtype=bool),
-            hours=jnp.zeros(1),
+            new_zero=jnp.ones((1, 2), dtype=bool),
+            homed=jnp.zeros((1, 2), dtype=bool),
+            hours=jnp.zeros((1, 2)),
             tangents=jnp.zeros((1, 2, 3)) if observer.image_px is None else None,
         )
         no_places = jnp.zeros(0, dtype=bool)

@@ -273,13 +273,15 @@ def looks_again(
     fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
     rows = np.arange(count)[:, None]
     error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
-    home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), count, 2)) * arrays.homed[:, None]
+    home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), count, 2)) * arrays.homed
     segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(count), 0))
+    # Row at which the zero of each axis was set last, for all draws.
+    zero = np.maximum.accumulate(np.where(arrays.new_zero, rows, 0), axis=0)[None]
     drift_rad = np.radians(physical[:, DRIFT_COLUMNS])
-    walked = drift_rad[:, None] * np.sqrt(arrays.hours)[:, None] * generator.standard_normal(home.shape)
+    walked = drift_rad[:, None] * np.sqrt(arrays.hours) * generator.standard_normal(home.shape)
     total = np.cumsum(walked, axis=1)
     # The zero drifts as a random walk from its homing on.
-    error = error + home[:, segment] + total - (total - walked)[:, segment]
+    error = error + np.take_along_axis(home - (total - walked), zero, axis=1) + total
     error = error + turned_by(fit.arrays, place_errors_rad)
     # The position in the play is Gaussian after an unknown approach, as in the filter.
     place = generator.standard_normal(home.shape)[:, segment]

@@ -149,6 +149,7 @@ class AxisCampaign(Shown):
         header: keys of `campaign.toml` outside `[axis]` but `format` and `unit`.
         periods: waves that `[axis]` defines.
         path: the folder; None where it was never written.
+        absolute: whether the encoder keeps its zero over a homing.
     """
 
     unit: str
@@ -158,6 +159,12 @@ class AxisCampaign(Shown):
     header: dict[str, object] = field(default_factory=dict)
     periods: WavePeriods = field(default_factory=WavePeriods)
     path: Path | None = None
+    absolute: bool = False
+
+    @property
+    def priors(self) -> dict[str, AxisPrior]:
+        """Stated priors; a zero that no homing sets has no scatter of homings."""
+        return {**self.stated, "home_sd": AxisPrior(0.0, 0.0)} if self.absolute else self.stated
 
     @property
     def rate(self) -> float | None:
@@ -253,10 +260,10 @@ def _parse_header(keys: Keys) -> dict[str, object]:
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
     """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and its fixed value."""
-    keys.only((*AXIS_KEYS, *PERIODS))
+    keys.only((*AXIS_KEYS, *PERIODS, "absolute"))
     stated: dict[str, AxisPrior] = {}
     for name in keys.values:
-        if name in PERIODS:
+        if name == "absolute" or name in PERIODS:
             continue
         kind = AXIS_KEYS[name].kind
         low = -COMMAND_MAX if kind == "normal" else 0.0
@@ -312,10 +319,15 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     header, unit = _parse_header(keys), keys.text_value("unit", 20)
     if not unit.strip():
         raise keys.refuse("unit", "text", 'the unit of readings, such as "deg" or "mm"', "name it")
-    stated, periods = _parse_axis_table(keys.table("axis")), _parse_periods(keys.table("axis"))
+    axis = keys.table("axis")
+    stated, periods = _parse_axis_table(axis), _parse_periods(axis)
+    absolute = "absolute" in axis and axis.flag("absolute")
+    if absolute and "home_sd" in stated:
+        allowed = "no home_sd beside absolute = true"
+        raise axis.refuse("home_sd", "absolute", allowed, "leave one of them out: no homing sets an absolute zero")
     moves = parse_axis_moves(files["moves.csv"])
     readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
-    return AxisCampaign(unit, moves, readings, stated, header, periods, path)
+    return AxisCampaign(unit, moves, readings, stated, header, periods, path, absolute)
 
 
 def unit_of_folder(folder: Path) -> str | None:
@@ -361,6 +373,7 @@ def _axis_table_lines(campaign: AxisCampaign) -> list[str]:
         "periods_in": "seconds" if periods.in_seconds else None,
         "period_between": [list(pair) for pair in periods.between],
         "encoder_period": periods.encoder,
+        "absolute": campaign.absolute,
     }
     return [*priors, *(toml_line(name, value) for name, value in entries.items() if value)]
 

@@ -22,7 +22,7 @@ from tvsbayes.instrument.conditions import powered_on_s
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
-from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
+from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, RigTable, require_periods
 from tvsbayes.instrument.sightings import Sighting
 from tvsbayes.twin.gear_errors import PERFECT, draw_gear_errors, drift_deg, kelvin_of, zero_shift_deg
 from tvsbayes.twin.head_physics import sighted_angles
@@ -147,7 +147,7 @@ def simulate(
         time_s = np.array([move.time_s for move in log.moves])
         measured = np.asarray(temperature_degC(time_s), float).tolist()
         log.moves = [replace(move, temperature_degC=one) for move, one in zip(log.moves, measured, strict=True)]
-    driven = _drive(log.moves, truth, rig.table.first_period_deg, streams, powered_on_s(full_header))
+    driven = _drive(log.moves, truth, rig.table, streams, powered_on_s(full_header))
     truth = replace(driven.truth, homing_side=home_approach)
     looks: tuple[Spot | Sighting, ...]
     if not rig.has_images:
@@ -196,7 +196,7 @@ class _Driven:
 def _drive(
     moves: Sequence[Move],
     truth: Truth,
-    first_period_deg: Mapping[str, float],
+    rig: RigTable,
     streams: _Streams,
     on_s: float | None,
 ) -> _Driven:
@@ -207,6 +207,8 @@ def _drive(
     first = np.diff(segments, prepend=-1) != 0
     home_draws = HOME_SD_DEG * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
     home_draws[0] = 0.0
+    # An encoder that keeps its zero is not set by a homing, and its zero drifts on.
+    home_draws[:, [axis in rig.absolute for axis in SIDES]] = 0.0
     stop_draws = streams.stops.standard_normal((len(moves), 2))
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
     drift_draws, time_s = streams.drift.standard_normal((len(moves), 2)), np.array([m.time_s for m in moves])
@@ -228,10 +230,11 @@ def _drive(
             ratios,
             repeated.play_at(p[f"backlash_deg.{axis}"], place_deg),
             harmonics_deg(p, axis),
-            first_period_deg.get(axis, FULL_TURN_DEG),
+            rig.first_period_deg.get(axis, FULL_TURN_DEG),
         )
         scale = p.get(f"drift_deg_per_root_hour.{axis}", 0.0)
-        drift[:, i] = drift_deg(time_s, first, scale, drift_draws[:, i], repeated.warming_deg)
+        is_set = np.arange(len(moves)) == 0 if axis in rig.absolute else first
+        drift[:, i] = drift_deg(time_s, is_set, scale, drift_draws[:, i], repeated.warming_deg)
         resting[:, i] += repeated.error_deg(place_deg) + drift[:, i]
         resting[:, i] += zero_shift_deg(p, axis, warm_minutes, kelvin)
         sds = {"+": p[f"stop_sd_deg.{positive}"], "-": p[f"stop_sd_deg.{negative}"]}
