@@ -12,7 +12,7 @@ from support.coarse_planning import ROUNDING
 from tvsbayes.instrument.plan import plan_minutes
 from tvsbayes.planning.candidates import Positions
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of
+from tvsbayes.planning.expectation import PARAMETERS, information_of
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
     LookArrays,
@@ -103,7 +103,7 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
     class Space:
         u = generator.uniform(0.5, 1.0, PARAMETERS)
 
-    for homed in (False, True):
+    for homed in (None, np.radians([0.05, 0.1]) ** 2):
         informations = information_of_looks(seen, chosen, path, Space, homed)
         for one, information in zip(rows, informations, strict=True):
             every = one[chosen].copy()
@@ -111,8 +111,8 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
                 every[:, :, column] = every[:, :, PARAMETERS + axis] * path[:, axis, None]
                 every[:, :, column] *= Space.u[column] * np.pi / 360
             whole = np.einsum("kia,kib->ab", every, every)
-            if homed:
-                whole[PARAMETERS:, PARAMETERS:] += np.eye(2) / HOME_VARIANCE_RAD2
+            if homed is not None:
+                whole[PARAMETERS:, PARAMETERS:] += np.diag(1 / homed)
                 # Beside a prior that is taken off again: few looks leave most directions open.
                 prior = np.diag([1.0] * PARAMETERS + [0.0] * 2)
                 covariance = np.linalg.inv(whole + prior)[:PARAMETERS, :PARAMETERS]

@@ -20,7 +20,7 @@ import numpy as np
 
 from tvsbayes.acquisition.journal_events import TrueAngles
 from tvsbayes.cameras.capture import StereoImage
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
@@ -272,7 +272,8 @@ class Instrument:
     def _found_home(self, axis: int) -> None:
         """Set the counter of an axis, with a new home offset, 0 in the first segment."""
         keeps_zero = AXES[axis] in self.rig.table.absolute
-        offset = 0.0 if axis in self._unhomed or keeps_zero else HOME_SD_DEG * self._homes.standard_normal()
+        sd_deg = self.rig.table.home_sd_deg[axis]
+        offset = 0.0 if axis in self._unhomed else sd_deg * self._homes.standard_normal()
         self._unhomed.discard(axis)
         gear = self._gears[axis]
         gear.drift(self.clock.now_us, self._drifts.standard_normal())

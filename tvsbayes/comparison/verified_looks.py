@@ -34,7 +34,7 @@ from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.inference.stored_posterior import answer_of
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import INDEX
@@ -367,7 +367,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
         what = f"the nominal counters of {AXES[k]} are those of the calibration: there is no correction to verify"
         raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
     noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
-    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + HOME_SD_DEG**2
+    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + campaign.rig.home_sd_deg[k] ** 2
     # A play smaller than the uncertainty of a look cannot be distinguished from none, and does not affect the promise.
     visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
     worlds = off if visible else off[:1]

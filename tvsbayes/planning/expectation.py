@@ -8,7 +8,6 @@ repeated errors of the gears at regular counters, have the prior N(0, 1) each.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -33,13 +32,12 @@ from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.kalman_filter import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
-from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import CREEP_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary
 from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
-from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
@@ -54,9 +52,15 @@ from tvsbayes.planning.gear_places import (
 )
 
 PARAMETERS = len(NAMES)
-HOME_VARIANCE_RAD2 = math.radians(HOME_SD_DEG) ** 2
+KEPT_SD_DEG = 1e-6
+"""Sd of a homing's shift of a zero that an absolute encoder keeps: next to none, but invertible."""
 SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
 """Looks are padded to this size or a power of four above it; moves to twice that."""
+
+
+def home_variances_rad2(rig: RigTable) -> np.ndarray:
+    """Return the variances of the shift of (pan, tilt) by a homing, shape (2,)."""
+    return np.radians(np.maximum(rig.home_sd_deg, KEPT_SD_DEG)) ** 2
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,11 @@ class Knowledge:
     def size(self) -> int:
         """Return the number of coordinates and errors, p + e."""
         return len(self.precision)
+
+    @property
+    def home_variances_rad2(self) -> np.ndarray | None:
+        """Return those of the homing that begins a session; None where it is the first."""
+        return home_variances_rad2(self.rig.table) if self.after_data else None
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -294,7 +303,7 @@ def design_arrays(
             redraw_mix=padded(redraw_arrays.redraw_mix, size),
             new_segment=padded(redraw_arrays.new_segment, size, False, bool),
             new_zero=padded(redraw_arrays.new_zero, size, False, bool),
-            homed=padded(redraw_arrays.homed, size, False, bool),
+            home_variance_rad2=padded(redraw_arrays.homed * np.radians(rig.table.home_sd_deg) ** 2, size),
             hours=padded(redraw_arrays.hours, size),
             tangents=None if rig.has_images else padded(np.zeros((count, 2, 3)), size),
         ),

@@ -16,7 +16,7 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.files.disk import write_folder
-from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
+from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, stereo_spots, with_pixels
 from tvsbayes.instrument.conditions import powered_on_s
 from tvsbayes.instrument.mechanisms import mechanism_of
@@ -205,10 +205,8 @@ def _drive(
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
     segments = np.array([m.segment for m in moves], int)
     first = np.diff(segments, prepend=-1) != 0
-    home_draws = HOME_SD_DEG * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
+    home_draws = np.array(rig.home_sd_deg) * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
     home_draws[0] = 0.0
-    # An encoder that keeps its zero is not set by a homing, and its zero drifts on.
-    home_draws[:, [axis in rig.absolute for axis in SIDES]] = 0.0
     stop_draws = streams.stops.standard_normal((len(moves), 2))
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
     drift_draws, time_s = streams.drift.standard_normal((len(moves), 2)), np.array([m.time_s for m in moves])
@@ -233,6 +231,7 @@ def _drive(
             rig.first_period_deg.get(axis, FULL_TURN_DEG),
         )
         scale = p.get(f"drift_deg_per_root_hour.{axis}", 0.0)
+        # The zero that an absolute encoder keeps drifts on.
         is_set = np.arange(len(moves)) == 0 if axis in rig.absolute else first
         drift[:, i] = drift_deg(time_s, is_set, scale, drift_draws[:, i], repeated.warming_deg)
         resting[:, i] += repeated.error_deg(place_deg) + drift[:, i]
