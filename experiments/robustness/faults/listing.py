@@ -281,6 +281,12 @@ FAULTS = (
           "test_a_command_with_a_digit_too_many_is_doubted"),
     Fault("compiled code under another function's name is run", "own_folder._seal", Reads("name", "''"),
           "test_a_file_under_anothers_name_is_none"),
+    Fault("a homing sets an absolute zero", "redraws", Argument("absolute", "()"),
+          "test_homings_shift_the_zeros_as_stated"),
+    Fault("a homing sets the absolute zero of an axis", "axis_rows._hours", Argument("zero", "np.arange(len(value))"),
+          "test_the_filter_is_the_dense_gaussian"),
+    Fault("a stated scatter of homings is not used", "RigTable.home_sd_deg", Returns("(0.05, 0.05)"),
+          "test_homings_shift_the_zeros_as_stated"),
     # Compensation.
     Fault("corrections of both sides change places", "Correction.sent", Argument("side", "-value"),
           "test_both_sides_are_linear_between_lines_and_constant_beyond"),
