@@ -52,7 +52,7 @@ from tvsbayes.planning.gear_places import (
 )
 
 PARAMETERS = len(NAMES)
-KEPT_SD_DEG = 1e-6
+KEPT_SD_DEG = 1e-7
 """Sd of a homing's shift of a zero that an absolute encoder keeps: next to none, but invertible."""
 SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
 """Looks are padded to this size or a power of four above it; moves to twice that."""
