@@ -339,7 +339,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
     # Any parameter may stand in [rig.prior], also one that belongs to [rig].
     prior_entries = _named_entries(table.table("prior"), (*prior_names, *declared_names, *_HOME_NAMES))
     absolute = table.some_words("absolute", AXES) if "absolute" in table else ()
-    home_sd_deg = {
+    home_sd_deg: dict[str, float] = {
         axis: _parse_home_sd(*prior_entries.pop(name), axis in absolute)
         for name, axis in _HOME_NAMES.items()
         if name in prior_entries
