@@ -311,6 +311,18 @@ def test_clouds_that_cannot_be_written_are_refused_with_a_remedy(ask, folder, op
     assert exit_code == 2 and document["error"]["code"] == code and remedy in document["error"]["remedy"]
 
 
+@pytest.mark.parametrize("kind", ["json", "header"])
+def test_an_exported_calibration_replaces_its_kind_only(ask, folder, tmp_path, kind):
+    out, command = tmp_path / "calibration", ("steps-for", folder, "--export", kind, "-o", tmp_path / "calibration")
+    assert ask(*command)[0] == 0 and ask(*command)[0] == 0
+    other = {"json": "header", "header": "json"}[kind]
+    code, document = ask("steps-for", folder, "--export", other, "-o", out)
+    assert (code, document["error"]["code"]) == (2, "occupied")
+    out.write_text("mine")
+    assert ask(*command)[0] == 2 and out.read_text() == "mine"
+    assert ask(*command, "--force")[0] == 0 and out.read_text() != "mine"
+
+
 @pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("view",)])
 @pytest.mark.parametrize("name", ["moves.csv", "campaign.toml", "log.jsonl", "frames/000003_left.png"])
 def test_no_output_replaces_the_data_of_a_campaign(ask, tmp_path, command, name):

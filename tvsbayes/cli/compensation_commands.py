@@ -14,6 +14,7 @@ from tvsbayes.cli.app import (
     TARGET_MISSED,
     CampaignFolder,
     Ended,
+    Force,
     Json,
     Seed,
     check_output,
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.mechanisms import Mechanism
 
 FITTING, MAKING = "fit", "compensation"
+EXPORTS = {"header": "calibration in C", "json": "calibration"}
+"""Kinds of file of an exported calibration, by the option's word."""
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
 
 
@@ -64,6 +67,7 @@ def compensate(
     period: Annotated[
         float | None, typer.Option("--period", help="Of a pec table, in commands (strongest wave).")
     ] = None,
+    force: Force = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -75,6 +79,7 @@ def compensate(
     """
     from tvsbayes.compensation.formats import Wish, checked
     from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
+    from tvsbayes.compensation.verification import compensation_in
     from tvsbayes.report.compensation_text import compensation_text
     from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
     from tvsbayes.results.fit_record import provenance
@@ -82,7 +87,6 @@ def compensate(
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.axis_record import results_for
 
-    check_output(out)
     if (mechanism := _two_axis_mechanism(campaign)) is not None:
         # Counters of two axes follow from the whole calibration, which is the table.
         default = "urdf" if mechanism.terms else "header"
@@ -95,15 +99,20 @@ def compensate(
         if mechanism.terms:
             from tvsbayes.cli.head_commands import compensate as compensate_head
 
-            compensate_head(campaign, out, as_json)
+            compensate_head(campaign, out, force, as_json)
         else:
+            check_output(out, kind=EXPORTS[to], force=force)
             export_calibration(campaign, to, out, as_json)
         return
     _check_choice("--applied-by", applied_by, APPLIERS)
     _check_choice("--letter", letter, tuple(LETTERS))
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
-    checked(wish)
+    form = checked(wish)
+    second = out.with_name(f"{out.name}.yaml") if out is not None and form.beside is not None else None
+    check_output(out, kind="compensation", force=force)
+    check_output(second, kind="compensation", force=force and second is not None)
     data = read_axis(campaign)
+    before = compensation_in(data)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
         compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
@@ -113,13 +122,14 @@ def compensate(
     if out is not None:
         write_atomically(out, file_text(compensation, data).encode())
         files[to] = str(out)
-        if (yaml_text := file_beside(compensation, data)) is not None:
-            second = out.with_name(f"{out.name}.yaml")
-            check_output(second)
+        if second is not None and (yaml_text := file_beside(compensation, data)) is not None:
             write_atomically(second, yaml_text.encode())
             files["yaml"] = str(second)
         if keep(document, record_path := output_place(campaign, "results") / "compensation.json"):
             files["compensation"] = str(record_path)
+            if before is not None and before.digest != compensation.digest:
+                ended = f"the promise of the table made before (--to {before.target}, {before.digest[:12]}) ends"
+                report_line(f"note: {ended}: `verify` tests this one alone")
     text = compensation_text(compensation, list(files.values()))
     if out is None:
         text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(compensation, data)}".rstrip("\n")

@@ -18,7 +18,7 @@ from tvsbayes.cli.app import check_output, command_line, finish, report_line, wr
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.display import concise
-from tvsbayes.errors import escaped, refusal, typed
+from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_kind import templates
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
@@ -103,9 +103,7 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
     return Import(lines, document, write, next_step, outcome=outcome)
 
 
-def import_sightings(
-    file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction
-) -> Import:
+def import_sightings(file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction) -> Import:
     """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
     table = read_foreign(file, sheet)
     rows = sighting_rows(table, wishes)
@@ -239,13 +237,20 @@ def _urdf_files(
     return {**templates, **with_priors(templates, priors, tables)}
 
 
-def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
+def compensate(folder: Path, out: Path | None, force: bool, as_json: bool) -> None:
     """Write the model of the robot with the estimated terms, and YAML with their covariance."""
     import yaml
 
     from tvsbayes.calibration.calibration_file import Origin
     from tvsbayes.comparison.verified_looks import accepted_calibration
 
+    yaml_path = None if out is None else out.with_name(f"{out.name}.yaml")
+    for place in (out, yaml_path):
+        check_output(place, kind="model of a head", force=force)
+    nominal = folder / HEAD_URDF
+    if out is not None and not force and out.exists() and nominal.exists() and out.samefile(nominal):
+        message = f"-o {escaped(str(out), 200)} would replace the model that this head is corrected from"
+        raise InputError("occupied", message, remedy="name another file, or add --force")
     data = read_campaign(folder)
     calibration, origin = accepted_calibration(data), Origin.of(data)
     kind = data.rig.mechanism
@@ -274,12 +279,10 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
     ]
     lines += [f"not in the file: {words}" for words in document["unsaid"]]
     files: dict[str, str] = {}
-    if out is None:
+    if out is None or yaml_path is None:
         described = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
         lines.append(f"nothing written: give -o FILE; it would hold {described}, and FILE.yaml their covariance")
     else:
-        yaml_path = out.with_name(f"{out.name}.yaml")
-        check_output(yaml_path)
         write_atomically(out, text)
         write_atomically(yaml_path, f"# {origin_text}\n{yaml.safe_dump(document, sort_keys=False)}".encode())
         files = {"urdf": str(out), "yaml": str(yaml_path)}

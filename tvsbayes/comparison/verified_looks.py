@@ -39,7 +39,7 @@ from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
-from tvsbayes.instrument.stops import rests_of
+from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
@@ -353,8 +353,9 @@ class _AxisStops:
 def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: int) -> _AxisStops:
     """Choose the stops of one axis, the other in the middle of its range."""
     low, high = calibration.range_steps[k]
+    least, most = counters_made(campaign.moves)[AXES[k]]
     if high - low > 4 * run_up:
-        low, high = low + run_up, high - run_up
+        low, high = max(low, least + run_up), min(high, most - run_up)
     counters = np.linspace(low, high, CANDIDATES).round()
     steps = np.tile(calibration.range_steps.mean(axis=1).round(), (2 * CANDIDATES, 1))
     steps[:, k] = np.repeat(counters, 2)
@@ -372,8 +373,15 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
     worlds = off if visible else off[:1]
     spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
-    visits = discriminating_visits(worlds, common, noise, np.repeat(spread, 2))
-    chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(visits.visits[i]))]
+    starts = steps[:, k] - sides[:, k] * run_up
+    reach = np.flatnonzero((starts >= least) & (starts <= most))
+    if not len(reach):
+        message = f"{AXES[k]}: no look has room for a run-up of {run_up} steps within the counters {least} to {most}"
+        raise NothingToEstimate("limits", message, remedy="drive further in a campaign, and fit it")
+    visits = discriminating_visits(
+        [world[reach] for world in worlds], common[np.ix_(reach, reach)], noise[reach], np.repeat(spread, 2)[reach]
+    )
+    chosen = [i for i, count in zip(reach.tolist(), visits.visits, strict=True) for _ in range(int(count))]
     return _AxisStops([VerifyStop(float(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
 
 

@@ -353,8 +353,19 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         table=table,
         settings=shaped.settings,
         promise=promise,
-        unsaid=form.unsaid if rows.both_sides else (*form.unsaid, ONE_SIDED),
+        unsaid=(*form.unsaid, *(() if rows.both_sides else (ONE_SIDED,)), *_unreachable(campaign, low, high, run_up)),
     )
+
+
+def _unreachable(campaign: AxisCampaign, low: float, high: float, run_up: float) -> tuple[str, ...]:
+    """Say where the table's range leaves no room for a run-up."""
+    least, most = campaign.range_allowed
+    ends = [f"arriving forward below {number(least + run_up, 6)}"] if low - run_up < least else []
+    ends += [f"arriving backward above {number(most - run_up, 6)}"] if high + run_up > most else []
+    if not ends:
+        return ()
+    where = "`limits` of [axis]" if campaign.limits else "the commands that were made"
+    return (f"{' and '.join(ends)} needs a run-up beyond {where}: the promise is for arrivals with one",)
 
 
 def _table(at: _Expected, correction: Correction) -> tuple[TableRow, ...]:

@@ -140,6 +140,14 @@ class Move:
             group="temperature",
         ),
     ] = None
+    assumed: Annotated[
+        int,
+        Column(
+            "optional: 1 for a move that an import has added; no plan goes by it; empty or 0: made",
+            *(0, 1),
+            group="assumed",
+        ),
+    ] = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

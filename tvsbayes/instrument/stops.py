@@ -259,3 +259,10 @@ def redraws(
     return Redraws(
         redraw, np.where(redraw[..., None], mix, 0.0), new_segment, new_zero, homed, since_s / SECONDS_PER_HOUR
     )
+
+
+def counters_made(moves: Sequence[Move]) -> dict[str, tuple[int, int]]:
+    """Return the lowest and highest counter by axis that were made; moves that an import has added are no limit."""
+    made = [move for move in moves if not move.assumed]
+    counters = {axis: [getattr(move, f"{axis}_steps") for move in made] for axis in AXES}
+    return {axis: (min(of_axis), max(of_axis)) for axis, of_axis in counters.items()}

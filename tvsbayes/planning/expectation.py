@@ -8,7 +8,7 @@ repeated errors of the gears at regular counters, have the prior N(0, 1) each.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -38,7 +38,7 @@ from tvsbayes.instrument.parameters import CREEP_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary
 from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import Rig, RigTable
-from tvsbayes.instrument.stops import redraws
+from tvsbayes.instrument.stops import counters_made, redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import MoveArrays, mirror_angles, trace
@@ -75,6 +75,7 @@ class Knowledge:
         after_data: whether there is a campaign; a new session then begins with an unknown home offset.
         gears: counters with coordinates for repeated errors of the gears, see `with_gears`.
         warm_minutes: time since power-on of looks that continue a campaign.
+        made: lowest and highest counter by axis that a campaign made; None without one.
         errors_of_fit: estimate of errors by a fit at its own places.
     """
 
@@ -86,6 +87,7 @@ class Knowledge:
     gears: GearPlaces = field(default=NO_PLACES)
     errors_of_fit: FittedErrors | None = None
     warm_minutes: float = 0.0
+    made: Mapping[str, tuple[int, int]] | None = None
 
     @property
     def size(self) -> int:
@@ -141,7 +143,8 @@ def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
     data_rig = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
     precision = np.linalg.inv(result.covariance)
     z = np.where(np.isin(NAMES, CREEP_NAMES), 0.0, result.z)
-    return Knowledge(data_rig, result.space, z, precision, True, errors_of_fit=fitted_errors(result, result.covariance))
+    errors, made = fitted_errors(result, result.covariance), counters_made(result.campaign.moves)
+    return Knowledge(data_rig, result.space, z, precision, True, errors_of_fit=errors, made=made)
 
 
 def fitted_errors(result: JointFit, covariance: np.ndarray) -> FittedErrors | None:

@@ -36,7 +36,7 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import COSTS_S, Rig
 from tvsbayes.instrument.stereo_pair import triangulate
-from tvsbayes.instrument.stops import rests_of
+from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.model.parameter_space import STOP_COLUMNS, physical_at
 from tvsbayes.planning.candidates import BACKLASH_COLUMNS, counter_range, have_room, run_up_steps, sheet_choices
 from tvsbayes.planning.expectation import home_variances_rad2
@@ -154,9 +154,7 @@ class WatchDesigns:
     @cached_property
     def _limits(self) -> np.ndarray:
         """Return the lowest and highest counter of (pan, tilt): the rig's, else those of the campaign; (2, 2)."""
-        counters = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
-        reached: dict[str, tuple[int, int]] = {axis: (min(of_axis), max(of_axis)) for axis, of_axis in counters.items()}
-        return counter_range(self.rig.limits, reached).limits
+        return counter_range(self.rig.limits, counters_made(self.campaign.moves)).limits
 
     def _reachable(self, candidate: Candidate) -> bool:
         if candidate.target not in self.rig.depths_mm:

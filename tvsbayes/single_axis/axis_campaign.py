@@ -29,6 +29,7 @@ from tvsbayes.files.csv_kind import (
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.files.own_outputs import PLAN_MARK
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.conditions import check_power, powered_on_s
@@ -52,6 +53,8 @@ _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "s
 """Log-normal parameters by which the model divides: the density is undefined where they are fixed at 0."""
 PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that define waves."""
+LIMITS = "limits"
+"""Key of `[axis]`: the commands that a plan may give."""
 PERIODS_MAX, RANGES_MAX = 8, 4
 """Largest numbers of stated and of unknown periods; each period adds two sampled coordinates."""
 
@@ -85,6 +88,7 @@ class AxisMove:
             group="temperature",
         ),
     ] = None
+    assumed: Annotated[int, MOVES["assumed"]] = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +152,7 @@ class AxisCampaign(Shown):
         stated: entries of `[axis]`; omitted names take the default, which scales with the travel.
         header: keys of `campaign.toml` outside `[axis]` but `format` and `unit`.
         periods: waves that `[axis]` defines.
+        limits: lowest and highest command that a plan may give, as `[axis]` states them; None where it does not.
         path: the folder; None where it was never written.
         absolute: whether the encoder keeps its zero over a homing.
     """
@@ -160,6 +165,7 @@ class AxisCampaign(Shown):
     periods: WavePeriods = field(default_factory=WavePeriods)
     path: Path | None = None
     absolute: bool = False
+    limits: tuple[float, float] | None = None
 
     @property
     def priors(self) -> dict[str, AxisPrior]:
@@ -171,6 +177,12 @@ class AxisCampaign(Shown):
         """Commands per second of a drive in continuous motion; None where the axis is read at stops."""
         rate = self.header.get("rate")
         return float(rate) if isinstance(rate, int | float) else None
+
+    @property
+    def range_allowed(self) -> tuple[float, float]:
+        """Lowest and highest command of plans and their run-ups: stated, else those that were really made."""
+        made = [move.command for move in self.moves if not move.assumed]
+        return self.limits or (min(made), max(made))
 
     @property
     def powered_on_s(self) -> float | None:
@@ -260,10 +272,10 @@ def _parse_header(keys: Keys) -> dict[str, object]:
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
     """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and its fixed value."""
-    keys.only((*AXIS_KEYS, *PERIODS, "absolute"))
+    keys.only((*AXIS_KEYS, *PERIODS, LIMITS, "absolute"))
     stated: dict[str, AxisPrior] = {}
     for name in keys.values:
-        if name == "absolute" or name in PERIODS:
+        if name in ("absolute", LIMITS, *PERIODS):
             continue
         kind = AXIS_KEYS[name].kind
         low = -COMMAND_MAX if kind == "normal" else 0.0
@@ -287,6 +299,17 @@ def _parse_periods(keys: Keys) -> WavePeriods:
     in_seconds = "periods_in" in keys and keys.word("periods_in", ("unit", "seconds")) == "seconds"
     between = _parse_ranges(keys) if "period_between" in keys else ()
     return WavePeriods(periods, between, in_seconds, encoder)
+
+
+def _parse_limits(keys: Keys) -> tuple[float, float] | None:
+    """`limits`: [lowest, highest] command."""
+    if LIMITS not in keys:
+        return None
+    ends = keys.numbers(LIMITS, -COMMAND_MAX, COMMAND_MAX, 2)
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        allowed = "[lowest, highest] command, the lower one first"
+        raise keys.refuse(LIMITS, "range", allowed, "give both ends that the machine allows, in commands")
+    return ends[0], ends[1]
 
 
 def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
@@ -327,7 +350,7 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
         raise axis.refuse("home_sd", "absolute", allowed, "leave one of them out: no homing sets an absolute zero")
     moves = parse_axis_moves(files["moves.csv"])
     readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
-    return AxisCampaign(unit, moves, readings, stated, header, periods, path, absolute)
+    return AxisCampaign(unit, moves, readings, stated, header, periods, path, absolute, _parse_limits(axis))
 
 
 def unit_of_folder(folder: Path) -> str | None:
@@ -382,7 +405,9 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
     """The content of `campaign.toml`."""
     lines = [toml_line("format", FORMAT), toml_line("unit", campaign.unit)]
     lines += [toml_line(key, value) for key, value in campaign.header.items()]
-    return ("\n".join([*lines, "[axis]", *_axis_table_lines(campaign)]) + "\n").encode()
+    # No estimate depends on the limits: they are no part of the hash of the inputs.
+    limits = [] if campaign.limits is None else [toml_line(LIMITS, list(campaign.limits))]
+    return ("\n".join([*lines, "[axis]", *limits, *_axis_table_lines(campaign)]) + "\n").encode()
 
 
 def axis_bytes(campaign: AxisCampaign) -> dict[str, bytes]:
@@ -444,4 +469,4 @@ def stops_csv(stops: Iterable[AxisStop]) -> bytes:
         if via is not None:
             rows.append((len(rows), via, "backward" if direction == "forward" else "forward", 0))
         rows.append((len(rows), command, direction, 1))
-    return csv_bytes(("step", "command", "direction", "read"), rows)
+    return PLAN_MARK + csv_bytes(("step", "command", "direction", "read"), rows)

@@ -248,6 +248,14 @@ FAULTS = (
           "test_a_pair_off_its_epipolar_lines_is_refused"),
     Fault("the stereo calibration divides by n instead of n - p", "bundle_adjustment.bundle_adjustment",
           Local("dof", "int(kept.sum())"), "test_degrees_of_freedom_are_coordinates_less_unknowns"),
+    # Outputs and plans.
+    Fault("an output replaces whatever file is there", "app.check_output", Call("require_own", "None"),
+          "test_a_page_replaces_pages_only"),
+    Fault("a plan goes by moves that an import added", "AxisCampaign.range_allowed",
+          Returns("self.limits or (min(m.command for m in self.moves), max(m.command for m in self.moves))"),
+          "test_no_plan_goes_where_an_import_thought_that_the_axis_was"),
+    Fault("the run-ups of a verification leave the limits", "verification.plan_verification",
+          Local("reach", "np.arange(len(mean))"), "test_a_verification_stays_within_the_limits"),
     # A run.
     Fault("a program under the place command's wrapper moves on", "place_command._signalled",
           Call("killpg", "process.send_signal(arg1)"), "test_the_program_below_a_wrapper_is_ended_with_it"),
