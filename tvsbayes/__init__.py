@@ -28,7 +28,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tvsbayes.assessment.fitted_calibration import calibration_of as calibration_of
-    from tvsbayes.calibration.calibration_file import load_calibration as load_calibration
     from tvsbayes.calibration.pointing import Calibration as Calibration
     from tvsbayes.compensation.promise import compensate as compensate
     from tvsbayes.coordinates.location import Locations as Locations
@@ -36,11 +35,12 @@ if TYPE_CHECKING:
     from tvsbayes.errors import TvsError as TvsError
     from tvsbayes.estimators.joint_fit import JointFit as JointFit
     from tvsbayes.estimators.joint_fit import fit as fit
-    from tvsbayes.inference.stored_posterior import load_posterior as load_posterior
     from tvsbayes.instrument.campaign import Campaign as Campaign
     from tvsbayes.instrument.model_choice import ModelChoice as ModelChoice
     from tvsbayes.pipeline import CampaignResults as CampaignResults
     from tvsbayes.pipeline import calibrate as calibrate
+    from tvsbayes.pipeline import load_calibration as load_calibration
+    from tvsbayes.pipeline import load_posterior as load_posterior
     from tvsbayes.pipeline import read_campaign as read_campaign
     from tvsbayes.pipeline import verify as verify
     from tvsbayes.posterior.draws import Posterior as Posterior
@@ -69,8 +69,8 @@ _HOME = {
     "calibration_of": "assessment.fitted_calibration",
     "compensate": "compensation.promise",
     "fit": "estimators.joint_fit",
-    "load_calibration": "calibration.calibration_file",
-    "load_posterior": "inference.stored_posterior",
+    "load_calibration": "pipeline",
+    "load_posterior": "pipeline",
     "locate": "coordinates.location",
     "read_campaign": "pipeline",
     "read_fit": "results.fit_record",
@@ -87,9 +87,9 @@ def __getattr__(name: str) -> object:
     if name == "plots":
         return import_module("tvsbayes.report.figures")
     if name == "__version__":
-        from importlib.metadata import version
+        from tvsbayes.files.packages import own_version
 
-        return version("tvsbayes")
+        return own_version()
     raise AttributeError(f"module 'tvsbayes' has no attribute {name!r}")
 
 

@@ -7,17 +7,32 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import MISFIT_REMEDY, InputError, NotConverged, NothingToEstimate, TvsError, escaped
-from tvsbayes.files.disk import make_folder, output_place, require_writable
+from tvsbayes.errors import (
+    MISFIT_REMEDY,
+    InputError,
+    NotConverged,
+    NothingToEstimate,
+    Reason,
+    TvsError,
+    escaped,
+    refusal,
+)
+from tvsbayes.files.disk import output_place
+from tvsbayes.files.packages import version_of
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.progress import Job, Show
+from tvsbayes.results.store import CHAIN as CHAIN_FILE
+from tvsbayes.results.store import FIT as FIT_FILE
+from tvsbayes.results.store import POSTERIOR as POSTERIOR_FILE
+from tvsbayes.results.store import FitFiles, read_fit_files, sole_writer, stored_fit
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
@@ -26,6 +41,7 @@ if TYPE_CHECKING:
     from tvsbayes.calibration.pointing import Calibration
     from tvsbayes.estimators.findings import Finding
     from tvsbayes.estimators.joint_fit import JointFit
+    from tvsbayes.inference.stored_posterior import StoredPosterior
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.posterior.draws import Posterior
     from tvsbayes.results.compensation_record import Compensation, Verification
@@ -159,18 +175,15 @@ def calibrate(
     from tvsbayes.estimators.joint_fit import fit_stages
 
     directory = None if folder is None else Path(folder)
-    if directory is not None:
-        require_writable(directory)
     fitting = {FITTING: sum(fit_stages(model.robust, campaign.moves).values())}
-    with Job(fitting | _later_stages(sampled, tier, directory), progress) as job:
+    held = nullcontext() if directory is None else sole_writer(directory)
+    with held, Job(fitting | _later_stages(sampled, tier, directory), progress) as job:
         joint = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
-        posterior, files = None, {}
+        posterior = None
         # A fit that must not be used is not sampled.
         if sampled and worth_sampling(joint):
             from tvsbayes.posterior.sampling import sample
 
-            if directory is not None:
-                make_folder(directory)
             sampling_progress = job.part(SAMPLING)
             if tier == IMPORTANCE:
                 posterior = sample(joint, tier, seed=seed, progress=sampling_progress)
@@ -180,15 +193,12 @@ def calibrate(
                     tier,
                     max_minutes=max_minutes,
                     seed=seed,
-                    checkpoint=None if directory is None else directory / "chain.npz",
+                    checkpoint=None if directory is None else directory / CHAIN_FILE,
                     resume=resume,
                     progress=sampling_progress,
                     first=None if first is None else lambda early: first(summarise(joint, early)),
                 )
-                job.begin(WRITING)
-                files = _posterior_files(posterior, directory, tell)
-        job.begin(SUMMARISING)
-        return _results(joint, posterior, seed, directory, files, tell)
+        return _results(joint, posterior, seed, directory, tell, job.begin, with_chain=tier != IMPORTANCE)
 
 
 def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, float]:
@@ -197,29 +207,29 @@ def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, f
 
     sampling = sum(sampling_stages(tier).values()) if sampled else 0.0
     filing = WRITING_SECONDS if sampled and tier != IMPORTANCE and folder is not None else 0.0
-    return {SAMPLING: sampling, WRITING: filing, SUMMARISING: SUMMARISING_SECONDS}
-
-
-def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> dict[str, str]:
-    """Write a converged posterior for ArviZ; the chain is stored already."""
-    if folder is None:
-        return {}
-    files = {}
-    if posterior.converged:
-        from tvsbayes.posterior.arviz_tree import write_posterior
-
-        tell("computing log likelihoods and predictions for posterior.nc ...")
-        write_posterior(posterior, folder / "posterior.nc")
-        files["posterior"] = str(folder / "posterior.nc")
-    return {**files, "chain": str(folder / "chain.npz")}
+    return {SAMPLING: sampling, SUMMARISING: SUMMARISING_SECONDS, WRITING: filing}
 
 
 def _results(
-    fit: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str], tell: Tell
+    fit: JointFit,
+    posterior: Posterior | None,
+    seed: int,
+    folder: Path | None,
+    tell: Tell,
+    begin: Callable[[str], None] = no_output,
+    *,
+    with_chain: bool = False,
 ) -> CampaignResults:
     """Compute summary, calibration and evidence of a fit and its sample; write them where a folder is given.
 
-    A `posterior.nc` there that is not among `files` belongs to another fit and is removed.
+    Args:
+        fit: mode and Laplace approximation.
+        posterior: its sample.
+        seed: seed of all random numbers.
+        folder: place of the files; a `posterior.nc` there that belongs to another fit is removed.
+        tell: shows lines to the user.
+        begin: begins a stage of the progress.
+        with_chain: whether a chain was run, which keeps `chain.npz` and gives `posterior.nc`.
     """
     import numpy as np
 
@@ -231,6 +241,7 @@ def _results(
     from tvsbayes.results.fit_record import FitRecord, covariance_of_draws, provenance
     from tvsbayes.results.stored_draws import ResultDraws, write_results
 
+    begin(SUMMARISING)
     summary = summarise(fit, posterior)
     sampled_posterior = posterior if summary.estimator == "posterior" else None
     calibration = calibration_of(fit, posterior, seed=seed) if fit.converged else None
@@ -245,13 +256,21 @@ def _results(
         covariance_of_draws(draws.names, draws.physical, summary.parameters),
         evidence_of(fit, summary, sampled_posterior, calibration, draws.physical),
         provenance(input_hashes(fit.campaign), seed),
-    )
+    ).identified()
+    files = {}
     if folder is not None:
-        if "posterior" not in files and (old_file := folder / "posterior.nc").exists():
-            old_file.unlink()
+        tree = None
+        if with_chain and posterior is not None and posterior.converged:
+            from tvsbayes.posterior.arviz_tree import posterior_bytes
+
+            begin(WRITING)
+            tell("computing log likelihoods and predictions for posterior.nc ...")
+            tree = posterior_bytes(posterior, record.digest)
+        elif (folder / POSTERIOR_FILE).exists():
             tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
-        mode = None if calibration is None else fit.stored
-        files = {**write_results(folder, record, draws, calibration, mode), **files}
+        files = write_results(folder, record, draws, calibration, None if calibration is None else fit.stored, tree)
+        if with_chain and posterior is not None:
+            files["chain"] = str(folder / CHAIN_FILE)
     causes = () if fit.converged else misfit_causes(fit.campaign, summary.parameters["pixel_scale"].value)
     return CampaignResults(record, fit, posterior, calibration, draws, unusable(summary, causes), files, causes)
 
@@ -294,8 +313,8 @@ def evidence_of(
 class StoredOrFitted:
     """Results of a campaign: those stored in `results/` for the same data and priors, else those of a new fit.
 
-    Each part is looked up separately, since results of an older version may lack one. Missing parts come from one fit
-    (Laplace approximation), made when the first of them is needed.
+    Stored parts are of one fit; results of an older version may lack one. Missing parts come from one fit (Laplace
+    approximation), made when the first of them is needed.
 
     Attributes:
         campaign: from `read_campaign`.
@@ -308,18 +327,27 @@ class StoredOrFitted:
     progress: Show | None = None
 
     @cached_property
+    def stored(self) -> FitFiles | Reason:
+        """The files of the stored fit, or why there are none."""
+        from tvsbayes.instrument.campaign import input_hashes
+
+        return stored_fit(self.campaign, input_hashes(self.campaign))
+
+    @cached_property
     def stored_calibration(self) -> Calibration | None:
         """The stored calibration, None where `results/` lack it."""
-        from tvsbayes.calibration.calibration_file import stored_calibration
+        from tvsbayes.calibration.calibration_file import calibration_of_arrays
 
-        return stored_calibration(self.campaign)
+        return None if isinstance(self.stored, Reason) else calibration_of_arrays(self.stored.arrays)
 
     @cached_property
     def stored_fit(self) -> JointFit | None:
         """The stored fit at its mode; None where `results/` lack it or another version named its parameters."""
-        from tvsbayes.results.stored_draws import stored_mode
+        from tvsbayes.results.stored_draws import mode_of
 
-        if (mode := stored_mode(self.campaign)) is None:
+        if isinstance(self.stored, Reason) or self.stored_calibration is None:
+            return None
+        if (mode := mode_of(self.stored.arrays, sum(s.status == "ok" for s in self.campaign.spots))) is None:
             return None
         from tvsbayes.estimators.joint_fit import restored
 
@@ -327,15 +355,12 @@ class StoredOrFitted:
 
     @cached_property
     def stored_record(self) -> FitRecord | None:
-        """The stored `fit.json`, None where it belongs to other data."""
-        from tvsbayes.instrument.campaign import input_hashes
-        from tvsbayes.results.fit_record import read_fit
+        """The stored `fit.json`, None where no calibration belongs to it."""
+        from tvsbayes.results.fit_record import fit_of
 
-        if self.campaign.path is None or self.stored_calibration is None:
+        if isinstance(self.stored, Reason) or self.stored_calibration is None:
             return None
-        path = self.campaign.path / "results" / "fit.json"
-        record = read_fit(path) if path.exists() else None
-        return record if record and record.provenance.inputs == input_hashes(self.campaign) else None
+        return fit_of(self.stored.keys)
 
     @cached_property
     def fitted(self) -> JointFit:
@@ -344,7 +369,7 @@ class StoredOrFitted:
         Raises:
             NotConverged: it did not converge.
         """
-        return _converged_fit(self.campaign, self.tell, self.progress)
+        return _converged_fit(self.campaign, _why_not_stored(self.stored), self.tell, self.progress)
 
     @cached_property
     def calibration(self) -> Calibration:
@@ -363,18 +388,114 @@ class StoredOrFitted:
         return self.fitted if self.stored_fit is None else self.stored_fit
 
     @cached_property
-    def record(self) -> FitRecord:
-        """The content of `fit.json` with the evidence for reports; a new fit is stored in the campaign's folder.
+    def reported(self) -> Reported:
+        """What a report shows, of one fit with the evidence for it; a new fit is stored in the campaign's folder.
 
         Raises:
             InputError: the folder cannot be written.
         """
-        if self.stored_record is not None and self.stored_record.evidence is not None:
-            return self.stored_record
+        record, calibration = self.stored_record, self.stored_calibration
+        if record is not None and record.evidence is not None and calibration is not None:
+            from tvsbayes.results.stored_draws import ratios_of
+
+            assert isinstance(self.stored, FitFiles)
+            return Reported(record, calibration, ratios_of(self.stored.arrays))
         place = None if self.campaign.path is None else output_place(self.campaign.path, "results")
-        if place is not None:
-            require_writable(place)
-        return _results(self.fitted, None, 0, place, {}, self.tell).record
+        with nullcontext() if place is None else sole_writer(place):
+            made = _results(self.fitted, None, 0, place, self.tell)
+        assert made.calibration is not None
+        return Reported(made.record, made.calibration, made.draws.effective_deg_per_step)
+
+
+class Reported(NamedTuple):
+    """A fit in a report: `fit.json`, its calibration, draws of the effective ratios (draws, 4) in deg/step."""
+
+    record: FitRecord
+    calibration: Calibration
+    ratios_deg_per_step: np.ndarray
+
+
+def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosterior:
+    """Load the draws of a fit from a folder's `results/`, of any instrument, without JAX.
+
+    Args:
+        folder: folder of a campaign after `tvsbayes fit`, or its `results`, or a folder of `--out`.
+        anyway: accept a rough answer or the Laplace approximation too.
+
+    Returns:
+        Named draws with weights, `.propagate(f)` for quantities of them.
+
+    Raises:
+        InputError: there are no results, they are not of one fit, of other data than lie in the folder, damaged, or of
+            a version that cannot be read.
+        NotConverged: the fit has no answer, or none that is accepted.
+    """
+    from tvsbayes.inference.stored_posterior import posterior_in
+
+    return posterior_in(_loaded(Path(folder)), anyway=anyway)
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Load a calibration with NumPy alone.
+
+    Args:
+        path: a campaign folder with `results/`, its `results` folder, a `draws.npz`, or the JSON that
+            `tvsbayes steps-for CAMPAIGN --export json` prints.
+
+    Returns:
+        A calibration: `.ray(pan_steps, tilt_steps)` is the beam, `.locate(..., aperture_deg)` the point in mm with
+        its covariance, `.steps_for(xyz_mm)` the counters to go to; from JSON without the draws that
+        `tvsbayes.locate` needs.
+
+    Raises:
+        InputError: there is no such file, tvsbayes did not write it, or the results are not of one fit or of other
+            data than lie in the folder.
+    """
+    from tvsbayes.calibration.calibration_file import (
+        calibration_of_arrays,
+        no_calibration,
+        read_calibration_json,
+        read_draws,
+    )
+
+    path = Path(path)
+    if not path.exists():
+        allowed = "a campaign folder with results/, a draws.npz, or the JSON of `steps-for --export json`"
+        remedy = "run `tvsbayes fit` on the campaign first, or correct the path"
+        file = escaped(str(path), 200)
+        raise refusal("missing-file", file=file, found="no such file", allowed=allowed, remedy=remedy)
+    if path.suffix == ".json" and path.is_file():
+        return read_calibration_json(path)
+    if path.is_file() and not path.with_name(FIT_FILE).exists():
+        # Copied to a robot by itself.
+        return read_draws(path)
+    calibration = calibration_of_arrays(_loaded(path.parent if path.is_file() else path).arrays)
+    if calibration is None:
+        raise no_calibration()
+    return calibration
+
+
+def _loaded(folder: Path) -> FitFiles:
+    """The files of one fit for Python, of the data in their campaign where there is one; errors as `load_posterior`."""
+    inner = folder / "results"
+    place = inner if inner.is_dir() or not (folder / FIT_FILE).exists() else folder
+    campaign = place.absolute().parent
+    inputs = inputs_of(read_campaign(campaign)) if (campaign / "campaign.toml").is_file() else None
+    found = read_fit_files(place, inputs, other_models=True)
+    if isinstance(found, Reason):
+        allowed = "results/ of one fit, of the data beside them"
+        code = "stale-results" if (place / FIT_FILE).exists() else "missing-file"
+        file = escaped(str(folder), 200)
+        raise refusal(code, file=file, found=found.reason, allowed=allowed, remedy=found.remedy)
+    return found
+
+
+def inputs_of(campaign: Campaign | AxisCampaign) -> dict[str, str]:
+    """Hashes of the inputs of an estimate, of any instrument."""
+    from tvsbayes.instrument.campaign import Campaign, input_hashes
+    from tvsbayes.single_axis.axis_campaign import axis_hashes
+
+    return input_hashes(campaign) if isinstance(campaign, Campaign) else axis_hashes(campaign)
 
 
 def read_campaign(folder: Path | str) -> Campaign | AxisCampaign:
@@ -448,38 +569,21 @@ def verify(
         return verify_looks(joint, calibration, looks, distance_mm=distance_mm, seed=seed)
 
 
-def _why_not_stored(campaign: Campaign) -> str:
+def _why_not_stored(stored: FitFiles | Reason) -> str:
     """Why `results/` cannot be used, in words: the reason for a new fit."""
-    from tvsbayes.instrument.campaign import input_hashes
-    from tvsbayes.results.fit_record import provenance, read_fit
-
-    path = None if campaign.path is None else campaign.path / "results" / "fit.json"
-    if path is None or not path.exists():
-        is_interrupted = path is not None and path.with_name("chain.npz").exists()
-        return (
-            "results/ hold only an interrupted chain (`tvsbayes fit --resume`)"
-            if is_interrupted
-            else "there are no results/ yet"
-        )
-    record = read_fit(path)
-    hashes, stored = input_hashes(campaign), record.provenance
-    files = {"moves": "moves.csv", "spots": campaign.looks_table.file, "stereo": "stereo.json", "rig": "[rig]"}
-    changed_inputs = [file for name, file in files.items() if stored.inputs.get(name) != hashes[name]]
-    version = stored.versions["tvsbayes"]
-    of_another = f"results/ are of tvsbayes {escaped(version, 40)}, with another model of the rig"
-    is_another = version != provenance(hashes, 0).versions["tvsbayes"]
-    if is_another and changed_inputs == [files["rig"]]:
-        return f"{of_another}, or of another [rig]"
-    if changed_inputs:
-        return f"results/ are of other {', '.join(changed_inputs)}"
-    if not record.summary.converged:
+    if isinstance(stored, Reason):
+        return stored.reason
+    if stored.keys.values.get("converged") is not True:
         return "results/ are of a fit that did not converge"
-    return of_another if is_another else "results/ lack what this command needs"
+    version = stored.keys.table("versions").values.get("tvsbayes")
+    if version != version_of("tvsbayes"):
+        return f"results/ are of tvsbayes {escaped(str(version), 40)}, with another model of the rig"
+    return "results/ lack what this command needs"
 
 
-def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> JointFit:
+def _converged_fit(campaign: Campaign, why: str, tell: Tell, progress: Show | None) -> JointFit:
     """Make a new fit for a command without stored results."""
-    tell(f"{_why_not_stored(campaign)}: {FITTING_FIRST}")
+    tell(f"{why}: {FITTING_FIRST}")
     from tvsbayes.estimators.joint_fit import fit as fit_joint
 
     compile_for(tell)

@@ -23,9 +23,15 @@ import numpy as np
 
 from experiments.common.command_line import print_only
 from experiments.common.console import console, quietly
+from experiments.common.paper_lab import LABS, write_lab
+from experiments.common.rigs import mounted_rig
 from experiments.common.rows import ROOT
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.plan import PlanBuilder, write_plan
+from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.instrument.stereo_pair import write_stereo
+from tvsbayes.twin.frames import write_frames
+from tvsbayes.twin.simulated_campaign import simulate
 
 FOREIGN, DATA = ROOT / "tests" / "data" / "foreign", ROOT / "data"
 TWIN = DATA / "twins" / "grid_twin"
@@ -132,6 +138,16 @@ def spots() -> None:
     for path in sorted(Path("drawn/frames").glob("*.png")):
         spot, side = path.stem.split("_")
         shutil.copy(path, f"pictures/{side}_{int(moves[int(spot)]):03d}.png")
+
+
+def lab_book() -> bytes:
+    """The lab book of two experiments in every direction, and their pictures in folders of directions, by the twin."""
+    run = simulate(mounted_rig(), four_point_protocol(2), SEED)
+    write_frames(Path(), run, SEED)
+    write_lab(LABS[0], run.campaign, Path(), Path())
+    Path("mine").mkdir()
+    write_stereo(run.campaign.stereo_pair, Path("mine/stereo.json"))
+    return Path("book.csv").read_bytes()
 
 
 def sightings() -> None:
@@ -293,6 +309,19 @@ KINDS = (
         "counters in `moves.csv` and with `stereo.json`.",
         (longer("new mine --pictures pictures"), longer("detect mine")),
         before=spots,
+    ),
+    Kind(
+        "A lab book and its pictures",
+        "As in the paper: `pictures` holds folders left, right, up and down, cameras are `_L` and `_R`, experiments\n"
+        "count from 1 in each direction, steps are those of each move. `mine` holds `stereo.json`. More of\n"
+        "[lab books](campaign-files.md#lab-books).",
+        (
+            longer("import book.csv --to mine --relative --pictures pictures --yes"),
+            longer("detect mine"),
+            longer("classic mine"),
+        ),
+        {"book.csv": lab_book},
+        7,
     ),
     Kind(
         "A robot's head: its URDF and a log",

@@ -195,7 +195,7 @@ def headlines_of(document: dict, truth: dict) -> dict[str, dict[str, float | Non
 
 def chances_below(campaign: Path, headlines: dict[str, dict]) -> dict[str, float]:
     """Share of the posterior below the truth of every headline, never zero or one: a draw more on each side."""
-    from tvsbayes.inference.stored_posterior import load_posterior
+    from tvsbayes.pipeline import load_posterior
 
     draws = load_posterior(campaign, anyway=True)
     count = len(draws.weights)

@@ -35,7 +35,7 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, ordered_spots, read_campaign
-from tvsbayes.instrument.plan import PlanStep, plan_minutes
+from tvsbayes.instrument.plan import PlanStep, counters_planned, plan_minutes
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.next_looks import Confirmation, confirmation, next_looks
 from tvsbayes.planning.target import parse_target
@@ -68,7 +68,8 @@ class Beside(Replanning):
         target = parse_target(f"u(worst) <= {self.target:g} deg/step")
         try:
             joint = fit(read_campaign(self.folder))
-            proposed = next_looks(joint, mounted_rig(), target, looks_next(looks), confirm_below=self.confirm_below)
+            options = {"confirm_below": self.confirm_below, "planned": counters_planned(shipped_plan("grid"))}
+            proposed = next_looks(joint, mounted_rig(), target, looks_next(looks), **options)
         except NotConverged:
             return
         self._last.fit, self._last.sampled = joint, proposed.confirmed

@@ -20,9 +20,9 @@ import numpy as np
 from experiments.common.command_line import print_only
 from experiments.common.page import heading
 from experiments.speed.benchmarks.measure import command_cost
-from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.coordinates.looks_file import LOOKS
 from tvsbayes.files.disk import shipped_data
+from tvsbayes.pipeline import load_calibration
 
 SIZES = 1_000, 100_000, 1_000_000
 SINGLE = 2_000

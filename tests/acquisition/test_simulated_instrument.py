@@ -25,9 +25,9 @@ from tvsbayes.twin.true_rig import draw_truth
 
 def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monkeypatch):
     """Without chance the engine on the device model sees what `simulate` computes from the plan."""
-    for name in ("SHEET_DEPTH_SD_MM", "SHEET_TILT_SD_DEG", "HOME_SD_DEG"):
+    for name in ("SHEET_DEPTH_SD_MM", "SHEET_TILT_SD_DEG"):
         monkeypatch.setattr(f"tvsbayes.twin.simulated_campaign.{name}", 0.0)
-    monkeypatch.setattr("tvsbayes.acquisition.simulated_instrument.HOME_SD_DEG", 0.0)
+    monkeypatch.setattr("tvsbayes.instrument.rig.HOME_SD_DEG", 0.0)
     # Gears that repeat their errors; drift goes with the time, and the engine's clock is not the plan's.
     scales = {"transmission_error_deg": 0.05, "play_variation_deg": 0.02}
     geared = {f"{name}.{axis}": Prior(scale, 0.0) for name, scale in scales.items() for axis in AXES}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -27,6 +28,7 @@ from support.c_headers import answers_of_header, needs_compiler
 from support.geared_rig import geared
 from support.refusals import refusal
 from support.small_campaign import small_campaign
+from support.stored_fits import calibration_bytes, edit_fit, store
 
 from tvsbayes.calibration.c_header import calibration_header
 from tvsbayes.calibration.calibration_file import (
@@ -34,17 +36,15 @@ from tvsbayes.calibration.calibration_file import (
     FORMATS,
     NO_CALIBRATION,
     Origin,
-    calibration_bytes,
     calibration_json,
     content_sha256,
     expected_error,
-    load_calibration,
-    stored_calibration,
 )
 from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import HARMONIC_NAMES
+from tvsbayes.pipeline import StoredOrFitted, load_calibration
 
 PRINTED = 5e-15
 """Of numbers with fifteen significant digits, as exports have them: half a unit of the last one of 1.00..."""
@@ -132,23 +132,25 @@ def test_a_strangers_name_ends_no_comment(bent, name):
 @pytest.mark.parametrize("vary", [False, True])
 def test_draws_file_brings_everything_back(tmp_path, vary):
     one = geared_complete() if vary else complete()
-    (tmp_path / "results").mkdir()
+    store(tmp_path / "results", one)
     path = tmp_path / "results" / "draws.npz"
-    path.write_bytes(calibration_bytes(one, physical=np.zeros((3, 65))))
     for place in (tmp_path, str(tmp_path), tmp_path / "results", path):
         assert differing(one, load_calibration(place)) == []
+    path.write_bytes(calibration_bytes(one, physical=np.zeros((3, 65))))
+    lone = shutil.copy(path, tmp_path)
+    assert differing(one, load_calibration(lone)) == []
 
 
 def test_results_without_a_calibration_are_no_damage(tmp_path):
     """A fit that did not converge, or an older version, leaves draws alone: such results count as none."""
     campaign = replace(small_campaign(), path=tmp_path)
-    (tmp_path / "results").mkdir()
-    np.savez_compressed(tmp_path / "results" / "draws.npz", names=np.array(INPUT_NAMES), physical=np.zeros((3, 65)))
-    assert stored_calibration(campaign) is None
+    store(tmp_path / "results", None)
+    assert StoredOrFitted(campaign).stored_calibration is None
     error = refusal(lambda: load_calibration(tmp_path))
     assert error.code == NO_CALIBRATION and error.remedy and "did not converge" in error.message
+    edit_fit(tmp_path / "results", fit_id=None)
     np.savez_compressed(tmp_path / "results" / "draws.npz", names=np.array(INPUT_NAMES))
-    assert refusal(lambda: stored_calibration(campaign)).code == "damaged-results"
+    assert refusal(lambda: StoredOrFitted(campaign).stored_calibration).code == "damaged-results"
 
 
 @pytest.mark.parametrize("vary", [False, True])
@@ -309,18 +311,17 @@ def test_damaged_json_is_refused(damage, tmp_path):
 
 def test_stored_calibration_is_that_of_these_data(tmp_path):
     campaign = replace(small_campaign(), path=tmp_path)
-    assert stored_calibration(replace(campaign, path=None)) is None
-    assert stored_calibration(campaign) is None
-    (tmp_path / "results").mkdir()
-    path = tmp_path / "results" / "draws.npz"
+    assert StoredOrFitted(replace(campaign, path=None)).stored_calibration is None
+    assert StoredOrFitted(campaign).stored_calibration is None
     one = replace(complete(), inputs_sha256=input_hashes(campaign))
-    path.write_bytes(calibration_bytes(one))
-    assert differing(one, stored_calibration(campaign)) == []
+    store(tmp_path / "results", one)
+    assert differing(one, StoredOrFitted(campaign).stored_calibration) == []
     for name in one.inputs_sha256:
-        path.write_bytes(calibration_bytes(replace(one, inputs_sha256=one.inputs_sha256 | {name: "f" * 64})))
-        assert stored_calibration(campaign) is None, name
-    path.write_bytes(b"no archive")
-    assert refusal(lambda: stored_calibration(campaign)).code == "damaged-results"
+        store(tmp_path / "results", one, **{name: "f" * 64})
+        assert StoredOrFitted(campaign).stored_calibration is None, name
+    store(tmp_path / "results", one)
+    (tmp_path / "results" / "draws.npz").write_bytes(b"no archive")
+    assert refusal(lambda: StoredOrFitted(campaign).stored_calibration).code == "damaged-results"
 
 
 MOMENTS_ALONE = ("inputs", "noise", "causes", "cause_covariance")
@@ -394,14 +395,14 @@ def test_the_c_header_states_its_error_and_overshoot(bent):
 
 
 def test_driving_loads_no_jax(tmp_path):
-    """From a file to counters and a point, without JAX, scipy or OpenCV."""
+    """From a file to counters and a point, with NumPy alone."""
     path = tmp_path / "draws.npz"
     path.write_bytes(calibration_bytes(complete()))
     code = (
-        "import sys; from tvsbayes.calibration.calibration_file import load_calibration\n"
-        "c = load_calibration(sys.argv[1]); s = c.steps_for((600, 0, 0))\n"
+        "import sys, tvsbayes\n"
+        "c = tvsbayes.load_calibration(sys.argv[1]); s = c.steps_for((600, 0, 0))\n"
         "c.locate(s.pan_steps, s.tilt_steps, s.aperture_deg)\n"
-        "print(sorted({m.split('.')[0] for m in sys.modules} & {'jax', 'jaxlib', 'equinox', 'scipy', 'cv2'}))\n"
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'jax', 'scipy', 'cv2', 'msgspec'}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]", done.stdout

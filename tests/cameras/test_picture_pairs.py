@@ -160,9 +160,12 @@ def test_names_that_do_not_decide_are_asked(tmp_path, way):
     write(tmp_path, [name for pair in NAMES[way] for name in pair])
     with pytest.raises(Question) as caught:
         paired_pictures(tmp_path, 100, Pairing(asks=True))
-    for candidate, pairs in zip(caught.value.candidates, (NAMES[way], [p[::-1] for p in NAMES[way]]), strict=True):
+    first, second, both = caught.value.candidates
+    for candidate, pairs in ((first, NAMES[way]), (second, [pair[::-1] for pair in NAMES[way]])):
         (left, right) = candidate.options[1::2]
         assert pairs_of(tmp_path, Pairing(globs=(left, right))) == sorted(pairs)
+    wide = paired_pictures(tmp_path, 100, Pairing(globs=(both.options[1], both.options[3])))
+    assert {picture.sides for picture in wide} == {SIDES} and len(wide) == 2 * len(NAMES[way])
 
 
 def test_wide_pictures_named_by_directions_are_asked(tmp_path):
@@ -171,7 +174,7 @@ def test_wide_pictures_named_by_directions_are_asked(tmp_path):
         drawn(tmp_path / way, "1.png", "2.png", size=(6, 16))
     with pytest.raises(Question) as caught:
         read_folder(tmp_path, 100, 1000, Pairing(asks=True))
-    patterns = caught.value.candidates[0].options[1::2]
+    patterns = caught.value.candidates[1].options[1::2]
     found = read_folder(tmp_path, 100, 1000, Pairing(globs=patterns, asks=True))
     assert {picture.sides for picture in found.used} == {SIDES} and found.usual == dict.fromkeys(SIDES, (8, 6))
     assert {picture.view for picture in found.used} == {"left/1", "left/2", "right/1", "right/2"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import math
+import os
 import shlex
 import shutil
 from dataclasses import replace
@@ -194,12 +195,12 @@ def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path
 
 
 def test_words_that_exclude_looks_are_reported_and_foreign_words_for_good_are_known(ask, table, tmp_path):
-    rows = [f"{pan},0,640,360,500,360,{word}" for pan, word in enumerate(("gut", "gültig", "oui", "fine", "mal", "ok"))]
-    table.write_text("\n".join(["pan,tilt,XL,YL,XR,YR,state", *rows, "9,0,,,,,fine"]) + "\n", encoding="utf-8")
+    rows = [f"{pan},0,640,360,500,360,{word}" for pan, word in enumerate(("gut", "gültig", "oui", "odd", "mal", "ok"))]
+    table.write_text("\n".join(["pan,tilt,XL,YL,XR,YR,state", *rows, "9,0,,,,,odd"]) + "\n", encoding="utf-8")
     code, document = ask("import", table, "--to", tmp_path / "mine", "--yes")
-    assert code == 0 and "status: 3 looks left out by column state: fine 2, mal 1" in document["assumed"]
+    assert code == 0 and "status: 3 looks left out by column state: odd 2, mal 1" in document["assumed"]
     spots = (tmp_path / "mine" / "spots.csv").read_text(encoding="utf-8").splitlines()[1:]
-    assert [line.rpartition(",")[2] for line in spots] == ["ok", "ok", "ok", "fine", "refused: mal", "ok", "fine"]
+    assert [line.rpartition(",")[2] for line in spots] == ["ok", "ok", "ok", "odd", "refused: mal", "ok", "odd"]
     log = tmp_path / "log.csv"
     log.write_text("steps,deg,quality\n0,0.1,bien\n9,0.2,hit\n18,0.3,\n")
     remarks = ask("import", log, "--to", tmp_path / "axis", "--axis")[1]["assumed"]
@@ -365,3 +366,33 @@ def test_cameras_may_come_first(ask, table, tmp_path):
     (tmp_path / "other" / "notes.txt").write_text("mine")
     code, document = ask("import", table, "--to", tmp_path / "other", "--yes")
     assert code == 2 and assert_error(document, "occupied")["found"] == "a folder with files"
+
+
+TRACKS = [f"step,reading_mm\n{''.join(f'{c},{scale * c + 0.01 * (c > 0):.3f}{chr(10)}' for c in (0, 100, 200, 300))}"
+          for scale in (0.01, 0.02)]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("tables", "options"), [([TABLE, TABLE.replace("200", "300")], ()), (TRACKS, ("--axis",))], ids=["scanner", "axis"]
+)
+def test_of_two_imports_into_one_new_folder_one_wins_whole(say, tmp_path, monkeypatch, tables, options):
+    """The second begins and ends while the first is about to show its folder."""
+    names, rename, done = ["first.csv", "second.csv"], os.rename, []
+    for name, text in zip(names, tables, strict=True):
+        (tmp_path / name).write_text(text)
+
+    def run(name: str, out: Path) -> int:
+        return say("import", tmp_path / name, "--to", out, "--yes", *options)[0]
+
+    def late(source, target):
+        if not done:
+            done.append(None)
+            done[0] = run("second.csv", tmp_path / "mine")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", late)
+    assert run("first.csv", tmp_path / "mine") == 2 and done == [0]
+    monkeypatch.undo()
+    assert run("second.csv", tmp_path / "alone") == 0
+    mine, alone = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("mine", "alone"))
+    assert mine == alone

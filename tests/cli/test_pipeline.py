@@ -11,19 +11,18 @@ import jax
 import numpy as np
 import pytest
 from msgspec import structs
-from support.small_results import small_record, whole_summary
+from support.small_results import small_draws, small_record, whole_summary
 from support.waits import check_forward, doings
 
 import tvsbayes
 from tvsbayes.cli.app import report_line
 from tvsbayes.errors import InputError
 from tvsbayes.estimators import joint_fit
-from tvsbayes.estimators.joint_fit import restored
 from tvsbayes.instrument.campaign import input_hashes, read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compiled import Traces
 from tvsbayes.pipeline import FITTING, SUMMARISING, StoredOrFitted, calibrate, compile_for
-from tvsbayes.results.stored_draws import stored_mode
+from tvsbayes.results.stored_draws import write_results
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once")
 
@@ -32,10 +31,10 @@ pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once"
 def test_stored_results_are_reused(grid_folder, monkeypatch):
     """`compare` and `plan --given` start from results/: the same model, mode and draws, no second fit."""
     campaign = read_campaign(grid_folder)
-    assert stored_mode(campaign) is None
+    assert StoredOrFitted(campaign).stored_fit is None
     results = tvsbayes.calibrate(campaign, grid_folder / "results", model=ModelChoice(per_axis=True), sampled=False)
     fresh = results.fit
-    back = restored(campaign, stored_mode(campaign))
+    back = StoredOrFitted(campaign).stored_fit
     for name in ("z", "covariance", "draws_z", "free", "reference_pose_rad"):
         np.testing.assert_array_equal(getattr(back, name), getattr(fresh, name))
     np.testing.assert_array_equal(back.draws.effective_deg_per_step, fresh.draws.effective_deg_per_step)
@@ -44,10 +43,11 @@ def test_stored_results_are_reused(grid_folder, monkeypatch):
     monkeypatch.setattr("tvsbayes.studies.study_job.fit", None)
     assert StoredOrFitted(campaign, report_line).fit.converged
     (grid_folder / "moves.csv").write_bytes((grid_folder / "moves.csv").read_bytes() + b"\n")
-    assert stored_mode(read_campaign(grid_folder)) is not None, "a blank line changes nothing that was measured"
+    # A blank line changes nothing that was measured.
+    assert StoredOrFitted(read_campaign(grid_folder)).stored_fit is not None
     spots = (grid_folder / "spots.csv").read_text().replace("d2", "d3")
     (grid_folder / "spots.csv").write_text(spots)
-    assert stored_mode(read_campaign(grid_folder)) is None
+    assert StoredOrFitted(read_campaign(grid_folder)).stored_fit is None
 
 
 def test_the_reason_for_a_new_fit_is_printed(grid_folder, monkeypatch):
@@ -73,7 +73,7 @@ def test_the_reason_for_a_new_fit_is_printed(grid_folder, monkeypatch):
         provenance = structs.replace(record.provenance, inputs=input_hashes(campaign) | others)
         provenance = structs.replace(provenance, versions=provenance.versions | {"tvsbayes": version})
         summary = structs.replace(whole_summary(), converged=converged)
-        path.write_text(json.dumps(replace(record, summary=summary, provenance=provenance).as_json()))
+        write_results(path.parent, replace(record, summary=summary, provenance=provenance), small_draws())
 
     now = record.provenance.versions["tvsbayes"]
     for case, reason in (
@@ -89,6 +89,8 @@ def test_the_reason_for_a_new_fit_is_printed(grid_folder, monkeypatch):
     ):
         keep(case[0], case[1], **case[2])
         assert why() == reason
+    (path.parent / "draws.npz").unlink()
+    assert why() == "results/ lack draws.npz"
 
 
 def test_the_first_compilation_is_announced(tmp_path, capsys, monkeypatch):
@@ -141,7 +143,7 @@ def test_a_sample_of_another_fit_is_removed(grid_folder):
     results, messages = grid_folder / "results", []
     results.mkdir()
     (results / "posterior.nc").write_bytes(b"of an earlier fit")
-    record = StoredOrFitted(read_campaign(grid_folder), messages.append).record
+    record = StoredOrFitted(read_campaign(grid_folder), messages.append).reported.record
     assert record.summary.estimator == "laplace" and (results / "fit.json").is_file()
     assert not (results / "posterior.nc").exists()
     assert any("posterior.nc of an earlier fit is removed" in line for line in messages)
@@ -149,7 +151,7 @@ def test_a_sample_of_another_fit_is_removed(grid_folder):
 
 @pytest.mark.parametrize(
     "call",
-    [lambda c: calibrate(c, c.path / "results"), lambda c: StoredOrFitted(c).record],
+    [lambda c: calibrate(c, c.path / "results"), lambda c: StoredOrFitted(c).reported],
     ids=["calibrate", "record"],
 )
 def test_an_unwritable_results_folder_is_refused_before_the_fit(grid_folder, monkeypatch, call):

@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.small_campaign import seen_steps, small_campaign
+from support.stored_fits import store
 
 from tvsbayes.assessment.fitted_calibration import calibration_of_draws
-from tvsbayes.calibration.calibration_file import CALIBRATION_FORMAT, calibration_bytes, load_calibration
+from tvsbayes.calibration.calibration_file import CALIBRATION_FORMAT
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.parameters import NAMES, RIG_PRIORS
+from tvsbayes.pipeline import load_calibration
 
 POINT = ("--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 70)
 RELATIVE_SD = 0.01
@@ -43,9 +45,7 @@ def folder(tmp_path) -> Path:
     """A campaign folder with results that fit it."""
     folder = tmp_path / "campaign"
     write_campaign(small_campaign(), folder)
-    (folder / "results").mkdir()
-    calibration = drawn_calibration(read_campaign(folder))
-    (folder / "results" / "draws.npz").write_bytes(calibration_bytes(calibration))
+    store(folder / "results", drawn_calibration(read_campaign(folder)))
     return folder
 
 
@@ -207,7 +207,7 @@ def test_limits_of_a_rig_are_kept(ask, folder, tmp_path):
     text = (source / "rig.toml").read_text()
     # An uncertain backlash: clearing it takes more steps than its best estimate.
     calibration = replace(load_calibration(folder), overshoot_steps={"pan": 6, "tilt": 6})
-    (folder / "results" / "draws.npz").write_bytes(calibration_bytes(calibration))
+    store(folder / "results", calibration)
     limits = "[positioner]\npan_min_steps = 97\npan_max_steps = 200\ntilt_min_steps = -100\ntilt_max_steps = 100\n"
     assert "[positioner]" not in text
     (tmp_path / "rig.toml").write_text(f"{text}\n{limits}")
@@ -309,6 +309,18 @@ def test_a_file_of_points_becomes_a_cloud(ask, say, folder, tmp_path, ending):
 def test_clouds_that_cannot_be_written_are_refused_with_a_remedy(ask, folder, options, code, remedy):
     exit_code, document = ask("locate", folder, *options)
     assert exit_code == 2 and document["error"]["code"] == code and remedy in document["error"]["remedy"]
+
+
+@pytest.mark.parametrize("kind", ["json", "header"])
+def test_an_exported_calibration_replaces_its_kind_only(ask, folder, tmp_path, kind):
+    out, command = tmp_path / "calibration", ("steps-for", folder, "--export", kind, "-o", tmp_path / "calibration")
+    assert ask(*command)[0] == 0 and ask(*command)[0] == 0
+    other = {"json": "header", "header": "json"}[kind]
+    code, document = ask("steps-for", folder, "--export", other, "-o", out)
+    assert (code, document["error"]["code"]) == (2, "occupied")
+    out.write_text("mine")
+    assert ask(*command)[0] == 2 and out.read_text() == "mine"
+    assert ask(*command, "--force")[0] == 0 and out.read_text() != "mine"
 
 
 @pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("view",)])

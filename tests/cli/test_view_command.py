@@ -57,7 +57,10 @@ def test_view_replaces_no_data_and_leaves_no_partial_file(say, folder, tmp_path,
         code, _, log = say("view", folder, "-o", folder / name)
         assert code == 2 and "would replace data" in log and (folder / name).read_bytes() == before
     out = tmp_path / "page.html"
-    out.write_text("an older page")
+    out.write_text("my page")
+    code, _, log = say("view", folder, "-o", out)
+    assert code == 2 and "--force" in log and out.read_text() == "my page"
+    out.write_text(older := "<title>tvsbayes view</title>")
 
     def full(descriptor):
         raise OSError(28, "No space left on device")
@@ -65,7 +68,7 @@ def test_view_replaces_no_data_and_leaves_no_partial_file(say, folder, tmp_path,
     monkeypatch.setattr("os.fsync", full)
     code, _, log = say("view", folder, "-o", out)
     assert code == 2 and "No space left" in log
-    assert out.read_text() == "an older page"
+    assert out.read_text() == older
     assert sorted(place.name for place in tmp_path.iterdir()) == ["campaign", "page.html"]
     (folder / "results").symlink_to(tmp_path)
     assert say("view", folder)[0] == 2

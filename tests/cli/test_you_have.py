@@ -28,4 +28,4 @@ def test_the_page_has_every_kind_and_no_refusal_but_that_of_the_board():
     assert [line[3:] for line in text.splitlines() if line.startswith("## ")] == [kind.title for kind in KINDS]
     refused = [line for line in text.splitlines() if line.startswith("error:")]
     assert len(refused) == 1 and "6x4 inner corners are seen" in refused[0]
-    assert len(QUICK) == len(KINDS) - 2
+    assert len(QUICK) == len(KINDS) - 3

@@ -13,7 +13,7 @@ from experiments.compensation.aimed_scanners import AIMS, aimed
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks, verify_looks
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.instrument.stops import rests_of
+from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.report.compensation_text import aim_plan_text, verification_text
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -90,6 +90,10 @@ def test_a_plan_reaches_its_stops_from_their_sides_and_tells(mounted_rig, mixed_
     for pan, tilt, pan_side, tilt_side in planned.stops:
         assert low <= pan <= high and down <= tilt <= up and {abs(pan_side), abs(tilt_side)} == {1}
     assert {stop[2] for stop in planned.stops} == {stop[3] for stop in planned.stops} == {-1, 1}
+    made = counters_made(mixed_fit.campaign.moves)
+    for step in planned.steps("d1"):
+        for axis, counter in (("pan", step.pan_steps), ("tilt", step.tilt_steps)):
+            assert counter is None or step.action == "home" or made[axis][0] <= counter <= made[axis][1]
     looks = simulate(mounted_rig, planned.steps("d1"), 8, truth).campaign
     rests = {axis: rests_of(looks.moves, axis) for axis in ("pan", "tilt")}
     for spot, (pan, tilt, pan_side, tilt_side) in zip(looks.spots, planned.stops, strict=True):

@@ -15,6 +15,8 @@ from support.compensated import results, table
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS, Origin, Wish
 from tvsbayes.compensation.promise import compensation_of
+from tvsbayes.errors import InputError
+from tvsbayes.files.own_outputs import require_own
 
 ORIGIN = Origin("tvsbayes of a test", "0123456789abcdef" * 4)
 WISHES = {
@@ -38,6 +40,17 @@ def test_every_file_states_source_sense_and_that_nothing_is_applied(target):
     text = written(target)
     for word in ("tvsbayes of a test", "applied to nothing", "sense:", "promise, arriving backward", "since homing"):
         assert word in text, word
+
+
+@pytest.mark.parametrize("target", FORMATS)
+def test_every_file_is_known_as_ours(target, tmp_path):
+    """LinuxCNC's by its end, after a table of 2000 lines."""
+    text = written(target)
+    (tmp_path / "table").write_text("0.0 0.0 0.0\n" * 2000 * (target == "linuxcnc") + text)
+    require_own(tmp_path / "table", "compensation")
+    (tmp_path / "table").write_text(text.replace("tvsbayes", "somebody"))
+    with pytest.raises(InputError, match="would be replaced"):
+        require_own(tmp_path / "table", "compensation")
 
 
 def test_csv_holds_the_readings_expected():

@@ -10,8 +10,10 @@ from msgspec import structs
 from support.compensated import driven, fresh, results, table, to_and_fro, true_axis
 
 from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.formats import Wish
+from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.compensation.verification import plan_verification, stored_compensation, verify_axis, verify_readings
-from tvsbayes.errors import InputError
+from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.report.compensation_text import compensation_section, verification_text
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -117,11 +119,32 @@ def test_python_verifies_in_one_call(monkeypatch):
     assert verify_axis(results().fit.campaign, fresh(3), made=table()).verdict == KEPT
 
 
+def test_a_verification_stays_within_the_limits():
+    """A table to +-20 of commands to +-24; where limits end at the table, its ends are reached from one side alone."""
+    for limits, (low, high) in ((None, (-24.0, 24.0)), ((-20.0, 20.0), (-20.0, 20.0)), ((-20.0, 7.0), (-20.0, 7.0))):
+        fit = replace(results().fit, campaign=replace(results().fit.campaign, limits=limits))
+        plan = plan_verification(fit, table())
+        rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[2:]]
+        commands = [float(row[1]) for row in rows]
+        assert low <= min(commands) and max(commands) <= high and {side for _, side in plan.stops} == {-1, 1}
+    narrow = replace(results().fit, campaign=replace(results().fit.campaign, limits=(30.0, 40.0)))
+    with pytest.raises(NothingToEstimate, match="no stop has room"):
+        plan_verification(narrow, table())
+
+
+def test_a_table_says_where_its_run_up_leaves_the_limits():
+    assert not [words for words in table().unsaid if "run-up" in words]
+    fit = replace(results().fit, campaign=replace(results().fit.campaign, limits=(-20.0, 24.0)))
+    made = compensation_of(replace(results(), fit=fit), Wish("csv"))
+    (words,) = [words for words in made.unsaid if "run-up" in words]
+    assert words.startswith("arriving forward below -19.") and "backward" not in words and "`limits` of [axis]" in words
+
+
 def test_plan_spreads_its_stops_and_states_whether_they_are_enough():
     plan = plan_verification(results().fit, table())
     assert plan.enough and len(plan.stops) >= 6 and {side for _, side in plan.stops} == {-1, 1}
     assert np.ptp([command for command, _ in plan.stops]) > 30
-    rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[1:]]
+    rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[2:]]
     at = [float(row[1]) for row in rows]
     for k, row in enumerate(rows):
         if row[3] == "1":

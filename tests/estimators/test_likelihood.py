@@ -70,6 +70,27 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
     assert evaluated.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    "homings",
+    [
+        {"absolute": ("pan",)},
+        {"absolute": ("pan", "tilt")},
+        {"stated_home_sd_deg": {"pan": 0.2, "tilt": 0.001}},
+        {"absolute": ("tilt",), "stated_home_sd_deg": {"pan": 0.001}},
+    ],
+)
+def test_homings_shift_the_zeros_as_stated(dozen, evaluate, homings):
+    """None sets that of an absolute encoder, which walks on; play, stops and the other axis are as they were."""
+    campaign = replace(dozen.campaign, rig=replace(dozen.campaign.rig, **homings))
+    arrays = jax.tree.map(jnp.asarray, campaign_arrays(campaign))
+    z = random_points(dozen, 1, 0.3)[0]
+    evaluated = evaluate(z, dozen.space, arrays)
+    dense = dense_log_density(campaign, evaluated)
+    assert evaluated.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+    plain = evaluate(z, dozen.space, dozen.arrays).log_likelihood
+    assert abs(plain - dense) > LOG_UNIT, "the entry changes nothing here"
+
+
 @pytest.mark.parametrize("coordinates", [(1.0, -0.5), (3.0, -8.0), (-8.0, 6.0)])
 def test_looks_that_scatter_equal_a_dense_gaussian(dozen, evaluate, coordinates):
     """Of either axis, of both, and of one alone."""

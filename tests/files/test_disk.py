@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.disk import decode, read_arrays, read_bytes, require_writable, shipped_data, write_atomically
+from tvsbayes.files.disk import (
+    decode,
+    new_folder,
+    read_arrays,
+    read_bytes,
+    require_writable,
+    shipped_data,
+    write_atomically,
+    write_folder,
+)
 
 
 def test_only_regular_files_inside_the_folder(tmp_path):
@@ -110,6 +119,52 @@ def test_shipped_data_lies_beside_a_checkout_or_inside_a_wheel():
     data = shipped_data()
     package = Path(__file__).resolve().parents[2] / "tvsbayes"
     assert data.name == "data" and data.parent.name in ("tvsbayes", package.parent.name)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+BEGUN = {"missing": None, "empty": {}, "with its cameras": {"stereo.json": b"{}"}}
+MINE, OTHER = ({"campaign.toml": who, "moves.csv": who, "frames.csv": who} for who in (b"mine", b"other"))
+
+
+@pytest.mark.parametrize("begun", BEGUN.values(), ids=BEGUN)
+def test_a_new_folder_is_there_whole_or_not_at_all(tmp_path, begun):
+    """Also below folders that are missing; what cannot be prepared leaves the place as it was."""
+    to = tmp_path / "deep" / "new"
+    if begun is not None:
+        write_folder(to, begun)
+    with pytest.raises(InputError, match="no space") as caught, new_folder(to, but=("stereo.json",)) as prepared:
+        (prepared / "moves.csv").write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "no space")
+    assert caught.value.code == "write"
+    assert to.exists() == (begun is not None)
+    assert contents(tmp_path / "deep") == {f"new/{name}": data for name, data in (begun or {}).items()}
+    assert write_folder(to, MINE, but=("stereo.json",)) == [str(to / name) for name in MINE]
+    assert contents(to) == (begun or {}) | MINE
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["new"], "nothing stays beside"
+
+
+@pytest.mark.parametrize("begun", BEGUN.values(), ids=BEGUN)
+def test_of_two_writers_of_a_new_folder_one_wins_whole(tmp_path, begun):
+    """The other is refused, although the folder was free when it began."""
+    to = tmp_path / "new"
+    if begun is not None:
+        write_folder(to, begun)
+    with pytest.raises(InputError) as caught, new_folder(to, but=("stereo.json",)) as prepared:
+        for name, data in OTHER.items():
+            (prepared / name).write_bytes(data)
+        write_folder(to, MINE, but=("stereo.json",))
+    assert caught.value.code == "occupied" and "name another folder" in caught.value.remedy
+    assert contents(tmp_path) == {f"new/{name}": data for name, data in ((begun or {}) | MINE).items()}
+
+
+@pytest.mark.parametrize("leftover", [".new.0123456789ab.tmp", "notes.txt"])
+def test_what_a_killed_process_left_does_not_occupy_a_folder(tmp_path, leftover):
+    (tmp_path / leftover).mkdir()
+    with nullcontext() if leftover.startswith(".") else pytest.raises(InputError, match="a folder with files"):
+        write_folder(tmp_path, MINE)
 
 
 def test_a_place_for_results_is_checked_before_the_work(tmp_path):

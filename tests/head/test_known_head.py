@@ -119,6 +119,11 @@ def test_a_model_is_corrected_and_marked(ask, known_head, tmp_path):
     terms = head_joints(out.read_bytes(), "new.urdf", dict.fromkeys(AXES)).terms
     for name in ("azimuth_axis_tilt_deg.north", "axes_not_square_deg", "azimuth_zero_deg"):
         assert abs(terms[name] - truth.parameters[name]) < 4 * u[name], name
+    assert ask("compensate", folder, "--to", "urdf", "-o", out)[0] == 0, "a model of ours is replaced"
+    for place in (folder / "head.urdf", tmp_path / "again.urdf"):
+        (tmp_path / "again.urdf").write_bytes(UNIT)
+        code, document = ask("compensate", folder, "--to", "urdf", "-o", place)
+        assert (code, document["error"]["code"]) == (2, "occupied") and place.read_bytes() == UNIT
     again = tmp_path / "again"
     again.mkdir()
     for path in folder.rglob("*"):
@@ -128,6 +133,8 @@ def test_a_model_is_corrected_and_marked(ask, known_head, tmp_path):
             place.write_bytes(path.read_bytes())
     (again / "head.urdf").write_bytes(out.read_bytes())
     assert_error(ask("compensate", again, "--to", "urdf")[1], "applied")
+    # It is marked as ours, but this head is corrected from it.
+    assert_error(ask("compensate", again, "--to", "urdf", "-o", again / "head.urdf")[1], "occupied")
     code, document = ask("compensate", folder, "--to", "csv")
     assert code == 2 and "--to urdf" in document["error"]["remedy"]
 

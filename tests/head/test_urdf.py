@@ -131,5 +131,3 @@ def test_without_a_model_there_are_properties():
     # A joint that turns down where elevation grows counts down.
     assert document["joints"]["tilt"]["steps_per_rad"] < 0 < document["joints"]["pan"]["steps_per_rad"]
     assert set(document["names"]) <= SIGHTING_HEAD.documented | set(TERMS)
-
-

@@ -64,6 +64,11 @@ FLOODS = {
     "lists.json": b'{"a": [' + b"[]," * 1_200_000 + b"[]]}",
     "flow.yaml": b"a: [" + b"1," * 2_000_000 + b"1]",
     "keys.toml": b"".join(b"a%d = 1\n" % k for k in range(300_000)),
+    "blank.txt": b"\n" * (TREE_BYTES_MAX - 1),
+    "spaces.txt": b" " * (TREE_BYTES_MAX - 2) + b"x",
+    "words.txt": b"a: b\n " * (TREE_BYTES_MAX // 6),
+    "brackets.txt": b"[ 1x1 p[" * (TREE_BYTES_MAX // 8),
+    "kalibr.txt": b"Calibration results\n===\ncam0 (a):\n" + b"  a: b\n" * 100_000,
     "sections.txt": b"[image]\n" * 400_000,
     "streams.txt": b'Intrinsic of "a" / 640x480\n' * 150_000,
 }

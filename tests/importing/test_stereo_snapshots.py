@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.calibration_files import FOREIGN, changed, mistakes
 
+from tvsbayes.cameras import imported_calibration
+from tvsbayes.cameras.assumed_covariance import with_assumed_covariance
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.stereo_pair import read_stereo
+from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
 
+KNOWN: dict[tuple, Stereo] = {}
 OPENCV, STATED = "opencv_other_names/pair.yml", "--rms-px 0.25 --views 20 --board 9x6 --pitch-mm 25 --joint"
 FILES = (
     *("opencv_other_names/pair.yml", "opencv_other_names/pair2.yml", "opencv_other_names/pair3.yml"),
@@ -35,6 +39,21 @@ FILES = (
     *(f"{OPENCV} {STATED}", f"{OPENCV} --u-focal-percent 0.2 --fixed-intrinsics", f"{OPENCV} --image-size 1280x720"),
     "direction_signs/log.csv",
 )
+
+
+@pytest.fixture(autouse=True)
+def once(monkeypatch):
+    """The covariance of equal pairs is computed once: most files hold the same one."""
+
+    def assumed(stereo, *made):
+        key = (*np.round(stereo.vector, 9), stereo.image_width, stereo.right_image_size, *made)
+        if key not in KNOWN:
+            KNOWN[key] = with_assumed_covariance(stereo, *made)
+        found = KNOWN[key]
+        fields = {name: getattr(found, name) for name in ("parameter_covariance", "rms_px", "assumed", "assumed_from")}
+        return replace(stereo, **fields)
+
+    monkeypatch.setattr(imported_calibration, "with_assumed_covariance", assumed)
 
 
 def numbers(path) -> dict[str, object]:

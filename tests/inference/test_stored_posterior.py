@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 
@@ -11,9 +10,10 @@ import pytest
 from msgspec import structs
 from support.axes import drawn, runs
 from support.small_results import small_draws, small_record, whole_summary
+from support.stored_fits import edit_fit
 
 from tvsbayes.errors import InputError, NotConverged
-from tvsbayes.inference.stored_posterior import load_posterior
+from tvsbayes.pipeline import load_posterior
 from tvsbayes.results.stored_draws import write_results
 from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
 from tvsbayes.single_axis.axis_fit import fit_axis
@@ -102,21 +102,16 @@ def test_results_of_before_answers_count_by_what_made_them(tmp_path):
         load_posterior(tmp_path, anyway=True)
 
 
-def edited(folder, **keys):
-    path = folder / "results" / "fit.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | keys))
-
-
 def test_refusals_say_what_to_do(tmp_path):
-    with pytest.raises(InputError, match=r"no results/fit\.json") as refused:
+    with pytest.raises(InputError, match="there are no results/ yet") as refused:
         load_posterior(tmp_path)
     assert "tvsbayes fit" in refused.value.remedy
     scanner(tmp_path)
-    edited(tmp_path, format="tvsbayes-fit/9")
+    edit_fit(tmp_path / "results", format="tvsbayes-fit/9")
     with pytest.raises(InputError, match="tvsbayes-fit/9") as refused:
         load_posterior(tmp_path)
     assert "the tvsbayes that wrote it" in refused.value.remedy
-    edited(tmp_path, format="tvsbayes-plan/1")
+    edit_fit(tmp_path / "results", format="tvsbayes-plan/1")
     with pytest.raises(InputError, match="tvsbayes-plan/1"):
         load_posterior(tmp_path)
     scanner(tmp_path)
@@ -125,7 +120,7 @@ def test_refusals_say_what_to_do(tmp_path):
     with pytest.raises(InputError, match=r"draws\.npz"):
         load_posterior(tmp_path)
     (tmp_path / "results" / "draws.npz").unlink()
-    with pytest.raises(InputError, match=r"no results/draws\.npz"):
+    with pytest.raises(InputError, match=r"results/ lack draws\.npz"):
         load_posterior(tmp_path)
 
 

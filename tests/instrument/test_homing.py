@@ -7,7 +7,8 @@ from support.small_campaign import small_campaign
 from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance, unrecorded, ways
+from tvsbayes.instrument.homing import ANYWHERE, every_way, has_play, homed, prior_chance, unrecorded, ways
+from tvsbayes.instrument.parameters import Prior
 
 
 def moves(*first: tuple[str, str]) -> tuple[Move, ...]:
@@ -44,3 +45,10 @@ def test_only_unknown_approaches_are_replaced():
     assert [m.pan_approach for m in rows] == ["right", "", "left", ""]
     assert [m.tilt_approach for m in rows] == ["up", "", "unknown", ""]
     assert homed(campaign, {"pan": ANYWHERE}) is campaign
+
+
+def test_an_axis_without_play_has_no_side():
+    exact, some = Prior(0.0, 0.0, "half-normal"), Prior(0.0, 0.1, "half-normal")
+    names = ("backlash_deg.pan", "play_variation_deg.pan")
+    assert not has_play(dict.fromkeys(names, exact), "pan")
+    assert all(has_play(dict.fromkeys(names, exact) | {name: some}, "pan") for name in names)

@@ -28,6 +28,19 @@ def test_plan_round_trip(tmp_path):
     assert read_plan(tmp_path / "plan.csv") == PLAN  # home counters default to 0
 
 
+def test_a_plan_says_who_wrote_it_and_lines_are_counted_with_that(tmp_path):
+    path = tmp_path / "plan.csv"
+    write_plan(PLAN, path)
+    first, names, *rest = path.read_text().splitlines()
+    assert first == "# plan by tvsbayes" and names.startswith("step,action")
+    path.write_text("\n".join([first, names, rest[0], rest[1].replace("place", "wait"), *rest[2:]]))
+    with pytest.raises(InputError) as refused:
+        read_plan(path)
+    assert refused.value.line == 4
+    path.write_text("\n".join([names, *rest]))
+    assert read_plan(path) == PLAN
+
+
 PLAN_REFUSED = {
     "no home": (1, {"action": "move"}, 2, "action"),
     "unknown action": (4, {"action": "wait"}, 5, "action"),

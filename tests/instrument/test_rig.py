@@ -394,3 +394,42 @@ def test_stereo_of_a_rig_must_not_link_outside(tmp_path):
     (folder / "stereo.json").symlink_to(tmp_path / "stereo.json")
     with pytest.raises(InputError, match="leaves the folder"):
         read_rig(path)
+
+
+def test_absolute_encoders_are_read_written_and_part_of_the_rig():
+    both = rig_table('[rig]\nabsolute = ["tilt", "pan"]\n')
+    assert both.absolute == ("pan", "tilt")
+    assert rig_table(rig_table_toml(both)) == both
+    plain = rig_table("[rig]\n")
+    assert plain.absolute == () and "absolute" not in rig_table_toml(plain)
+
+
+@pytest.mark.parametrize("value", ['"pan"', "[]", '["pan", "pan"]', '["azimuth"]', "[1]", "true"])
+def test_other_words_for_absolute_encoders_are_refused(value):
+    with pytest.raises(InputError, match=r'absolute.*list of "pan" and "tilt", or of one of them'):
+        rig_table(f"[rig]\nabsolute = {value}\n")
+
+
+def test_the_scatter_of_homings_is_read_and_written_where_it_is_stated():
+    table = rig_table('[rig]\nabsolute = ["tilt"]\n[rig.prior]\n"home_sd_deg.pan" = { value = 0.002, u = 0 }\n')
+    assert table.home_sd_deg == (0.002, 0.0) and rig_table("").home_sd_deg == (0.05, 0.05)
+    assert rig_table(rig_table_toml(table)) == table
+    assert rig_table("[rig.prior]\nhome_sd_deg.pan = { value = 0.002, u = 0 }\n").home_sd_deg == (0.002, 0.05)
+    assert "home_sd" not in rig_table_toml(RigTable())
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        (
+            'absolute = ["pan"]\n[rig.prior]\nhome_sd_deg.pan = { value = 0.1, u = 0 }',
+            "no homing sets an absolute",
+        ),
+        ("[rig.prior]\nhome_sd_deg.tilt = { value = 0.1, u = 1.0 }", "exactly 0"),
+        ("[rig.prior]\nhome_sd_deg.tilt = { value = 0.0, u = 0 }", "home_sd_deg"),
+        ("home_sd_deg.tilt = { value = 0.1, u = 0 }", r"\[rig.prior\]"),
+    ],
+)
+def test_other_scatters_of_homings_are_refused(entries, words):
+    with pytest.raises(InputError, match=words):
+        rig_table(f"[rig]\n{entries}\n")

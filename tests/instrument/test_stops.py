@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from support.written_rows import move_row
 
@@ -125,8 +126,19 @@ def test_a_stop_error_is_redrawn_when_its_counter_changes_or_is_set():
     assert new.redraw_mix[[0, 2, 4], 0].tolist() == [[0, 1], [1, 0], [0.5, 0.5]]
     assert new.redraw_mix[[1, 3], 0].tolist() == [[0, 0], [0, 0]]
     assert new.new_segment.tolist() == [True, False, False, False, True]
-    assert new.homed.tolist() == [False, False, False, False, True]
-    assert redraws(moves, (0, 4), homed_from=0).homed.tolist() == [True, True]
+    assert new.homed.tolist() == [[False, False]] * 4 + [[True, True]]
+    assert redraws(moves, (0, 4), homed_from=0).homed.tolist() == [[True, True]] * 2
+
+
+def test_a_homing_does_not_set_an_absolute_zero():
+    """The tilt walks on from the look before; its play and its stop are new."""
+    moves = (*pan_moves(0, 200, 0), move_row(3, 1, 3600.0, 0, 50, "left", "up"), move_row(4, 1, 7200.0, 9, 50))
+    new = redraws(moves, (1, 4), absolute=("tilt",))
+    assert new.new_segment.tolist() == [True, True] and new.redraw.tolist() == [[True, True]] * 2
+    assert new.new_zero.tolist() == [[True, True], [True, False]]
+    assert new.homed.tolist() == [[False, False], [True, False]]
+    since = (7200.0 - moves[1].time_s) / 3600.0
+    np.testing.assert_allclose(new.hours[1], [1.0, since], rtol=1e-12)
 
 
 def test_few_stops_are_counted_by_direction():

@@ -220,7 +220,7 @@ def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
     picks = np.random.default_rng(5).integers(0, len(pool.looks), 24)
     arranged = arrange(pool.looks[picks], known.sheets, pool.run_up)
     exact = information_of(arranged.steps, known).fisher
-    quick = information_of_looks(seen, picks, arranged.path, known.space, False, arranged.warm_minutes(known.rig))
+    quick = information_of_looks(seen, picks, arranged.path, known.space, None, arranged.warm_minutes(known.rig))
     assert exact.shape == (known.size, known.size) and known.gears.size > 20
     assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
 

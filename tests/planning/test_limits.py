@@ -90,7 +90,7 @@ def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
         known = prior_knowledge(with_priors(rig, focal_scale=Prior(1.0, focal_scale_u)))
         shown = LookArrays(looks, known, False).at(known.z, known.space)
         path = np.zeros((len(once), 2))
-        information = information_of_looks(shown, once, path, known.space, False)
+        information = information_of_looks(shown, once, path, known.space, None)
         target = structs.replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
         at = sensitivity(target, known.z, known.space, known.rig.table, shown.mirror_angles_rad.mean(axis=0))
         return limit_of(known, information, at, target)
@@ -112,7 +112,7 @@ def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, pool):
     target = parse_target("U95(x) at 1000,0,0 mm <= 0.5 mm")
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
     path = arrange(pool.looks, knowledge.sheets, pool.run_up).path
-    information = information_of_looks(seen, np.arange(len(pool.looks)), path, knowledge.space, False)
+    information = information_of_looks(seen, np.arange(len(pool.looks)), path, knowledge.space, None)
     limit = limit_of(knowledge, information, at, target)
     assert not limit.reachable and "at the point itself" in limit.needed
 

@@ -12,7 +12,7 @@ from support.coarse_planning import ROUNDING
 from tvsbayes.instrument.plan import plan_minutes
 from tvsbayes.planning.candidates import Positions
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of
+from tvsbayes.planning.expectation import PARAMETERS, information_of
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
     LookArrays,
@@ -28,14 +28,19 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 
 
 def test_looks_add_up_to_the_plan_they_make(knowledge, pool, seen):
-    """The fast sum equals the filter's pass over the arranged plan, with and without an unknown home offset."""
+    """The fast sum equals the filter's pass over the arranged plan, with and without an unknown home offset.
+
+    Of both axes, or of one beside an absolute encoder.
+    """
     picks = np.random.default_rng(5).integers(0, len(pool.looks), 24)
     arranged = arrange(pool.looks[picks], knowledge.sheets, pool.run_up)
-    for after_data in (False, True):
-        known = replace(knowledge, after_data=after_data)
+    kept = replace(knowledge.rig, table=replace(knowledge.rig.table, absolute=("pan",)))
+    for after_data, rig in ((False, knowledge.rig), (True, knowledge.rig), (True, kept)):
+        known = replace(knowledge, after_data=after_data, rig=rig)
+        variances = known.home_variances_rad2
         exact = information_of(arranged.steps, known).fisher
         quick = information_of_looks(
-            seen, picks, arranged.path, knowledge.space, after_data, arranged.warm_minutes(knowledge.rig)
+            seen, picks, arranged.path, knowledge.space, variances, arranged.warm_minutes(knowledge.rig)
         )
         assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
 
@@ -53,7 +58,7 @@ def test_order_of_experiments_does_not_matter(knowledge, pool, seen):
     values = []
     for order in (picks, generator.permutation(picks)):
         path = arrange(pool.looks[order], knowledge.sheets, pool.run_up).path
-        information = information_of_looks(seen, order, path, knowledge.space, False)
+        information = information_of_looks(seen, order, path, knowledge.space, None)
         values.append(at.value(covariance_of(knowledge.precision + information)))
     assert values[1] == pytest.approx(values[0], rel=ROUNDING)
 
@@ -103,7 +108,7 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
     class Space:
         u = generator.uniform(0.5, 1.0, PARAMETERS)
 
-    for homed in (False, True):
+    for homed in (None, np.radians([0.05, 0.1]) ** 2):
         informations = information_of_looks(seen, chosen, path, Space, homed)
         for one, information in zip(rows, informations, strict=True):
             every = one[chosen].copy()
@@ -111,8 +116,8 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
                 every[:, :, column] = every[:, :, PARAMETERS + axis] * path[:, axis, None]
                 every[:, :, column] *= Space.u[column] * np.pi / 360
             whole = np.einsum("kia,kib->ab", every, every)
-            if homed:
-                whole[PARAMETERS:, PARAMETERS:] += np.eye(2) / HOME_VARIANCE_RAD2
+            if homed is not None:
+                whole[PARAMETERS:, PARAMETERS:] += np.diag(1 / homed)
                 # Beside a prior that is taken off again: few looks leave most directions open.
                 prior = np.diag([1.0] * PARAMETERS + [0.0] * 2)
                 covariance = np.linalg.inv(whole + prior)[:PARAMETERS, :PARAMETERS]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,8 +13,8 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.protocols import grid_protocol
-from tvsbayes.instrument.stops import rests_of
-from tvsbayes.planning.candidates import UNSTATED_STEPS, counter_range, expected_run_up
+from tvsbayes.instrument.stops import counters_made, rests_of
+from tvsbayes.planning.candidates import counter_range, expected_run_up
 from tvsbayes.planning.expectation import Knowledge, information_of, knowledge_of
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.next_looks import Confirmation, next_looks
@@ -74,7 +75,8 @@ def test_what_is_promised_is_the_information_of_the_whole_run(proposal, mounted_
 
 
 def test_every_look_is_reached_with_a_run_up_inside_the_limits(proposal, mounted_rig, begun_fit):
-    limits = counter_range(mounted_rig.limits, UNSTATED_STEPS).limits
+    """Limits are not stated: what was commanded is the limit."""
+    limits = counter_range(mounted_rig.limits, counters_made(begun_fit.campaign.moves)).limits
     least = expected_run_up(knowledge_of(begun_fit, mounted_rig))
     assert proposal.steps[0].action == "place" and sum(step.action == "look" for step in proposal.steps) == 12
     log = run_plan(whole_plan(mounted_rig, proposal), mounted_rig)
@@ -86,6 +88,21 @@ def test_every_look_is_reached_with_a_run_up_inside_the_limits(proposal, mounted
     after = proposal.steps[proposal.steps.index(first_move) + 1]
     run_up = np.abs(np.array([after.pan_steps, after.tilt_steps]) - [first_move.pan_steps, first_move.tilt_steps])
     assert np.all(run_up >= least), "wherever the axes stood"
+
+
+def counters(proposal, axis: str) -> list[int]:
+    return [c for step in steps_of(proposal.steps) if (c := getattr(step, f"{axis}_steps")) is not None]
+
+
+def test_looks_go_on_to_what_a_running_plan_allows_and_never_by_an_added_move(begun_fit, mounted_rig):
+    made = counters_made(begun_fit.campaign.moves)
+    wider = {axis: (low - 40, high + 40) for axis, (low, high) in made.items()}
+    planned = next_looks(begun_fit, mounted_rig, TARGET, 8, planned=wider)
+    for axis, (low, high) in made.items():
+        assert low - 40 <= min(counters(planned, axis)) and max(counters(planned, axis)) <= high + 40
+    assert any(not low <= counter <= high for axis, (low, high) in made.items() for counter in counters(planned, axis))
+    far = replace(begun_fit.campaign.moves[-1], pan_steps=5000, tilt_steps=-5000, assumed=1)
+    assert counters_made((*begun_fit.campaign.moves, far)) == made
 
 
 def test_a_sheet_that_stands_there_costs_nothing(proposal):

@@ -99,11 +99,11 @@ def test_a_search_after_data_knows_no_home_offset(knowledge, seen):
     shown, picks = replace(seen, rows=rows), np.arange(6)
     wide, precision = shown.rows, search_precision(known)
     whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[:PARAMETERS, :PARAMETERS]
-    exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, True)
+    exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, known.home_variances_rad2)
     contrasts = np.isin(np.arange(PARAMETERS), CONTRAST_COLUMNS)
     expected = covariance_of(known.precision + exact + CONTRAST_PRECISION * np.diag(contrasts))
     assert whole == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING * expected.max())
-    without = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, False)
+    without = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, None)
     assert np.abs(without - exact).max() > 1e-3 * np.abs(exact).max(), "offsets count, or they could be left out"
 
 

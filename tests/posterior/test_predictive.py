@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import equinox as eqx
 import numpy as np
 import pytest
 from support.drawn_quantities import drawn_quantities
 from support.small_campaign import small_campaign
 
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.axes import HOME_SD_DEG
@@ -105,10 +107,25 @@ def test_an_error_is_held_while_its_axis_stands(dozen, errors_deg):
     assert held >= 5
 
 
-def test_looks_taken_again_scatter_about_their_stops(dozen, monkeypatch):
+def test_an_absolute_zero_walks_on_over_homings(dozen):
+    """From the first move on; that of the other axis is set by its homings and walks from there."""
+    campaign = replace(dozen.campaign, rig=replace(dozen.campaign.rig, absolute=("pan",)))
+    spots, moves = ordered_spots(campaign), campaign.moves
+    physical = np.zeros((DRAWS, len(NAMES)))
+    physical[:, [INDEX[name] for name in names_of("drift_deg_per_root_hour")]] = 2.0
+    of_pan = replace(dozen, campaign=campaign, arrays=campaign_arrays(campaign))
+    errors = taken_again_deg(of_pan, physical, np.zeros((len(spots), 2)), 6)
+    begun = {m.segment: m.time_s for m in reversed(moves)}
+    hours = np.array([[moves[s.move].time_s - begun[k] for k in (0, moves[s.move].segment)] for s in spots]) / 3600
+    expected = 4.0 * hours + [[0.0, HOME_SD_DEG**2 * (moves[s.move].segment > 0)] for s in spots]
+    np.testing.assert_allclose(errors.var(axis=0), expected, rtol=5 * np.sqrt(2 / DRAWS))
+
+
+def test_looks_taken_again_scatter_about_their_stops(dozen):
     """By 0.2 deg of pan and 0.1 of tilt, at every look another; stops, homings and play that err by nothing."""
     count = len(ordered_spots(dozen.campaign))
-    monkeypatch.setattr("tvsbayes.posterior.predictive.HOME_SD_DEG", 0.0)
+    none = np.zeros(dozen.arrays.spots.home_variance_rad2.shape)
+    dozen = replace(dozen, arrays=eqx.tree_at(lambda a: a.spots.home_variance_rad2, dozen.arrays, none))
     physical = np.zeros((DRAWS, len(NAMES)))
     physical[:, [INDEX[name] for name in names_of("look_scatter_deg")]] = 0.2, 0.1
     errors = taken_again_deg(dozen, physical, np.zeros((count, 2)), 5)

@@ -245,12 +245,12 @@ def test_a_report_does_not_use_the_fit_of_other_data(good, tmp_path, monkeypatch
     """`fit.json` of other data beside `draws.npz` of these: fit again, never combine."""
     folder = Path(shutil.copytree(good, tmp_path / "c"))
     data = read_campaign(folder)
-    assert StoredOrFitted(data, report_line).record.provenance.inputs == input_hashes(data)
+    assert StoredOrFitted(data, report_line).reported.record.provenance.inputs == input_hashes(data)
     change(folder / FIT, **{"inputs/spots": "0" * 64})
 
-    def fitted(campaign, tell, progress):
+    def fitted(campaign, why, tell, progress):
         raise NotConverged("not-converged", "fitted anew", remedy="-")
 
     monkeypatch.setattr("tvsbayes.pipeline._converged_fit", fitted)
     with pytest.raises(NotConverged, match="fitted anew"):
-        _ = StoredOrFitted(data, report_line).record
+        _ = StoredOrFitted(data, report_line).reported.record

@@ -50,7 +50,7 @@ def test_an_old_calibration_gives_the_same_points(name):
 
 
 def test_old_results_are_read_and_the_reason_of_a_new_fit_is_given(monkeypatch):
-    monkeypatch.setattr("tvsbayes.results.fit_record.version", lambda _: "0.2.0")
+    monkeypatch.setattr("tvsbayes.results.store.version_of", lambda _: "0.2.0")
     monkeypatch.setattr("tvsbayes.pipeline.compile_for", lambda _: None)
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
     messages: list[str] = []

@@ -7,8 +7,9 @@ import pytest
 from support.reported_twin import BATCH, PLANNED, evidence_of, stored
 from support.small_results import small_summary
 
-from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
+from tvsbayes.calibration.calibration_file import calibration_json, content_sha256
 from tvsbayes.errors import InputError
+from tvsbayes.pipeline import load_calibration
 from tvsbayes.report.evidence import CANNOT_TELL, MET, NOT_MET, Criterion, criterion
 from tvsbayes.report.scanner_document import criteria_table, report_document, verdict_of
 from tvsbayes.results.comparison_record import stored_hold_out

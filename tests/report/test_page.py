@@ -19,7 +19,6 @@ from msgspec import structs
 from support.reported_twin import PLANNED, Nodes, evidence_of, first_words, report_html, stored, words
 from support.small_results import estimate
 
-from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
@@ -28,6 +27,7 @@ from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
+from tvsbayes.pipeline import load_calibration
 from tvsbayes.report.document import Document, Issue, Section, Verdict
 from tvsbayes.report.fit_sections import _parameters
 from tvsbayes.report.page import BROWSERS, page_html, print_to_pdf, prose, replace_page, typeset

@@ -13,10 +13,10 @@ from support.commands import no_constant
 from support.small_campaign import small_campaign
 from support.small_results import small_draws, small_mode, small_record, small_summary
 
-from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.pipeline import load_calibration
 from tvsbayes.results.stored_draws import write_results
 
 

@@ -10,7 +10,13 @@ from support.refusals import refusal
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign_header import mechanism_key
-from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis, refuse_same_readings, write_axis
+from tvsbayes.single_axis.axis_campaign import (
+    axis_hashes,
+    axis_moves_bytes,
+    read_axis,
+    refuse_same_readings,
+    write_axis,
+)
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 
 TOML = 'format = "tvsbayes-axis/1"\nunit = "deg"\n'
@@ -35,6 +41,21 @@ def test_an_axis_folder_round_trips(tmp_path):
     assert mechanism_key(tmp_path / "a") == "axis"
 
 
+def test_limits_and_assumed_moves_are_kept_and_no_estimate_depends_on_the_limits(tmp_path):
+    moves = runs(1)
+    axis = campaign(moves, [0.01 * m.command for m in moves])
+    marked = replace(axis, limits=(-2500.0, 2400.5), moves=(replace(moves[0], assumed=1), *moves[1:]))
+    write_axis(marked, tmp_path / "a")
+    copy = read_axis(tmp_path / "a")
+    assert (copy.limits, copy.moves, copy.range_allowed) == ((-2500.0, 2400.5), marked.moves, (-2500.0, 2400.5))
+    assert axis_hashes(replace(axis, limits=copy.limits)) == axis_hashes(axis)
+    # Results of folders without the column stay valid.
+    assert axis_hashes(marked)["moves"] != axis_hashes(axis)["moves"] and b"assumed" not in axis_moves_bytes(axis.moves)
+    assert replace(copy, limits=None).range_allowed == (-2300.0, 2300.0), "the last move went there as well"
+    write_axis(replace(axis, moves=tuple(replace(m, assumed=int(m.command == 2300)) for m in moves)), tmp_path / "b")
+    assert read_axis(tmp_path / "b").range_allowed == (-2300.0, 2000.0)
+
+
 def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):
     axis = read_axis(folder(tmp_path / "a", "\ufeff" + TOML, MOVES.replace("\n", "\r\n")))
     assert axis.moves[1].command == 10.5
@@ -47,6 +68,18 @@ def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):
         ({"toml": TOML.replace("axis/1", "axis/2")}, "campaign.toml", 1, "format", "word"),
         ({"toml": TOML.replace('unit = "deg"', "")}, "campaign.toml", None, "unit", "missing-key"),
         ({"toml": TOML + "colour = 1\n"}, "campaign.toml", 3, "colour", "unknown-key"),
+        ({"toml": TOML + "[axis]\nlimits = [1, -1]\n"}, "campaign.toml", 4, "axis.limits", "range"),
+        ({"toml": TOML + "[axis]\nlimits = [1]\n"}, "campaign.toml", 4, "axis.limits", "range"),
+        ({"toml": TOML + "[axis]\nlimits = [0, 1e13]\n"}, "campaign.toml", 4, "axis.limits", "numbers"),
+        ({"toml": TOML + "[axis]\nlimits = true\n"}, "campaign.toml", 4, "axis.limits", "numbers"),
+        (
+            {
+                "moves": MOVES.replace("approach", "approach,assumed")
+                .replace("forward", "forward,2")
+                .replace(".5,", ".5,,")
+            },
+            *("moves.csv", 2, "assumed", "integer"),
+        ),
         ({"toml": TOML + "[axis]\nspeed = 1\n"}, "campaign.toml", 4, "axis.speed", "unknown-key"),
         ({"toml": TOML + "[axis]\nbacklash = 1\n"}, "campaign.toml", 4, "axis.backlash", "quantity"),
         (
@@ -110,3 +143,23 @@ def test_temperatures_start_at_absolute_zero(tmp_path):
     assert read_axis(folder(tmp_path / "a", moves=moves.format(-273.15))).moves[0].temperature_degC == -273.15
     with pytest.raises(InputError, match=r"temperature_degC.*-273\.15"):
         read_axis(folder(tmp_path / "b", moves=moves.format(-300)))
+
+
+def test_an_absolute_encoder_is_read_written_and_hashed(tmp_path):
+    plain = read_axis(folder(tmp_path / "a"))
+    kept = read_axis(folder(tmp_path / "b", TOML + "[axis]\nabsolute = true\n"))
+    assert kept.absolute and not plain.absolute
+    assert axis_hashes(kept)["axis"] != axis_hashes(plain)["axis"]
+    write_axis(kept, tmp_path / "c")
+    assert read_axis(tmp_path / "c").absolute
+    off = read_axis(folder(tmp_path / "d", TOML + "[axis]\nabsolute = false\n"))
+    assert axis_hashes(off) == axis_hashes(plain)
+
+
+@pytest.mark.parametrize(
+    ("line", "column"),
+    [("absolute = 1", "axis.absolute"), ("absolute = true\nhome_sd = { value = 0.1, u = 1.0 }", "axis.home_sd")],
+)
+def test_an_absolute_encoder_has_no_scatter_of_homings(tmp_path, line, column):
+    error = refusal(lambda: read_axis(folder(tmp_path / "a", TOML + f"[axis]\n{line}\n")))
+    assert error.column == column

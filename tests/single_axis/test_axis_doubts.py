@@ -37,6 +37,15 @@ def doubts(campaign: AxisCampaign) -> list[str]:
     return axis_warnings(campaign, rows_of(campaign))
 
 
+def test_moves_beyond_the_stated_limits_are_doubted_unless_an_import_added_them():
+    axis = replace(logged(), limits=(-2300.0, 2200.0))
+    beyond = [m.move for m in axis.moves if m.command > 2200]
+    (doubt,) = [doubt for doubt in doubts(axis) if "limits" in doubt]
+    assert f"moves {beyond[0]}" in doubt
+    added = tuple(replace(m, assumed=int(m.move in beyond)) for m in axis.moves)
+    assert not [doubt for doubt in doubts(replace(axis, moves=added)) if "limits" in doubt]
+
+
 def test_a_segment_counted_in_other_steps_is_named():
     whole = logged()
     mixed = replace(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.axes import FIRST_EDITION, campaign, drawn, random_moves, runs
@@ -19,8 +21,8 @@ def a_campaign(seed: int = 1) -> AxisCampaign:
     return drawn(seed, random_moves(seed, 36, 3), ratio_contrast=AxisPrior(3e-6, 1e-6)).campaign
 
 
-def dense(model, w):
-    """Covariance and residual of all rows, term by term."""
+def dense(model, w, absolute=False):
+    """Covariance and residual of all rows, term by term; an absolute zero walks from the first move on."""
     rows, at = model.rows, {k: float(v[0]) for k, v in model.coordinates.values(w).items()}
     sampled = model.play_is_sampled
     play = play_places(rows, np.array([at["backlash"] if sampled else 0.0]))
@@ -32,14 +34,15 @@ def dense(model, w):
     total = at["transmission_error"] ** 2 * k + 0.25 * at["play_variation"] ** 2 * k * np.outer(share, share)
     for i in range(len(x)):
         for j in range(len(x)):
-            if rows.segment[i] != rows.segment[j]:
+            if rows.segment[i] != rows.segment[j] and not absolute:
                 continue
             hours = np.cumsum(np.where(rows.segment == rows.segment[i], rows.hours, 0.0))
+            hours = rows.time_s / 3600.0 if absolute else hours
             total[i, j] += at["drift_per_root_hour"] ** 2 * min(hours[i], hours[j])
             low, high = sorted((i, j))
             if not rows.redrawn[low + 1 : high + 1].any():
                 total[i, j] += at["stop_sd.forward" if rows.side[i] > 0 else "stop_sd.backward"] ** 2
-            if rows.segment[i] > 0:
+            if rows.segment[i] > 0 and not absolute:
                 total[i, j] += at["home_sd"] ** 2
     total += np.diag(at["reading_scale"] ** 2 * rows.variance + (axis_model.FLOOR * rows.travel) ** 2)
     g = anchor - model.middle
@@ -56,13 +59,14 @@ def dense(model, w):
     return total, residual - (0.5 * side * at["backlash"] if sampled else 0.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_filter_is_the_dense_gaussian(seed):
-    model = model_of(a_campaign(seed))
+@pytest.mark.parametrize(("seed", "absolute"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
+def test_the_filter_is_the_dense_gaussian(seed, absolute):
+    model = model_of(replace(a_campaign(seed), absolute=absolute))
+    assert ("home_sd" in model.coordinates.names) is not absolute
     w = 0.4 * np.random.default_rng(seed).standard_normal((4, len(model.coordinates.names)))
     values = model.log_likelihood(w)
     for k in range(4):
-        total, residual = dense(model, w[k : k + 1])
+        total, residual = dense(model, w[k : k + 1], absolute)
         sign, log_det = np.linalg.slogdet(2 * np.pi * total)
         wanted = -0.5 * (log_det + residual @ np.linalg.solve(total, residual))
         # 36 rows of condition 1e10: the two solutions differ by rounding.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 
 import numpy as np
 import pytest
 from support.axes import PLACES, drawn, runs
+from support.stored_fits import npz
 
 from tvsbayes.errors import InputError
 from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
@@ -84,31 +84,26 @@ def test_strata_have_the_band_of_all_draws(kept):
     assert np.abs((ends - expected) / sd).max() < allowed < 1.1
 
 
-def npz(**arrays):
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)
-    return stream.getvalue()
-
-
 @pytest.mark.parametrize(
     "change",
     [
-        lambda data, w: data[: len(data) // 2],
-        lambda data, w: b"",
-        lambda data, w: npz(draws=w),
-        lambda data, w: npz(w=w[:, 1:]),
-        lambda data, w: npz(w=w[:1]),
-        lambda data, w: npz(w=np.where(w == w.max(), np.inf, w)),
-        lambda data, w: npz(w=w.astype(str)),
+        lambda data, w, tie: data[: len(data) // 2],
+        lambda data, w, tie: b"",
+        lambda data, w, tie: npz(draws=w, **tie),
+        lambda data, w, tie: npz(w=w[:, 1:], **tie),
+        lambda data, w, tie: npz(w=w[:1], **tie),
+        lambda data, w, tie: npz(w=np.where(w == w.max(), np.inf, w), **tie),
+        lambda data, w, tie: npz(w=w.astype(str), **tie),
     ],
     ids=["cut", "empty", "without w", "narrow", "one draw", "infinite", "text"],
 )
 def test_damaged_draws_are_refused(kept, copied, change):
     file = copied / "results" / "draws.npz"
-    file.write_bytes(change(file.read_bytes(), kept[1].w))
+    tie = {"fit_id": json.loads((copied / "results" / "fit.json").read_bytes())["fit_id"]}
+    file.write_bytes(change(file.read_bytes(), kept[1].w, tie))
     with pytest.raises(InputError) as caught:
         results_for(read_axis(copied))
-    assert (caught.value.code, caught.value.file) == ("damaged", "results/draws.npz")
+    assert (caught.value.code, caught.value.file) == ("damaged-results", "results/draws.npz")
     assert "tvsbayes fit" in caught.value.remedy
 
 

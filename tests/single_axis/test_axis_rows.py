@@ -7,9 +7,8 @@ import pytest
 from support.axes import campaign, random_moves, runs
 
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.instrument.column_names import DEGREES
 from tvsbayes.single_axis import axis_rows
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_campaign import DEGREES, AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import legs_are_long, play_places, reversal_of, rows_of, turn_jumps
 from tvsbayes.single_axis.classic_line import iso230_figures
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.axes import campaign, drawn, runs
 
+from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.single_axis.axis_campaign import AxisStop, Reading, read_axis
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
@@ -32,8 +33,46 @@ def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
     for stop in plan.next:
         for command in (stop.command, stop.via):
             assert command is None or -2300 <= command <= 2300
-    assert plan.plan_bytes().startswith(b"step,command,direction,read\n0,")
+    assert plan.plan_bytes().startswith(b"# plan by tvsbayes\nstep,command,direction,read\n0,")
     json.dumps(plan.as_json(), allow_nan=False)
+
+
+LOG = "position_mm,direction,dial_mm\n" + "".join(
+    f"{at},{word},{at + (0.1 if word == 'backward' else 0.0) + 0.01 * np.sin(7 * at + run):.4f}\n"
+    for run in range(2)
+    for word, places in (("forward", range(0, 101, 10)), ("backward", range(100, -1, -10)))
+    for at in places
+)
+"""A log of runs whose turns lie where it does not say: `import` adds moves past both ends."""
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "log.csv"
+    path.write_text(LOG)
+    assert run(["import", str(path), "--axis", "--to", str(path.parent / "axis"), "--yes"]) == 0
+    return read_axis(path.parent / "axis")
+
+
+def asked(plan) -> list[float]:
+    """All commands of a plan."""
+    return [command for stop in plan.next for command in (stop.command, stop.via) if command is not None]
+
+
+def test_no_plan_goes_where_an_import_thought_that_the_axis_was(imported):
+    added = [move.command for move in imported.moves if move.assumed]
+    assert added and not any(0 <= command <= 100 for command in added)
+    fit = fit_axis(imported, tier="importance")
+    for target in ("per_command", "position"):
+        assert min(asked(plan := plan_next(fit, target))) >= 0 and max(asked(plan)) <= 100 and len(plan.next) == 8
+
+
+def test_a_plan_stays_within_stated_limits_wherever_the_axis_was(fitted):
+    """Whole commands stay whole between limits that are not."""
+    fit = replace(fitted, campaign=replace(fitted.campaign, limits=(-1500.4, 900.7)))
+    commands = asked(plan_next(fit, "per_command"))
+    assert -1500 <= min(commands) < -1300 and max(commands) <= 900
+    assert all(command == round(command) for command in commands)
 
 
 @pytest.mark.parametrize("target", ["per_command", "effective_per_command", "backlash"])
@@ -98,7 +137,7 @@ def test_an_unusable_last_reading_does_not_change_the_gains(turned):
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 def test_a_stop_to_be_read_moves_neither_line_nor_reversal(turned, direction):
     rows = rows_of(turned)
-    via = _run_up_start(turned.moves, 45.0, SIDES[direction])
+    via = _run_up_start(turned, 45.0, SIDES[direction])
     more = rows_of(_with_stop(turned, rows, AxisStop(via, 45.0, direction), 60.0))
     assert len(more.value) == len(rows.value) + 1
     # Least squares of a point on the line, by another factorisation.

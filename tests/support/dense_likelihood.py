@@ -134,6 +134,7 @@ def side(directions: tuple[str, ...]) -> int:
 def angle_covariances(campaign: Campaign, values: dict[str, float], *, persistent: bool = True) -> np.ndarray:
     """Covariance of what the angles (pan, tilt) of all ordered spots are off by, rad^2, shape (2, n, n)."""
     moves, spots = campaign.moves, ordered_spots(campaign)
+    homings_deg = dict.fromkeys(SENSES, HOME_SD_DEG) | campaign.rig.stated_home_sd_deg
     homing_h = {m.segment: m.time_s / 3600 for m in reversed(moves)}
     covariances = np.zeros((2, len(spots), len(spots)))
     for axis, name in enumerate(SENSES):
@@ -146,10 +147,13 @@ def angle_covariances(campaign: Campaign, values: dict[str, float], *, persisten
                 shared = 0.0
                 if number == number_there and (persistent or first.move == second.move):
                     shared += np.mean([values[f"stop_sd_deg.{d}"] ** 2 for d in directions])
+                # The zero of an absolute encoder is one for all segments, and walks from the first move on.
+                absolute, hours = name in campaign.rig.absolute, min(one.time_s, other.time_s) / 3600
                 if one.segment == other.segment:
-                    shared += HOME_SD_DEG**2 * (one.segment > 0)
+                    shared += homings_deg[name] ** 2 * (one.segment > 0 and not absolute)
                     shared += band_sd[first.move] * band_sd[second.move]
-                    hours = min(one.time_s, other.time_s) / 3600 - homing_h[one.segment]
+                if one.segment == other.segment or absolute:
+                    hours -= homing_h[0 if absolute else one.segment]
                     shared += values[f"drift_deg_per_root_hour.{name}"] ** 2 * hours
                 at, there = getattr(one, f"{name}_steps"), getattr(other, f"{name}_steps")
                 shared += values[f"look_scatter_deg.{name}"] ** 2 * (i == j)

@@ -61,6 +61,6 @@ def proposing(
     return Ahead(laplace, proposal, sampled, accepted)
 
 
-def given_rig(sheet: str, step: int, ratio: float, accepted: bool, rig: Path, *rest: object) -> Ahead:
+def given_rig(sheet: str, step: int, ratio: float, accepted: bool, rig: Path, *rest: object, planned: object) -> Ahead:
     """In place of the function of the command, which is given the rig file too."""
     return proposing(sheet, step, ratio, accepted, *rest)

@@ -24,12 +24,13 @@ from hypothesis import HealthCheck, given, note, settings
 from hypothesis import strategies as st
 from support.fit_documents import changed, kept
 from support.small_campaign import seen_steps, small_campaign
+from support.stored_fits import calibration_bytes
 
 from tvsbayes.acquisition.journal import Journal, encode, read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.assessment.fitted_calibration import calibration_of_draws
-from tvsbayes.calibration.calibration_file import calibration_bytes, read_draws
+from tvsbayes.calibration.calibration_file import read_draws
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.errors import TvsError

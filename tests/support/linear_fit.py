@@ -78,7 +78,7 @@ def spot_arrays(readings: bool) -> SpotArrays:
     # A spot of the padding does not count.
     aperture[[1, -1]] = readings, 1.0
     shapes = {"pixels": (4,), "whitening": (4, 4), "aperture_rad": (), "triangulated_mm": (3,), "weight": ()}
-    shapes |= {"redraw_mix": (2, 2), "hours": ()}
+    shapes |= {"redraw_mix": (2, 2), "hours": (2,), "home_variance_rad2": (2,)}
     with jax.enable_x64(True):
         return SpotArrays(
             move_index=placed(np.zeros(size, np.int32)),
@@ -86,7 +86,7 @@ def spot_arrays(readings: bool) -> SpotArrays:
             valid=placed((np.arange(size) < SPOTS).astype(float)),
             redraw=placed(redraw),
             new_segment=placed(np.arange(size) == 0),
-            homed=placed(np.zeros(size, bool)),
+            new_zero=placed(np.tile(np.arange(size)[:, None] == 0, 2)),
             **{name: placed(np.zeros((size, *shape))) for name, shape in shapes.items()},
         )
 

@@ -12,16 +12,15 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.cli.main import run
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.report import figures
 from tvsbayes.report.document import Issue
 from tvsbayes.report.evidence import Evidence, gather
 from tvsbayes.report.page import page_html
 from tvsbayes.report.scanner_document import report_document
-from tvsbayes.results.fit_record import read_fit
 from tvsbayes.results.plan_record import PLAN_FORMAT
 
 TWIN = shipped_data() / "twins" / "paper_twin"
@@ -92,9 +91,10 @@ def stored(place: Path, documents: Mapping[str, object]) -> Iterator[None]:
 
 
 def evidence_of(place: Path) -> Evidence:
-    record = read_fit(place / "results" / "fit.json")
+    campaign = read_campaign(place)
+    record, calibration, ratios = StoredOrFitted(campaign).reported
     limits = {"range_mm": 1000.0, "limit_deg_per_step": 1e-3, "limit_mm": 1.0}
-    return gather(read_campaign(place), record, load_calibration(place), **limits)
+    return gather(campaign, record, calibration, ratios_deg_per_step=ratios, **limits)
 
 
 def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:

@@ -21,6 +21,7 @@ from tvsbayes.instrument.parameters import (
     LOOK_SCATTER_NAMES,
     STEREO_PARAMETER_NAMES,
     Prior,
+    names_of,
 )
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.protocols import grid_protocol
@@ -76,6 +77,21 @@ def test_home_offsets(rig):
     offsets = np.array(simulate(rig, plan, 1).truth.home_offsets_deg)
     assert np.array_equal(offsets[0], [0.0, 0.0])
     assert np.std(offsets[1:]) == pytest.approx(HOME_SD_DEG, rel=4 / np.sqrt(2 * 798))
+
+
+def test_homings_are_as_the_rig_states(rig):
+    """An absolute zero is set by none and drifts on; the other axis' homings scatter as stated."""
+    table = replace(rig.table, absolute=("pan",), stated_home_sd_deg={"tilt": 0.2})
+    plan = steps(*[("home", 0, 0), ("move", 100, 50)] * 400)
+    truth = draw_truth(rig, np.random.default_rng(0)).with_gears()
+    drifts = names_of("drift_deg_per_root_hour")
+    truth = replace(truth, parameters=truth.parameters | dict.fromkeys(drifts, 0.02))
+    costs_s = {"move_s": 60.0, "look_s": 0.0, "placement_s": 0.0}
+    realised = simulate(replace(rig, table=table, costs_s=costs_s), plan, 1, truth).truth
+    offsets, drift = np.array(realised.home_offsets_deg), np.array(realised.drift_deg)
+    assert not offsets[:, 0].any()
+    assert np.std(offsets[1:, 1]) == pytest.approx(0.2, rel=4 / np.sqrt(2 * 399))
+    assert not drift[::2, 1].any() and drift[2::2, 0].all()
 
 
 def test_homing_ends_on_the_side_that_it_states(fixed):

@@ -12,12 +12,10 @@ Times in the events: UTC for people, `time_s` for the campaign (seconds since th
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
 import os
 import re
-import sys
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,7 +25,7 @@ import msgspec
 
 from tvsbayes.acquisition.journal_events import FRAME_NAME, Event, Frame
 from tvsbayes.errors import DeviceFault, InputError, escaped, fault, refusal
-from tvsbayes.files.disk import flush_folder, make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import flush_folder, locked, make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import parse_json
 
 LOG = "log.jsonl"
@@ -409,20 +407,10 @@ def _disk_fault(error: OSError) -> DeviceFault:
 def _lock(descriptor: int) -> None:
     """Refuses a second writer; the lock ends with the process in every case."""
     try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            # The lock lies far beyond the end, so that readers are not locked out.
-            os.lseek(descriptor, LOG_BYTES_MAX + 1, os.SEEK_SET)
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        is_alone = locked(descriptor)
     except OSError as error:
-        # Errors of flock(2) and _locking for a held lock; any other error means a disk without locks.
-        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK):
-            found, allowed = escaped(error.strerror or str(error)), "a disk that can lock files"
-            raise refusal("lock", file=LOG, found=found, allowed=allowed, remedy="use a local disk") from error
+        found, allowed = escaped(error.strerror or str(error)), "a disk that can lock files"
+        raise refusal("lock", file=LOG, found=found, allowed=allowed, remedy="use a local disk") from error
+    if not is_alone:
         allowed, remedy = "one program at a time", "wait for the other, or end it"
-        raise refusal("locked", file=LOG, found="another writer", allowed=allowed, remedy=remedy) from error
+        raise refusal("locked", file=LOG, found="another writer", allowed=allowed, remedy=remedy)

@@ -14,7 +14,6 @@ import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from tvsbayes.files.csv_kind import Column
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX
+from tvsbayes.files.packages import own_version
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import CAMERAS, MOVES, PIXEL_SDS, SPOTS, Campaign, Look, Move, read_campaign
 
@@ -117,7 +117,7 @@ def _put(group: Any, name: str, value: object, unit: str = "", **attributes: obj
 def _entry(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
     header = campaign.header
     _put(entry, "title", campaign.title)
-    _put(entry, "program_name", "tvsbayes", version=metadata.version("tvsbayes"))
+    _put(entry, "program_name", "tvsbayes", version=own_version())
     created = header.get("created")
     if created is not None:
         _put(entry, "start_time", created.isoformat() if hasattr(created, "isoformat") else str(created))

@@ -20,7 +20,7 @@ import numpy as np
 
 from tvsbayes.acquisition.journal_events import TrueAngles
 from tvsbayes.cameras.capture import StereoImage
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
@@ -181,12 +181,15 @@ class _Gear:
         self._take_up()
         self.stop_error_deg = self._p[f"stop_sd_deg.{sense}"] * normal
 
-    def set_home(self, steps: int, offset_deg: float) -> None:
-        """Set the counter at the home switch: from here on the angle is ratio x counter + offset, without drift."""
+    def set_home(self, steps: int, offset_deg: float, keeps_zero: bool) -> None:
+        """Set the counter at the home switch: from here on the angle is ratio x counter + offset.
+
+        Without drift, unless the encoder `keeps_zero`.
+        """
         angle = self._p[f"degrees_per_step.{self._axis}"] * steps + offset_deg
         self._output_deg += angle - self._driving_deg
         self._driving_deg, self._place_deg = angle, angle - offset_deg
-        self._drift_deg, self.from_switch = 0.0, True
+        self._drift_deg, self.from_switch = self._drift_deg if keeps_zero else 0.0, True
         self._take_up()
 
     def drift(self, now_us: int, normal: float) -> None:
@@ -268,11 +271,13 @@ class Instrument:
 
     def _found_home(self, axis: int) -> None:
         """Set the counter of an axis, with a new home offset, 0 in the first segment."""
-        offset = 0.0 if axis in self._unhomed else HOME_SD_DEG * self._homes.standard_normal()
+        keeps_zero = AXES[axis] in self.rig.table.absolute
+        sd_deg = self.rig.table.home_sd_deg[axis]
+        offset = 0.0 if axis in self._unhomed else sd_deg * self._homes.standard_normal()
         self._unhomed.discard(axis)
         gear = self._gears[axis]
         gear.drift(self.clock.now_us, self._drifts.standard_normal())
-        gear.set_home(self.mechanics.home_steps[axis], offset)
+        gear.set_home(self.mechanics.home_steps[axis], offset, keeps_zero)
 
     def state_deg(self) -> TrueAngles:
         """Return the true angles for a row of moves.csv.

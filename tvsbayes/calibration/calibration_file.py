@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import io
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict, cast
 
@@ -23,11 +21,12 @@ from tvsbayes.calibration.frames import EXTRINSICS_NAMES, NO_POSE, extrinsics_of
 from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.instrument.campaign import Campaign, input_hashes
+from tvsbayes.files.packages import own_version
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.mechanisms import MECHANISMS
 
 CALIBRATION_FORMAT = "tvsbayes-calibration/2"
@@ -36,6 +35,7 @@ FORMATS = ("tvsbayes-calibration/1", CALIBRATION_FORMAT)
 NO_CALIBRATION = "no-calibration"
 """Code of the refusal of valid results without a calibration."""
 NAME_CHARS_MAX = 200
+DRAWS = Path("draws.npz")
 _ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
 
 
@@ -87,8 +87,8 @@ class CalibrationDocument(TypedDict):
     origin: NotRequired[dict[str, str]]
 
 
-def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
-    """Write the content of `draws.npz`: a calibration and further arrays."""
+def calibration_arrays(calibration: Calibration) -> dict[str, np.ndarray]:
+    """A calibration as arrays of `draws.npz`."""
     tables = _Tables(
         noise_variance=calibration.noise_variance,
         overshoot_steps=calibration.overshoot_steps,
@@ -97,19 +97,16 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
         causes=list(calibration.causes),
         gear_steps=_gear_steps(calibration),
     )
-    arrays = {name: getattr(calibration, name) for name in _ARRAYS} | more
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        format=CALIBRATION_FORMAT,
-        input_names=np.array(calibration.names),
-        noise_names=np.array(NOISE_NAMES),
-        estimator=calibration.estimator,
-        azimuth=calibration.azimuth,
-        tables=json.dumps(tables),
-        **arrays,
-    )
-    return buffer.getvalue()
+    others = {
+        "format": CALIBRATION_FORMAT,
+        "input_names": calibration.names,
+        "noise_names": NOISE_NAMES,
+        "estimator": calibration.estimator,
+        "azimuth": calibration.azimuth,
+        "tables": json.dumps(tables),
+    }
+    arrays = {name: getattr(calibration, name) for name in _ARRAYS}
+    return {name: np.asarray(value) for name, value in {**arrays, **others}.items()}
 
 
 KNOWN_INPUTS = {each.named(INPUT_NAMES) for each in MECHANISMS.values()}
@@ -148,7 +145,7 @@ class Origin:
         """Build the origin of a campaign's calibration exported today."""
         created, today = campaign.header.get("created"), datetime.datetime.now(datetime.UTC).date()
         measured = created.isoformat() if isinstance(created, datetime.date) else ""
-        return cls(campaign.title, measured, today.isoformat(), version("tvsbayes"))
+        return cls(campaign.title, measured, today.isoformat(), own_version())
 
 
 def content_sha256(document: Mapping[str, object]) -> str:
@@ -160,7 +157,7 @@ def content_sha256(document: Mapping[str, object]) -> str:
 def calibration_json(calibration: Calibration, origin: Origin | None = None) -> CalibrationDocument:
     """Build the JSON of a calibration without its draws, for a ROS node or another language.
 
-    `load_calibration` reads it. `origin` is added with the SHA-256 of all other content. Numbers have `DIGITS`.
+    `read_calibration_json` reads it. `origin` is added with the SHA-256 of all other content. Numbers have `DIGITS`.
     """
     document = _plain(_document(calibration))
     if origin is not None:
@@ -234,35 +231,6 @@ def expected_error(calibration: Calibration) -> ExpectedError:
     return ExpectedError(pan, tilt, azimuth, elevation, at_1_m)
 
 
-def load_calibration(path: Path | str) -> Calibration:
-    """Load a calibration with NumPy alone.
-
-    Args:
-        path: a campaign folder with `results/`, its `results` folder, a `draws.npz`, or the JSON that
-            `tvsbayes steps-for CAMPAIGN --export json` prints.
-
-    Returns:
-        A calibration: `.ray(pan_steps, tilt_steps)` is the beam, `.locate(..., aperture_deg)` the point in mm with
-        its covariance, `.steps_for(xyz_mm)` the counters to go to; from JSON without the draws that
-        `tvsbayes.locate` needs.
-
-    Raises:
-        InputError: there is no such file, or tvsbayes did not write it.
-    """
-    path = Path(path)
-    if path.is_dir():
-        inner = path / "results" / "draws.npz"
-        path = inner if inner.exists() or not (path / "draws.npz").exists() else path / "draws.npz"
-    if not path.exists():
-        allowed = "a campaign folder with results/, a draws.npz, or the JSON of `steps-for --export json`"
-        remedy = "run `tvsbayes fit` on the campaign first, or correct the path"
-        name = escaped(str(path), 200)
-        raise refusal("missing-file", file=name, found="no such file", allowed=allowed, remedy=remedy)
-    if path.suffix == ".json":
-        return _from_json(path)
-    return read_draws(path)
-
-
 def damaged_calibration(path: Path, reason: object) -> InputError:
     """Build the refusal of a file that tvsbayes did not write."""
     return InputError(
@@ -301,17 +269,33 @@ def _shaped(calibration: Calibration) -> Calibration:
 
 
 def read_draws(path: Path) -> Calibration:
-    """Read `draws.npz`; errors as in `load_calibration`."""
+    """Read a `draws.npz` by itself.
+
+    Raises:
+        InputError: it holds no calibration that tvsbayes wrote.
+    """
     try:
-        file = read_arrays(path, RESULTS_BYTES_MAX)
-        if "format" not in file and "physical" in file:
-            raise InputError(
-                NO_CALIBRATION,
-                f"{escaped(path.name)} holds draws and no calibration: its fit did not converge, or an older "
-                "tvsbayes wrote it",
-                file=escaped(path.name),
-                remedy="run `tvsbayes fit` on the campaign again",
-            )
+        arrays = read_arrays(path, RESULTS_BYTES_MAX)
+    except ValueError as error:
+        raise damaged_calibration(path, error) from error
+    calibration = calibration_of_arrays(arrays, path)
+    if calibration is None:
+        raise no_calibration(path)
+    return calibration
+
+
+def no_calibration(path: Path = DRAWS) -> InputError:
+    """Build the refusal of results whose fit left draws alone."""
+    name = escaped(path.name)
+    message = f"{name} holds draws and no calibration: its fit did not converge, or an older tvsbayes wrote it"
+    return InputError(NO_CALIBRATION, message, file=name, remedy="run `tvsbayes fit` on the campaign again")
+
+
+def calibration_of_arrays(file: Mapping[str, np.ndarray], path: Path = DRAWS) -> Calibration | None:
+    """Build the calibration in `draws.npz`, None where its fit did not converge; errors as in `read_draws`."""
+    if "format" not in file and "physical" in file:
+        return None
+    try:
         names = tuple(file["input_names"].tolist())
         columns = names in KNOWN_INPUTS and file["noise_names"].tolist() == list(NOISE_NAMES)
         if str(file["format"]) not in FORMATS or not columns:
@@ -350,7 +334,8 @@ def _tables(text: str, path: Path) -> _Tables:
         raise damaged_calibration(path, f"its tables are no JSON of tvsbayes: {error.found}") from error
 
 
-def _from_json(path: Path) -> Calibration:
+def read_calibration_json(path: Path) -> Calibration:
+    """Read what `calibration_json` made; errors as in `read_draws`."""
     keys = parse_json(read_bytes(path, RESULTS_BYTES_MAX), escaped(path.name))
     known = keys.word("format", FORMATS)
     convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
@@ -387,42 +372,3 @@ def _from_json(path: Path) -> Calibration:
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise damaged_calibration(path, error) from error
-
-
-def stored_calibration(campaign: Campaign) -> Calibration | None:
-    """Read the calibration in `results/` of a campaign folder, if it was made from exactly these data and priors.
-
-    It is None also where the results have no calibration (`NO_CALIBRATION`).
-
-    Raises:
-        InputError: the results are damaged.
-    """
-    path = None if campaign.path is None else campaign.path / "results" / "draws.npz"
-    if path is None or not path.exists():
-        return None
-    try:
-        calibration = read_draws(path)
-    except InputError as error:
-        if error.code == NO_CALIBRATION:
-            return None
-        raise
-    return calibration if calibration.inputs_sha256 == input_hashes(campaign) else None
-
-
-def stored_ratios(campaign: Campaign) -> dict[str, np.ndarray]:
-    """Read draws (n,) of the effective ratios from `results/`, deg/step, by direction.
-
-    Raises:
-        InputError: the draws are missing or damaged.
-    """
-    if campaign.path is None:
-        raise damaged_calibration(Path("draws.npz"), "the campaign has no folder")
-    path = campaign.path / "results" / "draws.npz"
-    try:
-        file = read_arrays(path, RESULTS_BYTES_MAX)
-        draws = np.array(file["effective_deg_per_step"], dtype=float)
-    except (KeyError, TypeError, ValueError) as error:
-        raise damaged_calibration(path, error) from error
-    if draws.ndim != 2 or draws.shape[1] != 4 or not np.all(np.isfinite(draws)):
-        raise damaged_calibration(path, ValueError("effective_deg_per_step"))
-    return dict(zip(DIRECTIONS, draws.T, strict=True))

@@ -20,14 +20,15 @@ from tvsbayes.cameras.picture_pairs import (
     Pairing,
     Picture,
     Size,
-    is_direction,
+    direction_of,
+    is_experiment,
     natural_order,
     read_folder,
 )
 from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, IMAGE_PIXELS_MAX, PNG_SIGNATURE, decode_image, png_bytes
-from tvsbayes.instrument.campaign import CAMERAS, SPOTS, UNDETECTED, Spot, frame_name
+from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Spot, frame_name
 from tvsbayes.progress import Advance, unshown
 
 Matching = Literal["number", "order"]
@@ -58,7 +59,7 @@ class View:
         """Whether one of its numbers counts experiments, not moves: exp01_P1."""
         number = list(_NUMBER.finditer(self.name))[position]
         word = re.search(r"([a-z]+)[ _.#-]*$", self.name[: number.start()].lower())
-        return word is not None and word[1] in SPOTS["experiment"].names.split()
+        return word is not None and is_experiment(word[1])
 
     def without_number(self, position: int) -> str:
         """The name without one of its numbers: the rest may name the sheet."""
@@ -208,7 +209,7 @@ def _are_experiments(views: Sequence[View], slot: int, names: Sequence[str]) -> 
     """Whether numbers that repeat are those of experiments, by the word before them or a direction beside them."""
     if len({view.numbers[slot] for view in views}) == len(views):
         return False
-    directed = any(is_direction(word) for name in names for word in re.findall("[a-z]+", name.lower()))
+    directed = any(direction_of(word) for name in names for word in re.findall("[a-z]+", name.lower()))
     return directed or any(view.is_of_experiment(slot) for view in views)
 
 

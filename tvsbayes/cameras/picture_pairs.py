@@ -23,7 +23,8 @@ from typing import NamedTuple
 from tvsbayes.errors import Candidate, InputError, all_of, escaped, listed, question, refusal
 from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size
-from tvsbayes.instrument.campaign import CAMERAS, SPOTS
+from tvsbayes.importing.words import vocabulary
+from tvsbayes.instrument.campaign import CAMERAS
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 OTHER_SUFFIXES = (".bmp", ".pgm", ".ppm", ".pnm", ".tif", ".tiff", ".webp")
@@ -265,9 +266,6 @@ CAMERA, INSIDE, LETTER, DIRECTION, BESIDE_LETTERS = 5, 4, 3, 2, 1
 _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\dA-Za-z_]+")
 
 
-_EXPERIMENT = frozenset(SPOTS["experiment"].names.split())
-
-
 @cache
 def _words() -> dict[str, frozenset[str]]:
     content = tomllib.loads((shipped_data() / "words" / "pictures.toml").read_text("utf-8"))
@@ -295,10 +293,16 @@ def _side_of(word: str) -> str:
     return ""
 
 
-def is_direction(word: str) -> bool:
-    """Whether a word names a direction of motion: left, up."""
-    words = _words()
-    return len(word) > 1 and any(word in words[name] for name in (*CAMERAS, "direction"))
+def is_experiment(word: str) -> bool:
+    """Whether a number behind a word counts experiments: exp01."""
+    return (word,) in vocabulary("experiment", "looks.toml")
+
+
+def direction_of(word: str) -> str:
+    """The direction of motion that a word names: left, right, up, down; "" for none."""
+    if len(word) == 1:
+        return ""
+    return next((name for name in (*CAMERAS, "up", "down") if word in _words()[name]), "")
 
 
 def _marks(path: str, numbered: frozenset[str]) -> list[_Mark]:
@@ -326,9 +330,9 @@ def _marks(path: str, numbered: frozenset[str]) -> list[_Mark]:
             elif side and word not in words[side] and len(word) < 8 and any(c in word for c in words["camera"]):
                 rank = CAMERA
             elif side:
-                is_prefix = depth > 1 or k == 0 or after in _EXPERIMENT
+                is_prefix = depth > 1 or k == 0 or is_experiment(after)
                 rank = INSIDE if not is_prefix else LETTER if len(word) == 1 else DIRECTION
-            elif word in words["direction"]:
+            elif direction_of(word):
                 rank = DIRECTION
             elif k == 0 and word in words["direction_letter"]:
                 rank = BESIDE_LETTERS
@@ -434,7 +438,9 @@ def _guessed(images: Sequence[str], named: Named, pairing: Pairing) -> dict[str,
     if len(numbers) == 2:
         of_number = dict(zip(numbers, pairing.sides, strict=True))
         guesses.append({n: Key(stems[n][: m.start()], of_number[int(m[1])]) for n, m in last.items()})
-    if len(folders) == 2:
+    if len(folders) == 2 and not any(
+        direction_of(word) for name in folders for word in re.findall("[a-z]+", name.lower())
+    ):
         of_folder = dict(zip(folders, pairing.sides, strict=True))
         parts = {name: stem.rpartition("/") for name, stem in stems.items()}
         guesses.append({name: Key(part[2], of_folder[part[0]]) for name, part in parts.items()})
@@ -463,15 +469,16 @@ def _question(folder: Path, guessed: Named, wide: bool = False) -> InputError:
     groups = [[name for name, key in complete.items() if key.side == side] for side in CAMERAS]
     globs = [_glob(folder, own) for own in groups]
     first = [escaped(own[0], 80) if own else "none" for own in groups]
+    pattern = f"**/*{Path(first[0]).suffix}"
+    both = Candidate("each holds the images of both", ("--left", pattern, "--right", pattern))
     answers = [
         Candidate(f"{first[k]} is the left camera's", ("--left", globs[k], "--right", globs[1 - k])) for k in (0, 1)
     ]
     found = f"names that do not say which camera took {first[0]} and which {first[1]}, or which belong together"
     if wide:
         found = f"{first[0]} and {first[1]}, twice as wide as high: of two cameras each, or of one"
-        pattern = f"**/*{Path(first[0]).suffix}"
-        both = Candidate("each holds the images of both", ("--left", pattern, "--right", pattern))
-        answers = [both, answers[0]]
+        answers = answers[:1]
+    answers.append(both)
     allowed = f"{NAMING}; or patterns of both cameras, whose pictures then pair in the order of their names"
     return question(file=escaped(str(folder), 200), found=found, allowed=allowed, candidates=answers)
 

@@ -123,6 +123,7 @@ def acquire(
     from tvsbayes.acquisition.replanning import AdaptOptions
     from tvsbayes.acquisition.running_estimate import EstimateOptions
     from tvsbayes.acquisition.session import acquire as run_plan
+    from tvsbayes.instrument.plan import counters_planned
 
     placement = None if place_command is None else PlaceCommand.parsed(place_command, place_seconds)
     vision = Vision()
@@ -140,7 +141,9 @@ def acquire(
             laser_class=laser_class,
             seed=seed or 0,
             estimate=EstimateOptions(laplace_estimate, target_u, estimate),
-            adapt=AdaptOptions(partial(propose_looks, rig), minutes) if adapt else None,
+            adapt=AdaptOptions(partial(propose_looks, rig, planned=counters_planned(steps)), minutes)
+            if adapt
+            else None,
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
             live=live_run,
@@ -168,8 +171,16 @@ def laplace_estimate(folder: Path, looks: int) -> Estimate:
     return Estimate.of(looks, {direction: e for direction, e in summary.effective.items() if e is not None})
 
 
-def propose_looks(rig: Path, folder: Path, looks: int, target_u: float, count: int, confirm_below: float) -> Ahead:
-    """The best next looks of a campaign; called in a process parallel to the run.
+def propose_looks(
+    rig: Path,
+    folder: Path,
+    looks: int,
+    target_u: float,
+    count: int,
+    confirm_below: float,
+    planned: dict[str, tuple[int, int]] | None = None,
+) -> Ahead:
+    """The best next looks of a campaign; called in a process parallel to the run, which may make counters as planned.
 
     Raises:
         TvsError: no campaign, or a fit that must not be used.
@@ -182,7 +193,8 @@ def propose_looks(rig: Path, folder: Path, looks: int, target_u: float, count: i
 
     compile_for(no_output)
     target = parse_target(f"u(worst) <= {target_u:g} deg/step")
-    looks_ahead = next_looks(fit(read_campaign(folder)), read_rig(rig), target, count, confirm_below=confirm_below)
+    data, allowed = fit(read_campaign(folder)), {"confirm_below": confirm_below, "planned": planned}
+    looks_ahead = next_looks(data, read_rig(rig), target, count, **allowed)
     return proposal_of(looks_ahead, looks)
 
 

@@ -15,7 +15,9 @@ import typer
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import styled
 from tvsbayes.errors import InputError, Question, TvsError, escaped, refusal, typed
-from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.disk import make_folder, write_atomically, write_folder
+from tvsbayes.files.own_outputs import require_own
+from tvsbayes.files.packages import own_version
 
 INTERRUPTED = 130
 TARGET_MISSED = 1
@@ -32,9 +34,7 @@ app = typer.Typer(
 
 def _print_version(requested: bool) -> None:
     if requested:
-        from importlib.metadata import version
-
-        _print(f"tvsbayes {version('tvsbayes')}")
+        _print(f"tvsbayes {own_version()}")
         raise typer.Exit
 
 
@@ -49,6 +49,7 @@ def _options(
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace a file that tvsbayes did not write.")]
 Anyway = Annotated[bool, typer.Option("--anyway", help="Go on at what `check` is certain of.")]
 OldOut = Annotated[Path | None, typer.Option("--output", hidden=True)]
 """The former name of --out."""
@@ -155,8 +156,7 @@ CAMERAS = ("stereo.json",)
 
 def write_new(out: Path, files: Mapping[str, bytes], next_steps: str, as_json: bool) -> None:
     """Write the files of an empty campaign into a new folder, and print them with the next steps."""
-    make_folder(out, empty=True, but=CAMERAS)
-    write_files(out, files)
+    write_folder(out, files, but=CAMERAS)
     text = f"{escaped(str(out), 200)}: {', '.join(files)}\nnext: {next_steps}"
     finish({"campaign": str(out), "files": list(files)}, text, as_json)
 
@@ -223,9 +223,17 @@ def check_order(rig: Path, plan: Path) -> None:
         raise InputError("usage", message, allowed="RIG PLAN", remedy=f"write {swapped}")
 
 
-def check_output(out: Path | None, *inputs: Path | None) -> None:
-    """Refuse an output before the work: without a folder, or on a path that is an input or a part of a campaign."""
+def check_output(out: Path | None, *inputs: Path | None, kind: str = "", force: bool = False) -> None:
+    """Refuse an output before the work: without a folder, or in the place of what may be somebody's only copy.
+
+    Args:
+        out: the file; None for none.
+        inputs: files that the command reads, never replaced; nor are parts of a campaign.
+        kind: one of `own_outputs.KINDS`: any other file is replaced only with `force`.
+        force: option --force.
+    """
     if out is None:
+        refuse_options("for an output", "name one with -o, or leave it out", force=force)
         return
     name = escaped(str(out), 200)
     if not out.parent.is_dir():
@@ -236,6 +244,8 @@ def check_output(out: Path | None, *inputs: Path | None) -> None:
         replaced = "a file that is read" if is_input else "data of the campaign in that folder"
         message = f"-o {name} would replace {replaced}"
         raise InputError("usage", message, found=name, allowed="another file", remedy="name another file")
+    if kind and not force:
+        require_own(out, kind)
 
 
 def finite(**values: float | None) -> None:

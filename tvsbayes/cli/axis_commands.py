@@ -19,6 +19,7 @@ from tvsbayes.files.disk import output_place, read_bytes, write_atomically
 from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
 from tvsbayes.results.records import plain
+from tvsbayes.results.store import sole_writer
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, axis_templates, parse_axis_moves, read_axis
 from tvsbayes.single_axis.axis_rows import rows_of
@@ -117,17 +118,18 @@ def _kept_fit(data: AxisCampaign, to: Path, quick: bool, no_sample: bool, max_mi
     from tvsbayes.single_axis.axis_fit import fit_axis
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
 
-    with waiting() as progress:
-        result = fit_axis(
-            data,
-            tier=IMPORTANCE if quick else CHAIN,
-            sampled=not no_sample,
-            max_minutes=max_minutes,
-            seed=seed,
-            progress=progress,
-        )
-    summary = summarise_axis(result)
-    return StoredFit(summary, keep_fit(result, summary, to), result.error or uninformed(summary))
+    with sole_writer(to):
+        with waiting() as progress:
+            result = fit_axis(
+                data,
+                tier=IMPORTANCE if quick else CHAIN,
+                sampled=not no_sample,
+                max_minutes=max_minutes,
+                seed=seed,
+                progress=progress,
+            )
+        summary = summarise_axis(result)
+        return StoredFit(summary, keep_fit(result, summary, to), result.error or uninformed(summary))
 
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:

@@ -11,7 +11,7 @@ from tvsbayes.cli.app import finish, refuse_options, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.errors import Candidate, InputError, escaped, question, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
-from tvsbayes.files.disk import make_folder, read_bytes
+from tvsbayes.files.disk import make_folder, read_bytes, write_folder
 from tvsbayes.files.documents import toml_line
 from tvsbayes.importing.axis import AxisRows, Wishes, axis_rows
 from tvsbayes.importing.guide import (
@@ -254,13 +254,14 @@ def _refuse_filled(to: Path) -> None:
 
 def _write(to: Path, rows: AxisRows) -> list[str]:
     """Write the tables and last the commented campaign.toml."""
+    # Another import may have filled it since the question.
+    _refuse_filled(to)
     known = AxisMove.__dataclass_fields__
     moves = [AxisMove(**{k: v for k, v in row.items() if k in known}) for row in rows.moves]
     readings = [Reading(**row) for row in rows.readings]
     contents = {"moves.csv": axis_moves_bytes(moves), "readings.csv": readings_bytes(readings)}
     if not (to / "campaign.toml").is_file():
-        make_folder(to, empty=True)
-        contents["campaign.toml"] = _header(rows)
+        return write_folder(to, contents | {"campaign.toml": _header(rows)})
     return write_files(to, contents)
 
 

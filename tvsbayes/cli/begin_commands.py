@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import CAMERAS, Json, check_word, finish, refuse_options, write_files, write_new
+from tvsbayes.cli.app import CAMERAS, Json, check_word, finish, refuse_options, write_new
 from tvsbayes.cli.instruments import INSTRUMENTS
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.cli.understood_columns import first_names
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes, write_atomically, write_folder
+from tvsbayes.importing.words import listed as named
 from tvsbayes.instrument.mechanisms import WORDS
 from tvsbayes.progress import Job
 
@@ -112,10 +112,9 @@ def _with_pictures(
     moves = _moves_of(moves_path)
     numbers = None if moves_path is None else range(len(moves))
     paired = pair_looks(views.views, numbers, rows, pair)  # type: ignore[arg-type]
-    _refuse_other_size(out, views)
+    refuse_other_size(out, views.image_sizes)
     if not (out / "campaign.toml").is_file():
-        make_folder(out, empty=True, but=CAMERAS)
-        write_files(out, campaign_templates())
+        write_folder(out, campaign_templates(), but=CAMERAS)
     if moves_path is None:
         write_atomically(out / "moves.csv", _blank_moves(1 + max(spot.move for spot in paired.spots)))
     elif moves_path.parent != out:
@@ -179,15 +178,15 @@ def has_rows(out: Path) -> bool:
     return spots.is_file() and len(read_bytes(spots, CSV_BYTES_MAX).splitlines()) > 1
 
 
-def _refuse_other_size(out: Path, views: ViewedFolder) -> None:
+def refuse_other_size(out: Path, sizes: dict[str, tuple[int, int]]) -> None:
     """Refuse pictures of another size than that of the calibration: they give no usable centre."""
     from tvsbayes.instrument.stereo_pair import read_stereo
 
     if not (out / "stereo.json").is_file():
         return
     calibrated = read_stereo(out / "stereo.json").image_sizes
-    if views.image_sizes != calibrated:
-        found, allowed = f"pictures of {_sizes_px(views.image_sizes)}", f"{_sizes_px(calibrated)} as in stereo.json"
+    if sizes != calibrated:
+        found, allowed = f"pictures of {_sizes_px(sizes)}", f"{_sizes_px(calibrated)} as in stereo.json"
         place, remedy = escaped(str(out / "stereo.json"), 200), "calibrate and observe at one image size"
         raise refusal("image-size", file=place, found=found, allowed=allowed, remedy=remedy)
 
@@ -239,7 +238,7 @@ def _unpaired_lines(views: ViewedFolder, pairs: PairedLooks, rows: str) -> list[
         "a second pair for its row": pairs.left_over,
     }
     lines = [
-        f"{len(names)} files: " * (len(names) > 1) + f"{first_names(names)}: {reason}"
+        f"{len(names)} files: " * (len(names) > 1) + f"{named(names, NAMES_LISTED)}: {reason}"
         for reason, names in files.items()
         if names
     ]

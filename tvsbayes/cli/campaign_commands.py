@@ -14,7 +14,7 @@ from tvsbayes.cli.app import CampaignFolder, Json, Seed, check_order, finish, fi
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
-from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
+from tvsbayes.files.disk import output_place, shipped_data, write_atomically, write_folder
 from tvsbayes.instrument.axes import DIRECTIONS, HOME_APPROACH
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import TARGETS
@@ -38,10 +38,8 @@ def demo(
     source = shipped_data() / "twins" / "paper_twin"
     with tempfile.TemporaryDirectory(prefix="tvsbayes-demo-") as scratch:
         folder = Path(scratch) / "paper_twin" if out is None else out
-        make_folder(folder, empty=True)
         # A checkout's own twin may have been fitted: results are not part of the campaign.
-        for part in sorted(path for path in source.iterdir() if path.is_file()):
-            write_atomically(folder / part.name, part.read_bytes())
+        write_folder(folder, {path.name: path.read_bytes() for path in sorted(source.iterdir()) if path.is_file()})
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
         from tvsbayes.estimators.four_point import classic as estimate_classic
         from tvsbayes.instrument.campaign import read_campaign

@@ -14,6 +14,7 @@ from tvsbayes.cli.app import (
     TARGET_MISSED,
     CampaignFolder,
     Ended,
+    Force,
     Json,
     Seed,
     check_output,
@@ -26,7 +27,7 @@ from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.instrument.mechanisms import MECHANISMS
-from tvsbayes.pipeline import StoredOrFitted
+from tvsbayes.pipeline import StoredOrFitted, inputs_of
 from tvsbayes.pipeline import verify as verified
 from tvsbayes.progress import Job
 
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.mechanisms import Mechanism
 
 FITTING, MAKING = "fit", "compensation"
+EXPORTS = {"header": "calibration in C", "json": "calibration"}
+"""Kinds of file of an exported calibration, by the option's word."""
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
 
 
@@ -64,6 +67,7 @@ def compensate(
     period: Annotated[
         float | None, typer.Option("--period", help="Of a pec table, in commands (strongest wave).")
     ] = None,
+    force: Force = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -75,6 +79,7 @@ def compensate(
     """
     from tvsbayes.compensation.formats import Wish, checked
     from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
+    from tvsbayes.compensation.verification import compensation_in
     from tvsbayes.report.compensation_text import compensation_text
     from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
     from tvsbayes.results.fit_record import provenance
@@ -82,7 +87,6 @@ def compensate(
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.axis_record import results_for
 
-    check_output(out)
     if (mechanism := _two_axis_mechanism(campaign)) is not None:
         # Counters of two axes follow from the whole calibration, which is the table.
         default = "urdf" if mechanism.terms else "header"
@@ -95,30 +99,37 @@ def compensate(
         if mechanism.terms:
             from tvsbayes.cli.head_commands import compensate as compensate_head
 
-            compensate_head(campaign, out, as_json)
+            compensate_head(campaign, out, force, as_json)
         else:
+            check_output(out, kind=EXPORTS[to], force=force)
             export_calibration(campaign, to, out, as_json)
         return
     _check_choice("--applied-by", applied_by, APPLIERS)
     _check_choice("--letter", letter, tuple(LETTERS))
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
-    checked(wish)
+    form = checked(wish)
+    second = out.with_name(f"{out.name}.yaml") if out is not None and form.beside is not None else None
+    check_output(out, kind="compensation", force=force)
+    check_output(second, kind="compensation", force=force and second is not None)
     data = read_axis(campaign)
+    before = compensation_in(data)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
         compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
-    document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **plain(provenance(axis_hashes(data), seed))}
+    origin = plain(provenance(axis_hashes(data), seed, results.fit_id))
+    document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **origin}
     files: dict[str, str] = {}
     if out is not None:
         write_atomically(out, file_text(compensation, data).encode())
         files[to] = str(out)
-        if (yaml_text := file_beside(compensation, data)) is not None:
-            second = out.with_name(f"{out.name}.yaml")
-            check_output(second)
+        if second is not None and (yaml_text := file_beside(compensation, data)) is not None:
             write_atomically(second, yaml_text.encode())
             files["yaml"] = str(second)
         if keep(document, record_path := output_place(campaign, "results") / "compensation.json"):
             files["compensation"] = str(record_path)
+            if before is not None and before.digest != compensation.digest:
+                ended = f"the promise of the table made before (--to {before.target}, {before.digest[:12]}) ends"
+                report_line(f"note: {ended}: `verify` tests this one alone")
     text = compensation_text(compensation, list(files.values()))
     if out is None:
         text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(compensation, data)}".rstrip("\n")
@@ -172,12 +183,13 @@ def verify(
     correction; of a scanner or head the counters that steps-for or the header gave, and the looks there. The
     most probable of: applied, not applied, applied twice, wrong sign, another machine.
     """
-    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
+    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256
+    from tvsbayes.comparison.verified_looks import accepted_calibration
     from tvsbayes.compensation.verification import stored_compensation
-    from tvsbayes.instrument.campaign import input_hashes, read_campaign
+    from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
-    from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign, read_axis
 
     mechanism = _two_axis_mechanism(campaign)
     if mechanism is not _two_axis_mechanism(fresh):
@@ -192,9 +204,11 @@ def verify(
     with waiting() as progress:
         new, distance = fresh if made is None else read_axis(fresh), distance_mm or 1000.0
         result = verified(known, new, made=made, distance_mm=distance, seed=seed, tell=report_line, progress=progress)
-    inputs = axis_hashes(known) if isinstance(known, AxisCampaign) else input_hashes(known)
-    table = content_sha256(calibration_json(load_calibration(campaign))) if made is None else made.digest
-    document = {"format": VERIFICATION_FORMAT, "inputs": inputs, "table": table, **result.as_json()}
+    if isinstance(known, AxisCampaign):
+        table = stored_compensation(known).digest
+    else:
+        table = content_sha256(calibration_json(accepted_calibration(known)))
+    document = {"format": VERIFICATION_FORMAT, "inputs": inputs_of(known), "table": table, **result.as_json()}
     keep(document, output_place(campaign, "results") / "verification.json")
     for remark in result.remarks if as_json else ():
         report_line(f"warning: {remark}")

@@ -18,9 +18,9 @@ from tvsbayes.cli.app import check_output, command_line, finish, report_line, wr
 from tvsbayes.cli.confirmed_import import Import, occupied
 from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.display import concise
-from tvsbayes.errors import escaped, refusal, typed
+from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_kind import templates
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
@@ -94,9 +94,7 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
     document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
 
     def write() -> list[str]:
-        if kind is SIGHTING_HEAD:
-            make_folder(to, empty=True)
-        write_files(to, files)
+        (write_folder if kind is SIGHTING_HEAD else write_files)(to, files)
         return [escaped(str(to), 200)]
 
     def outcome(written: list[str]) -> dict[str, Any]:
@@ -105,9 +103,7 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
     return Import(lines, document, write, next_step, outcome=outcome)
 
 
-def import_sightings(
-    file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction
-) -> Import:
+def import_sightings(file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction) -> Import:
     """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
     table = read_foreign(file, sheet)
     rows = sighting_rows(table, wishes)
@@ -132,8 +128,7 @@ def import_sightings(
     document |= {"sightings": len(sightings), "ok": ok, "campaign": str(to)}
 
     def write() -> list[str]:
-        to.mkdir(parents=True, exist_ok=True)
-        return write_files(to, contents.files)
+        return (write_folder if contents.is_new else write_files)(to, contents.files)
 
     return Import(lines, document, write, f"`tvsbayes check {typed(to)}`", ", or correct it with --column")
 
@@ -151,9 +146,10 @@ class ImportedHead:
 
 @dataclass(frozen=True)
 class _SightingFiles:
-    """Files of a head by name, and the assumptions in words."""
+    """Files of a head by name, whether their folder is new, and the assumptions in words."""
 
     files: dict[str, bytes]
+    is_new: bool
     assumed: list[str]
 
 
@@ -187,7 +183,7 @@ def _sighting_files(rows: ImportedHead, to: Path, table: str) -> _SightingFiles:
     files = dict(templates) if is_new else {}
     files |= with_priors(current, priors) if priors else {}
     files |= {MOVES.file: MOVES.content(rows.moves), SIGHTINGS.file: SIGHTINGS.content(rows.sightings)}
-    return _SightingFiles(files, [text for text in rows.assumed if text.partition(":")[0] not in stated])
+    return _SightingFiles(files, is_new, [text for text in rows.assumed if text.partition(":")[0] not in stated])
 
 
 def _joints_of(folder: Path) -> HeadJoints | None:
@@ -241,13 +237,20 @@ def _urdf_files(
     return {**templates, **with_priors(templates, priors, tables)}
 
 
-def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
+def compensate(folder: Path, out: Path | None, force: bool, as_json: bool) -> None:
     """Write the model of the robot with the estimated terms, and YAML with their covariance."""
     import yaml
 
     from tvsbayes.calibration.calibration_file import Origin
     from tvsbayes.comparison.verified_looks import accepted_calibration
 
+    yaml_path = None if out is None else out.with_name(f"{out.name}.yaml")
+    for place in (out, yaml_path):
+        check_output(place, kind="model of a head", force=force)
+    nominal = folder / HEAD_URDF
+    if out is not None and not force and out.exists() and nominal.exists() and out.samefile(nominal):
+        message = f"-o {escaped(str(out), 200)} would replace the model that this head is corrected from"
+        raise InputError("occupied", message, remedy="name another file, or add --force")
     data = read_campaign(folder)
     calibration, origin = accepted_calibration(data), Origin.of(data)
     kind = data.rig.mechanism
@@ -276,12 +279,10 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
     ]
     lines += [f"not in the file: {words}" for words in document["unsaid"]]
     files: dict[str, str] = {}
-    if out is None:
+    if out is None or yaml_path is None:
         described = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
         lines.append(f"nothing written: give -o FILE; it would hold {described}, and FILE.yaml their covariance")
     else:
-        yaml_path = out.with_name(f"{out.name}.yaml")
-        check_output(yaml_path)
         write_atomically(out, text)
         write_atomically(yaml_path, f"# {origin_text}\n{yaml.safe_dump(document, sort_keys=False)}".encode())
         files = {"urdf": str(out), "yaml": str(yaml_path)}
@@ -305,7 +306,7 @@ def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: boo
 
     def make(job: Job) -> Document:
         data = read_campaign(folder)
-        record = StoredOrFitted(data, report_line, job.part(FITTING)).record
+        record = StoredOrFitted(data, report_line, job.part(FITTING)).reported.record
         job.begin(DRAWING)
         return head_document(data, record, issue, check_campaign(data).warnings)
 

@@ -14,22 +14,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import CAMERAS, Json, check_word, is_interactive, refuse_options, report_line, write_files
-from tvsbayes.cli.begin_commands import has_rows
-from tvsbayes.cli.confirmed_import import Import, occupied
+from tvsbayes.cli.app import Json, check_word, is_interactive, refuse_options
+from tvsbayes.cli.begin_commands import stated_globs
+from tvsbayes.cli.confirmed_import import Import
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
-from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
-from tvsbayes.errors import InputError, Reason, closest, escaped, refusal, typed
+from tvsbayes.errors import InputError, Reason, closest, escaped, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
-from tvsbayes.files.disk import make_folder, read_bytes
+from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.instrument.axes import sides_of
 
 if TYPE_CHECKING:
-    from tvsbayes.files.foreign_table import ForeignTable
-    from tvsbayes.instrument.campaign import Move
-    from tvsbayes.instrument.column_names import ColumnMapping
     from tvsbayes.instrument.corrections import Correction
-    from tvsbayes.instrument.foreign_looks import ForeignLooks, Notation
 
 COPY, URDF, POINTING, AXIS, SIGHTINGS, LOOKS = "copy", "urdf", "pointing", "axis", "sightings", "looks"
 """Kinds of files; --format names that of a telescope's table."""
@@ -42,6 +37,7 @@ KINDS_OF: dict[str, tuple[str, ...]] = {
     "assume": (AXIS, SIGHTINGS),
     **dict.fromkeys(("relative", "flip", "shift_moves"), (COPY, SIGHTINGS, LOOKS)),
     "swap": (COPY, LOOKS),
+    **dict.fromkeys(("pictures", "left", "right"), (LOOKS,)),
     **dict.fromkeys(("pan_approach", "tilt_approach"), (SIGHTINGS, LOOKS)),
     **dict.fromkeys(("urdf", "pan_joint", "tilt_joint", "steps_per_turn"), (URDF,)),
 }
@@ -107,6 +103,13 @@ def import_(
         str, typer.Option("--pan-approach", help="How pan came to the first row: left, right or unknown.")
     ] = "unknown",
     tilt_approach: Annotated[str, typer.Option("--tilt-approach", help="Likewise up, down or unknown.")] = "unknown",
+    pictures: Annotated[
+        Path | None, typer.Option("--pictures", help="Of a lab book: folder of the pictures that it names.")
+    ] = None,
+    left: Annotated[
+        str | None, typer.Option("--left", help='Of its pictures those of the left camera: "a/*.png".')
+    ] = None,
+    right: Annotated[str | None, typer.Option("--right", help="Likewise of the right camera.")] = None,
     urdf: Annotated[bool, typer.Option("--urdf", help="FILE is a URDF: nominal geometry of a pan-tilt head.")] = False,
     pan_joint: Annotated[
         str | None, typer.Option("--pan-joint", help="Of a URDF: the joint about the vertical (default: by its name).")
@@ -124,12 +127,10 @@ def import_(
     """
     options = locals()
     from tvsbayes.instrument.corrections import Correction, flipped_axis, shift_of
-    from tvsbayes.instrument.foreign_looks import SD_PX, Notation
 
     o = SimpleNamespace(**options)
     approach = (o.pan_approach, o.tilt_approach)
     check_word("--angles", o.angles, ANGLE_UNITS, "write --angles deg or --angles rad")
-    notation = Notation(o.pixels_from, o.angles, SD_PX if o.sd_px is None else o.sd_px, o.relative, approach)
     sides_of(approach)
     example = "u_left_px=XL; --column target= where the table has none"
     stated = dict(_named("--column", text, example) for text in o.column or ())
@@ -171,8 +172,16 @@ def import_(
         wishes = SightingWishes(stated, o.angles, o.relative, approach, u_deg)
         task = import_sightings(o.file, o.to, o.sheet, wishes, correction)
     else:
+        from tvsbayes.cli.looks_import import import_looks
+        from tvsbayes.importing.looks import SD_PX, LookWishes
+
         interactive = not (o.yes or o.as_json) and is_interactive()
-        task = _looks(o.file, o.to, stated, o.sheet, notation, correction, interactive)
+        sd_px = SD_PX if o.sd_px is None else o.sd_px
+        looks = LookWishes(stated, o.pixels_from, o.angles, sd_px, o.relative, approach, o.pictures is not None)
+        globs = stated_globs(o.left, o.right, False)
+        if o.pictures is None:
+            refuse_options("for pictures", "add --pictures FOLDER, or leave it out", left=o.left, right=o.right)
+        task = import_looks(o.file, o.to, o.sheet, looks, correction, o.pictures, globs, interactive)
     if task is not None:
         task.carry_out(o.to, o.yes, o.as_json)
 
@@ -225,51 +234,6 @@ def _why_refused(kind_of_file: str, option: str) -> Reason:
     if AXIS in KINDS_OF[option]:
         return Reason("for files of an axis", "add --axis, or leave it out")
     return Reason("for spots in pictures, and these are sightings", remedy)
-
-
-def _looks(
-    file: Path,
-    to: Path,
-    stated: Mapping[str, str],
-    sheet: str | None,
-    notation: Notation,
-    correction: Correction,
-    interactive: bool,
-) -> Import:
-    """Import a table of moves and looks; missing columns are asked for where `interactive`."""
-    from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.instrument.campaign import stereo_spots
-    from tvsbayes.instrument.column_names import map_columns, with_placements
-    from tvsbayes.instrument.corrections import corrected
-    from tvsbayes.instrument.foreign_looks import looks_of
-
-    listed = _listed_moves(to)
-    table = read_foreign(file, sheet)
-    known = _complete_mapping(table, map_columns(table.columns, stated), stated, listed is not None, interactive)
-    mapping = with_placements(known, table.columns, stated)
-    looks = looks_of(table, mapping.columns, notation, listed)
-    changed = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
-    spots = None if changed.spots is None else stereo_spots(changed.spots)
-    by_distance: tuple[str, ...] = ()
-    if mapping is not known:
-        name = escaped(mapping.columns["target"])
-        by_distance = (f"target: every value of {name} is one placement of the sheet; --column target= says no",)
-    looks = replace(looks, moves=changed.moves, spots=spots, assumed=(*looks.assumed, *by_distance, *changed.changes))
-    _check_no_rows(to, looks)
-    document = {
-        **table_document(table, mapping),
-        "assumed": list(looks.assumed),
-        "moves": None if looks.moves is None else len(looks.moves),
-        "spots": None if looks.spots is None else len(looks.spots),
-        "ok": None if looks.spots is None else sum(spot.status == "ok" for spot in looks.spots),
-        "campaign": str(to),
-    }
-    next_step = f"`tvsbayes check {typed(to)}`"
-    if not (to / "stereo.json").is_file():
-        cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
-        next_step = f"`{cameras}`, or of pictures of a board, then {next_step}"
-    lines = _mapping_lines(table, mapping, notation, looks)
-    return Import(lines, document, lambda: _write_looks(to, looks), next_step, CORRECT_HINT)
 
 
 def _pointing_table(file: Path, to: Path) -> Import:
@@ -344,109 +308,9 @@ def _corrected_campaign(folder: Path, to: Path, correction: Correction, options:
     document = {"assumed": list(changed.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
 
     def write() -> list[str]:
-        make_folder(to, empty=True)
         copied = [name for name in ("campaign.toml", "stereo.json", HEAD_URDF) if (folder / name).is_file()]
         contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in copied}
         contents |= {"moves.csv": moves_bytes(moves), campaign.looks_table.file: looks_bytes(campaign)}
-        return write_files(to, contents)
+        return write_folder(to, contents)
 
     return Import(lines, document | {"campaign": str(to)}, write, f"`tvsbayes check {typed(to)}`")
-
-
-def _listed_moves(to: Path) -> tuple[Move, ...] | None:
-    """The moves of a campaign; None if there is only the template's row."""
-    from tvsbayes.instrument.campaign import campaign_templates, parse_moves
-    from tvsbayes.instrument.column_names import COUNTERS
-
-    if not (file := to / "moves.csv").is_file():
-        return None
-    data = read_bytes(file, CSV_BYTES_MAX)
-    if not (to / "campaign.toml").is_file() or data == campaign_templates()["moves.csv"]:
-        return None
-    try:
-        return parse_moves(data, str(file))
-    except InputError as error:
-        if error.found != "an empty cell" or error.column not in COUNTERS:
-            raise
-        remedy = "fill them in there; or, if FILE is the log of the moves, import it --to a new folder"
-        remedy += ", then `tvsbayes new` that folder with --pictures FOLDER"
-        raise refusal(
-            error.code,
-            file=escaped(str(file), 200),
-            line=error.line,
-            column=error.column,
-            found=error.found,
-            allowed="counters of all moves",
-            remedy=remedy,
-        ) from error
-
-
-def _complete_mapping(
-    table: ForeignTable, mapping: ColumnMapping, stated: Mapping[str, str], moves_known: bool, interactive: bool
-) -> ColumnMapping:
-    """The mapping of the columns, with missing ones asked for at a terminal.
-
-    Raises:
-        InputError: missing or ambiguous columns, and no terminal.
-    """
-    from tvsbayes.instrument.column_names import COUNTERS, FIELDS, PIXELS, map_columns, missing
-
-    open_fields = [*missing(mapping.columns, moves_known), *mapping.ambiguous]
-    if not open_fields:
-        return mapping
-    names = ", ".join(escaped(name) for name in table.columns)
-    if interactive:
-        answers = dict(stated)
-        report_line(f"{table.file} has the columns {names}")
-        for field in dict.fromkeys(open_fields):
-            answers[field] = typer.prompt(f"which of them is {field}? (empty: none)", default="", show_default=False)
-        mapping = map_columns(table.columns, answers)
-        open_fields = missing(mapping.columns, moves_known)
-        if not open_fields:
-            return mapping
-    hint = "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
-    hint *= set(mapping.columns).isdisjoint((*PIXELS, *COUNTERS))
-    raise column_refusal(table, mapping, open_fields, FIELDS, (*PIXELS, *COUNTERS), hint)
-
-
-def _check_no_rows(to: Path, looks: ForeignLooks) -> None:
-    """Refuse a folder whose tables have rows: nothing is overwritten."""
-    if to.exists() and not (to / "campaign.toml").is_file():
-        make_folder(to, empty=True, but=CAMERAS)
-    if looks.moves is not None and _listed_moves(to) is not None:
-        raise occupied(to / "moves.csv", "moves")
-    if looks.spots is not None and has_rows(to):
-        raise occupied(to / "spots.csv", "looks")
-
-
-def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
-    """Write the tables, and templates of the other files of a campaign where they are missing."""
-    from tvsbayes.instrument.campaign import campaign_templates, moves_bytes, spots_bytes
-
-    if not (to / "campaign.toml").is_file():
-        make_folder(to, empty=True, but=CAMERAS)
-        write_files(to, campaign_templates())
-    contents = {} if looks.moves is None else {"moves.csv": moves_bytes(looks.moves)}
-    contents |= {} if looks.spots is None else {"spots.csv": spots_bytes(looks.spots)}
-    return write_files(to, contents)
-
-
-def _mapping_lines(table: ForeignTable, mapping: ColumnMapping, notation: Notation, looks: ForeignLooks) -> list[str]:
-    """Fields with columns, units and first values; assumptions; counts of the result."""
-    from tvsbayes.instrument.column_names import DEGREES, FIELDS, SECONDS, unit_of_name
-
-    def unit(field: str, name: str) -> str:
-        if field.endswith("_px") and field.startswith(("u", "v")):
-            return f"px from {notation.pixels_from}"
-        if field == "aperture_deg":
-            return notation.angle_unit or unit_of_name(name, DEGREES) or "deg"
-        if field == "time_s":
-            return unit_of_name(name, SECONDS) or "s"
-        return "px" if field.endswith("_px") else "steps" if field.endswith("_steps") else ""
-
-    lines = table_lines(table, mapping, FIELDS, unit)
-    lines += [f"assumed: {text}" for text in looks.assumed]
-    ok = sum(spot.status == "ok" for spot in looks.spots or ())
-    counts = [] if looks.moves is None else [f"{len(looks.moves)} moves"]
-    counts += [] if looks.spots is None else [f"{len(looks.spots)} looks, {ok} with a spot"]
-    return [*lines, f"gives: {', '.join(counts)}"]

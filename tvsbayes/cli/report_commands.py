@@ -17,6 +17,7 @@ from tvsbayes.cli.app import (
     Anyway,
     CampaignFolder,
     Ended,
+    Force,
     Json,
     Seed,
     check_output,
@@ -81,16 +82,24 @@ def report(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="HTML file (default CAMPAIGN/results/report.html).")
     ] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """The calibration report as one HTML page. Verdict and results first, then the evidence."""
     from tvsbayes.instrument.campaign import read_campaign
 
     finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
-    check_output(out)
+    check_output(out, kind="report", force=force)
     if out is not None and out.suffix.lower() == ".pdf":
         message, remedy = "-o names the HTML page, and its PDF lies beside it", "write -o NAME.html --pdf"
         raise InputError("usage", message, column="--out", allowed="NAME.html", remedy=remedy)
+    if out is not None:
+        from tvsbayes.report.page import certificate_place
+
+        beside = {"printed report": out.with_suffix(".pdf") if pdf else None}
+        beside["certificate"] = certificate_place(out, out) if dcc or dcc_schema else None
+        for kind, place in beside.items():
+            check_output(place, kind=kind, force=force and place is not None)
     if not (dcc or dcc_schema):
         refuse_options("for a certificate", "add --dcc", country=country, customer_country=customer_country)
     issue = _issue(laboratory, customer)
@@ -171,16 +180,22 @@ class PageContent:
 
     def _document(self, job: Job) -> Document:
         """Gather evidence for a document; fits first where results are missing."""
-        from tvsbayes.calibration.calibration_file import load_calibration
         from tvsbayes.report.evidence import gather
         from tvsbayes.report.scanner_document import report_document
 
-        limits = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
-        self.record = StoredOrFitted(self.data, report_line, job.part(FITTING)).record
+        self.record, calibration, ratios = StoredOrFitted(self.data, report_line, job.part(FITTING)).reported
         job.begin(GATHERING)
         warnings = campaign_contents(self.campaign, self.data)["warnings"]
-        calibration = load_calibration(self.campaign)
-        self.evidence = gather(self.data, self.record, calibration, range_mm=self.range_mm, doubts=warnings, **limits)
+        self.evidence = gather(
+            self.data,
+            self.record,
+            calibration,
+            range_mm=self.range_mm,
+            ratios_deg_per_step=ratios,
+            limit_deg_per_step=self.limit_deg_per_step,
+            limit_mm=self.limit_mm,
+            doubts=warnings,
+        )
         job.begin(DRAWING)
         return report_document(self.evidence, self.issue)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from tvsbayes.cli.app import (
     TARGET_MISSED,
     CampaignFolder,
     Ended,
+    Force,
     Json,
     OldOut,
     Seed,
@@ -29,7 +31,7 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
-from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
+from tvsbayes.cli.compensation_commands import EXPORTS, export_calibration, plan_verify
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
@@ -192,6 +194,7 @@ def steps_for(
     rig: Annotated[Path | None, typer.Option("--rig", help="Rig file whose [positioner] limits are kept.")] = None,
     export: Annotated[str | None, typer.Option("--export", help="header or json: the calibration itself.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="File for --export (default: printed).")] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
@@ -202,17 +205,17 @@ def steps_for(
     point = None if x_mm is None or y_mm is None or z_mm is None else (x_mm, y_mm, z_mm)
     direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
     given = sum(value is not None for value in target.values())
-    if export not in (None, "header", "json"):
+    if export is not None and export not in EXPORTS:
         message, remedy = f"--export {escaped(export)}: allowed are header and json", "write --export header for C"
         raise InputError("usage", message, allowed="header, json", remedy=remedy)
     if export:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "rig": rig}
-        check_output(out)
+        check_output(out, kind=EXPORTS[export], force=force)
         remedy = "leave it out, --export writes the calibration itself; or leave out --export"
         refuse_options("for one target", remedy, **target, **options)
         export_calibration(campaign, export, out, as_json)
         return
-    refuse_options("for the exported calibration", "add --export header or --export json", out=out)
+    refuse_options("for the exported calibration", "add --export header or --export json", out=out, force=force)
     if given != (3 if point else 2 if direction else -1):
         remedy = "give --x-mm --y-mm --z-mm, or --azimuth-deg --elevation-deg, or --export alone"
         raise InputError("usage", "steps-for needs one target", remedy=remedy)
@@ -225,13 +228,22 @@ def steps_for(
     from tvsbayes.instrument.campaign import read_campaign
 
     limits = None if rig is None else _limits(rig)
+    measured = read_campaign(campaign)
     with waiting() as progress:
-        calibration = StoredOrFitted(read_campaign(campaign), report_line, progress).calibration
+        calibration = StoredOrFitted(measured, report_line, progress).calibration
+    from tvsbayes.instrument.stops import counters_made
     from tvsbayes.report.command_text import steps_text
 
     azimuth, elevation = direction or (None, None)
     sides = None if pan_approach is tilt_approach is None else (pan_approach or "left", tilt_approach or "up")
-    steps = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
+    counters = partial(calibration.steps_for, point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides)
+    try:
+        steps = counters(limits=limits or counters_made(measured.moves))
+    except InputError as error:
+        if limits is not None or error.code != "outside-limits":
+            raise
+        steps = counters()
+        report_line(f"warning: {error.message}; the campaign made {error.allowed}: --rig RIG.toml keeps its limits")
     document = {"estimator": calibration.estimator, **steps.as_json()}
     finish(document, steps_text(steps), as_json)
 
@@ -266,12 +278,13 @@ def plan(
     verify: Annotated[
         bool, typer.Option("--verify", help="Fewest readings or looks for `verify`: plan FOLDER --verify.")
     ] = False,
+    force: Force = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
     """How many looks, which ones, and when to stop. With --given: what next."""
     out = out or output
-    check_output(out, rig)
+    check_output(out, rig, kind="plan", force=force)
     finite(minutes=minutes, confirm=confirm)
     # Further options of a plan for a target.
     extra: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tvsbayes.cli.app import CampaignFolder, Json, check_output, finish, report_line
+from tvsbayes.cli.app import CampaignFolder, Force, Json, check_output, finish, report_line
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
@@ -22,6 +22,7 @@ def view(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="HTML file (default CAMPAIGN/results/view.html).")
     ] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """One HTML file to look at a campaign: rig in 3D, all looks.
@@ -31,7 +32,7 @@ def view(
     if serve("view", **locals()) or serve("view", beside):
         return
     folders = [folder for folder in (campaign, beside) if folder is not None]
-    check_output(out)
+    check_output(out, kind="page of view", force=force)
     from tvsbayes.view.scene import look_at
 
     result_scenes = look_at(campaign, beside, report_line)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.calibration.aiming import Direction, mirror_angles
-from tvsbayes.calibration.calibration_file import stored_calibration
+from tvsbayes.calibration.calibration_file import calibration_of_arrays
 from tvsbayes.calibration.optics import beam_components, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
@@ -29,21 +29,21 @@ from tvsbayes.compensation.verification import (
     other_axis,
     size_of,
 )
-from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.errors import InputError, NothingToEstimate, Reason
 from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.inference.stored_posterior import answer_of
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
-from tvsbayes.instrument.stops import rests_of
+from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
-from tvsbayes.results.records import stored_document
+from tvsbayes.results.store import stored_fit
 from tvsbayes.statistics.predicted_readings import PredictedReadings
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
@@ -74,16 +74,17 @@ def accepted_calibration(campaign: Campaign) -> Calibration:
         InputError: there is none for these data, or it is damaged.
         NotConverged: the fit is not accepted.
     """
-    document = stored_document(campaign, "fit.json", FIT_FORMATS, input_hashes(campaign))
-    calibration = stored_calibration(campaign)
-    if document is None or calibration is None:
+    stored = stored_fit(campaign, input_hashes(campaign))
+    calibration = None if isinstance(stored, Reason) else calibration_of_arrays(stored.arrays)
+    if isinstance(stored, Reason) or calibration is None:
         raise InputError(
             "missing-file",
             "results/ hold no calibration of these data: nothing can have been aimed with it",
             file="results/fit.json",
             remedy="run `tvsbayes fit`, aim by `tvsbayes steps-for` or the header, and look there",
         )
-    refuse_answer(answer_of(document), SURER)
+    stored.keys.word("format", FIT_FORMATS)
+    refuse_answer(answer_of(stored.keys), SURER)
     return calibration
 
 
@@ -352,8 +353,9 @@ class _AxisStops:
 def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: int) -> _AxisStops:
     """Choose the stops of one axis, the other in the middle of its range."""
     low, high = calibration.range_steps[k]
+    least, most = counters_made(campaign.moves)[AXES[k]]
     if high - low > 4 * run_up:
-        low, high = low + run_up, high - run_up
+        low, high = max(low, least + run_up), min(high, most - run_up)
     counters = np.linspace(low, high, CANDIDATES).round()
     steps = np.tile(calibration.range_steps.mean(axis=1).round(), (2 * CANDIDATES, 1))
     steps[:, k] = np.repeat(counters, 2)
@@ -366,13 +368,20 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
         what = f"the nominal counters of {AXES[k]} are those of the calibration: there is no correction to verify"
         raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
     noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
-    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + HOME_SD_DEG**2
+    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + campaign.rig.home_sd_deg[k] ** 2
     # A play smaller than the uncertainty of a look cannot be distinguished from none, and does not affect the promise.
     visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
     worlds = off if visible else off[:1]
     spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
-    visits = discriminating_visits(worlds, common, noise, np.repeat(spread, 2))
-    chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(visits.visits[i]))]
+    starts = steps[:, k] - sides[:, k] * run_up
+    reach = np.flatnonzero((starts >= least) & (starts <= most))
+    if not len(reach):
+        message = f"{AXES[k]}: no look has room for a run-up of {run_up} steps within the counters {least} to {most}"
+        raise NothingToEstimate("limits", message, remedy="drive further in a campaign, and fit it")
+    visits = discriminating_visits(
+        [world[reach] for world in worlds], common[np.ix_(reach, reach)], noise[reach], np.repeat(spread, 2)[reach]
+    )
+    chosen = [i for i, count in zip(reach.tolist(), visits.visits, strict=True) for _ in range(int(count))]
     return _AxisStops([VerifyStop(float(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
 
 

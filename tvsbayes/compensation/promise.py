@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from tvsbayes.compensation.correction import Correction, Cycles, cycles
 from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, Origin, Wish, checked, number
 from tvsbayes.compensation.periodic_error import drive_compensation, known_waves, strongest_period
 from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.files.packages import own_version
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import Compensation, SidePromise, TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
@@ -353,8 +353,19 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         table=table,
         settings=shaped.settings,
         promise=promise,
-        unsaid=form.unsaid if rows.both_sides else (*form.unsaid, ONE_SIDED),
+        unsaid=(*form.unsaid, *(() if rows.both_sides else (ONE_SIDED,)), *_unreachable(campaign, low, high, run_up)),
     )
+
+
+def _unreachable(campaign: AxisCampaign, low: float, high: float, run_up: float) -> tuple[str, ...]:
+    """Say where the table's range leaves no room for a run-up."""
+    least, most = campaign.range_allowed
+    ends = [f"arriving forward below {number(least + run_up, 6)}"] if low - run_up < least else []
+    ends += [f"arriving backward above {number(most - run_up, 6)}"] if high + run_up > most else []
+    if not ends:
+        return ()
+    where = "`limits` of [axis]" if campaign.limits else "the commands that were made"
+    return (f"{' and '.join(ends)} needs a run-up beyond {where}: the promise is for arrivals with one",)
 
 
 def _table(at: _Expected, correction: Correction) -> tuple[TableRow, ...]:
@@ -394,7 +405,7 @@ def compensate(
 def _origin(campaign: AxisCampaign) -> Origin:
     digest = hashlib.sha256("".join(sorted(axis_hashes(campaign).values())).encode()).hexdigest()
     name = campaign.path.name if campaign.path else "a campaign"
-    return Origin(f"tvsbayes {version('tvsbayes')} of {name}", digest)
+    return Origin(f"tvsbayes {own_version()} of {name}", digest)
 
 
 def file_text(made: Compensation, campaign: AxisCampaign) -> str:

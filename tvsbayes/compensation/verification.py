@@ -406,9 +406,9 @@ def discriminating_visits(
         off: deviation of each other hypothesis at the candidates, shape (m,) each.
         common: covariance (m, m) of errors common to all visits.
         noise: variances of the noise drawn at each visit, shape (m,).
-        first: mask of candidates that are always visited.
+        first: mask of candidates that are always visited; all where it holds none.
     """
-    visits = first.astype(float)
+    visits = first.astype(float) if first.any() else np.ones(len(first))
     reached = _separation(off, common, noise, visits)
     while reached < IDENTIFIED and visits.sum() < PLANNED_MAX:
         each = [_separation(off, common, noise, visits + row) for row in np.eye(len(visits))]
@@ -441,14 +441,19 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
     """Plan the fewest stops that discriminate the hypotheses, by greedy choice among the table's commands.
 
     Raises:
-        NothingToEstimate: the table corrects nothing.
+        NothingToEstimate: the table corrects nothing, or no run-up fits into the commands that are allowed.
     """
     applied = Correction.of(made)
-    run_up, (low, high) = made.reversal_command, made.range_command
+    run_up, (low, high) = made.reversal_command, fit.campaign.range_allowed
     nodes = np.array([row.command for row in made.table])
-    # Commands whose both sides can be reached within the range, if there are enough.
+    nodes = nodes[(nodes >= low) & (nodes <= high) & ((nodes - run_up >= low) | (nodes + run_up <= high))]
+    # Commands whose both sides can be reached, if there are enough.
     inside = nodes[(nodes - run_up >= low) & (nodes + run_up <= high)]
     nodes = inside if len(inside) >= SPREAD else nodes
+    if not len(nodes):
+        message = f"no stop has room for a run-up of {run_up:.6g} within the commands {low:.10g} to {high:.10g}"
+        remedy = "state `limits` in [axis] if the machine may go further"
+        raise NothingToEstimate("limits", message, file="campaign.toml", remedy=remedy)
     nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), CANDIDATES)).round().astype(int)]
     run = Since(made.hours, 0.0).cycles(nodes, run_up)
     u = np.full(len(run.read), reading_u(fit.campaign))
@@ -468,8 +473,12 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
     # Stops over the whole range first: a fault in a part of the table shows only there.
     spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
-    chosen = discriminating_visits(off, covariance - np.diag(noise) + shift, noise, np.isin(run.index, spread))
-    visits, reached = chosen.visits, chosen.reached
-    order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
+    starts = nodes[run.index] - run.side * run_up
+    reach = np.flatnonzero((starts >= low) & (starts <= high))
+    common = (covariance - np.diag(noise) + shift)[np.ix_(reach, reach)]
+    first = np.isin(run.index[reach], spread)
+    chosen = discriminating_visits([o[reach] for o in off], common, noise[reach], first)
+    reached = chosen.reached
+    order = [k for k, visits in zip(reach.tolist(), chosen.visits, strict=True) for _ in range(int(visits))]
     stops = tuple(VerifyStop(float(nodes[run.index[k]]), int(run.side[k])) for k in order)
     return VerifyPlan(stops, run_up, reached >= IDENTIFIED, float(np.sqrt(reached)))

@@ -26,7 +26,7 @@ from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, held_by, search_stages
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
-from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
+from tvsbayes.instrument.homing import Sides, has_play, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES
 from tvsbayes.instrument.places import line_share, seen_places
@@ -274,7 +274,8 @@ def fit(
             mode = problem.mode(z)
             job.begin(DIAGNOSING)
             result = fit_at(campaign, problem, mode, seed)
-            axes = unrecorded(campaign.moves)
+            # Without play the side from which an axis came makes no difference.
+            axes = tuple(axis for axis in unrecorded(campaign.moves) if has_play(table.priors, axis))
             if not axes or not result.converged:
                 return result
             job.begin(HOMING)

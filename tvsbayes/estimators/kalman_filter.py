@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import SpotArrays
-from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.model.geometry import Scalar, materialise
 
 STATES = 6
@@ -57,14 +56,13 @@ def filter_rows(
         functions: jax.numpy or numpy.
     """
     xp, pairs = functions, (len(spots.valid), 2)
-    home = xp.where(spots.homed, (HOME_SD_DEG * np.pi / 180) ** 2, 0.0)[:, None]
     segment = xp.broadcast_to(spots.new_segment[:, None], pairs)
-    drawn = xp.where(spots.redraw, stop_variance, 0.0)
+    drawn, zero = xp.where(spots.redraw, stop_variance, 0.0), spots.home_variance_rad2 + drift_variance
     return FilterRows(
         residual=xp.asarray(residual),
         load=xp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
-        keep=xp.where(xp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
-        variance=xp.concatenate([drawn, home + drift_variance, xp.where(segment, 1.0, 0.0)], axis=1),
+        keep=xp.where(xp.concatenate([spots.redraw, spots.new_zero, segment], axis=1), 0.0, 1.0),
+        variance=xp.concatenate([drawn, zero, xp.where(segment, 1.0, 0.0)], axis=1),
     )
 
 

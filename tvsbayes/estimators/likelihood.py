@@ -52,7 +52,7 @@ def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float
 
 def drift_variances(drift_rad_per_root_hour: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
     """Compute the variance of the drift of the zeros (pan, tilt) since the previous spot, or since a later homing."""
-    return spots.hours[:, None] * drift_rad_per_root_hour**2
+    return spots.hours * drift_rad_per_root_hour**2
 
 
 def scatter_variances(scatter_rad: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:

@@ -37,7 +37,6 @@ class Column:
         filled: an empty text is refused. An empty number is refused where the field has no default.
         group: columns of one group may be missing; they are written together where one of them is not at its default.
         rule: check of the column after all cells of the table are read; raises its error.
-        names: words of its name in foreign tables, lower case, without accents, separated by spaces.
         name, kind, words, default: taken from the field; `words` are those of a `Literal`, which its rule must check;
             the default is MISSING where there is none.
     """
@@ -49,7 +48,6 @@ class Column:
     filled: bool = False
     group: str = ""
     rule: Callable[[Table, Column, Values], None] | None = None
-    names: str = ""
     name: str = field(default="", kw_only=True)
     kind: type = field(default=str, kw_only=True)
     words: tuple[str, ...] = field(default=(), kw_only=True)

@@ -211,9 +211,10 @@ def parse_table(
         if data.startswith(marks):
             raise refuse("encoding", found=found, allowed="CSV as UTF-8 text", remedy=f"{FOREIGN}; or save it as UTF-8")
     rows = _csv_rows(decode(data, file, skipped), file, skipped)
-    _, header = next(rows, (1, []))
+    # Lines that say who wrote the table.
+    line_of_names, header = next(((line, row) for line, row in rows if not (row and row[0].startswith("#"))), (1, []))
     allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))
-    refuse_header = partial(refuse, line=1, allowed=allowed)
+    refuse_header = partial(refuse, line=line_of_names, allowed=allowed)
     if not header:
         raise refuse_header("empty", found="no header", remedy="write the column names into the first line")
     if len(header) == 1 and re.search(r"[;\t]", header[0]):

@@ -14,10 +14,12 @@ import math
 import os
 import re
 import secrets
+import shutil
 import stat
+import sys
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from importlib import resources
@@ -34,6 +36,7 @@ FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
 RESULTS_BYTES_MAX = 128 * 1024 * 1024
 """Largest size of a file of results, and of its unpacked arrays."""
 ARRAYS_MAX = 256
+LOCKED_BYTE = 2**40
 _NPY_HEADER = re.compile(
     rb"\x93NUMPY\x01\x00(?P<length>..)\{'descr': '(?P<kind>[<>|][biufU][0-9]{1,8})', 'fortran_order': "
     rb"(?P<fortran>True|False), 'shape': \((?P<shape>[0-9, ]{0,100})\),? ?\} *\n",
@@ -185,6 +188,9 @@ def flush_folder(folder: Path, disk: Flushing = os) -> None:
 
 
 OTHER_PLACE = "name another place or free this one"
+NEW_FOLDER = "a new or empty folder"
+UNFINISHED = re.compile(r"\.new\.[0-9a-f]{12}\.tmp$")
+"""What a killed `new_folder` leaves in an existing folder."""
 
 
 def unwritable(path: Path, error: OSError, allowed: str, remedy: str) -> InputError:
@@ -203,6 +209,37 @@ def write_atomically(path: Path, data: bytes) -> None:
         stream.write(data)
 
 
+def write_together(folder: Path, contents: Mapping[str, bytes | None]) -> None:
+    """Replace files of a folder in their order, once all are on the disk beside their places; None removes a file.
+
+    Raises:
+        InputError: the folder is missing, full or not writable.
+    """
+    prepared = {name: folder / _temporary(name) for name, data in contents.items() if data is not None}
+    try:
+        try:
+            for name, path in prepared.items():
+                with open(path, "xb") as stream:
+                    stream.write(contents[name] or b"")
+                    stream.flush()
+                    os.fsync(stream.fileno())
+            for name in contents:
+                if name in prepared:
+                    os.replace(prepared[name], folder / name)
+                else:
+                    (folder / name).unlink(missing_ok=True)
+        finally:
+            for path in prepared.values():
+                path.unlink(missing_ok=True)
+        flush_folder(folder)
+    except OSError as error:
+        raise unwritable(folder, error, "a writable folder with free space", OTHER_PLACE) from error
+
+
+def _temporary(name: str) -> str:
+    return f".{name}.{secrets.token_hex(6)}.tmp"
+
+
 @contextmanager
 def written_whole(path: Path) -> Iterator[BinaryIO]:
     """Open a stream that replaces `path` when its block ends without an error; else `path` stays unchanged.
@@ -212,7 +249,7 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
             the flush of the folder failed.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
+    temporary = path.with_name(_temporary(path.name))
     try:
         try:
             with open(temporary, "xb") as stream:
@@ -227,6 +264,31 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
         flush_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error, "a writable folder with free space", OTHER_PLACE) from error
+
+
+def locked(descriptor: int) -> bool:
+    """Lock an open file for this process; False where another one holds it. The lock ends with the process.
+
+    Raises:
+        OSError: the disk cannot lock files.
+    """
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            # The lock lies far beyond the end, so that readers are not locked out.
+            os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        # Errors of flock(2) and _locking for a held lock.
+        if error.errno in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK):
+            return False
+        raise
+    return True
 
 
 def remove_unfinished(folder: Path, names: Iterable[str]) -> list[str]:
@@ -256,15 +318,76 @@ def make_folder(folder: Path, *, empty: bool = False, but: Collection[str] = ())
     Raises:
         InputError: the folder cannot be created, or is not empty.
     """
-    allowed = "a new or empty folder"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        occupied = empty and any(path.name not in but for path in folder.iterdir())
+        occupied = empty and any(path.name not in but and not UNFINISHED.match(path.name) for path in folder.iterdir())
     except OSError as error:
-        raise unwritable(folder, error, allowed, "name another") from error
+        raise unwritable(folder, error, NEW_FOLDER, "name another") from error
     if occupied:
-        file, remedy = escaped(str(folder), 200), "name another folder; nothing is overwritten"
-        raise refusal("occupied", file=file, found="a folder with files", allowed=allowed, remedy=remedy)
+        raise _occupied(folder)
+
+
+def _occupied(folder: Path) -> InputError:
+    file, remedy = escaped(str(folder), 200), "name another folder; nothing is overwritten"
+    return refusal("occupied", file=file, found="a folder with files", allowed=NEW_FOLDER, remedy=remedy)
+
+
+@contextmanager
+def new_folder(to: Path, *, but: Collection[str] = ()) -> Iterator[Path]:
+    """Prepare the files of a new folder beside it; at the end of the block they are all there, or none of them.
+
+    Of two processes with one new folder, one wins whole and the other is refused. Yields the folder to write into.
+
+    Args:
+        to: a new folder, or an empty one.
+        but: names of files that the empty folder may contain.
+
+    Raises:
+        InputError: the folder cannot be created, or is not empty.
+    """
+    to = Path(to)
+    is_new = not to.exists()
+    make_folder(to.absolute().parent if is_new else to, empty=not is_new, but=but)
+    prepared = to.with_name(_temporary(to.name)) if is_new else to / _temporary("new")
+    try:
+        prepared.mkdir()
+        try:
+            yield prepared
+            for folder, _, _ in os.walk(prepared):
+                flush_folder(Path(folder))
+            if is_new:
+                os.rename(prepared, to)
+            else:
+                _move_into(prepared, to)
+        finally:
+            shutil.rmtree(prepared, ignore_errors=True)
+        flush_folder(to.absolute().parent if is_new else to)
+    except OSError as error:
+        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
+            raise _occupied(to) from error
+        raise unwritable(to, error, NEW_FOLDER, "name another") from error
+    except InputError as error:
+        if error.code != "write":
+            raise
+        # It names the place beside.
+        raise unwritable(to, OSError(error.found), NEW_FOLDER, "name another") from error
+
+
+def write_folder(to: Path, files: Mapping[str, bytes], *, but: Collection[str] = ()) -> list[str]:
+    """Write files by name into a new folder, all or none; arguments and errors as of `new_folder`. Returns paths."""
+    with new_folder(to, but=but) as prepared:
+        for name, data in files.items():
+            write_atomically(prepared / name, data)
+    return [str(Path(to) / name) for name in files]
+
+
+def _move_into(prepared: Path, to: Path) -> None:
+    """Move files into an existing folder; creating the first of them alone decides which of two processes wins."""
+    names = sorted(path.name for path in prepared.iterdir())
+    for name in names[:1]:
+        (to / name).touch(exist_ok=False)
+    for name in names:
+        os.replace(prepared / name, to / name)
 
 
 def require_writable(folder: Path) -> None:

@@ -198,6 +198,15 @@ class Keys:
             raise self.refuse(key, "word", allowed, remedy or closest(str(value)[:100], words))
         return str(value)
 
+    def some_words(self, key: str, words: tuple[str, ...]) -> tuple[str, ...]:
+        """A list of different words, in the order of `words`."""
+        allowed = f"a list of {' and '.join(shown(w) for w in words)}, or of one of them"
+        value = self._get(key, allowed)
+        entries: list[object] = value if isinstance(value, list) else []
+        if not entries or any(entry not in words for entry in entries) or len({*map(str, entries)}) != len(entries):
+            raise self.refuse(key, "words", allowed, f"write {key} = [{shown(words[0])}], or leave it out")
+        return tuple(word for word in words if word in entries)
+
     def numbers(self, key: str, low: float, high: float, most: int) -> tuple[float, ...]:
         """One number in [low, high], or a list of 1 to `most` different numbers."""
         allowed = f"a number from {low:g} to {high:g}, or a list of up to {most} different ones"

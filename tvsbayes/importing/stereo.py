@@ -18,13 +18,13 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from tvsbayes.errors import escaped, refusal
+from tvsbayes.errors import escaped
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import Keys
 from tvsbayes.importing.stereo_lenses import ERROR_MAX_PX, fitted_to_five, kind_of
 from tvsbayes.importing.stereo_programs import RATIONAL, adapted
 from tvsbayes.importing.stereo_trees import TREE_BYTES_MAX, read_trees
-from tvsbayes.importing.stereo_words import ROTATION_TOLERANCE, Entry, Fields, letters, words
+from tvsbayes.importing.stereo_words import ROTATION_TOLERANCE, Entry, Fields, letters, refused, words
 
 CAMERAS = ("left", "right")
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -75,9 +75,7 @@ def read_files(paths: Sequence[Path]) -> list[Keys]:
         if path.is_dir():
             inner = sorted(path.glob("*.npy")) or sorted(path.glob("*.txt"))
             if not 0 < len(inner) <= ARRAY_FILES_MAX:
-                found, allowed = f"a folder of {len(inner)} arrays", f"1 to {ARRAY_FILES_MAX} files .npy or .txt"
-                remedy = "name the files of the calibration: --import FILE"
-                raise refusal("kind", file=escaped(str(path), 200), found=found, allowed=allowed, remedy=remedy)
+                raise refused("folder", escaped(str(path), 200), count=len(inner), most=ARRAY_FILES_MAX)
         files += inner
     trees = [tree for path in files for tree in read_trees(read_bytes(path, TREE_BYTES_MAX), escaped(path.name))]
     if len(trees) > 1:
@@ -86,8 +84,7 @@ def read_files(paths: Sequence[Path]) -> list[Keys]:
         trees = [tree for tree in trees if tree not in alone]
         trees += [Keys(arrays, escaped(files[0].parent.name or "the arrays"), "")] if arrays else []
     if len(trees) > FILES_MAX:
-        found, allowed = f"{len(trees)} files", "one, two or three"
-        raise refusal("usage", file=trees[0].file, found=found, allowed=allowed, remedy="name those of one pair")
+        raise refused("files", trees[0].file, count=len(trees))
     return trees
 
 
@@ -150,7 +147,7 @@ class _Reader:
         """The pair by the names of `stereo.json`."""
         for name, (first, second) in self.fields.twice.items():
             remedy = f"say which: --key {name}={second.path}" if name in KEY_FIELDS else "remove one of them"
-            raise first.refuse("twice", "every quantity once", remedy, f"another under {second.place}")
+            raise first.refuse("twice", remedy=remedy, place=second.place)
         left, right = cameras = self.fields.cameras
         if self.fields.by_file and all("P" in camera for camera in cameras):
             shifts = [np.abs(camera["P"].numbers[[3, 7]]).max() for camera in cameras]
@@ -162,13 +159,8 @@ class _Reader:
             right.update({key: entry for key, entry in left.items() if key in ("fx", "fy", "cx", "cy")})
         for side in (0, 1):
             if kind_of(model := self.fields.model(side)) is None:
-                raise refusal(
-                    "lens-model",
-                    file=", ".join(keys.file for keys in self.fields.files),
-                    found=f"the model {escaped(model, 40)} of the {CAMERAS[side]} camera",
-                    allowed="plumb_bob, radtan, rational or equidistant",
-                    remedy="calibrate the pair again with five coefficients; renaming the model makes wrong rays",
-                )
+                files = ", ".join(keys.file for keys in self.fields.files)
+                raise refused("model", files, model=escaped(model, 40), side=CAMERAS[side])
         matrices = self.matrices = [self._matrix(side) for side in (0, 1)]
         size = self._size(matrices)
         if self._from_matlab():
@@ -228,9 +220,7 @@ class _Reader:
         self.places[name] = entry.place
         skewed = abs(matrix[0, 1]) > 1e-9 * abs(matrix[0, 0]) or matrix[1, 0] != 0
         if not (min(matrix[0, 0], matrix[1, 1]) > FOCAL_MIN and np.allclose(matrix[2], [0, 0, 1])) or skewed:
-            remedy = "is it another matrix? name it: --key M1=NAME"
-            allowed = "fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0, px"
-            raise entry.refuse("camera-matrix", allowed, remedy, "no camera matrix")
+            raise entry.refuse("matrix-pattern")
         return np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1.0]])
 
     def _distortion(self, side: int, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -255,16 +245,14 @@ class _Reader:
             return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
         count = {"fisheye": 4, "inverse": 5}.get(kind, values.size)
         if values.size != count:
-            found = f"{values.size} of a {kind} lens"
-            raise entry.refuse("lens-model", f"{count} coefficients", "take the file as it was", found)
+            raise entry.refuse("coefficients", found=values.size, kind=kind, count=count)
         fitted = fitted_to_five(matrix, values, size, "rational" if kind == "five" else kind)
         lens = {"fisheye": "a fisheye lens", "inverse": "a lens described from pixels to rays"}
         said = lens.get(kind, f"a lens of {values.size} coefficients")
         if not fitted.error_px <= ERROR_MAX_PX:
             miss = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "an undetermined amount"
-            allowed = f"what k1 k2 p1 p2 k3 describe to {ERROR_MAX_PX:g} px over the picture"
-            remedy = "do not rename the model: calibrate again with five coefficients, or crop the pictures"
-            raise entry.refuse("lens-model", allowed, remedy, f"{said}, which five coefficients miss by {miss}")
+            convert = words()["programs"]["convert"].get(self.source, "")
+            raise entry.refuse("lens", lens=said, miss=miss, most=ERROR_MAX_PX, convert=convert)
         self.notes.append(f"{entry.place}: {said}, fitted to five coefficients within {fitted.error_px:.2g} px")
         return fitted.distortion
 
@@ -277,8 +265,7 @@ class _Reader:
             entry = camera.get("size") or camera["width"]
             pixels = entry.numbers if "size" in camera else np.append(entry.numbers, camera["height"].numbers)
             if not all(n == int(n) and 1 <= n <= 65_535 for n in pixels):
-                found = escaped(str(pixels.tolist()), 60)
-                raise entry.refuse("image-size", "whole numbers of pixels", "correct it", found)
+                raise entry.refuse("pixels", found=escaped(str(pixels.tolist()), 60))
             width, height = int(pixels[0]), int(pixels[1])
             by_rows = _offset_share(matrix, (height, width)) < _offset_share(matrix, (width, height))
             if "size" in camera and (by_rows or self._from_matlab()) and width != height:
@@ -289,20 +276,18 @@ class _Reader:
             (left, entry), (right, _) = sizes
             found = f"left and right have two sizes: {left[0]} x {left[1]} and {right[0]} x {right[1]}"
             if abs(left[0] * right[1] / (left[1] * right[0]) - 1.0) > SHAPE_SHARE_MAX:
-                remedy = "calibrate them at sizes of one proportion"
-                raise entry.refuse("image-size", "sizes of one proportion of width to height", remedy, found)
+                raise entry.refuse("proportion", found=found)
             self.right_size = right
             self.notes.append(f"{found}: the right camera's numbers are those of its pictures scaled to the left one's")
         for size, entry in sizes[:1]:
             if self.stated_size not in (None, size):
-                found = f"{size[0]} x {size[1]} px"
-                raise entry.refuse("image-size", "the size of the pictures", "leave out --image-size", found)
+                raise entry.refuse("stated-size", found=f"{size[0]} x {size[1]}")
             return size
         if self.stated_size is not None:
             return self.stated_size
-        first, remedy = self.fields.files[0], "give it with --image-size, for example 1280x720"
-        remedy += f", or name {first.values['size_in']}, which has it" if "size_in" in first else ""
-        raise refusal("missing-key", file=first.file, found="no image size", allowed="image_width", remedy=remedy)
+        first = self.fields.files[0]
+        where = f", or name {first.values['size_in']}, which has it" if "size_in" in first else ""
+        raise refused("no-size", first.file, where=where)
 
     def _pose(self) -> _Pose:
         """R and T of x_right = R x_left + T, T in the file's unit: the first pose, checked against all others."""
@@ -325,12 +310,8 @@ class _Reader:
                 checks.append(partial(_essential_deviation, essential))
         for deviation in checks:
             if not deviation(first.rotation, first.translation) <= ROTATION_TOLERANCE:
-                allowed, found = "one pose of the right camera", "another pose than the rest of the file says"
-                remedy = "take the files as they were written, or remove what is of another calibration"
-                if deviation(first.rotation.T, first.translation) <= ROTATION_TOLERANCE:
-                    allowed, found = "R from left to right", "R transposed, by what else the file says"
-                    remedy = f"take its transpose: --key R={first.turn.path}.T"
-                raise first.turn.refuse("rotation", allowed, remedy, found)
+                turned = deviation(first.rotation.T, first.translation) <= ROTATION_TOLERANCE
+                raise first.turn.refuse("transposed" if turned else "other-pose", path=first.turn.path)
         if not checks and first.plain and "R" not in self.fields.stated:
             self._check_direction(first)
         return first
@@ -377,9 +358,7 @@ class _Reader:
         left, right = self.fields.cameras
         left_p, right_p = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
         if np.any(left_p[:2, 3] != 0) or not np.any(right_p[:2, 3]) or not (right_p[0, 0] > 0 and right_p[1, 1] > 0):
-            allowed = "P[0][3] = 0 in the left camera, -fx baseline in the right one"
-            remedy = "take both files from one stereo calibration"
-            raise right["P"].refuse("projection", allowed, remedy, "files that are no stereo pair")
+            raise right["P"].refuse("projection")
         turns = [c["rectification"].rotation() if "rectification" in c else np.eye(3) for c in (left, right)]
         if "M" not in left and "fx" not in left:
             # The files contain the rectified pair itself.
@@ -396,9 +375,7 @@ class _Reader:
         """
         path = pose.turn.path
         if self.transposed is not None:
-            remedy = f"say which: --key R={path}.T where it is transposed too, as by MATLAB, or --key R={path}"
-            found = f"R beside {self.transposed.place}, which is transposed: R may be too"
-            raise pose.turn.refuse("rotation", "R from left to right", remedy, found)
+            raise pose.turn.refuse("maybe-transposed", place=self.transposed.place, path=path)
         if math.degrees(float(np.linalg.norm(cv2.Rodrigues(pose.rotation)[0]))) < TURN_NOTED_DEG:
             return
         stated_deg, transposed_deg = (_toe_in_deg(r, pose.translation) for r in (pose.rotation, pose.rotation.T))
@@ -418,8 +395,7 @@ class _Reader:
     def _unit(self, length: float) -> float:
         """Millimetres per unit of the file: as stated, or by the format; an implausible one must be stated."""
         if not 0 < length < math.inf:
-            found, remedy = "cameras in one place", "T is 0: name the right one, --key T=NAME"
-            raise refusal("translation", file=self.places["T"], found=found, allowed="a baseline", remedy=remedy)
+            raise refused("no-baseline", self.places["T"])
         if self.unit_mm is not None:
             return self.unit_mm
         stated = self.unit or ("m" if self.source in words()["programs"]["metres"] else "")
@@ -429,12 +405,11 @@ class _Reader:
             inside = {name: length * mm for name, mm in UNITS_MM.items() if low <= length * mm <= high}
             options = [f"--import-unit {name} ({mm:.4g} mm)" for name, mm in inside.items()]
             options += [] if stated == "?" else [f"--import-unit {unit} if it is so"]
-            options += ["--import-unit 25 where it counts squares of 25 mm"] * (length < low)
-            found, allowed = f"cameras {length * UNITS_MM[unit]:.4g} mm apart, taken in {unit}", "without an option"
-            found = f"cameras {length:.4g} apart in a unit of the project" if stated == "?" else found
-            allowed = "a scale, or the unit" if stated == "?" else f"{low:g} to {high:g} mm {allowed}"
-            remedy = f"give {', or '.join(options or ['--import-unit 25 where 1 is 25 mm'])}"
-            raise refusal("unit", file=self.places["T"], found=found, allowed=allowed, remedy=remedy)
+            options += ["--import-unit 25 where it counts squares of 25 mm"] * (length < low or not options)
+            said = {"unit": unit, "low": low, "high": high, "options": ", or ".join(options)}
+            if stated == "?":
+                raise refused("no-unit", self.places["T"], length=length, **said)
+            raise refused("unit", self.places["T"], length=length * UNITS_MM[unit], **said)
         if not stated:
             self.notes.append("T is taken in mm: the file does not state a unit")
         return UNITS_MM[unit]

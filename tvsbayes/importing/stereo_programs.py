@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from tvsbayes.errors import InputError, escaped, listed, refusal
+from tvsbayes.errors import escaped, listed
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.documents import Keys
-from tvsbayes.importing.stereo_words import words
+from tvsbayes.importing.stereo_words import refused, words
 
 Size = tuple[int, int]
 Values = dict[str, Any]
@@ -30,7 +30,6 @@ STREAMS_MAX = 1000
 RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 """OpenCV's order of the coefficients of a rational lens."""
 FIRST_TWO = "cameras 1 (left) and 2 (right) of {}"
-MODELS_ALLOWED = "LENSMODEL_PINHOLE, LENSMODEL_OPENCV4, 5, 8 or 12"
 
 
 class Adapted(NamedTuple):
@@ -78,18 +77,8 @@ def adapted(keys: Keys, size: Size | None) -> Adapted | None:
                 unit = str(values.pop("unit", unit))
                 return Adapted(Keys(values, keys.file, keys.text), source, unit, notes)
             except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, cv2.error) as error:
-                raise refusal(
-                    "container",
-                    file=keys.file,
-                    found=f"entries that a file of this kind does not have, or lacks ({escaped(str(error), 60)})",
-                    allowed="the file as the camera's program writes it",
-                    remedy="take it again from there, whole",
-                ) from error
+                raise refused("structure", keys.file, error=escaped(str(error), 60)) from error
     return None
-
-
-def _lens_refusal(file: str, found: str, remedy: str, allowed: str = "a pinhole with k1 k2 p1 p2 k3") -> InputError:
-    return refusal("lens-model", file=file, found=found, allowed=allowed, remedy=remedy)
 
 
 def _numbers(text: str) -> list[float]:
@@ -190,7 +179,7 @@ def _kalibr_text(text: str) -> list[Values]:
 def _ost_text(text: str) -> list[Values]:
     """ost.txt of ROS' camera_calibration: the numbers of camera_info, one camera after the other."""
     trees = []
-    for part in re.split(r"^\s*\[image\]\s*$", text, flags=re.MULTILINE)[1:]:
+    for part in re.split(r"^[ \t]*\[image\][ \t]*$", text, flags=re.MULTILINE)[1:]:
         found = re.findall(r"^([a-z ]+)\n((?:[\d.eE+\- \t]+\n?)+)", part, re.MULTILINE)
         blocks = {name: _numbers(rows) for name, rows in found}
         values: Values = {f"image_{key}": int(blocks[key][0]) for key in ("width", "height") if blocks.get(key)}
@@ -206,11 +195,11 @@ def _halcon_text(text: str) -> list[Values]:
 
 
 _PRINTED: tuple[tuple[re.Pattern[str], Callable[[str], list[Values]]], ...] = (
-    (re.compile(r"^\s*\[LEFT_CAM_\w+\]\s*$", re.MULTILINE | re.IGNORECASE), _zed_text),
+    (re.compile(r"^[ \t]*\[LEFT_CAM_\w+\]\s*$", re.MULTILINE | re.IGNORECASE), _zed_text),
     (re.compile(rf'Intrinsic of "[^"\n]+" / [0-9]+x[0-9]|{_OBJECT}.*{_OBJECT}', re.DOTALL), _realsense_text),
     (re.compile(r"\A\s*Calibration results\s*\n=+\s*\n"), _kalibr_text),
     (re.compile(r"\A\s*# oST version"), _ost_text),
-    (re.compile(r"^\s*ParGroup: Cam\d|^# Used representation type", re.MULTILINE), _halcon_text),
+    (re.compile(r"^[ \t]*ParGroup: Cam\d|^# Used representation type", re.MULTILINE), _halcon_text),
 )
 
 
@@ -222,9 +211,7 @@ def _name_of_size(sizes: Mapping[str, Size], size: Size | None, file: str) -> st
     texts = [f"{width}x{height}" for width, height in sizes.values()]
     found = "no calibration of both cameras for one size"
     found = f"calibrations for pictures of {listed(texts, 8)} px" if texts else found
-    allowed, remedy = "the size of the pictures that the spots are in", f"--image-size {[*texts, '1280x720'][0]}"
-    remedy = f"state it, for example {remedy}"
-    raise refusal("image-size", file=file, found=found, allowed=allowed, remedy=remedy)
+    raise refused("which-size", file, found=found, example=[*texts, "1280x720"][0])
 
 
 def _zed(document: Values, file: str, size: Size | None, notes: list[str]) -> Values:
@@ -244,9 +231,8 @@ def _zed(document: Values, file: str, size: Size | None, notes: list[str]) -> Va
     def number(table: Values, section: str, key: str, default: float | None = None) -> float:
         value = table.get(f"{key}_{name}", table.get(key, default))
         if not isinstance(value, float):
-            found, column = "nothing" if value is None else escaped(str(value), 40), f"{section}.{key}"
-            remedy = "take the file as the ZED's program wrote it"
-            raise refusal("missing-key", file=file, column=column, found=found, allowed="a number", remedy=remedy)
+            found = "nothing" if value is None else escaped(str(value), 40)
+            raise refused("no-number", "", Keys({}, file, "", (section,)), key, found=found)
         return value
 
     values: Values = {}
@@ -275,10 +261,7 @@ def _depthai(document: Values, file: str, size: Size | None, notes: list[str]) -
         sockets = [1, 2]
     chains = [chain for s in sockets if s in cameras and (chain := _chain_pose(cameras, s)) is not None]
     if len(chains) < 2 or len({end for end, _ in chains}) > 1:
-        found = f"cameras at the sockets {listed([str(s) for s in cameras], 8) if cameras else 'none'}"
-        allowed = "two cameras, and a chain of toCameraSocket between them"
-        remedy = "take it from the device again: dai.CalibrationHandler.eepromToJsonFile()"
-        raise refusal("missing-key", file=file, found=found, allowed=allowed, remedy=remedy)
+        raise refused("chain", file, sockets=listed([str(s) for s in cameras], 8) if cameras else "none")
     (_, left), (_, right) = chains
     pose = np.linalg.inv(right) @ left
     values: Values = {"R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
@@ -311,11 +294,7 @@ def _realsense(document: Values, file: str, size: Size | None, notes: list[str])
     pair = STEREO_STREAMS if set(STEREO_STREAMS) <= set(names) else tuple(names)
     poses = [p for p in printed["poses"] if (p["from"], p["to"]) == pair and len(p["R"]) == 9 and len(p["T"]) == 3]
     if len(pair) != 2 or not poses:
-        streams = listed([escaped(name, 30) for name in names], 8)
-        found, allowed = f"streams {streams}, and no pose between two of them alone", "the intrinsics of two cameras"
-        remedy = "keep both Infrared streams, or those of your two cameras, and the extrinsics between them"
-        allowed = f"{allowed}, and the extrinsics from the first to the second"
-        raise refusal("missing-key", file=file, found=found, allowed=allowed, remedy=remedy)
+        raise refused("streams", file, streams=listed([escaped(name, 30) for name in names], 8))
     by_name = [{(s["width"], s["height"]): s for s in printed["streams"] if s["name"] == name} for name in pair]
     sizes = {f"{width}x{height}": (width, height) for width, height in by_name[0] if (width, height) in by_name[1]}
     chosen = sizes[_name_of_size(sizes, size, file)]
@@ -329,8 +308,7 @@ def _mrcal(document: Values, file: str, size: Size | None, notes: list[str]) -> 
     """One camera in mrcal's .cameramodel: fx fy cx cy and OpenCV's coefficients, pose from a reference; m."""
     model, numbers = str(document["lensmodel"]), [float(number) for number in document["intrinsics"]]
     if not re.fullmatch(r"LENSMODEL_(PINHOLE|OPENCV(4|5|8|12))", model):
-        remedy = "convert it: mrcal-convert-lensmodel LENSMODEL_OPENCV5 FILE, which prints by how much it misses"
-        raise _lens_refusal(file, f"the model {escaped(model, 60)}", remedy, MODELS_ALLOWED)
+        raise refused("mrcal", file, model=escaped(model, 60))
     values: Values = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=False))
     values |= {"distortion_model": model.removeprefix("LENSMODEL_").lower(), "D": numbers[4:] or [0.0] * 4}
     pose = _homogeneous(document["extrinsics"][:3], document["extrinsics"][3:])
@@ -362,8 +340,7 @@ def _calibio(document: Values, file: str, size: Size | None, notes: list[str]) -
         # Only the first object of a class states its name (cereal).
         name = camera["model"].get("polymorphic_name", name)
         if name != "libCalib::CameraModelOpenCV":
-            remedy = "calibrate again with the model OpenCV, k1 k2 p1 p2 k3"
-            raise _lens_refusal(file, f"the model {escaped(name, 60)} of calib.io", remedy)
+            raise refused("calibio", file, model=escaped(str(name), 60))
         data = camera["model"]["ptr_wrapper"]["data"]
         stated = {key: float(entry["val"]) for key, entry in data["parameters"].items()}
         values[side] = {"fx": stated["f"], "fy": stated["f"] * stated["ar"], "cx": stated["cx"], "cy": stated["cy"]}
@@ -391,16 +368,14 @@ def _metashape(document: Values, file: str, size: Size | None, notes: list[str])
     sensors = {sensor["id"]: sensor for sensor in listed_in(chunk, "sensors", "sensor")}
     cameras = [camera for camera in listed_in(chunk, "cameras", "camera") if len(camera.get("transform", ())) == 16]
     if len(cameras) != 2:
-        found, remedy = f"{len(cameras)} cameras with a pose", "export the two pictures of one moment alone"
-        raise refusal("missing-key", file=file, found=found, allowed="two cameras with a transform", remedy=remedy)
+        raise refused("metashape-poses", file, count=len(cameras))
     values: Values = {}
     for side, camera in zip(("left", "right"), cameras, strict=True):
         sensor = sensors[camera["sensor_id"]]
         options = sensor["calibration"] if isinstance(sensor["calibration"], list) else [sensor["calibration"]]
         stated = {"b1": 0.0, "b2": 0.0, "cx": 0.0, "cy": 0.0, **options[-1]}
         if sensor.get("type") != "frame" or any(stated.get(key) for key in ("b2", "k4", "p3", "p4")):
-            remedy = "fix b2, k4, p3, p4 at 0 and optimise again, or export the sensor by its OpenCV format (XML)"
-            raise _lens_refusal(file, f"a sensor of type {escaped(str(sensor.get('type')), 20)} of Metashape", remedy)
+            raise refused("metashape-lens", file, model=escaped(str(sensor.get("type")), 20))
         width, height = (int(stated["resolution"][key]) for key in ("width", "height"))
         values[side] = {"fx": stated["f"] + stated["b1"], "fy": stated["f"], "width": width, "height": height}
         values[side] |= {"cx": width / 2 - 0.5 + stated["cx"], "cy": height / 2 - 0.5 + stated["cy"]}

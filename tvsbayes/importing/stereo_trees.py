@@ -25,12 +25,12 @@ from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import array_of, arrays_of
 from tvsbayes.files.documents import Keys, parse_json, parse_toml
-from tvsbayes.files.foreign_table import text_of
 from tvsbayes.importing.stereo_programs import printed_trees
+from tvsbayes.importing.text import text_of
 
 PACKED = struct.error, zlib.error
 TREE_BYTES_MAX = 4 * 1024 * 1024
-ENTRIES_MAX = 200_000
+ENTRIES_MAX, PRINTED_CHARS_MAX = 200_000, 1_000_000
 DEPTH_MAX = 12
 LIMITS_TEXT, TRIM_REMEDY = f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
 _FORMATS_TEXT = (
@@ -65,7 +65,7 @@ def read_trees(data: bytes, file: str) -> list[Keys]:
             return [Keys(_plain(values, file), file, "")]
     text = text_of(data, file, _FORMATS_TEXT, _TEXT_REMEDY).text
     try:
-        printed = printed_trees(text)
+        printed = printed_trees(text) if len(text) <= PRINTED_CHARS_MAX else []
     except (ValueError, ArithmeticError) as error:
         found, *remedy = map(str, error.args)
         raise container_error(file, None, found, *remedy or ["take the file as the program wrote it"]) from error
@@ -79,7 +79,7 @@ def read_trees(data: bytes, file: str) -> list[Keys]:
         if text.count(",") > ENTRIES_MAX:
             raise container_error(file, None, LIMITS_TEXT, TRIM_REMEDY)
         return [parse_json(text.encode(), file)]
-    if re.match(r"(\s|#.*\n)*(\[[\w.\"-]+\]\s*(#.*)?$|[\w.-]+\s*=)", text, re.MULTILINE):
+    if re.match(r"(?:\s|#.*\n)*+(\[[\w.\"-]+\]\s*(#.*)?$|[\w.-]+\s*=)", text, re.MULTILINE):
         return [parse_toml(text.encode(), file)]
     return [Keys(_plain(document, file), file, text) for document in _yaml(text, file)]
 
@@ -115,19 +115,11 @@ def _plain(value: Any, file: str) -> Any:
 
 _MAT_PROGRAM = """
 import io, json, sys
-import numpy as np
 from scipy.io import loadmat
 
-def plain(value):
-    if isinstance(value, dict):
-        return {str(key): plain(each) for key, each in value.items() if not str(key).startswith("__")}
-    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return value.tolist()
-    if isinstance(value, np.ndarray | list):
-        return [plain(each) for each in (value if isinstance(value, list) else value.tolist())]
-    return value if isinstance(value, str | int | float) else None
-
-json.dump(plain(loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True)), sys.stdout)
+values = loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True)
+values = {key: value for key, value in values.items() if not key.startswith("__")}
+json.dump(values, sys.stdout, default=lambda value: value.tolist() if hasattr(value, "tolist") else None)
 """
 
 

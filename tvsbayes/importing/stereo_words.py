@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from tvsbayes.errors import InputError, closest, escaped, listed, refusal
+from tvsbayes.errors import InputError, closest, escaped, listed, refusal, shown
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.files.documents import Keys
 
@@ -38,6 +38,14 @@ def fields() -> dict[str, tuple[tuple[int, ...], list[str]]]:
     """Counts of numbers that a field can have, and its names."""
     tables = (words()[kind] for kind in ("camera", "pair", "made"))
     return {name: (tuple(of["counts"]), of["names"].split()) for table in tables for name, of in table.items()}
+
+
+def refused(what: str, file: str, keys: Keys | None = None, key: str = "", **values: object) -> InputError:
+    """A refusal of `data/words/stereo.toml` in a file, or of a key of a table."""
+    text = {name: text.format(**values) for name, text in words()["says"][what].items()}
+    if keys is not None:
+        return keys.refuse(key, text["code"], text["allowed"], text["remedy"], text["found"])
+    return refusal(text["code"], file=file, found=text["found"], allowed=text["allowed"], remedy=text["remedy"])
 
 
 class Meaning(NamedTuple):
@@ -81,16 +89,15 @@ class Entry(NamedTuple):
         """Key and file, in words."""
         return f"{escaped(self.path, 80)} of {self.keys.file}"
 
-    def refuse(self, code: str, allowed: str, remedy: str, found: str) -> InputError:
+    def refuse(self, what: str, **values: object) -> InputError:
         """The refusal of these numbers."""
-        return self.keys.refuse(self.key, code, allowed, remedy, found)
+        return refused(what, "", self.keys, self.key, **values)
 
     def rotation(self) -> np.ndarray:
         """The rotation (3, 3): nearest to a matrix of nine numbers, or from Rodrigues' three."""
         if self.numbers.size == 3:
             if np.linalg.norm(self.numbers) > math.pi:
-                found = escaped(str(self.numbers.tolist()), 60)
-                raise self.refuse("rotation", "Rodrigues' vector, rad", "is it in degrees? give R as a matrix", found)
+                raise self.refuse("degrees", found=escaped(str(self.numbers.tolist()), 60))
             return cv2.Rodrigues(self.numbers)[0]
         return self._nearest(self.numbers.reshape(3, 3))
 
@@ -108,9 +115,7 @@ class Entry(NamedTuple):
     def _nearest(self, matrix: np.ndarray) -> np.ndarray:
         deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
         if not deviation <= ROTATION_TOLERANCE:
-            allowed = f"R R^T = 1 and det R = +1 to {ROTATION_TOLERANCE:g}"
-            remedy = "take the file as its tool wrote it, or name the right entry: --key R=NAME"
-            raise self.refuse("rotation", allowed, remedy, f"a matrix that misses it by {deviation:.3g}")
+            raise self.refuse("no-rotation", found=deviation, tolerance=ROTATION_TOLERANCE)
         u, _, vt = np.linalg.svd(matrix)
         return u @ vt
 
@@ -146,9 +151,9 @@ def entries_of(keys: Keys, file: int) -> Iterator[Entry]:
     for key, value in keys.values.items():
         numbers = numbers_of(value)
         if numbers is None and isinstance(value, dict) and {"rows", "cols", "data"} <= {name.lower() for name in value}:
-            raise keys.refuse(key, "matrix", "rows times cols finite numbers", "take the file as its tool wrote it")
+            raise refused("not-finite", "", keys, key)
         if isinstance(value, str) and any(letters(key) in fields()[side][1] for side in ("width", "height")):
-            raise keys.refuse(key, "integer", "a whole number of px", "correct the value")
+            raise refused("pixel-text", "", keys, key, found=shown(value))
         if numbers is not None:
             yield Entry(keys, key, numbers.ravel(), numbers.shape, file)
         elif isinstance(value, dict):
@@ -260,13 +265,10 @@ class Fields:
         if len(hits) != 1 or hits[0].numbers.size not in fields()[field.rstrip("12")][0]:
             paths = [entry.path for entry in self.entries]
             found = f"{len(hits)} entries of that name" if len(hits) != 1 else f"{hits[0].numbers.size} numbers"
-            raise refusal(
-                "usage",
-                file=self.files[0].file,
-                found=f"--key {field}={escaped(name, 60)}: {found}",
-                allowed=f"one of {listed([escaped(path, 40) for path in paths], NAMES_LISTED)}",
-                remedy=closest(name[:80], paths) if paths else "name a file that holds numbers",
-            )
+            known = listed([escaped(path, 40) for path in paths], NAMES_LISTED)
+            remedy = closest(name[:80], paths) if paths else "name a file that holds numbers"
+            said = {"field": field, "name": escaped(name, 60), "found": found, "paths": known, "remedy": remedy}
+            raise refused("stated-key", self.files[0].file, **said)
         return hits[0]
 
     def missing(self, lacking: Sequence[str]) -> InputError:
@@ -275,29 +277,23 @@ class Fields:
         file = ", ".join(keys.file for keys in self.files)
         if len(self.files) == 1 and len(sideless["M"]) > 1 and "M1" in lacking:
             stated = [f"--key {field}{k}={name}" for field in "MD" for k, name in enumerate(sideless[field][:2], 1)]
-            found = f"camera matrices that no name gives to left and right: {listed(sideless['M'], NAMES_LISTED)}"
-            remedy = f"say which is which: {' '.join(stated)}"
-            allowed = "names with left and right, 0 and 1 or 1 and 2"
-            return refusal("missing-key", file=file, found=found, allowed=allowed, remedy=remedy)
+            return refused("sides", file, names=listed(sideless["M"], NAMES_LISTED), options=" ".join(stated))
         if len(self.files) == 1 and (sideless["M"] or sideless["fx"]):
-            found, allowed = "the calibration of one camera", "a pair: both cameras, and R and T between them"
-            remedy = "name the other camera's file too: --import LEFT --import RIGHT; R and T need pictures of both"
-            return refusal("missing-file", file=file, found=found, allowed=allowed, remedy=remedy)
+            return refused("one-camera", file)
         bare = {field.rstrip("12") for field in lacking}
         for entry in self.entries:
             names = {meaning.field for meaning in meanings(entry, of_any_count=True)} & bare
             if names and entry.numbers.size != 1 and not meanings(entry):
-                allowed = f"{', '.join(map(str, fields()[min(names)][0]))} finite numbers"
+                counts = ", ".join(map(str, fields()[min(names)][0]))
                 remedy = "write k1 k2 p1 p2 k3, 0 for those that the lens lacks" if "D" in names else "correct it"
                 found = f"{entry.numbers.size} numbers" if entry.numbers.size else "no list of finite numbers"
-                return entry.refuse("matrix", allowed, remedy, found)
+                return entry.refuse("count", counts=counts, remedy=remedy, found=found)
         unknown = [entry.path for entry in self.entries if not meanings(entry) and entry.numbers.size > 1]
         others = listed([escaped(path, 40) for path in unknown], NAMES_LISTED) if unknown else "no other numbers"
         remedy = "a pair needs M D of both cameras and R T between them: name the other file too"
         if unknown:
             remedy = f"name what holds it: --key {lacking[0]}=NAME"
-        found, allowed = f"no {' '.join(lacking)} under a name that is known, and {others}", "M1 D1 M2 D2 and R T"
-        return refusal("missing-key", file=file, found=found, allowed=f"{allowed}, or what gives them", remedy=remedy)
+        return refused("missing", file, lacking=" ".join(lacking), others=others, remedy=remedy)
 
     def model(self, camera: int) -> str:
         """The name of a camera's lens model in the files, lower case; "" if none."""

@@ -2,8 +2,7 @@
 
 The base is the parent link of the pan joint, z up; the beam is x of the child link of the tilt joint (REP 103). Joints
 turn by the right-hand rule about their axes: a tilt joint about +y lowers the beam. URDF: m and rad, `rpy` about fixed
-axes; terms in mm and degrees. The XML is read by expat: references to characters and comments inside numbers mean what
-XML says. Positions of elements refer to the text in UTF-8, in which `head.urdf` writes the corrected file.
+axes; terms in mm and degrees. Numbers are what XML says, by expat. Positions of elements are those in UTF-8.
 """
 
 from __future__ import annotations
@@ -104,16 +103,6 @@ class Tag:
             raise (self.first("axis") or self).refuse("an axis of length 0", "a direction", "write a unit vector")
         return axis / np.linalg.norm(axis)
 
-    def limits(self) -> tuple[float, float] | None:
-        """Lower and upper end of a revolute joint, rad; None where none are stated."""
-        tag = self.first("limit")
-        if self.type == "continuous" or tag is None:
-            return None
-        lower, upper = (float(self.numbers("limit", end, (0.0,))[0]) for end in ("lower", "upper"))
-        if not lower < upper:
-            raise tag.refuse(f"lower {lower:g}, upper {upper:g}", "lower < upper, rad", "exchange or correct them")
-        return lower, upper
-
 
 @dataclass(frozen=True)
 class Urdf:
@@ -133,11 +122,7 @@ class Urdf:
 
 
 def read_urdf(data: bytes, file: str) -> Urdf:
-    """Parse a URDF.
-
-    Raises:
-        InputError: not XML, a document type declaration, no robot, an unexpanded xacro, or two joints of one name.
-    """
+    """Parse a URDF; refuses document types, entities, an unexpanded xacro, and two joints of one name."""
     # Without a mark the declaration is ASCII in all other encodings.
     declared = re.match(rb"\s*<\?xml[^>]*?\sencoding\s*=\s*[\"']([\w.-]+)", data)
     wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
@@ -222,14 +207,13 @@ class HeadJoints:
     """Two joints of a URDF as a head; dictionaries by "pan" and "tilt".
 
     Attributes:
-        urdf: the file.
-        names: names of the joints.
+        urdf, names: the file, and the names of the joints.
         terms: nominal values, by the names of the head's terms; mm, degrees.
         sign: sense of a joint's motion where azimuth or elevation grows.
         height_m: distance of the tilt axis from the pan joint, along the pan axis.
         between: rotation and shift (m) from the child link of the pan joint to the parent link of the tilt joint.
-        reductions: turns of the motor for one of the joint; None where no transmission states them.
-        limits_deg: lowest and highest angle from the joint's zero, in the sense of azimuth or elevation; None without.
+        reductions: turns of the motor for one of the joint; None where not stated.
+        limits_deg: lowest and highest angle from the zero, as azimuth or elevation grows; None where not stated.
     """
 
     urdf: Urdf
@@ -247,12 +231,7 @@ class HeadJoints:
 
 
 def head_joints(data: bytes, file: str, names: Mapping[str, str | None]) -> HeadJoints:
-    """Read two joints as a head.
-
-    Args:
-        data: the URDF.
-        file: its name.
-        names: names of the joints by axis, None to find them in the file.
+    """Read two joints of the URDF in `file` as a head; `names` by axis, None to find them in the file.
 
     Raises:
         InputError: a joint is missing, does not turn, or is not mounted on the other; a number is none or absurd; the
@@ -306,13 +285,21 @@ def head_joints(data: bytes, file: str, names: Mapping[str, str | None]) -> Head
     ahead_m, aside_m, height_m = Frames.of(terms).stage.inv().apply(place)
     terms |= {"elevation_axis_offset_mm": 1000 * ahead_m, "beam_offset_mm.y": 1000 * aside_m}
     terms = {name: 0.0 if abs(value) < 1e3 * SAME else value for name, value in terms.items()}
-    sign, limits = {"pan": upwards, "tilt": -sense}, dict[str, tuple[float, float] | None]()
-    for axis, joint in (("pan", pan), ("tilt", tilt)):
-        ends = joint.limits()
-        low, high = sorted(math.degrees(sign[axis] * end) for end in ends or (0.0, 0.0))
-        limits[axis] = None if ends is None else (low, high)
+    sign = {"pan": upwards, "tilt": -sense}
+    limits = {axis: _limits_deg(joints[name], sign[axis]) for axis, name in chosen.items()}
     reductions = {axis: _reduction(urdf.reduction(name)) for axis, name in chosen.items()}
     return HeadJoints(urdf, chosen, terms, sign, height_m, between, reductions, limits)
+
+
+def _limits_deg(joint: Tag, sign: int) -> tuple[float, float] | None:
+    tag = joint.first("limit")
+    if joint.type == "continuous" or tag is None:
+        return None
+    lower, upper = (float(joint.numbers("limit", end, (0.0,))[0]) for end in ("lower", "upper"))
+    if not lower < upper:
+        raise tag.refuse(f"lower {lower:g}, upper {upper:g}", "lower < upper, rad", "exchange or correct them")
+    low, high = sorted(math.degrees(sign * end) for end in (lower, upper))
+    return low, high
 
 
 def _reduction(tag: Tag | None) -> float | None:
@@ -327,7 +314,6 @@ def _reduction(tag: Tag | None) -> float | None:
 
 
 def _refused(file: str, found: str, allowed: str, remedy: str) -> InputError:
-    """The error for joints that do not form a head."""
     return refusal("urdf-joint", file=file, found=found, allowed=allowed, remedy=remedy)
 
 

@@ -8,23 +8,21 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import NotConverged, escaped, refusal
-from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
-from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
+from tvsbayes.errors import NotConverged
+from tvsbayes.files.documents import Keys
 from tvsbayes.inference.summaries import Propagated, carried, reweighted
 from tvsbayes.results.records import AnswerKind
+from tvsbayes.results.store import AGAIN, FitFiles, damaged_draws
 
 if TYPE_CHECKING:
     import pandas as pd
 
-AGAIN = "run `tvsbayes fit` on the folder again"
 FORMAT, OLDER = re.compile(r"tvsbayes-(?:[a-z]+-)?fit/1"), re.compile(r"tvsbayes-(?:[a-z]+-)?fit/[0-9]+")
 """Formats of `fit.json` whose draws can be read, of any instrument; formats of any version."""
 ANSWERS: tuple[AnswerKind, ...] = ("accepted", "rough", "laplace")
@@ -76,31 +74,14 @@ class StoredPosterior(Shown):
         return reweighted(values[None], self.weights[None])
 
 
-def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosterior:
-    """Load the draws of a fit from a folder's `results/`, of any instrument, without JAX.
-
-    Args:
-        folder: folder of a campaign after `tvsbayes fit`, or its `results`.
-        anyway: accept a rough answer or the Laplace approximation too.
-
-    Returns:
-        Named draws with weights, `.propagate(f)` for quantities of them. Changes of the campaign since the fit are not
-        checked.
+def posterior_in(files: FitFiles, *, anyway: bool = False) -> StoredPosterior:
+    """The draws of a fit by name, from its files; `anyway` takes a rough answer or the Laplace approximation too.
 
     Raises:
-        InputError: there are no results, they are damaged or of a version that cannot be read.
+        InputError: they are damaged or of a version that cannot be read.
         NotConverged: the fit has no answer, or none that is accepted.
     """
-    folder = Path(folder)
-    inner = folder / "results"
-    place = inner if inner.is_dir() or not (folder / "fit.json").exists() else folder
-    missing = [name for name in ("fit.json", "draws.npz") if not (place / name).exists()]
-    if missing:
-        allowed, remedy = "a folder with results/ that `tvsbayes fit` wrote", "run `tvsbayes fit` on the folder first"
-        name = escaped(str(folder), 200)
-        raise refusal("missing-file", file=name, found=f"no results/{missing[0]}", allowed=allowed, remedy=remedy)
-    keys = parse_json(read_bytes(place / "fit.json", JSON_BYTES_MAX), "results/fit.json")
-    kind = keys.text_value("format")
+    keys, kind = files.keys, files.keys.text_value("format")
     if not FORMAT.fullmatch(kind):
         remedy = "read it with the tvsbayes that wrote it, or fit again" if OLDER.fullmatch(kind) else AGAIN
         raise keys.refuse("format", "format", "a fit of version 1, such as tvsbayes-fit/1", remedy)
@@ -110,7 +91,7 @@ def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosteri
         message = f"results/fit.json: the fit is {what}: its intervals are not accepted"
         remedy = "run `tvsbayes fit` without --no-sample or --quick; or load it with anyway=True and say so"
         raise NotConverged("unaccepted", message, remedy=remedy)
-    return _merged(_draws(place / "draws.npz"), answer)
+    return _merged(_draws(files.arrays), answer)
 
 
 def answer_of(keys: Keys) -> AnswerKind:
@@ -130,22 +111,20 @@ def answer_of(keys: Keys) -> AnswerKind:
     return ANSWERS[ANSWERS.index(keys.word("answer", ANSWERS))]
 
 
-def _draws(path: Path) -> dict[str, np.ndarray]:
+def _draws(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return all named columns."""
     draws: dict[str, np.ndarray] = {}
     try:
-        file = read_arrays(path, RESULTS_BYTES_MAX)
         for names, values in COLUMNS:
-            if names in file and values in file:
-                columns = np.asarray(file[values], dtype=float)
+            if names in arrays and values in arrays:
+                columns = np.asarray(arrays[values], dtype=float)
                 if columns.ndim != 2 or len(columns) < 2 or not np.all(np.isfinite(columns)):
                     raise ValueError(f"{values} of shape {columns.shape}")
-                draws |= dict(zip(map(str, file[names].tolist()), columns.T, strict=True))
+                draws |= dict(zip(map(str, arrays[names].tolist()), columns.T, strict=True))
         if not draws or len({len(column) for column in draws.values()}) > 1:
             raise ValueError("no draws by name, or columns of other lengths")
-    except (KeyError, TypeError, ValueError) as error:
-        allowed, reason = "draws by name, finite, as `tvsbayes fit` writes them", escaped(str(error), 120)
-        raise refusal("damaged", file="results/draws.npz", found=reason, allowed=allowed, remedy=AGAIN) from error
+    except (TypeError, ValueError) as error:
+        raise damaged_draws(error, "draws by name, finite, as `tvsbayes fit` writes them") from error
     return draws
 
 

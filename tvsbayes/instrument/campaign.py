@@ -31,7 +31,7 @@ from tvsbayes.files.csv_kind import (
     unique,
 )
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_toml, toml_line
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign_header import parse_header
@@ -59,7 +59,6 @@ APERTURE_MAX_DEG = 360.0
 """Largest absolute aperture reading."""
 # Distance outside the image allowed for a centroid, in image sizes: half a spot at the edge, not a wrong file.
 _IMAGE_MARGIN = 0.1
-_SIDES = "approach side from anfahrt seite von lado desde aproximacion cote approche depuis"
 _WHERE_OK = filled_where_ok("give the value or a refusal reason")
 _PIXEL = Column(
     "raw centroids, px, integer = centre of a pixel, (0, 0) the centre of the first (MATLAB counts from 1: subtract 1)",
@@ -91,7 +90,6 @@ class Move:
         Column(
             "0, 1, 2, ...",
             rule=counted,
-            names="move movement bewegung fahrt movimiento mouvement deplacement pose",
         ),
     ]
     segment: Annotated[
@@ -99,8 +97,6 @@ class Move:
         Column(
             "0, then the same or one more: a homing begins the next segment",
             rule=segments_in_time,
-            names="segment seg homing homings home homed rehomed reference referenced referenzfahrt referenziert "
-            "referenciado segmento",
         ),
     ]
     time_s: Annotated[
@@ -108,8 +104,6 @@ class Move:
         Column(
             "seconds, never decreasing",
             *(-1e12, 1e12),
-            names="time t timestamp stamp datetime date millis micros seconds elapsed zeit uhrzeit zeitstempel datum "
-            "tiempo hora fecha temps heure utc",
         ),
     ]
     pan_steps: Annotated[
@@ -117,7 +111,6 @@ class Move:
         Column(
             "absolute counters AFTER the move, whole numbers; left and up count up",
             *(-COUNTER_MAX, COUNTER_MAX),
-            names="pan azimuth azimut acimut horizontal horizontale horiz hor schwenk schwenken giro panoramique",
         ),
     ]
     tilt_steps: Annotated[
@@ -125,8 +118,6 @@ class Move:
         Column(
             "",
             *(-COUNTER_MAX, COUNTER_MAX),
-            names="tilt elevation vertical vert vertikal vertikale verticale hohe hoehe neigung neigen kippen "
-            "elevacion inclinacion inclinaison",
         ),
     ]
     pan_approach: Annotated[
@@ -135,12 +126,11 @@ class Move:
             "in the first row of a segment: `left`, `right` or `unknown`, the side from which the axis came there; "
             "empty elsewhere",
             rule=first_of_segment,
-            names=_SIDES,
         ),
     ] = ""
     tilt_approach: Annotated[
         TiltApproach | Literal[""],
-        Column("likewise `up`, `down`, `unknown`", rule=first_of_segment, names=_SIDES),
+        Column("likewise `up`, `down`, `unknown`", rule=first_of_segment),
     ] = ""
     temperature_degC: Annotated[
         float | None,
@@ -148,9 +138,16 @@ class Move:
             "optional: of the machine; its zeros shift with it. Empty cells are interpolated in time",
             *TEMPERATURES_DEGC,
             group="temperature",
-            names="temperature temp temperatur temperatura",
         ),
     ] = None
+    assumed: Annotated[
+        int,
+        Column(
+            "optional: 1 for a move that an import has added; no plan goes by it; empty or 0: made",
+            *(0, 1),
+            group="assumed",
+        ),
+    ] = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,7 +162,6 @@ class Spot:
         Column(
             "unique id",
             rule=unique,
-            names="spot look id nr no num index shot nummer aufnahme fleck numero toma mancha tache vue",
         ),
     ]
     move: Annotated[int, Column("the last move before the look")]
@@ -173,18 +169,15 @@ class Spot:
         str,
         Column(
             "any name for the placement of the sheet",
-            names="target sheet plane screen wall blatt schirm wand ebene tafel hoja plano pantalla pared feuille "
-            "ecran mur cible",
         ),
     ]
     experiment: Annotated[
         int | None,
         Column(
             "of the four-point method: number, and 1 to 4; both or neither",
-            names="experiment exp versuch experimento ensayo essai experience trial run",
         ),
     ] = None
-    point: Annotated[int | None, Column("", 1, 4, names="point pt punkt punto")] = None
+    point: Annotated[int | None, Column("", 1, 4)] = None
     u_left_px: Annotated[float | None, _PIXEL] = None
     v_left_px: Annotated[float | None, _PIXEL] = None
     u_right_px: Annotated[float | None, _PIXEL] = None
@@ -198,7 +191,6 @@ class Spot:
         Column(
             "the scanner's own reading, deg, or empty",
             *(-APERTURE_MAX_DEG, APERTURE_MAX_DEG),
-            names="aperture b receiver rx blende offnung empfanger apertura receptor ouverture recepteur apertur",
         ),
     ] = None
     status: Annotated[
@@ -207,7 +199,6 @@ class Spot:
             "`ok`; `undetected` (pixels empty, frames wait); or a reason in words",
             chars_max=200,
             filled=True,
-            names="status state ok valid quality zustand gultig qualitat estado valido calidad etat valide qualite",
         ),
     ] = "ok"
     ruv_left: Annotated[float, _CORRELATION] = 0.0
@@ -554,15 +545,12 @@ def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
 
 
 def write_campaign(campaign: Campaign, folder: Path) -> None:
-    """Write the four files of a campaign into a new or empty folder.
+    """Write the four files of a campaign into a new or empty folder, all or none.
 
     Raises:
-        InputError: the folder is not empty or cannot be written; `campaign_bytes` refuses (then nothing is written).
+        InputError: the folder is not empty or cannot be written, or `campaign_bytes` refuses.
     """
-    folder, files = Path(folder), campaign_bytes(campaign)
-    make_folder(folder, empty=True)
-    for name, data in files.items():
-        write_atomically(folder / name, data)
+    write_folder(Path(folder), campaign_bytes(campaign))
 
 
 def input_hashes(campaign: Campaign) -> dict[str, str]:

@@ -13,9 +13,9 @@ from itertools import pairwise
 from typing import Any
 
 from tvsbayes.errors import InputError, escaped
+from tvsbayes.importing.counters import COUNTERS
 from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Look, Move, Spot, stereo_spots
-from tvsbayes.instrument.column_names import COUNTERS
 
 _SHIFT = re.compile(r"([+-]?[0-9]{1,9})(?:@([0-9]{1,9}))?")
 

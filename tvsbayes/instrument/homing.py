@@ -14,6 +14,7 @@ from typing import Any
 
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign, Move
+from tvsbayes.instrument.parameters import Prior
 
 ANYWHERE = "anywhere"
 ONE_SIDED_CHANCE = 0.45
@@ -26,6 +27,12 @@ type Sides = Mapping[str, str]
 def unrecorded(moves: Sequence[Move]) -> tuple[str, ...]:
     """Axes without any recorded homing side."""
     return tuple(axis for axis in AXES if {getattr(m, f"{axis}_approach") for m in moves} <= {"", "unknown"})
+
+
+def has_play(priors: Mapping[str, Prior], axis: str) -> bool:
+    """Whether an axis may have play, by its priors."""
+    names = f"backlash_deg.{axis}", f"play_variation_deg.{axis}"
+    return any(priors[name].u > 0 or priors[name].value > 0 for name in names)
 
 
 def ways(axis: str) -> dict[str, float]:

@@ -216,25 +216,31 @@ class Redraws:
         redraw: whether the stop error of (pan, tilt) is new, shape (n, 2).
         redraw_mix: shares of the (negative, positive) direction in its variance, shape (n, 2, 2); one half each where
             the direction is unknown.
-        new_segment: whether the axes homed, shape (n,).
-        homed: whether they homed with an unknown home offset, shape (n,).
-        hours: time since the previous look, or since a homing after it, shape (n,).
+        new_segment: whether a segment began, and with it the play's position, shape (n,).
+        new_zero: whether the zero of (pan, tilt) is that of a homing; of an absolute encoder only at the first look,
+            shape (n, 2).
+        homed: whether it has an unknown home offset, shape (n, 2).
+        hours: time over which it walked: since the previous look, or since a homing after it, shape (n, 2).
     """
 
     redraw: np.ndarray
     redraw_mix: np.ndarray
     new_segment: np.ndarray
+    new_zero: np.ndarray
     homed: np.ndarray
     hours: np.ndarray
 
 
-def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) -> Redraws:
+def redraws(
+    moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1, absolute: Collection[str] = ()
+) -> Redraws:
     """Mark new stop errors: an axis draws one when its own counter changes or homing sets it (formulation 3.1).
 
     Args:
         moves: all moves in order.
         looks: number of the move before each look, in order.
         homed_from: first segment with an unknown home offset.
+        absolute: axes whose encoder keeps the zero: a homing draws none.
     """
     rests_at = [[rests[move] for move in looks] for rests in (rests_of(moves, axis) for axis in AXES)]
     move_numbers = np.array([[rest.move for rest in rests] for rests in rests_at]).T.reshape(-1, 2)
@@ -245,6 +251,18 @@ def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) ->
     segment = np.array([rest.segment for rest in rests_at[0]], dtype=int)
     seen_s = np.array([moves[move].time_s for move in looks], dtype=float)
     homed_s = np.array([moves[rest.homing].time_s for rest in rests_at[0]], dtype=float)
-    since_s = seen_s - np.where(new_segment, homed_s, np.concatenate([homed_s[:1], seen_s[:-1]]))
-    mixed, homed = np.where(redraw[..., None], mix, 0.0), new_segment & (segment >= homed_from)
-    return Redraws(redraw, mixed, new_segment, homed, since_s / SECONDS_PER_HOUR)
+    new_zero = new_segment[:, None] & ~np.isin(AXES, list(absolute))
+    new_zero[:1] = True
+    before_s = np.concatenate([homed_s[:1], seen_s[:-1]])
+    since_s = seen_s[:, None] - np.where(new_zero, homed_s[:, None], before_s[:, None])
+    homed = new_zero & ~np.isin(AXES, list(absolute)) & (segment >= homed_from)[:, None]
+    return Redraws(
+        redraw, np.where(redraw[..., None], mix, 0.0), new_segment, new_zero, homed, since_s / SECONDS_PER_HOUR
+    )
+
+
+def counters_made(moves: Sequence[Move]) -> dict[str, tuple[int, int]]:
+    """Return the lowest and highest counter by axis that were made; moves that an import has added are no limit."""
+    made = [move for move in moves if not move.assumed]
+    counters = {axis: [getattr(move, f"{axis}_steps") for move in made] for axis in AXES}
+    return {axis: (min(of_axis), max(of_axis)) for axis, of_axis in counters.items()}

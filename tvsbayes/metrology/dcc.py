@@ -294,8 +294,8 @@ def dcc_bytes(
     summary, made, when = fit.summary, fit.provenance, performed(campaign, issued)
     besides = [campaign.title, *astuple(parties), None if report is None else report.number]
     # PTB's Schematron requires a letter and up to four numbers; the whole version is in the description.
-    release = _RELEASE.match(made.versions["tvsbayes"])
-    listed = ", ".join(f"{name} {version}" for name, version in made.versions.items())
+    release = _RELEASE.match(made.shown_versions["tvsbayes"])
+    listed = ", ".join(f"{name} {version}" for name, version in made.shown_versions.items())
     pose = summary.reference_pose_deg
     kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
     where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"

@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,6 +25,7 @@ from jax import export
 from jax.typing import ArrayLike
 
 from tvsbayes.files.own_folder import OwnFolder
+from tvsbayes.files.packages import version_of
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
 """Libraries whose versions determine a trace."""
@@ -85,14 +85,16 @@ class Traces:
 
     def code(self, module: str) -> bytes:
         """Hash the sources that a function of a module is traced through and the versions of the libraries."""
-        digest = hashlib.sha256(" ".join(version(library) for library in LIBRARIES).encode())
+        digest = hashlib.sha256(" ".join(map(str, map(version_of, LIBRARIES))).encode())
         for path, content in sources_of(module, PACKAGE).items():
             digest.update(f"{path.relative_to(PACKAGE)} {len(content)}\n".encode() + content)
         return digest.digest()
 
     def name(self, key: str, module: str = "") -> str:
-        """Return a trace's file name; "" where its source has changed since this process read it, or cannot be read."""
+        """Return a trace's file name; "" where its source has changed since this process read it, or is unknown."""
         try:
+            if None in map(version_of, LIBRARIES):
+                return ""
             if any(path.stat().st_mtime > LOADED_TIME_S for path in sources_of(module, PACKAGE)):
                 return ""
             return hashlib.sha256(self.code(module) + key.encode()).hexdigest()

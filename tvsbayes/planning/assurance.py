@@ -220,7 +220,7 @@ class Assurance:
     def _reported_values(self, scene: _VisibleInstruments, experiments: int, design: LookPlan) -> np.ndarray:
         """Compute the reported uncertainty for the instruments of a block, shape (n,)."""
         knowledge, picks = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * experiments]
-        context = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
+        context = design.path, knowledge.space, knowledge.home_variances_rad2, design.warm_minutes(knowledge.rig)
 
         def covariance(seen: Seen) -> np.ndarray:
             information = information_of_looks(seen, picks, *context)

@@ -213,7 +213,9 @@ def candidates(knowledge: Knowledge) -> Candidates:
         )
     ratio = np.asarray(physical_at(knowledge.z, knowledge.space).value)[RATIO_COLUMNS]
     widest: Mapping[str, tuple[int, int]] = UNSTATED_STEPS
-    if not rig.has_images:
+    if knowledge.made is not None:
+        widest = knowledge.made
+    elif not rig.has_images:
         reach = {axis: int(REACH_DEG / abs(r)) for axis, r in zip(AXES, ratio.tolist(), strict=True)}
         widest = {axis: (-steps, steps) for axis, steps in reach.items()}
     stated_range = counter_range(rig.limits, widest)

@@ -8,8 +8,7 @@ repeated errors of the gears at regular counters, have the prior N(0, 1) each.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -33,14 +32,13 @@ from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.kalman_filter import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
-from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import CREEP_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary
 from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
-from tvsbayes.instrument.rig import Rig
-from tvsbayes.instrument.stops import redraws
+from tvsbayes.instrument.rig import Rig, RigTable
+from tvsbayes.instrument.stops import counters_made, redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import MoveArrays, mirror_angles, trace
@@ -54,9 +52,15 @@ from tvsbayes.planning.gear_places import (
 )
 
 PARAMETERS = len(NAMES)
-HOME_VARIANCE_RAD2 = math.radians(HOME_SD_DEG) ** 2
+KEPT_SD_DEG = 1e-7
+"""Sd of a homing's shift of a zero that an absolute encoder keeps: next to none, but invertible."""
 SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
 """Looks are padded to this size or a power of four above it; moves to twice that."""
+
+
+def home_variances_rad2(rig: RigTable) -> np.ndarray:
+    """Return the variances of the shift of (pan, tilt) by a homing, shape (2,)."""
+    return np.radians(np.maximum(rig.home_sd_deg, KEPT_SD_DEG)) ** 2
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,7 @@ class Knowledge:
         after_data: whether there is a campaign; a new session then begins with an unknown home offset.
         gears: counters with coordinates for repeated errors of the gears, see `with_gears`.
         warm_minutes: time since power-on of looks that continue a campaign.
+        made: lowest and highest counter by axis that a campaign made; None without one.
         errors_of_fit: estimate of errors by a fit at its own places.
     """
 
@@ -82,11 +87,17 @@ class Knowledge:
     gears: GearPlaces = field(default=NO_PLACES)
     errors_of_fit: FittedErrors | None = None
     warm_minutes: float = 0.0
+    made: Mapping[str, tuple[int, int]] | None = None
 
     @property
     def size(self) -> int:
         """Return the number of coordinates and errors, p + e."""
         return len(self.precision)
+
+    @property
+    def home_variances_rad2(self) -> np.ndarray | None:
+        """Return those of the homing that begins a session; None where it is the first."""
+        return home_variances_rad2(self.rig.table) if self.after_data else None
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -132,7 +143,8 @@ def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
     data_rig = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
     precision = np.linalg.inv(result.covariance)
     z = np.where(np.isin(NAMES, CREEP_NAMES), 0.0, result.z)
-    return Knowledge(data_rig, result.space, z, precision, True, errors_of_fit=fitted_errors(result, result.covariance))
+    errors, made = fitted_errors(result, result.covariance), counters_made(result.campaign.moves)
+    return Knowledge(data_rig, result.space, z, precision, True, errors_of_fit=errors, made=made)
 
 
 def fitted_errors(result: JointFit, covariance: np.ndarray) -> FittedErrors | None:
@@ -278,7 +290,7 @@ def design_arrays(
     # Half the moves, rounded up: arrays of moves have twice the size of those of looks.
     count = len(look_moves)
     size = bucket(max(count, (len(moves) + 1) // 2), SMALLEST_DESIGN, DESIGN_GROWTH)
-    redraw_arrays = redraws(moves, look_moves, homed_from)
+    redraw_arrays = redraws(moves, look_moves, homed_from, rig.table.absolute)
     return CampaignArrays(
         move_arrays(moves, 2 * size),
         SpotArrays(
@@ -293,7 +305,8 @@ def design_arrays(
             redraw=padded(redraw_arrays.redraw, size, False, bool),
             redraw_mix=padded(redraw_arrays.redraw_mix, size),
             new_segment=padded(redraw_arrays.new_segment, size, False, bool),
-            homed=padded(redraw_arrays.homed, size, False, bool),
+            new_zero=padded(redraw_arrays.new_zero, size, False, bool),
+            home_variance_rad2=padded(redraw_arrays.homed * np.radians(rig.table.home_sd_deg) ** 2, size),
             hours=padded(redraw_arrays.hours, size),
             tangents=None if rig.has_images else padded(np.zeros((count, 2, 3)), size),
         ),

@@ -25,7 +25,7 @@ from tvsbayes.model.compiled import compiled, in_batches, placed
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge, expect, largest_px, sheet_points
+from tvsbayes.planning.expectation import Knowledge, expect, largest_px, sheet_points
 
 
 @dataclass(frozen=True)
@@ -210,8 +210,9 @@ def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer)
             redraw=jnp.ones((1, 2), dtype=bool),
             redraw_mix=jnp.where(pair.side[None, :, None] * np.array([-1.0, 1.0]) > 0, 1.0, 0.0),
             new_segment=jnp.ones(1, dtype=bool),
-            homed=jnp.zeros(1, dtype=bool),
-            hours=jnp.zeros(1),
+            new_zero=jnp.ones((1, 2), dtype=bool),
+            home_variance_rad2=jnp.zeros((1, 2)),
+            hours=jnp.zeros((1, 2)),
             tangents=jnp.zeros((1, 2, 3)) if observer.image_px is None else None,
         )
         no_places = jnp.zeros(0, dtype=bool)
@@ -308,7 +309,7 @@ def information_of_looks(
     picks: np.ndarray,
     path: np.ndarray,
     space: ParameterSpace,
-    homed: bool,
+    home_variances_rad2: np.ndarray | None,
     warm_minutes: np.ndarray | None = None,
 ) -> np.ndarray:
     """Compute the Fisher information of chosen looks, shape (..., p + e, p + e), as `information_of` their plan.
@@ -320,7 +321,7 @@ def information_of_looks(
         picks: numbers of the looks taken, repeats allowed, shape (k,).
         path: steps travelled at each look, shape (k, 2).
         space: priors, for the scale of the contrast.
-        homed: whether the session begins with an unknown home offset.
+        home_variances_rad2: of the home offsets with which the session begins; None where they are known.
         warm_minutes: time since the session's start at each look, shape (k,); None for the constant creep of `seen`.
     """
     looks, index, count = np.unique(picks, return_inverse=True, return_counts=True)
@@ -347,10 +348,10 @@ def information_of_looks(
     information[..., np.array(linked)[:, None], linked] = np.einsum(
         "...mia,...mib,mab->...ab", offsets_of, offsets_of, squares
     )
-    if not homed:
+    if home_variances_rad2 is None:
         return information[..., :-2, :-2]
     coupling = information[..., :-2, -2:]
-    offsets = information[..., -2:, -2:] + np.eye(2) / HOME_VARIANCE_RAD2
+    offsets = information[..., -2:, -2:] + np.diag(1 / home_variances_rad2)
     return information[..., :-2, :-2] - coupling @ np.linalg.solve(offsets, np.swapaxes(coupling, -1, -2))
 
 

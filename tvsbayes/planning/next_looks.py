@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.conditions import powered_on_s, warm_minutes
 from tvsbayes.instrument.plan import PlanLog
 from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.stops import counters_made
 from tvsbayes.planning.candidates import sheet_choices
 from tvsbayes.planning.expectation import knowledge_of
 from tvsbayes.planning.planner import design_problem
@@ -74,7 +76,15 @@ def confirmation(fit: JointFit) -> Confirmation:
     return Confirmation(IMPORTANCE, posterior.converged, dict(zip(DIRECTIONS, ratios, strict=True)))
 
 
-def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_below: float | None = None) -> NextLooks:
+def next_looks(
+    fit: JointFit,
+    rig: Rig,
+    target: Target,
+    count: int,
+    *,
+    confirm_below: float | None = None,
+    planned: Mapping[str, tuple[int, int]] | None = None,
+) -> NextLooks:
     """Choose the looks that lower a target most per minute, by the fit of the present data.
 
     Args:
@@ -83,6 +93,7 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
         target: target to be lowered.
         count: number of looks.
         confirm_below: sample the posterior where the Laplace sd of every effective ratio is at most this, deg/step.
+        planned: lowest and highest counter by axis of a plan that is being run, allowed as those that were made are.
 
     Raises:
         NotConverged: the fit.
@@ -92,6 +103,10 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
         raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
     power_s = powered_on_s(fit.campaign.header)
     knowledge = replace(knowledge_of(fit, rig), warm_minutes=float(warm_minutes(fit.campaign.moves, power_s)[-1]))
+    if planned is not None:
+        made = counters_made(fit.campaign.moves)
+        allowed = {axis: (min(made[axis][0], low), max(made[axis][1], high)) for axis, (low, high) in planned.items()}
+        knowledge = replace(knowledge, made=allowed)
     problem = design_problem(knowledge, target, fit.reference_pose_rad, False)
     # The segment continues: no new home offset, and the expectation of the looks includes the creep so far.
     problem = replace(problem, knowledge=replace(problem.knowledge, after_data=False), warming=False)

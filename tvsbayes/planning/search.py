@@ -17,7 +17,7 @@ from tvsbayes.instrument.parameters import TARGET_ROWS
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanLog, PlanStep, continued, plan_minutes
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates, sheet_choices
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge
+from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookPlan, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.progress import Advance, unshown
@@ -191,12 +191,13 @@ def search_precision(knowledge: Knowledge) -> np.ndarray:
     """Return the precision with known contrasts; after data home offsets are two more columns."""
     precision = knowledge.precision.copy()
     precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += CONTRAST_PRECISION
-    if not knowledge.after_data:
+    variances = knowledge.home_variances_rad2
+    if variances is None:
         return precision
     size = len(precision)
     full = np.zeros((size + 2, size + 2))
     full[:size, :size] = precision
-    full[range(size, size + 2), range(size, size + 2)] = 1 / HOME_VARIANCE_RAD2
+    full[range(size, size + 2), range(size, size + 2)] = 1 / variances
     return full
 
 
@@ -285,7 +286,7 @@ class DesignProblem:
         """Compute the information of the looks `picks` (k,) of a design, or of those `taken` (indices in `picks`)."""
         rows = np.arange(len(picks)) if taken is None else taken
         minutes = design.warm_minutes(self.knowledge.rig)[rows] if self.warming else None
-        context = self.knowledge.space, self.knowledge.after_data, minutes
+        context = self.knowledge.space, self.knowledge.home_variances_rad2, minutes
         return information_of_looks(self.seen, picks[rows], design.path[rows], *context)
 
     def value(self, picks: np.ndarray, design: LookPlan, taken: np.ndarray | None = None) -> float:

@@ -36,10 +36,10 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import COSTS_S, Rig
 from tvsbayes.instrument.stereo_pair import triangulate
-from tvsbayes.instrument.stops import rests_of
+from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.model.parameter_space import STOP_COLUMNS, physical_at
 from tvsbayes.planning.candidates import BACKLASH_COLUMNS, counter_range, have_room, run_up_steps, sheet_choices
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2
+from tvsbayes.planning.expectation import home_variances_rad2
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, run_up_start
 from tvsbayes.planning.search import smallest_design
 from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
@@ -122,6 +122,7 @@ class WatchDesigns:
         self.fit, self.seed = fit, seed
         self.campaign = homed(fit.campaign, fit.sides)
         self.z = noise_draws(fit, 2, seed).centre
+        self._home_variances = home_variances_rad2(self.campaign.rig)
         spots = ordered_spots(self.campaign)
         used = fit.arrays.used
         self.rig = _rig_of(self.campaign, spots, used) if rig is None else rig
@@ -153,9 +154,7 @@ class WatchDesigns:
     @cached_property
     def _limits(self) -> np.ndarray:
         """Return the lowest and highest counter of (pan, tilt): the rig's, else those of the campaign; (2, 2)."""
-        counters = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
-        reached: dict[str, tuple[int, int]] = {axis: (min(of_axis), max(of_axis)) for axis, of_axis in counters.items()}
-        return counter_range(self.rig.limits, reached).limits
+        return counter_range(self.rig.limits, counters_made(self.campaign.moves)).limits
 
     def _reachable(self, candidate: Candidate) -> bool:
         if candidate.target not in self.rig.depths_mm:
@@ -202,7 +201,7 @@ class WatchDesigns:
         total = np.zeros((self.each.shape[1] - 2,) * 2)
         for looks in pattern.looks.values():
             block = self.each[list(looks)].sum(axis=0)
-            cross, offsets = block[:-2, -2:], block[-2:, -2:] + np.eye(2) / HOME_VARIANCE_RAD2
+            cross, offsets = block[:-2, -2:], block[-2:, -2:] + np.diag(1 / self._home_variances)
             total += homings * (block[:-2, :-2] - cross @ np.linalg.solve(offsets, cross.T))
         count = len(self.known)
         coupling, of_parameters = total[:count, count:], total[:count, :count]

@@ -9,14 +9,13 @@ import json
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import numpy as np
 import xarray as xr
 
-from tvsbayes.files.disk import write_atomically
+from tvsbayes.files.packages import version_of
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
 from tvsbayes.instrument.mechanisms import Mechanism
@@ -169,7 +168,7 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         "seed": posterior.seed,
         "converged": int(posterior.converged),
         **lengths,
-        "versions": json.dumps({name: version(name) for name in ("tvsbayes", CHAIN, "arviz", "jax", "numpy")}),
+        "versions": json.dumps({name: version_of(name) for name in ("tvsbayes", CHAIN, "arviz", "jax", "numpy")}),
         "inputs": json.dumps(input_hashes(fit.campaign)),
         "fingerprint": fingerprint(fit),
         "reference_pose_deg": np.degrees(fit.reference_pose_rad),
@@ -178,16 +177,13 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     return tree
 
 
-def write_posterior(posterior: Posterior, path: Path) -> None:
-    """Write `posterior.nc` (netCDF-4), whole or not at all.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+def posterior_bytes(posterior: Posterior, fit_id: str) -> bytes:
+    """Make `posterior.nc` (netCDF-4); `fit_id` is the id of the fit whose file it is."""
     tree = data_tree(posterior)
+    tree.attrs["fit_id"] = fit_id
     packed = {"zlib": True, "complevel": 4, "shuffle": True}
     encoding = {f"/{name}": dict.fromkeys(group.data_vars, packed) for name, group in tree.children.items()}
     with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
         file = Path(scratch) / "posterior.nc"
         tree.to_netcdf(file, engine="h5netcdf", encoding=encoding)
-        write_atomically(path, file.read_bytes())
+        return file.read_bytes()

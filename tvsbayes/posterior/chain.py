@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -17,6 +16,7 @@ import numpy as np
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.files.disk import read_arrays, write_atomically
+from tvsbayes.files.packages import version_of
 from tvsbayes.inference.chain import Chain
 from tvsbayes.inference.density import Points
 from tvsbayes.inference.importance import ImportanceRun, Pool, Weighing
@@ -41,7 +41,7 @@ def fingerprint(fit: JointFit, tier: Tier = CHAIN) -> str:
         array = np.asarray(array)
         digest.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
     for package in ("tvsbayes", CHAIN, "jax", "numpy"):
-        digest.update(f"{package} {version(package)}".encode())
+        digest.update(f"{package} {version_of(package)}".encode())
     if tier != CHAIN:
         digest.update(tier.encode())
     return digest.hexdigest()

@@ -20,7 +20,6 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.kalman_filter import STATES, Belief, FilterRows, kalman_update, no_belief
 from tvsbayes.estimators.likelihood import filter_input
 from tvsbayes.estimators.looks import WINDOW, observe_with_stop_errors
-from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.compiled import compiled, in_batches
@@ -273,13 +272,15 @@ def looks_again(
     fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
     rows = np.arange(count)[:, None]
     error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
-    home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), count, 2)) * arrays.homed[:, None]
+    home = np.sqrt(arrays.home_variance_rad2) * generator.standard_normal((len(z), count, 2))
     segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(count), 0))
+    # Row at which the zero of each axis was set last, for all draws.
+    zero = np.maximum.accumulate(np.where(arrays.new_zero, rows, 0), axis=0)[None]
     drift_rad = np.radians(physical[:, DRIFT_COLUMNS])
-    walked = drift_rad[:, None] * np.sqrt(arrays.hours)[:, None] * generator.standard_normal(home.shape)
+    walked = drift_rad[:, None] * np.sqrt(arrays.hours) * generator.standard_normal(home.shape)
     total = np.cumsum(walked, axis=1)
     # The zero drifts as a random walk from its homing on.
-    error = error + home[:, segment] + total - (total - walked)[:, segment]
+    error = error + np.take_along_axis(home - (total - walked), zero, axis=1) + total
     error = error + turned_by(fit.arrays, place_errors_rad)
     # The position in the play is Gaussian after an unknown approach, as in the filter.
     place = generator.standard_normal(home.shape)[:, segment]

@@ -63,8 +63,8 @@ def sample(
 
     Returns:
         The posterior: `.propagate` for any quantity, `.by_name` for the draws. `convergence.answer` says whether its
-        intervals are accepted or rough; with `converged` False they must not be used. `write_posterior` makes a file
-        for ArviZ of it.
+        intervals are accepted or rough; with `converged` False they must not be used. `data_tree` of
+        `posterior.arviz_tree` is the tree for ArviZ.
 
     Raises:
         TypeError: an argument has the wrong type.

@@ -437,15 +437,15 @@ def walks(fit: JointFit, stops: StopStates) -> Walks:
     """
     slope = np.asarray(fit.linearised.slope)
     spots = jax.tree.map(lambda x: np.asarray(x)[: len(slope)], fit.arrays.spots)
-    begins = np.flatnonzero(spots.new_segment)
     sd = np.sqrt(stops.variance.sum(axis=1) + stops.constant)[None]
     of_stops = Elimination.of(stops, sd, stops.gram[stops.overlapping][None])
     above = fit.z[DRIFT_COLUMNS] + np.sqrt(np.diag(fit.covariance)[DRIFT_COLUMNS])
     scale = np.radians(half_normal(above) * np.asarray(fit.space.u)[DRIFT_COLUMNS])
     columns, axes = [np.empty((slope.size // 2, 0))], [np.empty((0, 2))]
     for axis in np.flatnonzero(fit.free[DRIFT_COLUMNS]):
+        begins = np.flatnonzero(spots.new_zero[:, axis])
         for begin, end in zip(begins, [*begins[1:], len(slope)], strict=True):
-            hours = np.cumsum(spots.hours[begin:end])
+            hours = np.cumsum(spots.hours[begin:end, axis])
             knots = np.unique([0.0, *hours])
             knots = knots[np.linspace(0, len(knots) - 1, min(len(knots), WALK_STEPS + 1)).round().astype(int)]
             steps = np.diff(knots)

@@ -39,7 +39,6 @@ from tvsbayes.results.comparison_record import AxisHoldOut
 from tvsbayes.results.compensation_record import stored_verification
 from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
-from tvsbayes.results.records import plain
 from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_fit import AxisFit
@@ -423,8 +422,8 @@ def _steps(summary: AxisSummary, folder: str) -> list[str]:
 def axis_document(results: AxisResults, issue: Issue) -> Document:
     """The report of an axis with its number; `results.fit` must include `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
-    origin = plain(provenance(axis_hashes(fit.campaign), fit.seed))
-    content = json.dumps([summary.as_json(), origin["inputs"]], sort_keys=True)
+    origin = provenance(axis_hashes(fit.campaign), fit.seed)
+    content = json.dumps([summary.as_json(), origin.inputs], sort_keys=True)
     header = fit.campaign.header
     verdict = sentence(axis_verdict(summary)) + " No limit was stated." * summary.explained
     figures = [*_error_figures(fit), *_wave_figures(fit)]
@@ -441,7 +440,7 @@ def axis_document(results: AxisResults, issue: Issue) -> Document:
             steps=_steps(summary, folder),
             traceable="The readings are taken as stated.",
             warnings=[*summary.problems, *summary.warnings, *_lines("Prior conflict", summary.prior_conflicts)],
-            versions=origin["versions"],
+            versions=origin.shown_versions,
             sections=axis_sections(results, figures[1:]),
             title="Calibration of an axis",
             issue=issue,

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, stored_ratios
+from tvsbayes.calibration.calibration_file import calibration_json, content_sha256
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.coordinates.error_map import ErrorMap, SimpleError, error_map, simple_error
 from tvsbayes.coordinates.simple_calibration import simple_calibrations
 from tvsbayes.estimators.four_point import ClassicResult, classic_of
-from tvsbayes.instrument.axes import AXES, HOME_APPROACH, Axis
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_APPROACH, Axis
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
 from tvsbayes.report.spot_pictures import SpotCrop, spot_crops
@@ -150,6 +150,7 @@ def gather(
     calibration: Calibration,
     *,
     range_mm: float,
+    ratios_deg_per_step: np.ndarray | None = None,
     limit_deg_per_step: float | None = None,
     limit_mm: float | None = None,
     doubts: Sequence[str] = (),
@@ -161,6 +162,7 @@ def gather(
         fit: its `fit.json`.
         calibration: its draws.
         range_mm: range at which errors in mm are stated.
+        ratios_deg_per_step: draws of the effective ratios by direction, shape (draws, 4), for their limit.
         limit_deg_per_step: largest error allowed of every effective ratio.
         limit_mm: largest 3D error allowed at that range, with pan and tilt in the middle of the counters seen.
         doubts: warnings of `check`.
@@ -171,8 +173,8 @@ def gather(
     cell = MAP_CELLS // 2, MAP_CELLS // 2, maps.range_mm.tolist().index(range_mm)
     distances = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
     criteria = []
-    if limit_deg_per_step is not None:
-        criteria += _ratio_criteria(campaign, fit, limit_deg_per_step)
+    if limit_deg_per_step is not None and ratios_deg_per_step is not None:
+        criteria += _ratio_criteria(ratios_deg_per_step, fit, limit_deg_per_step)
     if limit_mm is not None:
         errors = _inflation(fit) * distances["joint"]
         criteria.append(criterion(f"3D point at {range_mm:g} mm", errors, limit_mm, "mm"))
@@ -219,10 +221,10 @@ def _inflation(fit: FitRecord) -> float:
     return 1.0 if fit.summary.validation is None else fit.summary.validation.inflation
 
 
-def _ratio_criteria(campaign: Campaign, fit: FitRecord, limit: float) -> list[Criterion]:
+def _ratio_criteria(ratios_deg_per_step: np.ndarray, fit: FitRecord, limit: float) -> list[Criterion]:
     """Every effective ratio against its limit, deg/step."""
     criteria = []
-    for direction, draws in stored_ratios(campaign).items():
+    for direction, draws in zip(DIRECTIONS, ratios_deg_per_step.T, strict=True):
         estimate = fit.summary.effective[direction]
         if estimate is not None:
             errors = _inflation(fit) * (draws - estimate.value)

@@ -107,7 +107,7 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
             steps=[f"`tvsbayes compare CAMPAIGN --by positions` says how well the fit predicts {look}s left out."],
             traceable=source,
             warnings=warnings,
-            versions=record.provenance.versions,
+            versions=record.provenance.shown_versions,
             sections=sections,
             title="Calibration of a pan-tilt head",
             issue=issue,

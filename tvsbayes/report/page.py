@@ -23,6 +23,7 @@ from markupsafe import Markup, escape
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
+from tvsbayes.files.own_outputs import PDF_MARK
 from tvsbayes.report.document import Document
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
@@ -70,7 +71,7 @@ def print_to_pdf(page: Path) -> Path:
             raise InputError("pdf", f"{Path(browser).name} did not print the report", remedy=remedy) from error
         if process.returncode or not pdf.exists():
             raise InputError("pdf", f"{Path(browser).name} ended with code {process.returncode}", remedy=remedy)
-        write_atomically(target, pdf.read_bytes())
+        write_atomically(target, pdf.read_bytes() + PDF_MARK)
     return target
 
 

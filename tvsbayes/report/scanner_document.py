@@ -67,7 +67,7 @@ def report_document(e: Evidence, issue: Issue | None = None) -> Document:
             criteria=criteria_table(e.criteria),
             traceable=traceability(e.campaign).statement,
             warnings=warnings_of(e),
-            versions=e.fit.provenance.versions,
+            versions=e.fit.provenance.shown_versions,
             sections=[*fit_sections(e), *verification, *uncertainty_sections(e)],
             issue=issue,
         )

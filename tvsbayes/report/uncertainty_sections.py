@@ -288,7 +288,7 @@ def method_section(e: Evidence) -> Section:
         for key in header_table(e.campaign, "traceability")
     ]
     rows += [["sha256", name, value] for name, value in origin.inputs.items()]
-    rows.append(["versions", "", ", ".join(f"{name} {value}" for name, value in origin.versions.items())])
+    rows.append(["versions", "", ", ".join(f"{name} {value}" for name, value in origin.shown_versions.items())])
     table = TableView("Traceability as declared, inputs, versions", ["", "name", "value"], rows)
     return Section("Method, traceability, provenance", text, tables=[table])
 

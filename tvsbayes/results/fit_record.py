@@ -14,17 +14,17 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, structs
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import escaped
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
+from tvsbayes.files.packages import UNKNOWN, version_of
 from tvsbayes.results.comparison_record import Gap
 from tvsbayes.results.estimates import Cause, FitSummary, StopResidual
 from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, BudgetTable
@@ -38,6 +38,7 @@ from tvsbayes.results.records import (
     read_record,
     schema_of,
 )
+from tvsbayes.results.store import AGAIN, fit_id
 from tvsbayes.results.tiers import CHAIN
 
 FIT_FORMAT = "tvsbayes-fit/1"
@@ -46,7 +47,6 @@ FIT_FORMATS = (FIT_FORMAT,)
 type Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 PACKAGES = (*("tvsbayes", "jax", "optimistix", "equinox", CHAIN, "arviz", "numpy", "scipy"), "opencv-python-headless")
 """Packages whose versions a result states."""
-AGAIN = "run `tvsbayes fit` again"
 
 
 class NamedCovariance(ClosedRecord, frozen=True):
@@ -79,21 +79,29 @@ class Provenance(Record, frozen=True):
 
     Attributes:
         inputs: SHA-256 of the inputs of the estimate, by file.
-        versions: versions of Python and `PACKAGES`.
+        versions: versions of Python and `PACKAGES`; null where a package's metadata are missing.
         seed: seed of all random numbers.
         command: the command as typed.
+        fit_id: SHA-256 of the fit that these results are or rest on, without the command; absent in results of 0.3.0
+            and earlier.
     """
 
     inputs: dict[str, Sha256]
-    versions: Annotated[dict[str, str], Meta(extra_json_schema={"required": ("python", "tvsbayes")})]
+    versions: Annotated[dict[str, str | None], Meta(extra_json_schema={"required": ("python", "tvsbayes")})]
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
     command: str
+    fit_id: Sha256 | None = None
+
+    @property
+    def shown_versions(self) -> dict[str, str]:
+        """Versions for people."""
+        return {name: version or UNKNOWN for name, version in self.versions.items()}
 
 
-def provenance(inputs: Mapping[str, str], seed: int) -> Provenance:
-    """The provenance of results that this process makes."""
-    versions = {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}}
-    return Provenance(dict(inputs), versions, seed, shlex.join(["tvsbayes", *sys.argv[1:]]))
+def provenance(inputs: Mapping[str, str], seed: int, fit: str | None = None) -> Provenance:
+    """The provenance of results that this process makes; `fit` is the id of the fit that they rest on."""
+    versions = {"python": sys.version.split()[0], **{name: version_of(name) for name in PACKAGES}}
+    return Provenance(dict(inputs), versions, seed, shlex.join(["tvsbayes", *sys.argv[1:]]), fit)
 
 
 def covariance_of_draws(names: Sequence[str], physical: np.ndarray, columns: Mapping[str, object]) -> NamedCovariance:
@@ -130,10 +138,12 @@ class FitRecord(Shown):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the results and their provenance: it identifies everything made from them."""
-        content = plain([self.summary.estimator, self.summary.effective, self.summary.parameters])
-        made = [self.provenance.inputs, self.provenance.versions, self.provenance.seed]
-        return hashlib.sha256(json.dumps([content, made], sort_keys=True).encode()).hexdigest()
+        """The id of the fit: it identifies everything made from it."""
+        return self.provenance.fit_id or fit_id(self.as_json())
+
+    def identified(self) -> FitRecord:
+        """The record with its id."""
+        return replace(self, provenance=structs.replace(self.provenance, fit_id=self.digest))
 
     @property
     def results_id(self) -> str:
@@ -179,7 +189,11 @@ def read_fit(path: Path | str) -> FitRecord:
     Raises:
         InputError: missing, damaged or of an unknown version, with the key.
     """
-    keys = parse_json(read_bytes(Path(path), JSON_BYTES_MAX), escaped(Path(path).name))
+    return fit_of(parse_json(read_bytes(Path(path), JSON_BYTES_MAX), escaped(Path(path).name)))
+
+
+def fit_of(keys: Keys) -> FitRecord:
+    """The record of a document; errors as of `read_fit`."""
     keys.word("format", FIT_FORMATS)
     hold_to_schema(keys, fit_schema(), AGAIN)
     _check_agreement(keys)
@@ -198,17 +212,3 @@ def read_fit(path: Path | str) -> FitRecord:
         if table.predicted is not None and set(table.predicted) != set(FIGURES):
             raise keys.refuse("positioning", "schema", ", ".join(FIGURES), AGAIN, "other figures")
     return record
-
-
-def write_files(folder: Path, draws: bytes, document: Mapping[str, object]) -> dict[str, str]:
-    """Write `draws.npz` and the document `fit.json`, each completely or not at all; return both paths.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    contents = {"draws": draws, "fit": json.dumps(document, indent=1, allow_nan=False).encode()}
-    make_folder(folder)
-    paths = {"draws": folder / "draws.npz", "fit": folder / "fit.json"}
-    for kind, path in paths.items():
-        write_atomically(path, contents[kind])
-    return {kind: str(path) for kind, path in paths.items()}

@@ -1,27 +1,25 @@
-"""`results/draws.npz`: draws behind `fit.json`, the calibration that `locate` reads, and the fit's mode.
+"""`results/draws.npz` of scanner and head: draws behind `fit.json`, the calibration, and the fit's mode.
 
 Draws in the units of the names, ratios in deg/step, pose in rad; mode and covariance in prior coordinates.
 """
 
 from __future__ import annotations
 
-import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.calibration.calibration_file import (
-    calibration_bytes,
-    damaged_calibration,
-    stored_calibration,
-)
+from tvsbayes.calibration.calibration_file import calibration_arrays
 from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays
 from tvsbayes.instrument.axes import AXES, SENSES
-from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.homing import ANYWHERE
-from tvsbayes.results.fit_record import FitRecord, write_files
+from tvsbayes.results.store import damaged_draws, write_fit
+
+if TYPE_CHECKING:
+    from tvsbayes.results.fit_record import FitRecord
 
 
 @dataclass(frozen=True)
@@ -71,30 +69,15 @@ class ResultDraws:
 _MODE_ARRAYS = ("z", "covariance", "prior", "valid", "weight")
 
 
-def _draws_bytes(
-    draws: ResultDraws, estimator: str, calibration: Calibration | None = None, mode: StoredMode | None = None
-) -> bytes:
-    """The content of `draws.npz`; without a calibration the draws must not be used for calculations."""
-    arrays = {**vars(draws), "names": np.array(draws.names), "derived_names": np.array(draws.derived_names)}
-    if calibration is None:
-        buffer = io.BytesIO()
-        np.savez(buffer, estimator=np.array(estimator), **arrays)
-        return buffer.getvalue()
-    if mode is not None:
-        arrays |= {f"mode_{name}": getattr(mode, name) for name in _MODE_ARRAYS}
-        arrays["mode_log_density"] = np.array(mode.log_density)
-        arrays["mode_sides"] = np.array(mode.sides)
-    return calibration_bytes(calibration, **arrays)
-
-
 def write_results(
     folder: Path,
     record: FitRecord,
     draws: ResultDraws,
     calibration: Calibration | None = None,
     mode: StoredMode | None = None,
+    posterior: bytes | None = None,
 ) -> dict[str, str]:
-    """Write `fit.json` and `draws.npz`, each completely or not at all.
+    """Write the files of a fit as one set; errors and paths as of `write_fit`.
 
     Args:
         folder: is created where it does not exist.
@@ -102,42 +85,50 @@ def write_results(
         draws: the draws behind the record.
         calibration: read by `locate` and `steps-for`; None for a fit that must not be used.
         mode: starting point of `compare` and `plan`.
+        posterior: content of `posterior.nc`.
+    """
+    arrays = {**vars(draws), "names": np.array(draws.names), "derived_names": np.array(draws.derived_names)}
+    if calibration is None:
+        arrays["estimator"] = np.array(record.summary.estimator)
+    else:
+        arrays |= calibration_arrays(calibration)
+        if mode is not None:
+            arrays |= {f"mode_{name}": getattr(mode, name) for name in (*_MODE_ARRAYS, "log_density", "sides")}
+    return write_fit(folder, record.identified().as_json(), arrays, posterior)
 
-    Returns:
-        Paths by "draws" and "fit".
+
+def mode_of(arrays: Mapping[str, np.ndarray], spots: int) -> StoredMode | None:
+    """The mode in `draws.npz`; None where the fit has none that may be used.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: it is damaged, or not that of so many spots.
     """
-    content = _draws_bytes(draws, record.summary.estimator, calibration, mode)
-    return write_files(folder, content, record.as_json())
-
-
-def stored_mode(campaign: Campaign) -> StoredMode | None:
-    """The mode of the fit in `results/`, if it converged and was made from exactly these data and priors.
-
-    Raises:
-        InputError: the results are damaged.
-    """
-    if campaign.path is None or stored_calibration(campaign) is None:
+    if "mode_z" not in arrays:
         return None
-    path = campaign.path / "results" / "draws.npz"
     try:
-        file = read_arrays(path, RESULTS_BYTES_MAX)
-        if "mode_z" not in file:
-            return None
-        arrays = {name: np.array(file[f"mode_{name}"], dtype=float) for name in _MODE_ARRAYS}
-        log_density = np.array(file["mode_log_density"], dtype=float)
-        names = tuple(file["names"].tolist())
-        count, spots = len(names), sum(spot.status == "ok" for spot in campaign.spots)
-        shapes = {"z": (count,), "covariance": (count, count), "valid": (spots,), "weight": (spots,)}
-        if any(arrays[name].shape != shape for name, shape in shapes.items()) or arrays["prior"].shape[:1] != (2,):
+        numbers = {name: np.array(arrays[f"mode_{name}"], dtype=float) for name in (*_MODE_ARRAYS, "log_density")}
+        names = tuple(arrays["names"].tolist())
+        count = len(names)
+        shapes = {"z": (count,), "covariance": (count, count), "valid": (spots,), "weight": (spots,), "log_density": ()}
+        if any(numbers[name].shape != shape for name, shape in shapes.items()) or numbers["prior"].shape[:1] != (2,):
             raise ValueError("a mode of another shape")
-        if log_density.shape or not all(np.isfinite(array).all() for array in (*arrays.values(), log_density)):
+        if not all(np.isfinite(array).all() for array in numbers.values()):
             raise ValueError("a mode that is not finite")
-        sides = tuple(map(str, file["mode_sides"].tolist())) if "mode_sides" in file else ("", "")
+        sides = tuple(map(str, arrays["mode_sides"].tolist())) if "mode_sides" in arrays else ("", "")
         if any(side not in ("", ANYWHERE, *SENSES[axis]) for axis, side in zip(AXES, sides, strict=True)):
             raise ValueError("a way of homing that there is not")
-        return StoredMode(names, log_density=float(log_density), sides=sides, **arrays)
     except (KeyError, TypeError, ValueError) as error:
-        raise damaged_calibration(path, error) from error
+        raise damaged_draws(error) from error
+    return StoredMode(names, log_density=float(numbers.pop("log_density")), sides=sides, **numbers)
+
+
+def ratios_of(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Draws of the effective ratios left, right, up, down, deg/step, shape (draws, 4).
+
+    Raises:
+        InputError: they are missing or damaged.
+    """
+    draws = arrays.get("effective_deg_per_step", np.zeros(0))
+    if draws.dtype.kind != "f" or draws.ndim != 2 or draws.shape[1] != 4 or not np.all(np.isfinite(draws)):
+        raise damaged_draws("effective_deg_per_step")
+    return draws

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,11 +27,11 @@ from tvsbayes.files.csv_kind import (
     unique,
 )
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.files.own_outputs import PLAN_MARK
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import header_values
-from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
@@ -41,33 +42,35 @@ Approach = Literal["forward", "backward", "unknown"]
 """Forward means an increasing command, for either sign of the unit per command."""
 COMMAND_MAX = 1e12
 """Largest absolute command or reading."""
+DEGREES = {
+    **{"deg": 1.0, "rad": math.degrees(1.0), "mrad": math.degrees(1e-3), "urad": math.degrees(1e-6)},
+    **{"arcmin": 1 / 60, "arcsec": 1 / 3600, "gon": 0.9},
+}
+"""Units of angle of readings, in deg."""
 TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
 """One turn in each unit of angle."""
 _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
 """Log-normal parameters by which the model divides: the density is undefined where they are fixed at 0."""
 PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that define waves."""
+LIMITS = "limits"
+"""Key of `[axis]`: the commands that a plan may give."""
 PERIODS_MAX, RANGES_MAX = 8, 4
 """Largest numbers of stated and of unknown periods; each period adds two sampled coordinates."""
-_MOVE = replace(MOVES["move"], names="")
 
 
 @dataclass(frozen=True, slots=True)
 class AxisMove:
     """A row of `moves.csv`: the command AFTER the move; `approach` in the first row of a segment, else empty."""
 
-    move: Annotated[int, _MOVE]
-    # A run of a scanner is an experiment; a run of an axis is the moves between two homings.
-    segment: Annotated[int, replace(MOVES["segment"], names=MOVES["segment"].names + " run lauf durchlauf")]
+    move: Annotated[int, MOVES["move"]]
+    segment: Annotated[int, MOVES["segment"]]
     time_s: Annotated[float, MOVES["time_s"]]
     command: Annotated[
         float,
         Column(
             "absolute counter or commanded position AFTER the move; decimals allowed",
             *(-COMMAND_MAX, COMMAND_MAX),
-            names="command commanded cmd counter steps step counts target goal position pos microsteps microstep "
-            "mikroschritte mikroschritt usteps ustep micropasos micropas schritte soll sollwert zahler pasos contador "
-            "consigna posicion pas consigne setpoint nominal demand pulse pwm sollposition sollwinkel",
         ),
     ]
     approach: Annotated[
@@ -75,7 +78,6 @@ class AxisMove:
         Column(
             "in the first row of a segment: `forward` (rising command), `backward` or `unknown`; empty elsewhere",
             rule=first_of_segment,
-            names=MOVES["pan_approach"].names + " direction dir richtung direccion",
         ),
     ] = ""
     temperature_degC: Annotated[
@@ -84,9 +86,9 @@ class AxisMove:
             "optional: of the axis; the readings' zero shifts with it. Empty cells are interpolated in time",
             *TEMPERATURES_DEGC,
             group="temperature",
-            names="temperature temp temperatur temperatura",
         ),
     ] = None
+    assumed: Annotated[int, MOVES["assumed"]] = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +107,6 @@ class Reading:
             "does)",
             *(-COMMAND_MAX, COMMAND_MAX),
             rule=filled_where_ok("give the value, or say why there is none"),
-            names="value reading read measured encoder angle ist istwert messwert winkel lesung lectura medida valor "
-            "angulo codificador lecture mesure codeur autocollimator actual feedback dial gauge indicator istposition "
-            "istwinkel",
         ),
     ] = None
     u: Annotated[
@@ -116,7 +115,6 @@ class Reading:
             "standard uncertainty; empty or 0 where unknown: readings repeated at one move then determine it, else "
             "the scatter of stops includes it",
             *(0.0, COMMAND_MAX),
-            names=" ".join(["u", *sorted(SPREAD - {"s"})]),
         ),
     ] = 0.0
     status: Annotated[
@@ -154,7 +152,9 @@ class AxisCampaign(Shown):
         stated: entries of `[axis]`; omitted names take the default, which scales with the travel.
         header: keys of `campaign.toml` outside `[axis]` but `format` and `unit`.
         periods: waves that `[axis]` defines.
+        limits: lowest and highest command that a plan may give, as `[axis]` states them; None where it does not.
         path: the folder; None where it was never written.
+        absolute: whether the encoder keeps its zero over a homing.
     """
 
     unit: str
@@ -164,12 +164,25 @@ class AxisCampaign(Shown):
     header: dict[str, object] = field(default_factory=dict)
     periods: WavePeriods = field(default_factory=WavePeriods)
     path: Path | None = None
+    absolute: bool = False
+    limits: tuple[float, float] | None = None
+
+    @property
+    def priors(self) -> dict[str, AxisPrior]:
+        """Stated priors; a zero that no homing sets has no scatter of homings."""
+        return {**self.stated, "home_sd": AxisPrior(0.0, 0.0)} if self.absolute else self.stated
 
     @property
     def rate(self) -> float | None:
         """Commands per second of a drive in continuous motion; None where the axis is read at stops."""
         rate = self.header.get("rate")
         return float(rate) if isinstance(rate, int | float) else None
+
+    @property
+    def range_allowed(self) -> tuple[float, float]:
+        """Lowest and highest command of plans and their run-ups: stated, else those that were really made."""
+        made = [move.command for move in self.moves if not move.assumed]
+        return self.limits or (min(made), max(made))
 
     @property
     def powered_on_s(self) -> float | None:
@@ -259,10 +272,10 @@ def _parse_header(keys: Keys) -> dict[str, object]:
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
     """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and its fixed value."""
-    keys.only((*AXIS_KEYS, *PERIODS))
+    keys.only((*AXIS_KEYS, *PERIODS, LIMITS, "absolute"))
     stated: dict[str, AxisPrior] = {}
     for name in keys.values:
-        if name in PERIODS:
+        if name in ("absolute", LIMITS, *PERIODS):
             continue
         kind = AXIS_KEYS[name].kind
         low = -COMMAND_MAX if kind == "normal" else 0.0
@@ -286,6 +299,17 @@ def _parse_periods(keys: Keys) -> WavePeriods:
     in_seconds = "periods_in" in keys and keys.word("periods_in", ("unit", "seconds")) == "seconds"
     between = _parse_ranges(keys) if "period_between" in keys else ()
     return WavePeriods(periods, between, in_seconds, encoder)
+
+
+def _parse_limits(keys: Keys) -> tuple[float, float] | None:
+    """`limits`: [lowest, highest] command."""
+    if LIMITS not in keys:
+        return None
+    ends = keys.numbers(LIMITS, -COMMAND_MAX, COMMAND_MAX, 2)
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        allowed = "[lowest, highest] command, the lower one first"
+        raise keys.refuse(LIMITS, "range", allowed, "give both ends that the machine allows, in commands")
+    return ends[0], ends[1]
 
 
 def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
@@ -318,10 +342,15 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     header, unit = _parse_header(keys), keys.text_value("unit", 20)
     if not unit.strip():
         raise keys.refuse("unit", "text", 'the unit of readings, such as "deg" or "mm"', "name it")
-    stated, periods = _parse_axis_table(keys.table("axis")), _parse_periods(keys.table("axis"))
+    axis = keys.table("axis")
+    stated, periods = _parse_axis_table(axis), _parse_periods(axis)
+    absolute = "absolute" in axis and axis.flag("absolute")
+    if absolute and "home_sd" in stated:
+        allowed = "no home_sd beside absolute = true"
+        raise axis.refuse("home_sd", "absolute", allowed, "leave one of them out: no homing sets an absolute zero")
     moves = parse_axis_moves(files["moves.csv"])
     readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
-    return AxisCampaign(unit, moves, readings, stated, header, periods, path)
+    return AxisCampaign(unit, moves, readings, stated, header, periods, path, absolute, _parse_limits(axis))
 
 
 def unit_of_folder(folder: Path) -> str | None:
@@ -367,6 +396,7 @@ def _axis_table_lines(campaign: AxisCampaign) -> list[str]:
         "periods_in": "seconds" if periods.in_seconds else None,
         "period_between": [list(pair) for pair in periods.between],
         "encoder_period": periods.encoder,
+        "absolute": campaign.absolute,
     }
     return [*priors, *(toml_line(name, value) for name, value in entries.items() if value)]
 
@@ -375,22 +405,30 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
     """The content of `campaign.toml`."""
     lines = [toml_line("format", FORMAT), toml_line("unit", campaign.unit)]
     lines += [toml_line(key, value) for key, value in campaign.header.items()]
-    return ("\n".join([*lines, "[axis]", *_axis_table_lines(campaign)]) + "\n").encode()
+    # No estimate depends on the limits: they are no part of the hash of the inputs.
+    limits = [] if campaign.limits is None else [toml_line(LIMITS, list(campaign.limits))]
+    return ("\n".join([*lines, "[axis]", *limits, *_axis_table_lines(campaign)]) + "\n").encode()
 
 
-def write_axis(campaign: AxisCampaign, folder: Path) -> None:
-    """Write the three files into a new or empty folder; reading them returns the same campaign.
+def axis_bytes(campaign: AxisCampaign) -> dict[str, bytes]:
+    """The three files; reading them returns the same campaign.
 
     Raises:
-        InputError: the folder is not empty or cannot be written, or `read_axis` would refuse the files (then nothing is
-            written).
+        InputError: `read_axis` would refuse them.
     """
     contents = axis_moves_bytes(campaign.moves), readings_bytes(campaign.readings), axis_toml(campaign)
     files = dict(zip(_FILES, contents, strict=True))
     _parse_files(files, None)
-    make_folder(Path(folder), empty=True)
-    for name, data in files.items():
-        write_atomically(Path(folder) / name, data)
+    return files
+
+
+def write_axis(campaign: AxisCampaign, folder: Path) -> None:
+    """Write the three files into a new or empty folder, all or none.
+
+    Raises:
+        InputError: the folder is not empty or cannot be written, or `axis_bytes` refuses.
+    """
+    write_folder(Path(folder), axis_bytes(campaign))
 
 
 def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
@@ -431,4 +469,4 @@ def stops_csv(stops: Iterable[AxisStop]) -> bytes:
         if via is not None:
             rows.append((len(rows), via, "backward" if direction == "forward" else "forward", 0))
         rows.append((len(rows), command, direction, 1))
-    return csv_bytes(("step", "command", "direction", "read"), rows)
+    return PLAN_MARK + csv_bytes(("step", "command", "direction", "read"), rows)

@@ -36,7 +36,7 @@ LINE_SLOPE = float(np.sqrt(12.0))
 
 def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """Doubts about the data, in sentences."""
-    sentences = temperature_doubts(campaign.moves)
+    sentences = _beyond_limits(campaign) + temperature_doubts(campaign.moves)
     if rows.in_motion:
         return sentences + _warnings_in_motion(campaign, rows)
     sentences += lone_doubts(campaign.moves, [move.command for move in campaign.moves], "command")
@@ -56,6 +56,16 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     if unread:
         sentences.append(f"{unread} readings are not used: their status is not ok")
     return sentences + data_doubts(campaign, rows)
+
+
+def _beyond_limits(campaign: AxisCampaign) -> list[str]:
+    """Moves made beyond the stated limits."""
+    if campaign.limits is None:
+        return []
+    low, high = campaign.limits
+    beyond = [m.move for m in campaign.moves if not m.assumed and not low <= m.command <= high]
+    words = f"commands beyond `limits = [{low:.10g}, {high:.10g}]` of [axis]: moves {listed(beyond, 5)}"
+    return [f"{words}; correct one of both"] if beyond else []
 
 
 def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:

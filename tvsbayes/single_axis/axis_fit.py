@@ -243,7 +243,7 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
         InputError: too many moves, or angles that wrap.
     """
     rows = rows_of(campaign)
-    priors = default_priors(rows) | campaign.stated
+    priors = default_priors(rows) | campaign.priors
     return AxisModel.of(rows, priors, more, waves_of(rows, priors, campaign.periods))
 
 

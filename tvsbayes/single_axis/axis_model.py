@@ -153,7 +153,7 @@ class AxisModel:
             unused |= {"transmission_error", "transmission_error_length", "play_variation", "reading_scale"}
         if not np.any(rows.variance > 0):
             unused.add("reading_scale")
-        if len(np.unique(rows.segment)) < 2:
+        if len(np.unique(rows.zero)) < 2:
             unused.add("home_sd")
         if not np.any(rows.hours > 0):
             unused.add("drift_per_root_hour")
@@ -177,8 +177,8 @@ class AxisModel:
 
     @cached_property
     def homed(self) -> np.ndarray:
-        """Segments with readings, without the first; each has its own zero."""
-        return np.unique(self.rows.segment)[1:]
+        """Numbers of the zeros that have readings, without the first."""
+        return np.unique(self.rows.zero)[1:]
 
     @property
     def play_is_sampled(self) -> bool:
@@ -287,7 +287,7 @@ class AxisModel:
         columns = filled[:, :, 1:]
         columns[..., OFFSET], columns[..., SLOPE], columns[..., CONTRAST] = 1.0, anchor, 0.5 * play.path
         columns[..., BACKLASH] = 0.5 * play.side
-        columns[..., self.layout["homed"]] = rows.segment[:, None] == self.homed
+        columns[..., self.layout["homed"]] = rows.zero[:, None] == self.homed
         columns[..., self.layout["unknown"]] = spread[..., None] * np.equal.outer(rows.segment, self.unknown_segments)
         for name, column in shifts.items():
             filled[:, :, 0] -= self.priors[name].value * column

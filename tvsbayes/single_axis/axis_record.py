@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -13,12 +12,11 @@ import numpy as np
 from msgspec import Meta, field, structs
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import NothingToEstimate, TvsError, escaped, refusal
-from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays
+from tvsbayes.errors import NothingToEstimate, Reason, TvsError
 from tvsbayes.progress import Show
 from tvsbayes.results.convergence import Convergence, MonteCarloError
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate, PeriodEstimate
-from tvsbayes.results.fit_record import Provenance, Sha256, provenance, write_files
+from tvsbayes.results.fit_record import Provenance, Sha256, provenance
 from tvsbayes.results.records import (
     AnswerKind,
     Count,
@@ -30,8 +28,8 @@ from tvsbayes.results.records import (
     plain,
     read_record,
     schema_of,
-    stored_document,
 )
+from tvsbayes.results.store import AGAIN, FitFiles, damaged_draws, fit_id, stored_fit, write_fit
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_density import blocks_of, line_factors, line_weights
 from tvsbayes.single_axis.axis_doubts import axis_warnings
@@ -414,51 +412,41 @@ def uninformed(summary: AxisSummary) -> TvsError | None:
 
 
 def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]:
-    """Write `fit.json` and `draws.npz`; return their paths by kind.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Write the files of a fit; errors and paths as of `write_fit`."""
     origin = plain(provenance(axis_hashes(fit.campaign), fit.seed))
-    buffer = io.BytesIO()
-    draws = np.stack(list(fit.draws.values()), axis=-1)
-    np.savez(buffer, names=np.array(list(fit.draws)), w=fit.w, draws=draws)
-    return write_files(folder, buffer.getvalue(), {"format": AXIS_FIT_FORMAT, **summary.as_json(), **origin})
+    document = {"format": AXIS_FIT_FORMAT, **summary.as_json(), **origin}
+    arrays = {"names": np.array(list(fit.draws)), "w": fit.w, "draws": np.stack(list(fit.draws.values()), axis=-1)}
+    return write_fit(folder, document | {"fit_id": fit_id(document)}, arrays)
 
 
 @dataclass(frozen=True, repr=False)
 class AxisResults(Shown):
-    """A fit and its summary."""
+    """A fit and its summary; `fit_id` is its id in `results/`, None for one that is not stored or older than ids."""
 
     summary: AxisSummary
     fit: AxisFit
+    fit_id: str | None = None
 
     def shown(self) -> View:
         """Show the summary."""
         return self.summary.shown()
 
 
-def _stored_w(folder: Path, names: int, remedy: str) -> np.ndarray:
-    """Coordinates (draws, names) in the `results/` of a folder; `remedy` is the remedy where they are damaged.
+def _stored_w(arrays: Mapping[str, np.ndarray], names: int) -> np.ndarray:
+    """Coordinates (draws, names) in `draws.npz`.
 
     Raises:
-        InputError: the file is missing or damaged.
+        InputError: they are missing or damaged.
     """
-    place = "results/draws.npz"
-    try:
-        w = read_arrays(folder / place, RESULTS_BYTES_MAX)["w"]
-        # A single draw has no covariance.
-        if w.dtype.kind != "f" or w.ndim != 2 or w.shape[1] != names or len(w) < 2 or not np.all(np.isfinite(w)):
-            raise ValueError(f"w of shape {w.shape}")
-    except (KeyError, ValueError) as error:
-        found = "no w" if isinstance(error, KeyError) else escaped(str(error), 120)
-        allowed = f"w of shape (draws, {names}), finite, as in results/fit.json"
-        raise refusal("damaged", file=place, found=found, allowed=allowed, remedy=remedy) from error
+    w = arrays.get("w", np.zeros(0))
+    # A single draw has no covariance.
+    if w.dtype.kind != "f" or w.ndim != 2 or w.shape[1] != names or len(w) < 2 or not np.all(np.isfinite(w)):
+        raise damaged_draws(f"w of shape {w.shape}", f"w of shape (draws, {names}), finite, as in results/fit.json")
     return w
 
 
-FITTING_FIRST = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
-OTHER_MODEL = "results/ are of a version with another model of the axis: fitting first (weighted draws) ..."
+FITTING_FIRST = "fitting first (weighted draws) ..."
+OTHER_MODEL = "results/ are of a version with another model of the axis"
 
 
 def results_for(
@@ -483,22 +471,24 @@ def results_for(
         InputError: stored results are damaged.
         NotConverged: the fit did not converge.
     """
-    document, why = stored_document(campaign, "fit.json", (AXIS_FIT_FORMAT,), axis_hashes(campaign)), FITTING_FIRST
-    if document is not None and document.values.get("converged") is True and campaign.path is not None:
-        remedy = "run `tvsbayes fit` again"
-        hold_to_schema(document, axis_fit_schema(), remedy)
-        summary = read_record(AxisSummary, document, remedy, held=True)
+    stored = stored_fit(campaign, axis_hashes(campaign))
+    why = stored.reason if isinstance(stored, Reason) else "results/ are of a fit that did not converge"
+    if isinstance(stored, FitFiles) and stored.keys.values.get("converged") is True:
+        document = stored.keys
+        document.word("format", (AXIS_FIT_FORMAT,))
+        hold_to_schema(document, axis_fit_schema(), AGAIN)
+        summary = read_record(AxisSummary, document, AGAIN, held=True)
         if "answer" not in document.values and summary.estimator == "posterior":
             # 0.2.0 had accepted samples only.
             summary = structs.replace(summary, answer="accepted")
-        origin = read_record(Provenance, document, remedy, held=True)
+        origin = read_record(Provenance, document, AGAIN, held=True)
         model = model_of(campaign, more)
         names = model.coordinates.names
         if summary.parameters.keys() >= {name for name in names if not name.startswith("wave_")}:
-            w = _stored_w(campaign.path, len(names), remedy)
-            return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed))
+            w = _stored_w(stored.arrays, len(names))
+            return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed), origin.fit_id)
         why = OTHER_MODEL
-    notify(why)
+    notify(f"{why}: {FITTING_FIRST}")
     fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
     if fit.error is not None:
         raise fit.error

@@ -64,7 +64,8 @@ class AxisRows:
         legs: all moves.
         move: number of the move.
         command, side, segment: as in `Legs`.
-        hours: time since the previous row in the segment, or since the segment's first move in its first row.
+        zero: number of the segment whose homing set the zero; 0 of an encoder that keeps it.
+        hours: time since the previous row of the same zero, or since that segment's first move in its first row.
         path: commands travelled since the segment began.
         redrawn: whether the stop's error is new since the previous row.
         value: mean of the readings, unit.
@@ -86,6 +87,7 @@ class AxisRows:
     command: np.ndarray
     side: np.ndarray
     segment: np.ndarray
+    zero: np.ndarray
     hours: np.ndarray
     path: np.ndarray
     redrawn: np.ndarray
@@ -134,11 +136,11 @@ class AxisRows:
         time_h = np.cumsum(self.hours)
         for k, row in enumerate(rows_kept):
             previous = rows_kept[k - 1] if k else -1
-            first = np.flatnonzero(self.segment == self.segment[row])[0]
+            first = np.flatnonzero(self.zero == self.zero[row])[0]
             same = previous >= first
             hours[k] = time_h[row] - time_h[previous] if same else time_h[row] - time_h[first] + self.hours[first]
             redrawn[k] = not same or bool(self.redrawn[previous + 1 : row + 1].any())
-        arrays = ("move", "command", "side", "segment", "path", "value", "variance", "within", "count")
+        arrays = ("move", "command", "side", "segment", "zero", "path", "value", "variance", "within", "count")
         columns = {name: getattr(self, name)[rows_kept] for name in (*arrays, "time_s", "warm_s", "width_s")}
         columns["kelvin"] = None if self.kelvin is None else self.kelvin[rows_kept]
         return replace(self, hours=hours, redrawn=redrawn, **columns)
@@ -252,6 +254,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
     remedy = "check the columns move and value, and that the reading follows this axis"
     _check_motion(slope, command, value, remedy)
     times_s = np.array([m.time_s for m in campaign.moves])
+    zero = 0 * legs.segment if campaign.absolute else legs.segment
     stated_u = [r.u for r in used if r.u > 0]
     rows = AxisRows(
         unit=campaign.unit,
@@ -260,7 +263,8 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         command=command,
         side=legs.side[moves],
         segment=legs.segment[moves],
-        hours=_hours(times_s / HOUR_S, legs, moves),
+        zero=zero[moves],
+        hours=_hours(times_s / HOUR_S, zero, moves),
         path=_path(legs)[moves],
         redrawn=_redrawn(legs, moves) | (read["variance"] == 0),
         **read,
@@ -334,8 +338,9 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
     spread = np.sqrt(mean((time_s - np.repeat(rows_time, count)) ** 2))
     segment = by_move["segment"][rows_move]
     first = np.r_[True, np.diff(segment) > 0]
+    zero = 0 * segment if campaign.absolute else segment
     starts_s = np.array([by_move["time_s"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
-    gaps = np.where(first, rows_time - starts_s, np.r_[0.0, np.diff(rows_time)])
+    gaps = np.where(np.r_[True, np.diff(zero) > 0], rows_time - starts_s, np.r_[0.0, np.diff(rows_time)])
     design = np.column_stack([np.ones(len(rows_command)), rows_command - rows_command.mean()])
     level, per_command = np.linalg.lstsq(design, rows_value, rcond=None)[0]
     starts_command = np.array([by_move["command"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
@@ -346,6 +351,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
         command=rows_command,
         side=np.full(len(rows_move), int(np.sign(rate))),
         segment=segment,
+        zero=zero,
         hours=np.maximum(gaps, 0.0) / HOUR_S,
         path=np.abs(rows_command - starts_command),
         redrawn=first,
@@ -402,11 +408,11 @@ def _kelvin(campaign: AxisCampaign, times_s: np.ndarray) -> np.ndarray | None:
     return kelvin_at(campaign.moves, times_s, np.array([move.time_s for move in campaign.moves], dtype=float))
 
 
-def _hours(times_h: np.ndarray, legs: Legs, moves: np.ndarray) -> np.ndarray:
+def _hours(times_h: np.ndarray, zero: np.ndarray, moves: np.ndarray) -> np.ndarray:
     hours = np.zeros(len(moves))
     for row, move in enumerate(moves):
-        first = int(np.flatnonzero(legs.segment == legs.segment[move])[0])
-        previous = int(moves[row - 1]) if row and legs.segment[moves[row - 1]] == legs.segment[move] else first
+        first = int(np.flatnonzero(zero == zero[move])[0])
+        previous = int(moves[row - 1]) if row and zero[moves[row - 1]] == zero[move] else first
         hours[row] = times_h[move] - times_h[previous]
     return hours
 

@@ -32,7 +32,7 @@ def whitened(
 
     Args:
         columns: shape (n or 1, rows, c).
-        rows: their times and segments.
+        rows: their times and zeros.
         drift: variance per hour, shape (n,).
         stop: variances of stop errors or seeing, shape (n, rows).
         reading: variances of readings, shape (n, rows).
@@ -40,14 +40,14 @@ def whitened(
             shape (n or 1, rows).
     """
     n, count, width = len(drift), columns.shape[1], columns.shape[2]
-    new_segment = np.append(False, rows.segment[1:] != rows.segment[:-1]).tolist()
+    is_homed = np.append(False, rows.zero[1:] != rows.zero[:-1]).tolist()
     is_new = np.all(carry == 0, axis=0).tolist()
     # For a single draw plain floats avoid the overhead of array calls.
     by_row = [_by_row(numbers, n) for numbers in (np.outer(drift, rows.hours), stop, reading, carry)]
     blocks = []
     p_zero = p_held = p_both = 0.0 * by_row[0][0]
     for k, (drift_variance, scatter, noise, share) in enumerate(zip(*by_row, strict=True)):
-        if new_segment[k]:
+        if is_homed[k]:
             p_zero, p_both = 0.0 * p_zero, 0.0 * p_both
         p_zero = p_zero + drift_variance
         if is_new[k]:
@@ -76,7 +76,7 @@ def whitened(
     column_of_row = np.swapaxes(columns, 0, 1)
     share = np.broadcast_to(carry, (n, count)).T[..., None]
     for k in range(count):
-        if new_segment[k]:
+        if is_homed[k]:
             zero = np.zeros((n, width))
         if is_new[k]:
             innovation = column_of_row[k] - zero

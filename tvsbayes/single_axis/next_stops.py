@@ -7,7 +7,7 @@ covariances. The variance due to unknown scales stays constant: the plan begins 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -32,7 +32,7 @@ CANDIDATES, STOPS_DEFAULT, DRAWS = 17, 8, 24
 MOVE_S = 60.0
 """Time of a move where the campaign has no times."""
 RUN_UP_SHARE = 0.05
-"""Run-up before the move back to a position, as a share of the range."""
+"""Run-up before the move back to a position, as a share of the commands that are allowed."""
 
 
 def unit_of(target: str, unit: str) -> str:
@@ -103,13 +103,18 @@ def _move_seconds(campaign: AxisCampaign) -> float:
     return float(np.median(gaps)) if gaps else MOVE_S
 
 
-def _run_up_start(moves: Sequence[AxisMove], command: float, side: int) -> float | None:
+def _whole(campaign: AxisCampaign) -> bool:
+    """Whether all commands are whole numbers, so that a plan gives such alone."""
+    return all(move.command == round(move.command) for move in campaign.moves)
+
+
+def _run_up_start(campaign: AxisCampaign, command: float, side: int) -> float | None:
     """The command to visit first, so that the last move to `command` is towards `side`; None where it is already."""
-    if side * (command - moves[-1].command) > 0:
+    if side * (command - campaign.moves[-1].command) > 0:
         return None
-    commands = np.array([move.command for move in moves])
-    via = command - side * RUN_UP_SHARE * float(np.ptp(commands))
-    return float(np.round(via)) if np.all(commands == np.round(commands)) else via
+    low, high = campaign.range_allowed
+    via = command - side * RUN_UP_SHARE * (high - low)
+    return float(np.round(via)) if _whole(campaign) else via
 
 
 def _with_stop(campaign: AxisCampaign, rows: AxisRows, stop: AxisStop, seconds: float) -> AxisCampaign:
@@ -226,14 +231,14 @@ class _Session:
     stops: tuple[NextStop, ...] = ()
 
     def choices(self, aim: _Aim, move_s: float, minutes: float, advance: Advance) -> Iterator[_Session]:
-        """The session with one more stop: at every place from both sides, within the commands and the time."""
+        """The session with one more stop: at every place from both sides, within the limits and the time."""
+        low, high = aim.fit.campaign.range_allowed
         for k, command in enumerate(aim.places.tolist()):
             advance(k / len(aim.places))
             for direction in ("forward", "backward"):
-                via = _run_up_start(self.campaign.moves, command, SIDES[direction])
+                via = _run_up_start(self.campaign, command, SIDES[direction])
                 stop_minutes = (1 + (via is not None)) * move_s / 60.0
-                within = via is None or aim.places[0] <= via <= aim.places[-1]
-                if within and self.minutes + stop_minutes <= minutes:
+                if (via is None or low <= via <= high) and self.minutes + stop_minutes <= minutes:
                     after = _with_stop(self.campaign, aim.fit.rows, AxisStop(via, command, direction), move_s)
                     u = aim.u(after)
                     stop = NextStop(command, direction, via, u, self.u - u, (self.u - u) / stop_minutes)
@@ -271,10 +276,10 @@ def plan_next(
     if target not in TARGETS:
         allowed = ", ".join(TARGETS)
         raise InputError("target", f"--target {target[:60]!r}", allowed=allowed, remedy="name one of them")
-    commands = np.array([m.command for m in fit.campaign.moves])
-    grid = np.unique(np.r_[np.linspace(commands.min(), commands.max(), CANDIDATES), fit.rows.command.min()])
-    if np.all(commands == np.round(commands)):
-        grid = np.unique(np.round(grid))
+    low, high = fit.campaign.range_allowed
+    grid = np.unique(np.r_[np.linspace(low, high, CANDIDATES), np.clip(fit.rows.command.min(), low, high)])
+    if _whole(fit.campaign):
+        grid = np.unique(np.clip(np.round(grid), math.ceil(low), math.floor(high)))
     aim, move_s = _Aim.of(fit, target, grid), _move_seconds(fit.campaign)
     session, longest = _Session(fit.campaign, aim.u_now), math.inf if minutes is None else minutes
 

@@ -11,13 +11,13 @@ import math
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 
 import jax
 import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.files.packages import own_version
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import PlanStep
@@ -62,7 +62,7 @@ class StudyJob:
         rig = self.rig
         parts = [
             STUDY_FORMAT,
-            version("tvsbayes"),
+            own_version(),
             rig_table_toml(rig.table),
             json.dumps({name: [p.value, p.u, p.distribution] for name, p in sorted(rig.truth.items())}),
             "" if rig.stereo is None else stereo_bytes(rig.stereo).decode(),

@@ -16,8 +16,8 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.files.disk import write_atomically
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, write_axis
+from tvsbayes.files.disk import write_folder
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, axis_bytes
 from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors, kind_of
 from tvsbayes.single_axis.waves import SECOND, WANDER, WavePeriods
 from tvsbayes.twin.gear_errors import kelvin_of, zero_shift
@@ -106,8 +106,8 @@ class SimulatedAxis(Shown):
 
     def write(self, folder: Path) -> None:
         """Write the campaign folder with `truth.json`."""
-        write_axis(self.campaign, folder)
-        write_atomically(folder / "truth.json", json.dumps(self.truth.as_json(), indent=1, allow_nan=False).encode())
+        truth = json.dumps(self.truth.as_json(), indent=1, allow_nan=False).encode()
+        write_folder(folder, {"truth.json": truth, **axis_bytes(self.campaign)})
 
 
 def _drawn(name: str, prior: AxisPrior, rng: np.random.Generator) -> float:
@@ -215,9 +215,16 @@ def _time_shift(truth: AxisTruth, warm_s: float, kelvin: float, time_s: float) -
 
 
 def stops_of(
-    truth: AxisTruth, moves: Sequence[AxisMove], rng: np.random.Generator, powered_on_s: float | None = None
+    truth: AxisTruth,
+    moves: Sequence[AxisMove],
+    rng: np.random.Generator,
+    powered_on_s: float | None = None,
+    absolute: bool = False,
 ) -> np.ndarray:
-    """Compute the output after every move, unit, (moves,), warming since `powered_on_s` or the first move."""
+    """Compute the output after every move, unit, (moves,), warming since `powered_on_s` or the first move.
+
+    The zero of an `absolute` encoder is not set by homings: it walks on.
+    """
     true = truth.parameters
     ratio, contrast, backlash = true["per_command"], true["ratio_contrast"], true["backlash"]
     stops = np.empty(len(moves))
@@ -227,9 +234,13 @@ def stops_of(
     since = moves[0].time_s if powered_on_s is None else powered_on_s
     kelvin = kelvin_of(moves)
     for row, move in enumerate(moves):
-        if last is None or move.segment != last.segment:
-            home = 0.0 if last is None else true["home_sd"] * float(rng.standard_normal())
-            wheel, zero = ratio * move.command + home, 0.0
+        homed = last is None or move.segment != last.segment
+        if last is not None and (absolute or not homed):
+            hours = (move.time_s - last.time_s) / 3600.0
+            zero += true["drift_per_root_hour"] * np.sqrt(hours) * float(rng.standard_normal())
+        if last is None or homed:
+            home = 0.0 if last is None or absolute else true["home_sd"] * float(rng.standard_normal())
+            wheel, zero = ratio * move.command + home, zero if absolute else 0.0
             side = {"forward": 1, "backward": -1}.get(move.approach, 0)
             turned = side * np.sign(ratio)
             share = -turned if side else rng.uniform(-1.0, 1.0)
@@ -240,8 +251,6 @@ def stops_of(
             wheel += (ratio + 0.5 * contrast * np.sign(step)) * step
             stand = take_up(stand, wheel, backlash)
             side = int(np.sign(step)) or side
-            hours = (move.time_s - last.time_s) / 3600.0
-            zero += true["drift_per_root_hour"] * np.sqrt(hours) * float(rng.standard_normal())
             fresh = step != 0
         if fresh:
             sd = true["stop_sd.backward"] if side < 0 else true["stop_sd.forward"]
@@ -302,7 +311,7 @@ def simulate_axis(template: AxisCampaign, moves: Sequence[AxisMove] | None = Non
         commands, template.stated, per_command, travel, rng, template.periods, (moves[0].time_s, moves[-1].time_s)
     )
     u = _reading_u(template, travel)
-    stops = stops_of(truth, moves, rng, template.powered_on_s)
+    stops = stops_of(truth, moves, rng, template.powered_on_s, template.absolute)
     readings: list[Reading] = []
     for move, stand in zip(moves, stops, strict=True):
         if read is None or move.move in read:

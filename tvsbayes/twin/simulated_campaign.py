@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.files.disk import make_folder, write_atomically
-from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
+from tvsbayes.files.disk import write_folder
+from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, stereo_spots, with_pixels
 from tvsbayes.instrument.conditions import powered_on_s
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
-from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
+from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, RigTable, require_periods
 from tvsbayes.instrument.sightings import Sighting
 from tvsbayes.twin.gear_errors import PERFECT, draw_gear_errors, drift_deg, kelvin_of, zero_shift_deg
 from tvsbayes.twin.head_physics import sighted_angles
@@ -78,9 +78,7 @@ class SimulatedCampaign(Shown):
 
     def write(self, folder: str | Path) -> None:
         """Write the campaign folder and its truth.json."""
-        make_folder(Path(folder), empty=True)
-        for name, data in self.files().items():
-            write_atomically(Path(folder) / name, data)
+        write_folder(Path(folder), self.files())
 
 
 @dataclass(frozen=True)
@@ -149,7 +147,7 @@ def simulate(
         time_s = np.array([move.time_s for move in log.moves])
         measured = np.asarray(temperature_degC(time_s), float).tolist()
         log.moves = [replace(move, temperature_degC=one) for move, one in zip(log.moves, measured, strict=True)]
-    driven = _drive(log.moves, truth, rig.table.first_period_deg, streams, powered_on_s(full_header))
+    driven = _drive(log.moves, truth, rig.table, streams, powered_on_s(full_header))
     truth = replace(driven.truth, homing_side=home_approach)
     looks: tuple[Spot | Sighting, ...]
     if not rig.has_images:
@@ -198,7 +196,7 @@ class _Driven:
 def _drive(
     moves: Sequence[Move],
     truth: Truth,
-    first_period_deg: Mapping[str, float],
+    rig: RigTable,
     streams: _Streams,
     on_s: float | None,
 ) -> _Driven:
@@ -207,7 +205,7 @@ def _drive(
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
     segments = np.array([m.segment for m in moves], int)
     first = np.diff(segments, prepend=-1) != 0
-    home_draws = HOME_SD_DEG * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
+    home_draws = np.array(rig.home_sd_deg) * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
     home_draws[0] = 0.0
     stop_draws = streams.stops.standard_normal((len(moves), 2))
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
@@ -230,10 +228,12 @@ def _drive(
             ratios,
             repeated.play_at(p[f"backlash_deg.{axis}"], place_deg),
             harmonics_deg(p, axis),
-            first_period_deg.get(axis, FULL_TURN_DEG),
+            rig.first_period_deg.get(axis, FULL_TURN_DEG),
         )
         scale = p.get(f"drift_deg_per_root_hour.{axis}", 0.0)
-        drift[:, i] = drift_deg(time_s, first, scale, drift_draws[:, i], repeated.warming_deg)
+        # The zero that an absolute encoder keeps drifts on.
+        is_set = np.arange(len(moves)) == 0 if axis in rig.absolute else first
+        drift[:, i] = drift_deg(time_s, is_set, scale, drift_draws[:, i], repeated.warming_deg)
         resting[:, i] += repeated.error_deg(place_deg) + drift[:, i]
         resting[:, i] += zero_shift_deg(p, axis, warm_minutes, kelvin)
         sds = {"+": p[f"stop_sd_deg.{positive}"], "-": p[f"stop_sd_deg.{negative}"]}

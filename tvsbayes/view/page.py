@@ -9,11 +9,11 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 
 import numpy as np
 from markupsafe import Markup
 
+from tvsbayes.files.packages import own_version
 from tvsbayes.instrument.campaign import CAMERAS, PIXELS
 from tvsbayes.report.page import rendered
 from tvsbayes.results.records import plain
@@ -94,4 +94,4 @@ def page_html(document: bytes) -> bytes:
     """
     # No text of a campaign can end the element that contains the document (HTML standard 4.12.1.3).
     held = Markup(document.decode().replace("<", "\\u003c"))
-    return rendered("view", "page.html", "page.css", scripts=SCRIPTS, version=version("tvsbayes"), document=held)
+    return rendered("view", "page.html", "page.css", scripts=SCRIPTS, version=own_version(), document=held)

@@ -35,6 +35,7 @@ from tvsbayes.report.evidence import GearBand, gear_bands
 from tvsbayes.results.comparison_record import Comparison
 from tvsbayes.results.estimates import StopResidual
 from tvsbayes.results.fit_record import FitRecord
+from tvsbayes.results.store import FIT
 from tvsbayes.statistics.intervals import WithSd
 from tvsbayes.view.laser_ways import Ways, laser_ways
 from tvsbayes.view.shapes import (
@@ -345,8 +346,8 @@ def stored_campaign(folder: Path) -> StoredCampaign:
     record, calibration = results.stored_record, results.stored_calibration
     fit = None if record is None else results.stored_fit
     if record is None or calibration is None or fit is None:
-        stored = (Path(folder) / "results" / "fit.json").exists()
-        return StoredCampaign(campaign, None, NOT_OF_THESE if stored else NOT_FITTED)
+        is_fitted = (Path(folder) / "results" / FIT).exists()
+        return StoredCampaign(campaign, None, NOT_OF_THESE if is_fitted else NOT_FITTED)
     from tvsbayes.assessment.residuals import stop_residuals
 
     return StoredCampaign(campaign, Fitted(fit, record, stop_residuals(fit), gear_bands(calibration)), None)

@@ -81,6 +81,7 @@ class Tally:
         self.counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
         self.reasons: dict[tuple[str, str], list[int]] = defaultdict(list)
         self.questions: Counter[tuple[str, str]] = Counter()
+        self.unlisted: list[int] = []
 
     def add(self, seed: int, drawn: Drawn, verdict: Verdict) -> None:
         """Count a table; keep the file of one that is wrong in silence."""
@@ -91,6 +92,8 @@ class Tally:
             (OUTPUT / f"{seed}-{drawn.file.name.replace('.md', '.txt')}").write_bytes(drawn.file.data)
         elif verdict.question:
             self.questions[verdict.question, drawn.kind] += 1
+        if verdict.unlisted:
+            self.unlisted.append(seed)
 
     def of(self, *answers: str) -> Counter[str]:
         """Counts of the tables whose careful answer is one of these."""
@@ -108,6 +111,9 @@ class Tally:
         )
         rows = [(k, a, c.total(), *(c[word] or "" for word in WORDS)) for (k, a), c in sorted(self.counts.items())]
         print(table(("kind", "careful", "drawn", *WORDS), rows))
+        if self.unlisted:
+            numbers = " ".join(map(str, self.unlisted[:12]))
+            print(f"\n{len(self.unlisted)} tables have columns that no line of `import` names: {numbers}.")
         if self.questions:
             print("\n## What was asked\n")
             print(table(("question", "kind", "tables"), [(*key, n) for key, n in self.questions.most_common()]))

@@ -46,6 +46,8 @@ class Verdict(NamedTuple):
     """right, guessed, asked, wrong, unanswered, refused, crash."""
     why: str = ""
     question: str = ""
+    unlisted: tuple[str, ...] = ()
+    """Columns that are named nowhere in the document of `import`."""
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -88,6 +90,8 @@ def read_sightings(folder: Path) -> Folder:
     """A folder of a head."""
     moves, readings = rows_of(folder / "moves.csv"), []
     for row in rows_of(folder / "sightings.csv"):
+        if row["status"] != "ok":
+            continue
         move = moves[int(row["move"])]
         pair = (int(move["pan_steps"]), int(move["tilt_steps"]), float(row["elevation_deg"]))
         readings.append(Reading(0.0, float(row["azimuth_deg"]), u=float(row["u_deg"] or 0), pair=pair))
@@ -315,7 +319,9 @@ def judge(drawn: Drawn, folder: Path) -> Verdict:
             return Verdict("wrong", why)
         if drawn.truth.meant:
             return Verdict("wrong", "a unit that nobody knows is replaced in silence")
-        return Verdict("guessed" if drawn.truth.answer == "ask" else "right")
+        named = " ".join(json.dumps(document, ensure_ascii=False).replace("\\n", " ").replace('\\"', '"').split())
+        unlisted = tuple(name for name in drawn.file.heads if " ".join(name.split()) not in named)
+        return Verdict("guessed" if drawn.truth.answer == "ask" else "right", unlisted=unlisted)
     error = document.get("error", {})
     question = asked(error)
     has, right = answered(error, line, out, drawn.truth)

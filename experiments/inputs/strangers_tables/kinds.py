@@ -284,7 +284,7 @@ def unknown_unit(rng: np.random.Generator, language: str) -> Drawn:
 
 def no_unit(rng: np.random.Generator, language: str) -> Drawn:
     """Steps and a reading without any unit."""
-    axis = draw_axis(rng)
+    axis = draw_axis(rng, command_unit="step", variety=True)
     sweep = sweeps(rng, axis.commands, False)
     values, readings = read_all(rng, axis, sweep)
     columns: dict[str, Sequence[Cell]] = {

@@ -25,7 +25,6 @@ from experiments.inputs.strangers_tables.measured import (
     pick,
     sweeps,
     unit_text,
-    with_unit,
 )
 from experiments.inputs.strangers_tables.sheets import Cell, File
 
@@ -254,43 +253,67 @@ def sightings(rng: np.random.Generator, language: str) -> Drawn:
     unit = pick(rng, ("deg",) * 4 + ("rad", "arcmin", "gon", "mrad"))
     # Nobody leaves out that angles are gon.
     named = unit == "gon" or chance(rng, 0.75)
-    count = int(rng.integers(8, 30))
-    pan = rng.integers(-60, 60, count) * 50
-    tilt = rng.integers(0, 30, count) * 50
-    ratio = pick(rng, (0.02, 0.05, 0.03))
+    count, ratio = int(rng.integers(8, 30)), pick(rng, (0.02, 0.05, 0.03))
+    pan, tilt = rng.integers(-60, 60, count) * 50, rng.integers(0, 30, count) * 50
     azimuth = 40 * chance(rng, 0.5) + ratio * pan + rng.normal(0, 0.01, count)
     azimuth = azimuth % 360 if chance(rng, 0.5) else (azimuth + 180) % 360 - 180
     elevation = 5 + ratio * tilt + rng.normal(0, 0.01, count)
     digits = {"deg": 4, "rad": 7, "arcmin": 2, "gon": 4, "mrad": 3}[unit]
     cells = [[decimal(a / ANGLE[unit], digits) for a in angles] for angles in (azimuth, elevation)]
-    names = pick(rng, words.AZIMUTH[language])
-    text = unit_text(rng, unit, language)
-    form = pick(rng, ("{} ({})", "{} [{}]", "{} / {}"))
-    if unit in ASCII and names[0].isascii() and names[1].isascii() and chance(rng, 0.25):
-        form, text = "{}_{}", ASCII[unit]
-    heads = [form.format(name, text) if named else name for name in names]
+    degrees = [[float(c) * ANGLE[unit] for c in column] for column in cells]
+    written: list[Sequence[Cell]] = list(cells)
+    if unit == "deg" and not named and chance(rng, 0.3):
+        # Minutes and seconds tell the unit.
+        named, degrees = True, [[round(3600 * d) / 3600 for d in column] for column in degrees]
+        written, digits = [[sexagesimal(d) for d in column] for column in degrees], 3
+        heads = list(pick(rng, words.AZIMUTH[language]))
+    else:
+        heads = sighting_heads(rng, unit if named else "", language)
     counters = pick(rng, words.PAN[language])
     columns: dict[str, Sequence[Cell]] = {}
     if chance(rng, 0.4):
         columns[pick(rng, words.SECONDS[language])] = [decimal(12.0 * k, 1) for k in range(count)]
-    columns[counters[0]], columns[counters[1]] = [Decimal(int(n)) for n in pan], [Decimal(int(n)) for n in tilt]
-    columns[heads[0]], columns[heads[1]] = cells
-    u = 0.0
+    columns |= {name: [Decimal(int(n)) for n in steps] for name, steps in zip(counters, (pan, tilt), strict=True)}
+    columns |= dict(zip(heads, written, strict=True))
+    u, wrong = 0.0, set()
     if chance(rng, 0.2):
-        small = pick(rng, ("arcsec", "deg"))
+        small, name, factor = pick(rng, ("arcsec", "deg")), *pick(rng, (("u", 1), ("U95", 2), ("U (k=2)", 2)))
         u_cell = Decimal("18") if small == "arcsec" else Decimal("0.005")
-        columns[with_unit(rng, "u", small, "en")] = [u_cell] * count
-        u = float(u_cell) * ANGLE[small]
+        columns[f"{name} ({unit_text(rng, small, 'en')})"] = [u_cell] * count
+        u = float(u_cell) * ANGLE[small] / factor
     if chance(rng, 0.2):
         columns[pick(rng, words.TEMPERATURE[language])] = [decimal(t, 1) for t in rng.normal(12, 0.2, count)]
-    degrees = [tuple(float(c) * ANGLE[unit] for c in column) for column in cells]
+    if chance(rng, 0.15):
+        status, good, bad = pick(rng, words.STATUS[language])
+        wrong = set(rng.choice(count, int(rng.integers(0, 3)), replace=False).tolist())
+        columns[status] = [bad if k in wrong else good for k in range(count)]
+    if chance(rng, 0.15):
+        columns = {name: columns[name] for name in rng.permutation(np.array(list(columns), object))}
     readings = tuple(
-        Reading(0.0, a, u=u, pair=(int(p), int(t), e)) for p, t, a, e in zip(pan, tilt, *degrees, strict=True)
+        Reading(0.0, a, u=u, pair=(int(p), int(t), e))
+        for k, (p, t, a, e) in enumerate(zip(pan, tilt, *degrees, strict=True))
+        if k not in wrong
     )
-    digit = 10.0**-digits * ANGLE[unit]
     # Degrees are what all take an angle for; radians are not told from them by a reader that does not ask.
     answer: Answer = "right" if named else "either" if unit == "deg" else "ask"
-    truth = Truth(readings, "deg", None, digit, answer, ratio=ratio)
+    truth = Truth(readings, "deg", None, 10.0**-digits * ANGLE[unit], answer, ratio=ratio)
     kind = "sightings" if named else f"sightings without a unit, {'degrees' if unit == 'deg' else 'others'}"
-    file = sheets.any_file(rng, sheets.columns_sheet(columns, language))
-    return Drawn(kind, file, truth, ("--sightings",))
+    return Drawn(kind, sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth, ("--sightings",))
+
+
+def sighting_heads(rng: np.random.Generator, unit: str, language: str) -> list[str]:
+    """Names of azimuth and elevation, with their unit if any."""
+    names = pick(rng, words.AZIMUTH[language])
+    if not unit:
+        return list(names)
+    text, form = unit_text(rng, unit, language), pick(rng, ("{} ({})", "{} [{}]", "{} / {}"))
+    if all(name.isascii() for name in names) and chance(rng, 0.25):
+        form, text = "{}_{}", ASCII[unit]
+    return [form.format(name, text) for name in names]
+
+
+def sexagesimal(degrees: float) -> str:
+    """Degrees, minutes and seconds."""
+    seconds = round(abs(degrees) * 3600)
+    sign = "-" if degrees < 0 else ""
+    return f"{sign}{seconds // 3600}\u00b0{seconds // 60 % 60:02d}'{seconds % 60:02d}\""

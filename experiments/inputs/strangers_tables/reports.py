@@ -104,7 +104,7 @@ def positions_across(rng: np.random.Generator, language: str) -> Drawn:
         [f"{pair[side < 0]} {k // 2 + 1} ({text})", *values]
         for k, (side, values) in enumerate(zip(runs.sides, runs.values, strict=True))
     ]
-    sheet = Sheet([[name, *(sheets.number(command, ".") for command in axis.commands)]], rows, language)
+    sheet = Sheet([], [[name, *axis.commands], *rows], language)
     truth = truth_of(axis, runs.readings(), answer="either")
     return Drawn("positions across, runs below", sheets.text_file(rng, sheet), truth)
 

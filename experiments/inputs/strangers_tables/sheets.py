@@ -34,6 +34,8 @@ class File(NamedTuple):
 
     name: str
     data: bytes
+    heads: tuple[str, ...] = ()
+    """Names of the columns, one line of them."""
 
 
 def columns_sheet(columns: dict[str, Sequence[Cell]], language: str) -> Sheet:
@@ -51,7 +53,7 @@ def number(cell: Cell, point: str, form: str = "plain") -> str:
     if form == "minus":
         text = text.replace("-", "\u2212")
     if form == "exponent" and "." in text:
-        text = f"{cell:.9E}"
+        text = f"{float(cell):.9E}"
     return text.replace(".", point)
 
 
@@ -60,6 +62,11 @@ def preamble(rng: np.random.Generator, language: str) -> list[str]:
     lines = list(rng.permutation(np.array(words.PREAMBLE[language]))[: int(rng.integers(1, 4))])
     lines += [words.DATE[language]] if chance(rng, 0.6) else []
     return [str(line) for line in lines] + [""] * chance(rng, 0.5)
+
+
+def named(sheet: Sheet) -> tuple[str, ...]:
+    """Names of the columns, where they stand on one line."""
+    return tuple(sheet.heads[0]) if len(sheet.heads) == 1 else ()
 
 
 def text_file(rng: np.random.Generator, sheet: Sheet) -> File:
@@ -80,7 +87,8 @@ def text_file(rng: np.random.Generator, sheet: Sheet) -> File:
     writer = csv.writer(stream, "stranger")
     empty = [""] * int(rng.integers(1, 4)) * chance(rng, 0.03)
     writer.writerows([*sheet.heads, *([number(cell, point, form) for cell in row] + empty for row in sheet.rows)])
-    return File(f"log.{pick(rng, ('csv', 'csv', 'txt', 'dat'))}", encoded(rng, stream.getvalue()))
+    name = f"log.{pick(rng, ('csv', 'csv', 'txt', 'dat'))}"
+    return File(name, encoded(rng, stream.getvalue()), named(sheet))
 
 
 def encoded(rng: np.random.Generator, text: str) -> bytes:
@@ -118,7 +126,7 @@ def workbook(rng: np.random.Generator, sheet: Sheet) -> File:
         book.create_sheet("Sheet2")
     stream = io.BytesIO()
     book.save(stream)
-    return File("log.xlsx", stream.getvalue())
+    return File("log.xlsx", stream.getvalue(), named(sheet))
 
 
 def markdown(rng: np.random.Generator, sheet: Sheet) -> File:
@@ -129,7 +137,7 @@ def markdown(rng: np.random.Generator, sheet: Sheet) -> File:
     lines = [names, [rule] * len(names), *([number(cell, ".") for cell in row] for row in sheet.rows)]
     text = "\n".join(left + " | ".join(cells) + right for cells in lines) + "\n"
     title = "# Measurements\n\nTable 1, first day.\n\n" if chance(rng, 0.4) else ""
-    return File("report.md", encoded(rng, title + text))
+    return File("report.md", encoded(rng, title + text), tuple(names))
 
 
 def with_index(rng: np.random.Generator, sheet: Sheet) -> None:

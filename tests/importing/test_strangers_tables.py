@@ -1,0 +1,117 @@
+"""Drawn tables of strangers (`experiments/inputs`): their truths agree with their axes, and their judge can fail."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.inputs.strangers_tables.__main__ import DRAWS, drawn_table
+from experiments.inputs.strangers_tables.judge import folder_difference
+from experiments.inputs.strangers_tables.kinds import Drawn
+from experiments.inputs.strangers_tables.measured import Reading, Truth
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[Drawn]:
+    """Some tables of every kind."""
+    tables = [drawn_table(seed) for seed in range(20_000, 20_300)]
+    assert len({table.kind for table in tables}) > len(DRAWS)
+    return tables
+
+
+def axes(tables: Sequence[Drawn]) -> list[Truth]:
+    return [table.truth for table in tables if table.truth.readings[0].pair is None]
+
+
+def test_truths_have_the_ratio_and_the_play_of_their_axes(drawn):
+    """By least squares with a column of sides; a play is ten scatters or more, over ten readings or more."""
+    seen = 0
+    for truth in axes(drawn):
+        sides = np.array([r.side for r in truth.readings])
+        known = sides != 0
+        if len(set(sides[known].tolist())) < 2:
+            continue
+        commands, values = (
+            np.array([getattr(r, name) for r in truth.readings])[known] for name in ("command", "value")
+        )
+        columns = np.column_stack([commands, np.ones(known.sum()), -0.5 * sides[known]])
+        ratio, _, play = np.linalg.lstsq(columns, values, rcond=None)[0]
+        # Ten readings over a hundred scatters; that of deviations is 1 to some parts in a thousand.
+        assert ratio == pytest.approx(truth.ratio, rel=2e-2), truth
+        assert abs(play) == pytest.approx(truth.play, rel=0.3, abs=2 * truth.digit), truth
+        seen += 1
+    assert seen > 150
+
+
+def written(truth: Truth, folder: Path, change: Callable[[list[Reading]], list[Reading]] = lambda r: r) -> Path:
+    """A folder that holds a truth, or what became of it."""
+    folder.mkdir()
+    (folder / "campaign.toml").write_text(f'unit = "{truth.unit or "deg"}"\n', encoding="utf-8")
+    moves, readings, before, side = [], [], None, 0
+    for k, r in enumerate(change(list(truth.readings))):
+        first = before is None or before.segment != r.segment
+        rises = 0 if first else (r.command > before.command) - (r.command < before.command)
+        if r.side and not first and (rises or side) != r.side:
+            # From beyond.
+            beyond = r.command - r.side * 1e-3 * (1 + abs(r.command))
+            moves.append((r.segment, k, beyond, ""))
+        side = r.side or rises
+        approach = {0: "unknown", 1: "forward", -1: "backward"}[r.side] if first else ""
+        time_s = k if r.time_s is None else r.time_s
+        readings.append((len(moves), repr(r.value), repr(r.u), "ok"))
+        moves.append((r.segment, time_s, r.command, approach))
+        before = r
+    for name, head, rows in (
+        ("moves.csv", "segment,time_s,command,approach", moves),
+        ("readings.csv", "move,value,u,status", readings),
+    ):
+        with open(folder / name, "w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([head.split(","), *rows])
+    return folder
+
+
+def test_a_folder_that_holds_the_truth_is_right(drawn, tmp_path):
+    for number, truth in enumerate(axes(drawn)):
+        assert folder_difference(written(truth, tmp_path / str(number)), truth) == "", truth
+
+
+FAULTS: dict[str, Callable[[list[Reading]], list[Reading]]] = {
+    "value": lambda readings: [*readings[:3], readings[3]._replace(value=1.01 * readings[3].value + 1), *readings[4:]],
+    "value x 1000": lambda readings: [r._replace(value=1000 * r.value) for r in readings],
+    "command": lambda readings: [readings[0]._replace(command=readings[0].command + 1.5), *readings[1:]],
+    "side": lambda readings: [r._replace(side=-r.side) for r in readings],
+    "u for none": lambda readings: [r._replace(u=0.5) for r in readings],
+    "readings: fewer": lambda readings: readings[:-1],
+    "readings: more": lambda readings: [*readings, readings[-1]._replace(command=1e6)],
+    "homings": lambda readings: [*readings[:4], *(r._replace(segment=r.segment + 1) for r in readings[4:])],
+    "times": lambda readings: [r._replace(time_s=1e5 * k + 0.5) for k, r in enumerate(readings)],
+}
+
+
+@pytest.mark.parametrize("reason", FAULTS)
+def test_every_fault_of_a_folder_is_named(reason, drawn, tmp_path):
+    """Of tables that state all of it."""
+    seen = 0
+    for number, truth in enumerate(axes(drawn)):
+        plain = not truth.spread and truth.kept is None and truth.unit and truth.segments == "exact"
+        if not plain or any(r.u for r in truth.readings) or len({r.side for r in truth.readings}) < 2:
+            continue
+        if reason == "times":
+            truth = replace(
+                truth, clock=1.1, readings=tuple(r._replace(time_s=1.0 * k) for k, r in enumerate(truth.readings))
+            )
+        found = folder_difference(written(truth, tmp_path / str(number), FAULTS[reason]), truth)
+        assert found.startswith(reason.split(" x ")[0]) or (reason, found) == ("side", "command"), (
+            reason,
+            found,
+            truth,
+        )
+        seen += 1
+        if seen == 40:
+            return
+    pytest.fail(f"{seen} tables")
