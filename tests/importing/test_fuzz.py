@@ -45,7 +45,7 @@ def imported(path, folder):
 @few(200)
 @given(damaged(FILES))
 def test_damaged_files_are_read_or_refused(tmp_path_factory, case):
-    name, data = case
+    _, data = case
     folder = tmp_path_factory.mktemp("damaged")
     path = folder / "file"
     path.write_bytes(data)

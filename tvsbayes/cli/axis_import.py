@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +47,16 @@ KINDS = ("csv", *LOGS)
 _TABLES = ("csv", "epics", "klipper")
 KINDS_OF = {
     **{"run": ("phd2",), "assume": KINDS, "column": _TABLES, "unit": _TABLES, "deviations": ("csv",)},
+    "encoders": _TABLES,
     **{"runs": ("csv",), "counts_per_turn": _TABLES, "sheet": ("csv", "pe")},
 }
 """Kinds for which an option is."""
+_NONE = {"value": 0.0, "u": 0.0}
+ENCODER_ENTRIES: dict[str, dict[str, Any]] = {
+    "motor": {"absolute": True},
+    "output": {"absolute": True, "backlash": _NONE, "play_variation": _NONE, "ratio_contrast": _NONE},
+}
+"""Entries of `[axis]` where commands are angles of an absolute encoder: one on the axis itself sees no play."""
 UNIT = "deg"
 """Unit of readings in the template, where no column states one."""
 
@@ -66,6 +73,7 @@ class FileOptions:
         runs: order of runs beside each other.
         units: unit by field.
         assume: numbers that the file does not state, by name.
+        encoders: where commands are angles of an encoder, "output", "motor" or "incremental".
     """
 
     kind: str = "auto"
@@ -75,6 +83,7 @@ class FileOptions:
     runs: str | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     assume: Mapping[str, float] = field(default_factory=dict)
+    encoders: str | None = None
 
     def wishes(self, columns: Mapping[str, str]) -> Wishes:
         """What they say about a table."""
@@ -138,6 +147,7 @@ def import_readings(
                 else {}
             )
             rows = axis_rows(table, wish.wishes({**stated, **named}), unit_of_folder(to))
+            rows = replace(rows, axis={**rows.axis, **ENCODER_ENTRIES.get(wish.encoders or "", {})})
             lines, document = list(rows.lines), dict(rows.document)
     _refuse_filled(to)
     return _import_of(rows, lines, document, to)
@@ -178,6 +188,7 @@ def _check_options(kind: str, opts: FileOptions, stated: Mapping[str, str], shee
     """Refuse options that a file of this kind would ignore."""
     given: dict[str, object] = {"run": opts.run, "column": stated or None, "unit": opts.units or None}
     given |= {"deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn, "sheet": sheet, "runs": opts.runs}
+    given["encoders"] = opts.encoders
     refused = {name: value for name, value in given.items() if kind not in KINDS_OF[name]}
     refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **refused)
 
@@ -256,8 +267,7 @@ def _write(to: Path, rows: AxisRows) -> list[str]:
     """Write the tables and last the commented campaign.toml."""
     # Another import may have filled it since the question.
     _refuse_filled(to)
-    known = AxisMove.__dataclass_fields__
-    moves = [AxisMove(**{k: v for k, v in row.items() if k in known}) for row in rows.moves]
+    moves = [AxisMove(**row) for row in rows.moves]
     readings = [Reading(**row) for row in rows.readings]
     contents = {"moves.csv": axis_moves_bytes(moves), "readings.csv": readings_bytes(readings)}
     if not (to / "campaign.toml").is_file():

@@ -103,7 +103,9 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
     return Import(lines, document, write, next_step, outcome=outcome)
 
 
-def import_sightings(file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction) -> Import:
+def import_sightings(
+    file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction, encoders: str | None
+) -> Import:
     """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
     table = read_foreign(file, sheet)
     rows = sighting_rows(table, wishes)
@@ -118,7 +120,8 @@ def import_sightings(file: Path, to: Path, sheet: str | None, wishes: SightingWi
         of_joint = corrected(moves, None, Correction(flipped=turned))
         moves, assumed = of_joint.moves or (), [*assumed, *of_joint.changes]
     priors = first_priors(moves, sightings, rows.encoders, assumed)
-    imported = ImportedHead(moves, sightings, priors, rows.encoders, (*assumed, *changed.changes))
+    absolute = _absolute(table.file, rows.encoders, encoders, priors, assumed)
+    imported = ImportedHead(moves, sightings, priors, rows.encoders, absolute, (*assumed, *changed.changes))
     contents = _sighting_files(imported, to, table.file)
     ok = sum(sighting.status == "ok" for sighting in sightings)
     lines = table_lines(table, rows.understood, FIELDS, rows.units)
@@ -135,12 +138,13 @@ def import_sightings(file: Path, to: Path, sheet: str | None, wishes: SightingWi
 
 @dataclass(frozen=True)
 class ImportedHead:
-    """Moves and sightings of a table, priors of ratios and zeros, axes read by encoders, and assumptions in words."""
+    """Moves and sightings of a table, priors, axes read by encoders and by absolute ones, and assumptions in words."""
 
     moves: Sequence[Move]
     sightings: Sequence[Sighting]
     priors: dict[str, Prior]
     encoders: Set[str]
+    absolute: tuple[str, ...]
     assumed: tuple[str, ...]
 
 
@@ -182,8 +186,36 @@ def _sighting_files(rows: ImportedHead, to: Path, table: str) -> _SightingFiles:
     priors = {name: prior for name, prior in rows.priors.items() if name not in stated}
     files = dict(templates) if is_new else {}
     files |= with_priors(current, priors) if priors else {}
+    if rows.absolute:
+        line = toml_line("absolute", list(rows.absolute)).encode()
+        files |= {
+            name: re.sub(rb"(?m)^\[rig\][^\n]*$", rb"\g<0>\n" + line, files.get(name, current[name]), count=1)
+            for name in PRIOR_FILES
+            if name in current
+        }
     files |= {MOVES.file: MOVES.content(rows.moves), SIGHTINGS.file: SIGHTINGS.content(rows.sightings)}
     return _SightingFiles(files, is_new, [text for text in rows.assumed if text.partition(":")[0] not in stated])
+
+
+def _absolute(
+    file: str, encoders: Set[str], kind: str | None, priors: dict[str, Prior], assumed: list[str]
+) -> tuple[str, ...]:
+    """Axes whose encoders are absolute, as --encoders says; one on the axis itself has no play and no contrast.
+
+    Raises:
+        InputError: --encoders, and no angle of an encoder in the table.
+    """
+    if kind is not None and not encoders:
+        allowed, remedy = "angles of encoders, which have a unit or decimals", "leave --encoders out"
+        raise refusal("usage", file=file, found="counters", allowed=allowed, remedy=remedy)
+    if encoders and kind is None:
+        other = "--encoders output (absolute, on the axis itself) or motor (absolute, before the gears) says another"
+        assumed.append(f"encoders: incremental, with a new zero at each homing; {other}")
+    axes = tuple(axis for axis in AXES if axis in encoders) if kind in ("output", "motor") else ()
+    for axis in axes if kind == "output" else ():
+        priors |= {f"backlash_deg.{axis}": Prior(0.0, 0.0), f"play_variation_deg.{axis}": Prior(0.0, 0.0)}
+        priors[f"ratio_contrast_deg_per_step.{axis}"] = Prior(0.0, 0.0)
+    return axes
 
 
 def _joints_of(folder: Path) -> HeadJoints | None:

@@ -28,11 +28,12 @@ if TYPE_CHECKING:
 
 COPY, URDF, POINTING, AXIS, SIGHTINGS, LOOKS = "copy", "urdf", "pointing", "axis", "sightings", "looks"
 """Kinds of files; --format names that of a telescope's table."""
+ENCODERS = ("output", "motor", "incremental")
 ANGLE_UNITS = ("deg", "rad", "mrad", "gon", "arcmin", "arcsec")
 KINDS_OF: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("column", "sheet"), (AXIS, SIGHTINGS, LOOKS)),
     **{"pixels_from": (COPY, LOOKS), "angles": (SIGHTINGS, LOOKS), "sd_px": (LOOKS,)},
-    **{"axis": (AXIS,), "sightings": (SIGHTINGS,), "kind": (POINTING, AXIS)},
+    **{"axis": (AXIS,), "sightings": (SIGHTINGS,), "kind": (POINTING, AXIS), "encoders": (AXIS, SIGHTINGS)},
     **dict.fromkeys(("run", "runs", "unit", "deviations", "counts_per_turn"), (AXIS,)),
     "assume": (AXIS, SIGHTINGS),
     **dict.fromkeys(("relative", "flip", "shift_moves"), (COPY, SIGHTINGS, LOOKS)),
@@ -73,6 +74,14 @@ def import_(
         str,
         typer.Option("--format", help="auto, pointing (telescope); of an axis csv, phd2 (KStars), epics, klipper, pe."),
     ] = "auto",
+    encoders: Annotated[
+        str | None,
+        typer.Option(
+            "--encoders",
+            help="Where commands are angles of encoders: output (absolute, on the axis), motor (absolute, before the "
+            "gears), incremental.",
+        ),
+    ] = None,
     run: Annotated[int | None, typer.Option("--run", min=1, help="Of a guide log: run; without it a list.")] = None,
     runs: Annotated[
         str | None,
@@ -131,6 +140,7 @@ def import_(
     o = SimpleNamespace(**options)
     approach = (o.pan_approach, o.tilt_approach)
     check_word("--angles", o.angles, ANGLE_UNITS, "write --angles deg or --angles rad")
+    check_word("--encoders", o.encoders, ENCODERS, f"write one of {', '.join(ENCODERS)}")
     sides_of(approach)
     example = "u_left_px=XL; --column target= where the table has none"
     stated = dict(_named("--column", text, example) for text in o.column or ())
@@ -162,7 +172,7 @@ def import_(
         check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
         check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")
         units = dict(_named("--unit", text, "value=um") for text in o.unit or ())
-        wish = FileOptions(o.kind, o.run, o.deviations, o.counts_per_turn, o.runs, units, assumed)
+        wish = FileOptions(o.kind, o.run, o.deviations, o.counts_per_turn, o.runs, units, assumed, o.encoders)
         task = import_readings(o.file, o.to, stated, o.sheet, wish, yes=o.yes, as_json=o.as_json)
     elif kind_of_file == SIGHTINGS:
         from tvsbayes.cli.head_commands import import_sightings
@@ -170,7 +180,7 @@ def import_(
 
         u_deg = _assumptions(o.assume, {"u_deg": "standard uncertainty"}, "u_deg=0.005").get("u_deg")
         wishes = SightingWishes(stated, o.angles, o.relative, approach, u_deg)
-        task = import_sightings(o.file, o.to, o.sheet, wishes, correction)
+        task = import_sightings(o.file, o.to, o.sheet, wishes, correction, o.encoders)
     else:
         from tvsbayes.cli.looks_import import import_looks
         from tvsbayes.importing.looks import SD_PX, LookWishes

@@ -15,7 +15,8 @@ from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_kind import Column, CsvKind, Values
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table, table_blocks
 from tvsbayes.files.disk import opened, read_bytes
-from tvsbayes.files.foreign_table import is_foreign, read_foreign
+from tvsbayes.importing.reader import read_foreign
+from tvsbayes.importing.text import is_foreign
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import APERTURE_MAX_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX

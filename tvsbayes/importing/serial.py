@@ -11,6 +11,8 @@ from tvsbayes.importing.table import Row, Rows
 
 PAIRED_SHARE = 0.6
 """Least share of "name: value" lines in a file of pairs; the others are messages at a program's start."""
+VALUES_MIN = 20
+"""Least number of values of a name by whose decimals one can be seen to be cut."""
 USUAL_SHARE = 0.97
 """Share of a name's values with one number of decimals, from which a value with fewer was cut."""
 REPEATED_SHARE = 0.1
@@ -112,7 +114,9 @@ def _cut_lines(stream: list[_Pair]) -> set[int]:
     return {
         pair.line
         for pair, places in decimals.items()
-        if places < usual[pair.name][0] and usual[pair.name][1] >= USUAL_SHARE * (by_name[pair.name].total() - 1)
+        if places < usual[pair.name][0]
+        and by_name[pair.name].total() >= VALUES_MIN
+        and usual[pair.name][1] >= USUAL_SHARE * (by_name[pair.name].total() - 1)
     }
 
 
@@ -132,8 +136,11 @@ def _blocks(stream: list[_Pair], usual: list[str]) -> tuple[list[dict[str, _Pair
         names = [pair.name for pair in block]
         heads = {pair.name: pair for pair in block if signature.count(pair.name) == 1}
         repeats = [name for name in dict.fromkeys(signature) if signature.count(name) > 1]
-        if not block or names[0] != signature[0] or len(heads) < len(set(signature) - set(repeats)):
+        if not block or names[0] != signature[0]:
             orphans.update(pair.line for pair in block)
+        elif len(heads) < len(set(signature) - set(repeats)):
+            # A move whose reading was lost is a move.
+            rows.append({**heads, **extras})
         elif not repeats:
             rows.append({**heads, **extras})
         else:

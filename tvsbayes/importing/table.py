@@ -93,7 +93,7 @@ def table_of(file: str, kind: str, columns: Mapping[str, Sequence[object]], line
 
 def is_number(cell: str) -> bool:
     """Whether a cell is a number, with a decimal point or comma."""
-    return bool(NUMBER.fullmatch(cell) or _COMMA.fullmatch(cell))
+    return any(form.fullmatch(cell) for form in (NUMBER, _COMMA, _GROUPED_POINT, _GROUPED_COMMA))
 
 
 def cleaned(cell: str) -> str:
@@ -136,7 +136,9 @@ def headed(found: Rows) -> Rows:
     if not data:
         return Rows(rows, notes)
     first = data
-    above = data - 2 if data > 1 and _all_units(rows[data - 1].cells) else data - 1
+    # "n", "v" and "w" are units too, where names stand above them.
+    has_units = data > 1 and _all_units(rows[data - 1].cells) and _may_be_names(rows[data - 2].cells, rows[data].cells)
+    above = data - 2 if has_units else data - 1
     if _may_be_names(rows[above].cells, rows[data].cells):
         first = above
         if first and _is_group_row(rows[first - 1].cells, rows[first].cells):
@@ -165,14 +167,12 @@ def _first_data(rows: Sequence[Row]) -> int:
 
 
 def _may_be_names(cells: Sequence[str], data: Sequence[str]) -> bool:
-    """Whether a row can hold the names of the columns: no number, but as many texts as most of the data."""
+    """Whether a row can hold the names of the columns: texts, for half of the numbers of the data or more."""
     filled = [cell for cell in cells if cell]
     numbers = sum(map(is_number, data))
-    return (
-        len(filled) >= max(2, numbers)
-        and not any(is_number(c) and not c.lstrip("+-").isdigit() for c in filled)
-        and not is_number(filled[0])
-    )
+    # A whole number can be the name of a run.
+    decimals = any(is_number(cell) and not cell.lstrip("+-").isdigit() for cell in filled)
+    return 2 * len(filled) >= max(4, numbers) and not decimals and not is_number(filled[0])
 
 
 def _all_units(cells: Sequence[str]) -> bool:

@@ -12,6 +12,7 @@ from tvsbayes.errors import CONTROL, escaped, refusal
 from tvsbayes.files.csv_table import CSV_ROWS_MAX
 from tvsbayes.importing.table import (
     ABOVE_MAX,
+    COLUMNS_MAX,
     KINDS,
     WORKBOOKS,
     Row,
