@@ -222,14 +222,7 @@ def _results(
 ) -> CampaignResults:
     """Compute summary, calibration and evidence of a fit and its sample; write them where a folder is given.
 
-    Args:
-        fit: mode and Laplace approximation.
-        posterior: its sample.
-        seed: seed of all random numbers.
-        folder: place of the files; a `posterior.nc` there that belongs to another fit is removed.
-        tell: shows lines to the user.
-        begin: begins a stage of the progress.
-        with_chain: whether a chain was run, which keeps `chain.npz` and gives `posterior.nc`.
+    With a chain, which keeps `chain.npz`, they include `posterior.nc`; one of another fit is removed.
     """
     import numpy as np
 
@@ -451,12 +444,7 @@ def load_calibration(path: Path | str) -> Calibration:
         InputError: there is no such file, tvsbayes did not write it, or the results are not of one fit or of other
             data than lie in the folder.
     """
-    from tvsbayes.calibration.calibration_file import (
-        calibration_of_arrays,
-        no_calibration,
-        read_calibration_json,
-        read_draws,
-    )
+    from tvsbayes.calibration import calibration_file
 
     path = Path(path)
     if not path.exists():
@@ -465,14 +453,11 @@ def load_calibration(path: Path | str) -> Calibration:
         file = escaped(str(path), 200)
         raise refusal("missing-file", file=file, found="no such file", allowed=allowed, remedy=remedy)
     if path.suffix == ".json" and path.is_file():
-        return read_calibration_json(path)
+        return calibration_file.read_calibration_json(path)
     if path.is_file() and not path.with_name(FIT_FILE).exists():
         # Copied to a robot by itself.
-        return read_draws(path)
-    calibration = calibration_of_arrays(_loaded(path.parent if path.is_file() else path).arrays)
-    if calibration is None:
-        raise no_calibration()
-    return calibration
+        return calibration_file.read_draws(path)
+    return calibration_file.calibration_in(_loaded(path.parent if path.is_file() else path).arrays)
 
 
 def _loaded(folder: Path) -> FitFiles:

@@ -24,7 +24,7 @@ class Weight:
     """A row of an invented file."""
 
     row: Annotated[int, Column("0, 1, 2, ...", rule=counted)]
-    segment: Annotated[int, Column("any", names="run")]
+    segment: Annotated[int, Column("any")]
     side: Annotated[Literal["left", "right", ""], Column("where from", rule=first_of_segment)] = ""
     mass_g: Annotated[float | None, Column("g", -1.0, 5.0, rule=filled_where_ok("weigh it"))] = None
     status: Annotated[str, Column("`ok`, or why not", filled=True)] = "ok"

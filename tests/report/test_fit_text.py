@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from msgspec import structs
 from support.small_results import small_summary
-from tvsbayes.head.foreign_sightings import STEP_DEG
 
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
+from tvsbayes.importing.sightings import STEP_DEG
 from tvsbayes.report.advice import next_steps
 from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.fit_text import FINE_DEG, classic_text, demo_text, fit_text

@@ -19,6 +19,7 @@ from support.small_results import small_draws, small_record, whole_summary
 from support.stored_fits import edit_fit, npz
 
 from tvsbayes.errors import InputError, Reason
+from tvsbayes.files.disk import locked
 from tvsbayes.instrument.campaign import input_hashes, read_campaign, write_campaign
 from tvsbayes.pipeline import inputs_of, load_calibration, load_posterior
 from tvsbayes.pipeline import read_campaign as read_any
@@ -218,6 +219,21 @@ def test_a_killed_fit_holds_its_folder_no_longer(tmp_path):
     with sole_writer(results):
         assert not unfinished.exists()
     assert not (results / LOCK).exists()
+
+
+def test_a_lock_whose_holder_goes_meanwhile_is_taken_anew(tmp_path, monkeypatch):
+    """The file that was opened is no longer there when it is locked: a lock on it would hold nobody off."""
+    results, taken = tmp_path / "results", []
+
+    def late(descriptor: int) -> bool:
+        if not taken:
+            (results / LOCK).unlink()
+        taken.append(locked(descriptor))
+        return taken[-1]
+
+    monkeypatch.setattr("tvsbayes.results.store.locked", late)
+    with sole_writer(results):
+        assert taken == [True, True] and (results / LOCK).exists()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links")

@@ -278,17 +278,16 @@ def read_draws(path: Path) -> Calibration:
         arrays = read_arrays(path, RESULTS_BYTES_MAX)
     except ValueError as error:
         raise damaged_calibration(path, error) from error
-    calibration = calibration_of_arrays(arrays, path)
-    if calibration is None:
-        raise no_calibration(path)
+    return calibration_in(arrays, path)
+
+
+def calibration_in(arrays: Mapping[str, np.ndarray], path: Path = DRAWS) -> Calibration:
+    """Build the calibration that must be in `draws.npz`; errors as in `read_draws`."""
+    if (calibration := calibration_of_arrays(arrays, path)) is None:
+        name = escaped(path.name)
+        message = f"{name} holds draws and no calibration: its fit did not converge, or an older tvsbayes wrote it"
+        raise InputError(NO_CALIBRATION, message, file=name, remedy="run `tvsbayes fit` on the campaign again")
     return calibration
-
-
-def no_calibration(path: Path = DRAWS) -> InputError:
-    """Build the refusal of results whose fit left draws alone."""
-    name = escaped(path.name)
-    message = f"{name} holds draws and no calibration: its fit did not converge, or an older tvsbayes wrote it"
-    return InputError(NO_CALIBRATION, message, file=name, remedy="run `tvsbayes fit` on the campaign again")
 
 
 def calibration_of_arrays(file: Mapping[str, np.ndarray], path: Path = DRAWS) -> Calibration | None:

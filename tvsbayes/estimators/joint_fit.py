@@ -358,7 +358,7 @@ def restored(campaign: Campaign, stored: StoredMode) -> JointFit | None:
 
     Args:
         campaign: the campaign that was fitted.
-        stored: from `stored_draws.stored_mode`.
+        stored: from `stored_draws.mode_of`.
 
     Returns:
         The fit, with the Laplace draws of `fit` at its default seed; None where another version of tvsbayes used other

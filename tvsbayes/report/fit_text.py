@@ -30,7 +30,7 @@ from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import CHAIN
 
 FINE_DEG = 1e-5
-"""Size of a step of an encoder in `head.foreign_sightings`; motor steps are much larger."""
+"""Size of a step of an encoder in `importing.sightings`; motor steps are much larger."""
 PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 

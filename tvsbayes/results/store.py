@@ -169,8 +169,10 @@ def sole_writer(folder: Path) -> Iterator[None]:
         if is_alone is False:
             raise _other_writer(folder, os.read(descriptor, LOCK_BYTES_MAX).decode(errors="replace"))
         since = datetime.datetime.now(datetime.UTC).isoformat(" ", "seconds")
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {platform.node()} since {since}".encode())
+        # On a full disk the lock holds without its words.
+        with suppress(OSError):
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f"process {os.getpid()} on {platform.node()} since {since}".encode())
         if is_alone:
             remove_unfinished(folder, (FIT, DRAWS, POSTERIOR, CHAIN))
         try:
@@ -197,9 +199,10 @@ def _lock_of(path: Path) -> tuple[int, bool | None]:
             is_alone = locked(descriptor)
         except OSError:
             return descriptor, None
-        if not is_alone or (path.exists() and os.path.samestat(os.fstat(descriptor), path.stat())):
-            return descriptor, is_alone
-        # Its former holder has removed it in between.
+        # Its former holder may have removed it in between.
+        with suppress(FileNotFoundError):
+            if not is_alone or os.path.samestat(os.fstat(descriptor), path.stat()):
+                return descriptor, is_alone
         os.close(descriptor)
 
 
