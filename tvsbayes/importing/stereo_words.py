@@ -41,7 +41,7 @@ def fields() -> dict[str, tuple[tuple[int, ...], list[str]]]:
     return {name: (tuple(of["counts"]), of["names"].split()) for table in tables for name, of in table.items()}
 
 
-def refused(what: str, file: str, keys: Keys | None = None, key: str = "", **values: object) -> InputError:
+def refused(what: str, file: str, keys: Keys | None = None, key: str = "", /, **values: object) -> InputError:
     """A refusal of `data/words/stereo.toml` in a file, or of a key of a table."""
     text = {name: text.format(**values) for name, text in words()["says"][what].items()}
     if keys is not None:
