@@ -383,6 +383,18 @@ def test_rows_of_a_lab_book_are_moves_and_looks_that_wait():
     assert result.rows.understood.unused == ("Remark",)
 
 
+def test_merged_cells_and_distances_of_a_spreadsheet():
+    """The number stands in the first row of an experiment; the sheet is named by its distance."""
+    rows = ("0 0 7 P1 17.5", "0 0 - P2 27.5", "200 0 - P3 27.5", "200 0 - P4 17.5", "0 0 - - -", "5 0 - P1 17.5")
+    result = looks(*rows, header="Pan Tilt Exp Point Distance_cm")
+    assert [(s.experiment, s.point, s.target) for s in result.spots] == [
+        *((7, 1, "17.5"), (7, 2, "27.5"), (7, 3, "27.5"), (7, 4, "17.5")),
+    ]
+    assert "experiment: 3 rows with a point alone are of the experiment above them" in result.assumed
+    assert "experiment, point: 1 row with only one of them, which is left out" in result.assumed
+    assert any("every value of Distance_cm is one placement" in text for text in result.assumed)
+
+
 def test_looks_are_kept_without_their_pictures():
     """Without --pictures the looks wait, and how pictures come is said; a refused look keeps its reason."""
     result = looks("0 0 1 1 a.png ok", "0 0 1 2 b.png bad", header="Pan Tilt Exp Pt File State")
