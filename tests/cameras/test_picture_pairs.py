@@ -233,6 +233,8 @@ def test_pairs_as_stated_go_by_their_order(tmp_path, options, turned):
         ({"globs": ("A/*.png", "B/t8.png")}, "2 left and 1 right pictures"),
         ({"globs": ("A/*.png", "C/*.png")}, "2 and 0 pictures"),
         ({"globs": ("A/*.png", "../B/*.png")}, "pictures of two cameras"),
+        ({"globs": ("A/*.png", "")}, "pictures of two cameras"),
+        ({"globs": ("A/*.png", "**.png")}, "pictures of two cameras"),
         ({"in_order": True}, "3 at most"),
     ],
 )

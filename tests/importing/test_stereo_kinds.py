@@ -328,6 +328,7 @@ def test_missing_names_are_given_by_the_user(mounted, tmp_path):
 HOSTILE = {
     "entity.xml": b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><opencv_storage><M1>&b;</M1></opencv_storage>',
     "open.xml": b"<opencv_storage><M1>",
+    "twice.xml": b"<opencv_storage><M1>1 2</M1><M1>1 3</M1></opencv_storage>",
     "deep.xml": b"<opencv_storage>" + 2000 * b"<a>" + 2000 * b"</a>" + b"</opencv_storage>",
     "laughs.yml": b"".join(
         b"a%d: &a%d [%s]\n" % (k, k, b",".join(10 * [b"*a%d" % (k - 1) if k else b"1"])) for k in range(9)

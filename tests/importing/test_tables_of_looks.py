@@ -310,14 +310,16 @@ def test_other_fields_in_four_languages():
 
 
 def test_fields_are_the_columns_of_a_campaign():
-    """Every column of moves.csv and spots.csv can be imported under its own name."""
-    assert set(MOVES.columns) | set(SPOTS.columns) == set(FIELDS) - {
+    """Every column of moves.csv and spots.csv can be imported under its own name, but the importer's own mark."""
+    columns = {**MOVES.columns, **SPOTS.columns}
+    del columns["assumed"]
+    assert set(columns) == set(FIELDS) - {
         "picture",
         "picture_left",
         "picture_right",
         "direction",
     }
-    names = [name for name in FIELDS if name in {**MOVES.columns, **SPOTS.columns}]
+    names = [name for name in FIELDS if name in columns]
     assert look_claims(table_of(names, []), {}).columns == {name: name for name in names}
 
 
@@ -381,6 +383,18 @@ def test_rows_of_a_lab_book_are_moves_and_looks_that_wait():
     assert result.rows.pictures == [("left/exp01_P1_L.png",), ("left/exp01_P2_L.png",), ("left/exp01_P3_L.png",), ("",)]
     assert result.rows.created == datetime.datetime(2025, 7, 24, 9) and result.rows.lines == [3, 4, 5, 6]
     assert result.rows.understood.unused == ("Remark",)
+
+
+def test_merged_cells_and_distances_of_a_spreadsheet():
+    """The number stands in the first row of an experiment; the sheet is named by its distance."""
+    rows = ("0 0 7 P1 17.5", "0 0 - P2 27.5", "200 0 - P3 27.5", "200 0 - P4 17.5", "0 0 - - -", "5 0 - P1 17.5")
+    result = looks(*rows, header="Pan Tilt Exp Point Distance_cm")
+    assert [(s.experiment, s.point, s.target) for s in result.spots] == [
+        *((7, 1, "17.5"), (7, 2, "27.5"), (7, 3, "27.5"), (7, 4, "17.5")),
+    ]
+    assert "experiment: 3 rows with a point alone are of the experiment above them" in result.assumed
+    assert "experiment, point: 1 row with only one of them, which is left out" in result.assumed
+    assert any("every value of Distance_cm is one placement" in text for text in result.assumed)
 
 
 def test_looks_are_kept_without_their_pictures():

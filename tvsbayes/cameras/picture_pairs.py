@@ -497,6 +497,17 @@ def _glob(folder: Path, names: Sequence[str]) -> str:
     return pattern if matched == {*names} else "PATTERN"
 
 
+def _matched(folder: Path, glob: str) -> list[str]:
+    """Files below a folder that a pattern names; one that leaves the folder, or is none, matches nothing."""
+    if Path(glob).is_absolute() or ".." in Path(glob).parts:
+        return []
+    try:
+        return [path.relative_to(folder).as_posix() for path in folder.glob(glob) if path.is_file()]
+    except ValueError:
+        # An empty pattern, or ** beside other letters.
+        return []
+
+
 def _stated_pairs(folder: Path, pairing: Pairing, most: int, refuse: Callable[..., InputError]) -> list[Picture]:
     """Pair pictures in the order of their names, the first of one camera with the first of the other.
 
@@ -504,9 +515,7 @@ def _stated_pairs(folder: Path, pairing: Pairing, most: int, refuse: Callable[..
     picture holds both.
     """
     if pairing.globs is not None:
-        # A pattern that leaves the folder matches nothing.
-        inside = [glob for glob in pairing.globs if not Path(glob).is_absolute() and ".." not in Path(glob).parts]
-        matches = [[p.relative_to(folder).as_posix() for p in folder.glob(glob) if p.is_file()] for glob in inside]
+        matches = [_matched(folder, glob) for glob in pairing.globs]
         groups = [sorted(names, key=natural_order) for names in matches]
         if pairing.globs[0] == pairing.globs[1] and groups and groups[0]:
             return [Picture(_stem(name), folder / name, pairing.sides) for name in groups[0]]

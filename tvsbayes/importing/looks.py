@@ -40,6 +40,8 @@ SD_PX = 0.1
 PIXEL_MAX, SD_MIN, SD_MAX, APERTURE_MAX_DEG, CORRELATION_MAX, POINT_MAX = 1e6, 1e-4, 100.0, 360.0, 0.999999, 4
 PLACEMENT_ROWS = 4
 """Fewest rows of a distance that stands for a placement of the sheet; distances of single rows are measured ones."""
+BOOK_PLACES_MAX = 8
+"""Largest number of distances of the sheets of a lab book; more are measured ones."""
 UNDETECTED = "undetected"
 WORDS = "looks.toml"
 _NAMED = (
@@ -215,15 +217,18 @@ def _by_distance(claims: Claims, table: ForeignTable, stated: Mapping[str, str])
     """The column of distances that names the sheet where no other does.
 
     That needs one unused column of a distance, whose every value fills one run of rows: a sheet that is put back to a
-    distance is a new placement, and a distance of each row is none.
+    distance is a new placement, and a distance of each row is none. A lab book's sheet stands at two distances in turn.
     """
-    if "target" in {*claims.columns, *claims.ambiguous, *stated} or not {*PIXELS} <= {*claims.columns}:
+    seen, book = {*PIXELS} <= {*claims.columns}, {*FOUR_POINT} <= {*claims.columns}
+    if "target" in {*claims.columns, *claims.ambiguous, *stated} or not (seen or book):
         return None
     named = [text for text in claims.unused if place_of(words_of(text), "distance", WORDS) is not None]
     if len(named) != 1:
         return None
     filled = [cell for cell in table.columns[named[0]] if cell]
     runs = [filled[k] for k in range(len(filled)) if k == 0 or filled[k] != filled[k - 1]]
+    if book and not seen:
+        return named[0] if len({*filled}) <= BOOK_PLACES_MAX else None
     is_placement = runs and len({*runs}) == len(runs) and min(map(filled.count, runs)) >= PLACEMENT_ROWS
     return named[0] if is_placement else None
 
@@ -397,7 +402,7 @@ def _looks(
     numbers = cells.whole("spot", 0, ID_MAX, optional=True)
     statuses, targets = cells.text("status"), cells.text("target")
     remarks = list[str]()
-    four = _four_point(cells, remarks)
+    four = _four_point(cells, remarks, not seen)
     pictures = [cells.text(name) for name in PICTURES if name in cells]
     marks = [*pixels, [status or None for status in statuses]] if seen else [four["point"] if four else [], *pictures]
     # The other rows are moves without a look.
@@ -455,7 +460,7 @@ def _looks(
     return looks, row_of_look
 
 
-def _four_point(cells: FieldCells, assumed: list[str]) -> dict[str, list[int | None]]:
+def _four_point(cells: FieldCells, assumed: list[str], book: bool) -> dict[str, list[int | None]]:
     """The columns of the four-point method by field; none where the table has only one of them."""
     fields = [name for name in FOUR_POINT if name in cells]
     if len(fields) == 1:
@@ -464,10 +469,19 @@ def _four_point(cells: FieldCells, assumed: list[str]) -> dict[str, list[int | N
         assumed.append(f"column {column} is left out: no column gives the other of {' and '.join(FOUR_POINT)}")
     if len(fields) < len(FOUR_POINT):
         return {}
+    # A spreadsheet's merged cells: the number stands in the first row of an experiment alone.
+    numbers, filled = cells.text("experiment"), 0
+    if book:
+        for row, point in enumerate(cells.text("point")):
+            if point and not numbers[row] and row and numbers[row - 1]:
+                numbers[row], filled = numbers[row - 1], filled + 1
+    if filled:
+        assumed.append(f"experiment: {filled} rows with a point alone are of the experiment above them")
+    texts = {"experiment": numbers, "point": cells.text("point")}
     # P1, exp 07.
     plain = {
         cells.columns[name]: tuple(
-            _LABELLED.sub(r"\1", cell) if _LABELLED.fullmatch(cell) else cell for cell in cells.text(name)
+            _LABELLED.sub(r"\1", cell) if _LABELLED.fullmatch(cell) else cell for cell in texts[name]
         )
         for name in fields
     }

@@ -91,13 +91,7 @@ def read_files(paths: Sequence[Path]) -> list[Keys]:
 def foreign_pair(
     files: Sequence[Keys], size: tuple[int, int] | None, unit_mm: float | None, keys: Mapping[str, str]
 ) -> ForeignPair:
-    """The pair in the tables of another program.
-
-    Args:
-        files: as `read_files` returns them.
-        size: image width and height, px, where the files do not state it.
-        unit_mm: unit of lengths, mm; None: that of the format; with an implausible baseline the user must state it.
-        keys: keys of M1, D1, M2, D2, R, T in the files, where their names are unknown.
+    """The pair in the tables of another program; options as of `cameras.imported_calibration.read_calibration`.
 
     Raises:
         InputError: unknown, contradictory, or of lenses that five coefficients do not describe.

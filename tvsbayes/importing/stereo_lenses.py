@@ -38,13 +38,9 @@ def kind_of(model: str) -> str | None:
 
 
 def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], kind: str) -> FittedLens:
-    """Fit five coefficients to another model.
+    """Fit five coefficients to another model in a picture of this size, px.
 
-    Args:
-        matrix: camera matrix.
-        distortion: OpenCV's 8, 12 or 14, the 4 of its fisheye model, or the 5 of the inverse one.
-        size: width and height of the picture, px.
-        kind: kind of the other model.
+    `distortion` holds OpenCV's 8, 12 or 14 coefficients, the 4 of its fisheye model, or the 5 of the inverse one.
     """
     pixels: np.ndarray = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 2)
     target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]

@@ -33,14 +33,7 @@ FIRST_TWO = "cameras 1 (left) and 2 (right) of {}"
 
 
 class Adapted(NamedTuple):
-    """A calibration under known names: its tables (refusals name the file), and what its format states.
-
-    Attributes:
-        keys: the tables.
-        source: the program.
-        unit: unit of lengths: "m", "cm" or "mm"; "?" where the numbers have none.
-        notes: assumptions.
-    """
+    """A calibration under known names; `unit` of lengths is m, cm or mm, or "?" where the numbers have none."""
 
     keys: Keys
     source: str
@@ -49,21 +42,13 @@ class Adapted(NamedTuple):
 
 
 def printed_trees(text: str) -> list[Values]:
-    """Values of what a program prints as text, a table for each camera or one; none for any other text.
-
-    Raises:
-        ValueError, ArithmeticError: it is recognised and broken, or its lens is none of ours.
-    """
+    """What a program prints as text, a table for each camera or one; none for any other text, ValueError if broken."""
     with np.errstate(over="raise", invalid="raise", divide="raise"):
         return next((read(text) for mark, read in _PRINTED if mark.search(text)), [])
 
 
 def adapted(keys: Keys, size: Size | None) -> Adapted | None:
-    """A program's own structure under known names; None for any other file.
-
-    Args:
-        keys: the file.
-        size: size of the pictures, px, where the user states it.
+    """A program's own structure under known names; None for any other file. `size` as the user states it, px.
 
     Raises:
         InputError: no pair in the file, a lens that is none of ours, or several picture sizes and none stated.

@@ -22,6 +22,7 @@ from tvsbayes.files.disk import shipped_data
 from tvsbayes.files.documents import Keys
 
 NAMES_LISTED = 12
+LEFT, RIGHT = r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1"
 NUMBER_MAX = 1e12
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R from a rotation, for files of few digits; the nearest rotation is used."""
@@ -40,7 +41,7 @@ def fields() -> dict[str, tuple[tuple[int, ...], list[str]]]:
     return {name: (tuple(of["counts"]), of["names"].split()) for table in tables for name, of in table.items()}
 
 
-def refused(what: str, file: str, keys: Keys | None = None, key: str = "", **values: object) -> InputError:
+def refused(what: str, file: str, keys: Keys | None = None, key: str = "", /, **values: object) -> InputError:
     """A refusal of `data/words/stereo.toml` in a file, or of a key of a table."""
     text = {name: text.format(**values) for name, text in words()["says"][what].items()}
     if keys is not None:
@@ -171,12 +172,7 @@ def letters(name: str) -> str:
 
 
 def meanings(entry: Entry, *, of_any_count: bool = False) -> list[Meaning]:
-    """Possible meanings of an entry, by the longest part of its path that is a known name.
-
-    Args:
-        entry: an entry of a file.
-        of_any_count: use its name alone, for any count of numbers.
-    """
+    """Possible meanings of an entry, by the longest part of its path that is a known name; for its count of numbers."""
     parts = (*entry.keys.path, entry.key)
     if set(words()["marks"]["ignored"]) & set(parts):
         return []
@@ -198,12 +194,6 @@ def side_of(part: str) -> str:
     return name if name in (*words()["sides"], "0", "1", "2") else ""
 
 
-def side_in_name(file: str) -> int | None:
-    """The camera in the name of a file; None if none."""
-    patterns = r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1"
-    return next((number for number, pattern in enumerate(patterns) if re.search(pattern, file.lower())), None)
-
-
 class Fields:
     """Entries of all files by field; those of cameras by field and number (0 left, 1 right)."""
 
@@ -220,10 +210,10 @@ class Fields:
         numbers = {meaning.side for _, meaning in readings if meaning.side.isdigit()}
         offset = 0 if "0" in numbers or not numbers else 1
         # Files of one camera each have entries without a side: the first file is the left one, unless names state it.
-        alone = {entry.file: None for entry, of in readings if of.field in ("M", "fx") and not of.side}
-        camera_files = sorted(alone)
+        camera_files = sorted({entry.file for entry, of in readings if of.field in ("M", "fx") and not of.side})
         self.by_file = len(camera_files) == 2
-        if self.by_file and [side_in_name(files[k].file) for k in camera_files] == [1, 0]:
+        names = [files[k].file.lower() for k in camera_files]
+        if self.by_file and re.search(RIGHT, names[0]) and re.search(LEFT, names[1]) and not re.search(LEFT, names[0]):
             camera_files.reverse()
         for entry, (field, side) in readings:
             if field in words()["made"]:

@@ -231,7 +231,9 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
             "another size, not used": pictures.other_size,
             "found by the other finder": pictures.by_fallback,
         }
-        lines += [f"{note}: {escaped(', '.join(names), 400)}" for note, names in names_by_note.items() if names]
+        lines += [
+            f"{len(names)} {note}: {escaped(', '.join(names), 400)}" for note, names in names_by_note.items() if names
+        ]
     if result.reordered:
         lines.append(f"right corners turned to agree: {escaped(', '.join(result.reordered), 400)}")
     if result.excluded:
