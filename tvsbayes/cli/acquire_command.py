@@ -193,8 +193,8 @@ def propose_looks(
 
     compile_for(no_output)
     target = parse_target(f"u(worst) <= {target_u:g} deg/step")
-    data, allowed = fit(read_campaign(folder)), {"confirm_below": confirm_below, "planned": planned}
-    looks_ahead = next_looks(data, read_rig(rig), target, count, **allowed)
+    known = fit(read_campaign(folder))
+    looks_ahead = next_looks(known, read_rig(rig), target, count, confirm_below=confirm_below, planned=planned)
     return proposal_of(looks_ahead, looks)
 
 

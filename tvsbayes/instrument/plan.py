@@ -121,7 +121,7 @@ def write_plan(steps: Sequence[PlanStep], path: Path, mechanism: Mechanism = TWO
 
 def counters_planned(plan: Sequence[PlanStep]) -> dict[str, tuple[int, int]]:
     """Return the lowest and highest counter of a plan by axis."""
-    ranges = {}
+    ranges: dict[str, tuple[int, int]] = {}
     for axis in AXES:
         counters = [counter for step in plan if (counter := getattr(step, f"{axis}_steps")) is not None]
         ranges[axis] = min(counters), max(counters)
