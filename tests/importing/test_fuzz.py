@@ -65,14 +65,14 @@ FLOODS = {
 
 
 MEASURED = """
-import resource, sys
+import resource, sys, runpy
 from pathlib import Path
-from importing.test_fuzz import FLOODS, imported
+tests = runpy.run_path(sys.argv[2])
 folder = Path(sys.argv[1])
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-for name, data in FLOODS.items():
+for name, data in tests["FLOODS"].items():
     (folder / "flood").write_bytes(data)
-    imported(folder / "flood", folder)
+    tests["imported"](folder / "flood", folder)
     print(name, 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before))
 """
 
@@ -82,7 +82,7 @@ def test_floods_take_little_memory(tmp_path):
     """In a process of its own, whose largest size counts."""
     tests = Path(__file__).parents[1]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tests.parent), str(tests)))}
-    command = [sys.executable, "-c", MEASURED, str(tmp_path)]
+    command = [sys.executable, "-c", MEASURED, str(tmp_path), __file__]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     rows = [line.rsplit(" ", 1) for line in done.stdout.splitlines()]
     assert done.returncode == 0 and len(rows) == len(FLOODS), done.stderr

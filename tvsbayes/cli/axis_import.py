@@ -139,7 +139,7 @@ def import_readings(
         if kind == "pe":
             rows = periodic_error_rows(table, text, wish.assume)
             lines = [f"{table.file}: {table.kind}; {len(table)} rows, {LOGS[kind]}"]
-            document: dict[str, Any] = {"file": table.file, "kind": kind, "rows": len(table)}
+            document = {"file": table.file, "kind": kind, "rows": len(table)}
         else:
             named = (
                 dict(zip(("command", "value"), list(table.columns)[1:], strict=True))

@@ -93,10 +93,10 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     cells, notations = FieldCells(table, columns).with_plain("command", "value", "u")
     assumed += [column.remark for column in notations.values() if column.remark]
     units = units_of(cells, {f: c.unit for f, c in notations.items()}, wishes)
-    commands = cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)
-    values = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
-    stated_u = cells.numbers("u", 0.0, NUMBER_MAX, optional=True, default=0.0)
-    values, stated_u, unit = in_one_unit(cells, commands, values, stated_u, units, wishes, assumed)
+    commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
+    read = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
+    given_u = [u or 0.0 for u in cells.numbers("u", 0.0, NUMBER_MAX, optional=True)]
+    values, stated_u, unit = in_one_unit(cells, commands, read, given_u, units, wishes, assumed)
     time_unit = stated_unit(cells, "time_s", wishes)
     times = seconds_of(cells, assumed, time_unit)
     homings, statuses = homings_of(cells, assumed), cells.text("status")

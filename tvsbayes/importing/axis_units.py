@@ -165,7 +165,8 @@ def _unit_of_command(
     pairs = [(c, v) for c, v in zip(commands, values, strict=True) if v is not None]
     if command_unit is None or command_unit.kind not in ("length", "angle") or len({c for c, _ in pairs}) < 2:
         return None
-    slope = np.polyfit(*np.array(pairs).T, 1)[0]
+    c, v = np.array(pairs, float).T
+    slope = float(np.polyfit(c, v, 1)[0])
     return command_unit if abs(slope - 1.0) <= UNIT_SLOPE else None
 
 
@@ -202,14 +203,12 @@ def _standard_u(
     name, table = cells.columns["u"], cells.table
     unit = unit or reading
     factor = 1.0 if unit is None else None if result is None else unit.in_units_of(result)
-    if factor is None:
-        found = (
-            f"u in {unit.name} in column {escaped(name)}, of readings in {result.name if result else 'an unnamed unit'}"  # type: ignore[union-attr]
-        )
-        usual = {"length": ("mm", "um"), "angle": ("deg", "arcsec")}.get(unit.kind, ()) if result is None else ()  # type: ignore[union-attr]
-        candidates = [
-            Candidate(f"readings in {text}", ("--unit", f"value={text}")) for text in dict.fromkeys((unit.name, *usual))
-        ]  # type: ignore[union-attr]
+    if unit is not None and factor is None:
+        of = result.name if result else "an unnamed unit"
+        found = f"u in {unit.name} in column {escaped(name)}, of readings in {of}"
+        usual = {"length": ("mm", "um"), "angle": ("deg", "arcsec")}.get(unit.kind, ())
+        names = dict.fromkeys((unit.name, *usual))
+        candidates = [Candidate(f"readings in {text}", ("--unit", f"value={text}")) for text in names]
         candidates = (candidates if result is None else []) + [Candidate("no column of u", ("--column", "u="))]
         raise question(
             file=table.file,
@@ -219,13 +218,13 @@ def _standard_u(
             candidates=candidates,
             code="unit",
         )
-    if factor != 1.0:
-        assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")  # type: ignore[union-attr]
+    if unit is not None and result is not None and factor != 1.0:
+        assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")
     coverage = wishes.coverage or name_of(name).coverage
     if coverage is not None and coverage != 1.0:
         how = f"over {coverage:g}; --assume coverage=NUMBER says another"
         assumed.append(f"u: column {escaped(name)} is an expanded uncertainty, {how}")
-    return [rounded(u * factor / (coverage or 1.0)) for u in stated]
+    return [rounded(u * (factor or 1.0) / (coverage or 1.0)) for u in stated]
 
 
 def shown_units(units: Mapping[str, Unit | None], unit: str | None, cells: FieldCells) -> dict[str, str]:

@@ -303,7 +303,7 @@ def _written_times(cells: FieldCells, texts: Sequence[str]) -> tuple[list[float]
         elif at is None:
             allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
             raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=")
-        seconds.append(of_day if at is None else at.timestamp())
+        seconds.append(at.timestamp() if at is not None else of_day or 0.0)
         is_local = is_local and not re.search(r"(?:Z|[+-]\d\d:?\d\d)$", cell)
     return [value - seconds[0] for value in seconds], is_local
 

@@ -88,7 +88,7 @@ def whole_counters(cells: FieldCells) -> list[Pair]:
     """
     remedy = "give the counters of the motors; angles are what the fit finds"
     columns = [cells.whole(name, -COUNTER_MAX, COUNTER_MAX, remedy=remedy) for name in COUNTERS]
-    return list(zip(*columns, strict=True))  # type: ignore[arg-type]
+    return list(zip(*columns, strict=True))
 
 
 def _approaches(cells: FieldCells, axis: str, default: str) -> list[str]:

@@ -320,12 +320,12 @@ def _logged_pulse(
     if not rates:
         found, remedy = f"run {run.number} does not state xRate", "state it: --assume pulse_arcsec_per_s=NUMBER"
         raise refusal("missing-value", file=file, line=run.line, found=found, allowed="a number", remedy=remedy)
-    evidence = {
+    stated = {
         "Norm rates": header.get("at_equator"),
         "the mount's guide speed": header.get("guide_speed"),
         "the calibration's guide speed": header["calibrated_speed"] / cosine if "calibrated_speed" in header else None,
     }
-    evidence = {name: rate for name, rate in evidence.items() if rate}
+    evidence = {name: rate for name, rate in stated.items() if rate}
     others = _other_rates(run, runs)
     if others is not None:
         evidence["the other runs"] = others

@@ -283,8 +283,8 @@ def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) 
             f"{name}: angles in {unit.name} as they stand, without whole turns, in steps of {STEP_DEG:g} deg"
         )
     if len(of_encoders) == len(COUNTERS):
-        return list(zip(*(of_encoders[name] for name in COUNTERS), strict=True))  # type: ignore[arg-type]
+        return list(zip(*(of_encoders[name] for name in COUNTERS), strict=True))
     if not of_encoders:
         return whole_counters(cells)
     columns = [of_encoders.get(name) or cells.whole(name, -COUNTER_MAX, COUNTER_MAX) for name in COUNTERS]
-    return list(zip(*columns, strict=True))  # type: ignore[arg-type]
+    return list(zip(*columns, strict=True))

@@ -190,20 +190,10 @@ _COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:[.,][0-9]+)?)\b|\b([23])\s*(?:x\s*
 """Coverage factor in the name of a column of expanded uncertainties (GUM, 6.2), or a multiple of sd."""
 COVERAGE_USUAL = 2.0
 _KNOWN = (
-    "command",
-    "value",
-    "position",
-    "deviation",
-    "u",
-    "expanded",
-    "time",
-    "segment",
-    "approach",
-    "status",
-    "moving",
+    *("command", "value", "position", "deviation", "u", "expanded", "time", "segment", "approach", "status", "moving"),
+    *("resting", "temperature", "repeat", "index", "aside", "statistic", "run", "several", "forward", "backward"),
+    *("clockwise", "counterclockwise"),
 )
-_KNOWN += ("resting", "temperature", "repeat", "index", "aside", "statistic", "run", "several", "forward", "backward")
-_KNOWN += ("clockwise", "counterclockwise")
 
 
 @dataclass(frozen=True)

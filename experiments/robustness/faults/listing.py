@@ -200,7 +200,7 @@ FAULTS = (
           Reads("wishes.pixels_from", "-value"), "test_notations_of_others"),
     Fault("an expanded uncertainty is taken for a standard one", "axis_units._standard_u", Local("coverage", "None"),
           "test_forty_tables_are_read_rightly_or_asked_about"),
-    Fault("decimal commas are dropped", "foreign_table._with_point",
+    Fault("decimal commas are dropped", "importing.table._with_point",
           Returns("value.replace('.', '') if commas else value"), "test_every_notation_gives_the_same_table"),
     Fault("a file is renamed before it is on the disk", "written_whole", Call("fsync", "None"),
           "test_interrupted_write_leaves_the_old_file_whole"),
