@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tvsbayes.errors import Candidate, escaped, refusal
+from tvsbayes.errors import Candidate, escaped, question
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
 from tvsbayes.importing.axis_units import Wishes, in_one_unit, shown_units, stated_unit, units_of
@@ -34,6 +34,8 @@ TURN_TOLERANCE = 0.1
 """Largest deviation of a jump from whole turns by play and errors of gears, turns."""
 JUMP_SDS = 6.0
 """Largest deviation of a jump from a power of two, in typical deviations of steps from the line, plus two counts."""
+TURNS_USUAL = (360.0, 400.0, 1000.0, 1024.0, 2000.0, 2048.0, 2500.0, 3600.0, 4000.0, 4096.0, 8192.0, 10000.0)
+"""Counts of a turn of usual encoders."""
 BITS = range(8, 33)
 """Exponents of encoders that count modulo a power of two."""
 OVERSHOOT_SHARE = 0.05
@@ -393,5 +395,8 @@ def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
     if abs(typical - turn) <= JUMP_SDS * float(np.median(np.abs(residuals))) + 2.0:
         return turn
     found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
-    remedy = "state where the encoder restarts, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
-    raise refusal("wrapped", file="value", found=found, allowed=allowed, remedy=remedy)
+    usual = [n for n in TURNS_USUAL if abs(n / typical - 1.0) <= TURN_TOLERANCE]
+    turns = dict.fromkeys((*usual, turn, round(typical)))
+    candidates = [Candidate(f"the encoder restarts after {n:g}", ("--counts-per-turn", f"{n:g}")) for n in turns]
+    candidates.append(Candidate("these are motions", ("--counts-per-turn", "0")))
+    raise question(file="value", found=found, allowed=allowed, candidates=candidates, code="wrapped")

@@ -23,6 +23,7 @@ from tvsbayes.importing.columns import (
     factor_between,
     missing_column,
 )
+from tvsbayes.importing.runs import counts_rows
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import listed, means
 
@@ -97,6 +98,8 @@ def _role(column: Column) -> str:
     command, value = name.place("command"), name.place("value")
     if (column.numeric or column.has_digits) and (command is not None or value is not None):
         return "command" if value is None or (command is not None and command < value) else "value"
+    if not name.has("command", "value", "position") and not kind and counts_rows(column.cells):
+        return "aside"
     if not column.numeric and not (column.has_digits and name.has("command", "value", "position")):
         return "aside"
     if name.has("statistic") and not name.has("position"):

@@ -38,7 +38,7 @@ _SEXAGESIMAL = re.compile(
     r"(?:(?P<s>\d{1,2}(?:\.\d+)?)\s*(?:\"|''|\u2033|s)?)?"
 )
 _FRACTION = re.compile(r"(?P<sign>[+-]?)(?:(?P<whole>\d+)[ -])?(?P<above>\d+)/(?P<below>\d+)")
-_WITH_UNIT = re.compile(r"(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\d\s.,;+-].*)")
+_WITH_UNIT = re.compile(r"(?P<number>[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\d\s.,;+-].*)")
 NO_TIME = Candidate("no times, the order of the rows alone", ("--column", "time_s="))
 
 
@@ -86,7 +86,7 @@ def _one_unit(name: str, cells: Sequence[str]) -> PlainColumn | None:
     unit = parse_unit(units.pop())
     if unit is None or unit.kind == "other":
         return None
-    plain = tuple("" if match is None else match["number"] for match in matches)
+    plain = tuple("" if match is None else match["number"].replace(",", ".") for match in matches)
     return PlainColumn(plain, unit, f"column {escaped(name)}: every cell is in {unit.name}")
 
 

@@ -23,7 +23,7 @@ POSITIONS_MIN = 3
 _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
 _SIGN = re.compile(r"^\s*([+-])\s*\d*\s*(?:[(\[/,]|$)|^\s*\d+\s*([+-])\s*(?:[(\[/,]|$)|\s\(?([+-])\)?\s*(?:[(\[/,]|$)")
 """A sign in place of a direction: "+1", "1 - (mm)", "Run 1 (+)"."""
-_NEVER = ("aside", "temperature", "time", "index", "several", "moving", "resting", "status", "approach")
+_NEVER = ("aside", "statistic", "temperature", "time", "index", "several", "moving", "resting", "status", "approach")
 
 
 @dataclass(frozen=True)
@@ -66,10 +66,12 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     runs = _turned(table, runs, remarks)
     sides = [run.side for run in runs]
     names = [run.name.text for run in runs]
-    if not any(sides) and not _row_sides(table):
-        order = order or _order(table, runs)
-        sides = [1 if order != ALTERNATE or k % 2 == 0 else -1 for k in range(len(runs))]
     positions = [float(cell) for cell in table.columns[command]]
+    if not any(sides) and not _row_sides(table):
+        # Beside commands that rise and fall, columns are readings of one stop.
+        turns = positions not in (sorted(positions), sorted(positions, reverse=True))
+        order = order or (REPEATS if turns else _order(table, runs))
+        sides = [1 if order != ALTERNATE or k % 2 == 0 else -1 for k in range(len(runs))]
     rising = sorted(range(len(positions)), key=positions.__getitem__)
     side_of_row = _row_sides(table)
     if side_of_row and not any(run.side for run in runs):
@@ -202,6 +204,7 @@ def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
     names = {run.name.text for run in runs}
     rest = [name_of(text) for text, cells in table.columns.items() if text not in names and _numeric(cells)]
     rest = [name for name in rest if all(table.columns[name.text])]
+    rest = [name for name in rest if name.has("command") or not counts_rows(table.columns[name.text])] or rest
     for kind in ("command", "position", ""):
         fit = [
             name
@@ -237,6 +240,11 @@ def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
         candidates=candidates,
         code="missing-column",
     )
+
+
+def counts_rows(cells: Sequence[str]) -> bool:
+    """Whether cells are 0, 1, 2 ... or 1, 2, 3 ..."""
+    return list(cells) in ([str(k) for k in range(len(cells))], [str(k) for k in range(1, len(cells) + 1)])
 
 
 def _order(table: ForeignTable, runs: Sequence[Run]) -> str:

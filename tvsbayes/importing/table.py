@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.words import means, parse_unit, words_of
+from tvsbayes.importing.words import means, parse_unit, place_of, words_of
 
 COLUMNS_MAX = 200
 CELL_CHARS_MAX = 1000
@@ -132,6 +132,9 @@ def headed(found: Rows) -> Rows:
     groups of columns above. A row with numbers holds no names.
     """
     rows, notes = [row for row in found.rows if any(row.cells)], found.notes
+    # A sheet may begin at its second column.
+    empty = min((next(k for k, cell in enumerate(row.cells) if cell) for row in rows), default=0)
+    rows = [Row(line, cells[empty:]) for line, cells in rows]
     data = _first_data(rows)
     if not data:
         return Rows(rows, notes)
@@ -208,6 +211,8 @@ def table_of_rows(file: str, rows: Sequence[Row], description: Sequence[str]) ->
         _names(filled, width) if has_names else ([f"column {k}" for k in range(1, width + 1)], filled, "")
     )
     description += [below] * bool(below)
+    body, sums = _without_sums(body)
+    description += [sums] * bool(sums)
     repeated = [row for row in body if has_names and row.cells == filled[0].cells]
     if repeated:
         body = [row for row in body if row.cells != filled[0].cells]
@@ -223,6 +228,21 @@ def table_of_rows(file: str, rows: Sequence[Row], description: Sequence[str]) ->
             texts = (row[k] if isinstance(row[k], Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
             columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in texts)
     return ForeignTable(file, ", ".join(description), tuple(line for line, _ in body), columns, rows[0].line)
+
+
+def _without_sums(rows: Sequence[Row]) -> tuple[Sequence[Row], str]:
+    """The rows without those whose first text is a word of a summary, as "Mean", and a note on these."""
+    sums = []
+    for row in rows:
+        text = next((cell for cell in row.cells if cell and not is_number(cell)), "")
+        words = words_of(text)
+        is_sum = words and len(words) <= 2 and place_of(words[:1], "summary") is not None
+        if is_sum and any(map(is_number, row.cells)):
+            sums.append(row)
+    if not sums or 2 * len(sums) > len(rows):
+        return rows, ""
+    named = ", ".join(str(row.line) for row in sums[:4]) + " ..." * (len(sums) > 4)
+    return [row for row in rows if row not in sums], f"rows that sum up, left out (line {named})"
 
 
 def _names(rows: Sequence[Row], width: int) -> tuple[list[str | None], Sequence[Row], str]:
@@ -264,7 +284,9 @@ def _unique(names: Sequence[str]) -> list[str | None]:
     """Names of columns: numbered where they repeat, None without a name."""
     counts: Counter[str] = Counter()
     names_once: list[str | None] = []
-    for name in names:
+    for text in names:
+        # Names may stand in two lines of a cell.
+        name = " ".join(text.split())
         counts[name] += 1
         names_once.append(None if not name else name if counts[name] == 1 else f"{name} ({counts[name]})")
     return names_once

@@ -145,10 +145,16 @@ def _separator(lines: Sequence[str]) -> str:
     that divides most lines and the names, else commas.
     """
     for sample in (lines[:ROWS_TRIED], lines[-ROWS_TRIED:]):
-        widths = {s: [len(line.split(None if s == " " else s)) for line in sample] for s in SEPARATORS}
+        # Separators after the last cell of a row divide nothing.
+        widths = {s: [len(line.rstrip(s).split(None if s == " " else s)) for line in sample] for s in SEPARATORS}
         modes = {s: max(Counter(w).items(), key=lambda item: item[1], default=(1, 0)) for s, w in widths.items()}
         regular = (s for s, (cells, count) in modes.items() if cells > 1 and count >= 0.9 * len(sample))
-        frequent = (s for s, (cells, count) in modes.items() if 1 < cells == widths[s][0] and 2 * count > len(sample))
+        # Commas and spaces stand in numbers and titles too: there the first line must be divided alike.
+        frequent = (
+            s
+            for s, (cells, count) in modes.items()
+            if 1 < cells and 2 * count > len(sample) and (s in "\t;|" or cells == widths[s][0])
+        )
         if separator := next(regular, None) or next(frequent, None):
             return separator
     # In a short table below a heading only names and rows are divided.

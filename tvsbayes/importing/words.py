@@ -286,6 +286,9 @@ def _unit_of_words(text: str, words: list[str]) -> tuple[Unit | None, list[str]]
         return unit, words_of(text[: parted.start()])
     if (slash := re.search(r"([A-Za-z]+)/([A-Za-z]+)$", text)) and parse_unit(slash[1]) and parse_unit(slash[2]):
         return Unit("other", "other", 1.0), words
+    if len(words) == 1 and place_of(words, "value") is not None:
+        # "Micrometer" is what was read.
+        return None, words
     end = len(words)
     while end and words[end - 1].isdigit():
         end -= 1
