@@ -12,7 +12,7 @@ from statistics import fmean, stdev
 from tvsbayes.errors import Candidate, escaped, question, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.table import ForeignTable, table_of
-from tvsbayes.importing.words import Name, listed, means, name_of
+from tvsbayes.importing.words import Name, listed, means, name_of, place_of
 
 FORWARD, ALTERNATE, REPEATS = "forward", "alternate", "repeats"
 ORDERS = (FORWARD, ALTERNATE, REPEATS)
@@ -67,33 +67,30 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     sides = [run.side for run in runs]
     names = [run.name.text for run in runs]
     positions = [float(cell) for cell in table.columns[command]]
-    if not any(sides) and not _row_sides(table):
-        # Beside commands that rise and fall, columns are readings of one stop.
-        turns = positions not in (sorted(positions), sorted(positions, reverse=True))
-        order = order or (REPEATS if turns else _order(table, runs))
-        sides = [1 if order != ALTERNATE or k % 2 == 0 else -1 for k in range(len(runs))]
     rising = sorted(range(len(positions)), key=positions.__getitem__)
-    side_of_row = _row_sides(table)
-    if side_of_row and not any(run.side for run in runs):
-        rows = [
-            (row, k)
-            for k in range(len(runs))
-            for side in (1, -1)
-            for row in (rising if side > 0 else rising[::-1])
-            if side_of_row[row] == side
-        ]
-        remarks.append(f"runs: {len(runs)} columns ({listed(names)}), each forward and then backward as its rows say")
-    elif order == REPEATS:
+    side_of_row = [] if any(sides) else _row_sides(table)
+    if not any(sides):
+        # Beside commands that rise and fall, or come again, columns are readings of one stop.
+        turns = positions not in (sorted(positions), sorted(positions, reverse=True))
+        again = len({*zip(positions, side_of_row, strict=True)}) < len(positions) if side_of_row else turns
+        order = order or (
+            REPEATS if again else FORWARD if side_of_row and not _are_readings(runs) else _order(table, runs)
+        )
+        sides = [1 if order != ALTERNATE or k % 2 == 0 else -1 for k in range(len(runs))]
+    if order == REPEATS:
         rows = [(row, k) for row in range(len(positions)) for k in range(len(runs))]
         remarks.append(f"columns {listed(names)}: readings of one stop each; --runs says another")
+    elif side_of_row:
+        ways = ((side, row) for side in (1, -1) for row in rising[::side] if side_of_row[row] == side)
+        in_order = [row for _, row in ways]
+        rows = [(row, k) for k in range(len(runs)) for row in in_order]
+        remarks.append(f"runs: {len(runs)} columns ({listed(names)}), each forward and then backward as its rows say")
     else:
-        rows = [(row, k) for k in range(len(runs)) for row in (rising if sides[k] > 0 else rising[::-1])]
-        named = "forward runs rise, backward runs fall"
-        words = (
-            named
-            if any(run.side for run in runs)
-            else f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
-        )
+        rows = [(row, k) for k in range(len(runs)) for row in rising[:: sides[k]]]
+        if any(run.side for run in runs):
+            words = "forward runs rise, backward runs fall"
+        else:
+            words = f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
         remarks.append(f"runs: {len(runs)} columns ({listed(names)}), read one after the other; {words}")
     unit = next((run.name.unit for run in runs if run.name.unit), None)
     factors = [run.name.unit.in_units_of(unit) if run.name.unit and unit else 1.0 for run in runs]
@@ -108,14 +105,18 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     unknown = next((run.name.unknown for run in runs if run.name.unknown), "")
     reading = f"{kind}{bracket or (f' ({unknown})' if unknown else '')}"
     columns: dict[str, Sequence[object]] = {command: [table.columns[command][row] for row, _ in rows]}
-    if order != REPEATS:
+    if order != REPEATS or side_of_row:
         columns["direction"] = [
             "forward" if (side_of_row[row] if side_of_row else sides[k]) > 0 else "backward" for row, k in rows
         ]
+    if order != REPEATS:
         columns["cycle"] = [str(runs[k].number) for _, k in rows]
     columns[reading] = [_scaled(table.columns[names[k]][row], factors[k]) for row, k in rows]
     rest = [name for name in table.columns if name not in (*names, command)]
     spread = [name for name in rest if name_of(name).has("u", "expanded")]
+    if len(runs) > len(set(sides)):
+        # Beside several runs of one side a standard deviation is theirs, not that of a reading.
+        spread = [name for name in spread if place_of(name_of(name).words, "scatter") is None]
     if len(spread) == 1:
         columns[spread[0]] = [table.columns[spread[0]][row] for row, _ in rows]
     by_rows = table_of(table.file, table.kind, columns, [table.lines[row] for row, _ in rows])
@@ -242,6 +243,12 @@ def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
     )
 
 
+def _are_readings(runs: Sequence[Run]) -> bool:
+    """Whether columns are called readings, not runs, so that they may be of one stop."""
+    name = runs[0].name
+    return name.has("value") and not name.has("run") and any(not word.isdigit() for word in name.words)
+
+
 def counts_rows(cells: Sequence[str]) -> bool:
     """Whether cells are 0, 1, 2 ... or 1, 2, 3 ..."""
     return list(cells) in ([str(k) for k in range(len(cells))], [str(k) for k in range(1, len(cells) + 1)])
@@ -255,8 +262,7 @@ def _order(table: ForeignTable, runs: Sequence[Run]) -> str:
     """
     names = [run.name.text for run in runs]
     values = [[float(cell) if cell else math.nan for cell in table.columns[name]] for name in names]
-    is_run = runs[0].name.has("run") or not any(not word.isdigit() for word in runs[0].name.words)
-    is_reading = not is_run and runs[0].name.has("value")
+    is_reading = _are_readings(runs)
     half = len(runs) // 2
     if not is_reading and _agree(values[::2], values[1::2]) and _agree(values[:half], values[half:]):
         return FORWARD
