@@ -225,7 +225,7 @@ MISTAKES = {
         "steps,encoder counts\n" + "".join(f"{100 * k},{97 * k % 1000}\n" for k in range(60)),
         (),
         "jump by about 1000 counts",
-        "--counts-per-turn N",
+        "--counts-per-turn 1000",
     ),
     "times that run back": ("t,steps,angle\n0,0,1\n2,1,2\n1,2,3\n", (), "times that do not decrease", "time_s="),
     "names alone": ("steps,mm\n", (), "no rows below the names", "with the data"),

@@ -63,6 +63,10 @@ def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: boo
     of_role: dict[str, list[str]] = {}
     for text, column in free.items():
         of_role.setdefault(_role(column), []).append(text)
+    numbers = [name for role in ("command", "value", "position", "") for name in of_role.get(role, ())]
+    if len(numbers) < 2:
+        # A column that counts the rows is no number of theirs, unless little else is there.
+        of_role.setdefault("", []).extend(of_role.get("index", ()))
     remarks: list[str] = []
     _take_command(table, known, of_role, taken, remarks)
     of_role = {role: _of_device(known, names, taken["command"]) for role, names in of_role.items()}
@@ -99,7 +103,7 @@ def _role(column: Column) -> str:
     if (column.numeric or column.has_digits) and (command is not None or value is not None):
         return "command" if value is None or (command is not None and command < value) else "value"
     if not name.has("command", "value", "position") and not kind and counts_rows(column.cells):
-        return "aside"
+        return "index"
     if not column.numeric and not (column.has_digits and name.has("command", "value", "position")):
         return "aside"
     if name.has("statistic") and not name.has("position"):
