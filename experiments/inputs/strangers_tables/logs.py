@@ -282,18 +282,8 @@ def sightings(rng: np.random.Generator, language: str) -> Drawn:
         columns[pick(rng, words.SECONDS[language])] = [decimal(12.0 * k, 1) for k in range(count)]
     columns |= dict(zip(counters, steps, strict=True))
     columns |= dict(zip(heads, written, strict=True))
-    u, wrong = 0.0, set()
-    if chance(rng, 0.2):
-        small, name, factor = pick(rng, ("arcsec", "deg")), *pick(rng, (("u", 1), ("U95", 2), ("U (k=2)", 2)))
-        u_cell = Decimal("18") if small == "arcsec" else Decimal("0.005")
-        columns[f"{name} ({unit_text(rng, small, 'en')})"] = [u_cell] * count
-        u = float(u_cell) * ANGLE[small] / factor
-    if chance(rng, 0.2):
-        columns[pick(rng, words.TEMPERATURE[language])] = [decimal(t, 1) for t in rng.normal(12, 0.2, count)]
-    if chance(rng, 0.15):
-        status, good, bad = pick(rng, words.STATUS[language])
-        wrong = set(rng.choice(count, int(rng.integers(0, 3)), replace=False).tolist())
-        columns[status] = [bad if k in wrong else good for k in range(count)]
+    more, u, wrong = beside_sightings(rng, language, count)
+    columns |= more
     if chance(rng, 0.15):
         columns = {name: columns[name] for name in rng.permutation(np.array(list(columns), object))}
     readings = tuple(
@@ -312,6 +302,26 @@ def sightings(rng: np.random.Generator, language: str) -> Drawn:
         else f"sightings without a unit, {'degrees' if unit == 'deg' else 'others'}"
     )
     return Drawn(kind, sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth, ("--sightings",))
+
+
+def beside_sightings(
+    rng: np.random.Generator, language: str, count: int
+) -> tuple[dict[str, Sequence[Cell]], float, set[int]]:
+    """Further columns, the standard uncertainty that they state, and the rows that do not count."""
+    columns: dict[str, Sequence[Cell]] = {}
+    u, wrong = 0.0, set()
+    if chance(rng, 0.2):
+        small, name, factor = pick(rng, ("arcsec", "deg")), *pick(rng, (("u", 1), ("U95", 2), ("U (k=2)", 2)))
+        u_cell = Decimal("18") if small == "arcsec" else Decimal("0.005")
+        columns[f"{name} ({unit_text(rng, small, 'en')})"] = [u_cell] * count
+        u = float(u_cell) * ANGLE[small] / factor
+    if chance(rng, 0.2):
+        columns[pick(rng, words.TEMPERATURE[language])] = [decimal(t, 1) for t in rng.normal(12, 0.2, count)]
+    if chance(rng, 0.15):
+        status, good, bad = pick(rng, words.STATUS[language])
+        wrong = set(rng.choice(count, int(rng.integers(0, 3)), replace=False).tolist())
+        columns[status] = [bad if k in wrong else good for k in range(count)]
+    return columns, u, wrong
 
 
 def sighting_heads(rng: np.random.Generator, unit: str, language: str) -> list[str]:
