@@ -36,6 +36,7 @@ DRAWS = {
     **{logs.telemetry: 3, logs.labview: 4, logs.remark_names: 6, logs.serial: 6, logs.camonitor: 2, logs.sightings: 8},
     **{reports.tolerances: 5, reports.wrapped: 2, reports.sheet_with_means: 2, reports.blocks: 1.5},
     **dict.fromkeys((reports.positions_across, reports.two_axes, reports.numbered_sensors, reports.repeats), 1),
+    **dict.fromkeys((kinds.reading_without_unit, kinds.unit_above), 1.5),
     **dict.fromkeys((reports.steps_and_target, reports.json_lines, reports.piezo), 1),
 }
 """Weights of the kinds."""

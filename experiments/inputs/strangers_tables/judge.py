@@ -219,10 +219,11 @@ def by_stops(truth: Truth, told: Sequence[Reading]) -> str:
 
 
 def times(truth: Truth, pairs: Sequence[tuple[Reading, Reading]]) -> str:
-    """Times as the table states them, or none: then 0, 1, 2 ... are written."""
+    """Times as the table states them, or none: then 0, 1, 2 ... are written. A stop has one time."""
     if not truth.clock:
         return ""
-    stated, found = ([(r[k].time_s or 0.0) - (pairs[0][k].time_s or 0.0) for r in pairs] for k in (0, 1))
+    first = [p for k, p in enumerate(pairs) if k == 0 or p[0].command != pairs[k - 1][0].command]
+    stated, found = ([(p[k].time_s or 0.0) - (first[0][k].time_s or 0.0) for p in first] for k in (0, 1))
     if all(abs(t - s) <= truth.clock for t, s in zip(found, stated, strict=True)):
         return ""
     return "" if all(t == round(t) and 0 <= t <= 2 * len(pairs) for t in found) else "times"

@@ -126,7 +126,7 @@ def u_column(rng: np.random.Generator, axis: Axis, language: str) -> tuple[str, 
 def long_sheet(rng: np.random.Generator, axis: Axis, language: str) -> tuple[Sheet, Truth]:
     """A row for each reading, with further columns; nothing in them follows the commands."""
     stated = chance(rng, 0.5)
-    sweep = sweeps(rng, axis.commands, stated)
+    sweep = sweeps(rng, axis.commands, stated, variety=True)
     values, readings = read_all(rng, axis, sweep)
     count = len(readings)
     more: dict[str, Sequence[Cell]] = {}
@@ -143,22 +143,28 @@ def long_sheet(rng: np.random.Generator, axis: Axis, language: str) -> tuple[She
         name = pick(rng, words.CYCLE[language])
         more[name] = [Decimal(stop.run // 2 + 1) for stop in sweep.stops]
         truth = replace(truth, segments="any")
-    elif chance(rng, 0.08) and stated:
+    elif chance(rng, 0.1) and stated:
+        numbers = [stop.run // 2 for stop in sweep.stops]
+        marks = [Decimal(k == 0 or numbers[k] != numbers[k - 1]) for k in range(count)]
         name = pick(rng, words.HOMING[language])
-        marks = [stop.run // 2 for stop in sweep.stops]
-        more[name] = [Decimal(mark + 1) for mark in marks]
-        readings = [r._replace(segment=mark) for r, mark in zip(readings, marks, strict=True)]
+        counted = name.endswith(".") or chance(rng, 0.7)
+        more[name] = [Decimal(n + 1) for n in numbers] if counted else marks
+        readings = [r._replace(segment=n) for r, n in zip(readings, numbers, strict=True)]
     command, reading = names_of(rng, axis, language)
     columns[headed(rng, command, axis.command_unit, language)] = [stop.command for stop in sweep.stops]
     if stated:
-        rising, falling = pick(rng, words.SIDES["all"] if chance(rng, 0.35) else words.SIDES[language])
-        sides = [Decimal(word) if word in ("1", "-1") else word for word in (rising, falling)]
+        pair = pick(rng, words.SIDES["all"] if chance(rng, 0.35) else words.SIDES[language])
+        if DOMAIN[axis.unit] == "deg" and chance(rng, 0.15):
+            pair, truth = pick(rng, words.TURNS), replace(truth, answer="either")
+        sides = [Decimal(word) if word in ("1", "-1") else word for word in pair]
         columns[pick(rng, words.DIRECTION[language])] = [sides[stop.side < 0] for stop in sweep.stops]
+    # Positions that were passed, or not read.
     cells: list[Cell] = list(values)
-    # A position that was passed, or not read.
-    empty = {int(rng.integers(1, count - 1))} if chance(rng, 0.08) else set()
+    empty = {k for k, stop in enumerate(sweep.stops) if not stop.read}
+    empty |= {int(rng.integers(1, count - 1))} if chance(rng, 0.08) else set()
+    nothing = pick(rng, ("", "", "", "n/a", "NaN", "-", "--", "#N/A"))
     for k in empty:
-        cells[k] = pick(rng, ("", "", "n/a", "NaN", "-", "--", "#N/A"))
+        cells[k] = nothing
     after, readings = further_columns(rng, axis, language, sweep, values, readings, empty)
     columns[headed(rng, reading, axis.unit, language)] = cells
     columns |= after
@@ -183,8 +189,10 @@ def further_columns(
     columns: dict[str, Sequence[Cell]] = {}
     if chance(rng, 0.25):
         name, cell, u = u_column(rng, axis, language)
-        columns[name] = [cell] * count
-        readings = [r._replace(u=u) for r in readings]
+        # Each of its own, in multiples of the least.
+        times = rng.integers(1, 4, count) if chance(rng, 0.4) else np.ones(count, int)
+        columns[name] = [cell * int(n) for n in times]
+        readings = [r._replace(u=u * int(n)) for r, n in zip(readings, times, strict=True)]
     if chance(rng, 0.2) and DOMAIN[axis.command_unit] == DOMAIN[axis.unit] and not axis.geared:
         columns |= error_column(rng, axis, language, sweep, values)
     if chance(rng, 0.25):
@@ -293,3 +301,35 @@ def no_unit(rng: np.random.Generator, language: str) -> Drawn:
     }
     truth = truth_of(axis, readings, answer="either", unit=None, command_unit=None)
     return Drawn("no unit at all", sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)
+
+
+def reading_without_unit(rng: np.random.Generator, language: str) -> Drawn:
+    """The unit of the commands alone is named; the reading's is the same, or 1/100 mm or um, as its size says."""
+    unit = pick(rng, ("mm", "mm", "um", "1/100 mm"))
+    axis = draw_axis(rng, rotary=False, unit=unit, command_unit="mm")
+    stated = chance(rng, 0.4)
+    sweep = sweeps(rng, axis.commands, stated)
+    values, readings = read_all(rng, axis, sweep)
+    command, reading = names_of(rng, axis, language)
+    columns: dict[str, Sequence[Cell]] = {with_unit(rng, command, "mm", language): [s.command for s in sweep.stops]}
+    if stated:
+        pair = pick(rng, words.SIDES[language])
+        columns[pick(rng, words.DIRECTION[language])] = [pair[stop.side < 0] for stop in sweep.stops]
+    columns[reading] = values
+    truth = truth_of(axis, readings, answer="either" if unit == "mm" else "ask")
+    kind = f"a reading without unit beside mm, {'the same' if unit == 'mm' else 'another'}"
+    return Drawn(kind, sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)
+
+
+def unit_above(rng: np.random.Generator, language: str) -> Drawn:
+    """The unit stands in a line above the names alone."""
+    axis = draw_axis(rng, rotary=False, unit=pick(rng, ("mm", "inch")), command_unit=None)
+    axis = replace(axis, command_unit="step") if axis.command_unit != axis.unit else axis
+    sweep = sweeps(rng, axis.commands, False)
+    values, readings = read_all(rng, axis, sweep)
+    command, reading = names_of(rng, axis, language)
+    sheet = sheets.columns_sheet({command: [s.command for s in sweep.stops], reading: values}, language)
+    label = {"en": "All values in", "de": "Alle Werte in", "es": "Valores en", "fr": "Valeurs en"}[language]
+    sheet.above = [*sheets.preamble(rng, language), f"{label} {unit_text(rng, axis.unit, language)}", ""]
+    truth = truth_of(axis, readings, answer="either")
+    return Drawn("the unit above the names alone", sheets.any_file(rng, sheet), truth)

@@ -269,12 +269,46 @@ def sightings(rng: np.random.Generator, language: str) -> Drawn:
         heads = list(pick(rng, words.AZIMUTH[language]))
     else:
         heads = sighting_heads(rng, unit if named else "", language)
-    counters = pick(rng, words.PAN[language])
+    counters: Sequence[str] = pick(rng, words.PAN[language])
+    steps = [[Decimal(int(n)) for n in axis] for axis in (pan, tilt)]
+    if encoders := named and chance(rng, 0.12):
+        # Angles of encoders in place of counters, which become counters of 1e-5 deg.
+        small = pick(rng, ("deg", "rad", "deg"))
+        counters = [f"{name} ({unit_text(rng, small, language)})" for name in pick(rng, words.ENCODERS)]
+        steps = [[decimal(0.05 * float(n) / ANGLE[small], 6) for n in axis] for axis in (pan, tilt)]
+        pan, tilt = ([round(float(n) * ANGLE[small] * 1e5) for n in axis] for axis in steps)
     columns: dict[str, Sequence[Cell]] = {}
     if chance(rng, 0.4):
         columns[pick(rng, words.SECONDS[language])] = [decimal(12.0 * k, 1) for k in range(count)]
-    columns |= {name: [Decimal(int(n)) for n in steps] for name, steps in zip(counters, (pan, tilt), strict=True)}
+    columns |= dict(zip(counters, steps, strict=True))
     columns |= dict(zip(heads, written, strict=True))
+    more, u, wrong = beside_sightings(rng, language, count)
+    columns |= more
+    if chance(rng, 0.15):
+        columns = {name: columns[name] for name in rng.permutation(np.array(list(columns), object))}
+    readings = tuple(
+        Reading(0.0, a, u=u, pair=(int(p), int(t), e))
+        for k, (p, t, a, e) in enumerate(zip(pan, tilt, *degrees, strict=True))
+        if k not in wrong
+    )
+    # Degrees are what all take an angle for; radians are not told from them by a reader that does not ask.
+    answer: Answer = "either" if encoders else "right" if named else "either" if unit == "deg" else "ask"
+    truth = Truth(readings, "deg", None, 10.0**-digits * ANGLE[unit], answer, ratio=ratio)
+    kind = (
+        "sightings beside encoders"
+        if encoders
+        else "sightings"
+        if named
+        else f"sightings without a unit, {'degrees' if unit == 'deg' else 'others'}"
+    )
+    return Drawn(kind, sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth, ("--sightings",))
+
+
+def beside_sightings(
+    rng: np.random.Generator, language: str, count: int
+) -> tuple[dict[str, Sequence[Cell]], float, set[int]]:
+    """Further columns, the standard uncertainty that they state, and the rows that do not count."""
+    columns: dict[str, Sequence[Cell]] = {}
     u, wrong = 0.0, set()
     if chance(rng, 0.2):
         small, name, factor = pick(rng, ("arcsec", "deg")), *pick(rng, (("u", 1), ("U95", 2), ("U (k=2)", 2)))
@@ -287,18 +321,7 @@ def sightings(rng: np.random.Generator, language: str) -> Drawn:
         status, good, bad = pick(rng, words.STATUS[language])
         wrong = set(rng.choice(count, int(rng.integers(0, 3)), replace=False).tolist())
         columns[status] = [bad if k in wrong else good for k in range(count)]
-    if chance(rng, 0.15):
-        columns = {name: columns[name] for name in rng.permutation(np.array(list(columns), object))}
-    readings = tuple(
-        Reading(0.0, a, u=u, pair=(int(p), int(t), e))
-        for k, (p, t, a, e) in enumerate(zip(pan, tilt, *degrees, strict=True))
-        if k not in wrong
-    )
-    # Degrees are what all take an angle for; radians are not told from them by a reader that does not ask.
-    answer: Answer = "right" if named else "either" if unit == "deg" else "ask"
-    truth = Truth(readings, "deg", None, 10.0**-digits * ANGLE[unit], answer, ratio=ratio)
-    kind = "sightings" if named else f"sightings without a unit, {'degrees' if unit == 'deg' else 'others'}"
-    return Drawn(kind, sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth, ("--sightings",))
+    return columns, u, wrong
 
 
 def sighting_heads(rng: np.random.Generator, unit: str, language: str) -> list[str]:

@@ -216,6 +216,10 @@ def draw_axis(
             # Readings that fall, or begin anywhere.
             per_command *= 1 if chance(rng, 0.8) else -1
             zero += travel * rng.uniform(-2, 2) * chance(rng, 0.3)
+        elif command_unit == unit == "mm" and chance(rng, 0.12):
+            # The dial stands elsewhere, or on the other side.
+            per_command *= 1 if chance(rng, 0.7) else -1
+            zero += pick(rng, (100.0, 25.0, -10.0))
         elif command_unit == unit == "deg" and chance(rng, 0.15):
             geared = True
             ratio = pick(rng, (2, 5, 10, 36, 50, 100))
@@ -251,6 +255,7 @@ class Stop(NamedTuple):
     command: Decimal
     side: int
     run: int
+    read: bool = True
 
 
 @dataclass
@@ -272,18 +277,30 @@ class Sweep:
         return rises or self.told_side(number - 1)
 
 
-def sweeps(rng: np.random.Generator, commands: Sequence[Decimal], stated: bool) -> Sweep:
-    """Runs up and down; with directions stated also from one side alone, and ends approached from beyond."""
+def sweeps(rng: np.random.Generator, commands: Sequence[Decimal], stated: bool, variety: bool = False) -> Sweep:
+    """Runs up and down; with directions stated also from one side alone, and ends approached from beyond.
+
+    With variety also from the top, with several readings at a stop, or with ends that are passed without a reading.
+    """
     runs, stops = int(rng.integers(2, 5)), []
     style = int(rng.integers(3)) if stated else 0
+    passed = variety and not stated and chance(rng, 0.12)
     for run in range(runs):
         up = [Stop(command, 1, 2 * run) for command in commands]
         down = [Stop(command, -1, 2 * run + 1) for command in reversed(commands)]
-        if style == 0:
+        if passed:
+            beyond = commands[1] - commands[0]
+            up = [Stop(commands[0] - beyond, -1, 2 * run, False), *up, Stop(commands[-1] + beyond, 1, 2 * run, False)]
+            stops += up + down
+        elif style == 0:
             # To and fro without overrun: an end is read once.
             stops += (up if run == 0 else up[1:]) + down[1:]
         elif style == 1:
             stops += up + down
         else:
             stops += up
+    if variety and not passed and chance(rng, 0.12):
+        stops = [Stop(commands[0] + commands[-1] - stop.command, -stop.side, stop.run) for stop in stops]
+    if variety and not passed and chance(rng, 0.1):
+        stops = [stop for stop in stops for _ in range(2)]
     return Sweep(stops, stated)

@@ -191,14 +191,18 @@ def deviations(rng: np.random.Generator, language: str) -> Drawn:
     runs = draw_runs(rng, axis, (1, -1) * pairs)
     errors = deviations_of(runs, unit)
     truth = in_positions(runs, errors, unit, answer="ask")
-    name = pick(rng, words.DEVIATION[language])
+    name, plain = pick(rng, words.DEVIATION[language]), unit not in ("mm", "deg") and chance(rng, 0.3)
+    if plain:
+        # That they are deviations is told by their size alone.
+        name = names_of(rng, axis, language)[1]
     if chance(rng, 0.5):
-        names = [f"{name} {word} {k + 1}" for k in range(pairs) for word in pair]
+        names = [f"{'' if plain else name + ' '}{word} {k + 1}" for k in range(pairs) for word in pair]
         form, text = pick(rng, ("{} ({})", "{} [{}]")), unit_text(rng, unit, language)
         position = headed(rng, names_of(rng, axis, language)[0], axis.command_unit, language)
         rows: list[list[Cell]] = [list(row) for row in zip(axis.commands, *errors, strict=True)]
         sheet = Sheet([[position, *(form.format(n, text) for n in names)]], rows, language)
-        return Drawn("deviations of runs side by side", sheets.any_file(rng, sheet), truth)
+        kind = "deviations of runs side by side" + plain * ", not called so"
+        return Drawn(kind, sheets.any_file(rng, sheet), truth)
     order = [list(zip(axis.commands, run, strict=True))[::side] for side, run in zip(runs.sides, errors, strict=True)]
     words_of = pick(rng, words.SIDES[language])
     columns: dict[str, Sequence[Cell]] = {
@@ -210,7 +214,11 @@ def deviations(rng: np.random.Generator, language: str) -> Drawn:
         ],
         with_unit(rng, name, unit, language): [v for run in order for _, v in run],
     }
-    return Drawn("deviations alone", sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)
+    return Drawn(
+        "deviations alone" + plain * ", not called so",
+        sheets.any_file(rng, sheets.columns_sheet(columns, language)),
+        truth,
+    )
 
 
 def averages(rng: np.random.Generator, language: str) -> Drawn:

@@ -122,8 +122,17 @@ def workbook(rng: np.random.Generator, sheet: Sheet) -> File:
     for row in sheet.rows:
         cells = [cell if isinstance(cell, str) else number(cell, point) if as_text else float(cell) for cell in row]
         active.append([*left, *(None if cell == "" else cell for cell in cells)])
+    if chance(rng, 0.08):
+        # A summary to the right of the rows.
+        for k, cell in enumerate(("Max", 0.034, "Min", -0.021)):
+            active.cell(len(heads) + len(above) + 3 + k // 2, len(left) + len(sheet.rows[0]) + 2 + k % 2, cell)
     if chance(rng, 0.2):
         book.create_sheet("Sheet2")
+    if chance(rng, 0.08):
+        # Words come first.
+        info = book.create_sheet("Info", 0)
+        for text in preamble(rng, sheet.language):
+            info.append([text])
     stream = io.BytesIO()
     book.save(stream)
     return File("log.xlsx", stream.getvalue(), named(sheet))
@@ -137,7 +146,8 @@ def markdown(rng: np.random.Generator, sheet: Sheet) -> File:
     lines = [names, [rule] * len(names), *([number(cell, ".") for cell in row] for row in sheet.rows)]
     text = "\n".join(left + " | ".join(cells) + right for cells in lines) + "\n"
     title = "# Measurements\n\nTable 1, first day.\n\n" if chance(rng, 0.4) else ""
-    return File("report.md", encoded(rng, title + text), tuple(names))
+    above = "".join(f"{line}\n" for line in sheet.above if line)
+    return File("report.md", encoded(rng, title + above + "\n" * bool(above) + text), tuple(names))
 
 
 def with_index(rng: np.random.Generator, sheet: Sheet) -> None:
@@ -158,6 +168,8 @@ def _capitals(name: str) -> str:
     """Capitals up to the unit: "mm" is never "MM"."""
     begin = re.search(r"[(\[/_,]| in |\bmm$", name)
     word = name if begin is None else name[: begin.start()]
+    if re.fullmatch(r"[^(]*\((mm|in|deg)\)", name) and len(name) % 3 == 0:
+        return name.upper()
     # u is no U.
     return name if len(word.strip()) == 1 else word.upper() + name[len(word) :]
 
@@ -195,7 +207,13 @@ def units_in_cells(rng: np.random.Generator, sheet: Sheet) -> None:
                 row[k] = number(row[k], point) + space + found[2]
 
 
-QUIRKS = (with_index, other_case, other_case, blank_rows, mean_row, names_again, units_in_cells)
+def footer(rng: np.random.Generator, sheet: Sheet) -> None:
+    """A line of text below the rows."""
+    for line in [[], [pick(rng, words.FOOTER[sheet.language])]][chance(rng, 0.5) :]:
+        sheet.rows.append([*line, *[""] * (len(sheet.rows[0]) - len(line))])
+
+
+QUIRKS = (with_index, other_case, other_case, blank_rows, mean_row, names_again, units_in_cells, footer)
 
 
 def any_file(rng: np.random.Generator, sheet: Sheet, markdowns: bool = True) -> File:

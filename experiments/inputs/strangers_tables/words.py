@@ -82,15 +82,27 @@ DIRECTION = {
 SIDES = {
     "en": (
         *(("forward", "backward"), ("fwd", "bwd"), ("fwd", "rev"), ("up", "down"), ("Forward", "Reverse")),
-        *(("positive", "negative"), ("pos", "neg"), ("increasing", "decreasing"), ("F", "B")),
+        *(
+            ("positive", "negative"),
+            ("pos", "neg"),
+            ("increasing", "decreasing"),
+            ("F", "B"),
+            ("from below", "from above"),
+        ),
     ),
     "de": (
         *(("vor", "zurück"), ("vorwärts", "rückwärts"), ("hin", "rück"), ("auf", "ab")),
-        *(("steigend", "fallend"), ("positiv", "negativ"), ("Hinfahrt", "Rückfahrt")),
+        *(("steigend", "fallend"), ("positiv", "negativ"), ("Hinfahrt", "Rückfahrt"), ("von unten", "von oben")),
     ),
-    "es": (("ida", "vuelta"), ("avance", "retroceso"), ("subida", "bajada"), ("adelante", "atrás")),
+    "es": (
+        ("desde abajo", "desde arriba"),
+        ("ida", "vuelta"),
+        ("avance", "retroceso"),
+        ("subida", "bajada"),
+        ("adelante", "atrás"),
+    ),
     "fr": (("aller", "retour"), ("avant", "arrière"), ("montée", "descente"), ("croissant", "décroissant")),
-    "all": (("+", "-"), ("+1", "-1"), ("↑", "↓"), ("→", "←"), ("1", "-1")),
+    "all": (("+", "-"), ("+1", "-1"), ("↑", "↓"), ("→", "←"), ("1", "-1"), ("[+]", "[-]")),
 }
 """Of commands that rise, and that fall."""
 RUN_SIDES = {
@@ -202,9 +214,27 @@ PREAMBLE = {
         "Company: Example Ltd",
         "Test report 12",
     ),
-    "de": ("Seriennummer: 20417", "Prüfer: M. Müller", "Maschine: Fräse, X-Achse", "Protokoll Nr. 12"),
-    "es": ("Número de serie: 20417", "Operador: J. Pérez", "Máquina: fresadora, eje X", "Informe 12"),
-    "fr": ("Numéro de série : 20417", "Opérateur : J. Dupont", "Machine : fraiseuse, axe X", "Rapport 12"),
+    "de": (
+        "Seriennummer: 20417",
+        "Prüfer: M. Müller",
+        "Maschine: Fräse, X-Achse",
+        "Protokoll Nr. 12",
+        "Verfahrweg (mm): 300",
+    ),
+    "es": (
+        "Número de serie: 20417",
+        "Operador: J. Pérez",
+        "Máquina: fresadora, eje X",
+        "Informe 12",
+        "Recorrido (mm): 300",
+    ),
+    "fr": (
+        "Numéro de série : 20417",
+        "Opérateur : J. Dupont",
+        "Machine : fraiseuse, axe X",
+        "Rapport 12",
+        "Course (mm) : 300",
+    ),
 }
 DATE = {"en": "Date: 2026-03-12", "de": "Datum: 12.03.2026", "es": "Fecha: 12/03/2026", "fr": "Date : 12/03/2026"}
 PAN = {
@@ -276,3 +306,17 @@ MEANS = {
     "fr": ("Moyenne aller", "Moyenne retour", "Moyenne", "Écart-type"),
 }
 """Of a sheet of runs: both sides, all, scatter."""
+FOOTER = {
+    "en": ("Checked by: J. Smith", "Max. error: 0.034", "End of test"),
+    "de": ("Geprüft: M. Müller", "Größte Abweichung: 0,034", "Ende der Messung"),
+    "es": ("Revisado: J. Pérez", "Error máximo: 0,034", "Fin del ensayo"),
+    "fr": ("Vérifié : J. Dupont", "Écart maximal : 0,034", "Fin de l'essai"),
+}
+"""Lines below a table."""
+ENCODERS = (
+    ("Encoder az", "Encoder el"),
+    ("enc_pan", "enc_tilt"),
+    ("Pan encoder", "Tilt encoder"),
+    ("Enc Az", "Enc Alt"),
+)
+"""Of a head."""
