@@ -120,6 +120,10 @@ def test_installed_package_works_away_from_the_tree(kind, built, tmp_path):
     assert [name for name in SHIPPED if not (data / name).is_file()] == []
     shown = "from tvsbayes.positioner import firmware_folder; print(firmware_folder())"
     assert (Path(run(python, "-c", shown, **options).strip()) / "README.md").is_file()
+    # The words of tables are data of the package.
+    (tmp_path / "messuhr.csv").write_text("Sollposition (mm);Messuhr (1/100 mm)\n0;0,2\n10;1000,5\n20;2001,0\n0;3,1\n")
+    run(command, "import", "messuhr.csv", "--axis", "--to", "screw", "--yes", **options)
+    assert 'unit = "mm"' in (tmp_path / "screw" / "campaign.toml").read_text(encoding="utf-8")
     if kind == ".whl":  # the same files as from source: one fit is enough
         document = json.loads(run(command, "demo", "--json", **options))
         assert document["fit"]["converged"] is True
