@@ -47,7 +47,7 @@ def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path, no_picture
 
     code, planned = ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")
     assert code == 0 and planned["enough"]
-    assert (tmp_path / "plan.csv").read_text().startswith("# plan by tvsbayes\nstep,command,direction,read")
+    assert (tmp_path / "plan.csv").read_text().startswith("step,command,direction,read")
 
     code, document = ask("verify", folder, drive(folder, tmp_path / "kept", (1.0, 1.0)))
     jsonschema.validate(document, shipped_schema("verification-1"))

@@ -9,7 +9,7 @@ import pytest
 from support.compensated import results
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.own_outputs import PDF_MARK, PLAN_MARK, require_own
+from tvsbayes.files.own_outputs import PDF_MARK, require_own
 from tvsbayes.single_axis.axis_campaign import write_axis
 from tvsbayes.single_axis.axis_record import keep_fit
 
@@ -30,7 +30,8 @@ def test_anything_else_is_refused(tmp_path, found):
     elif found == "pipe":
         os.mkfifo(path)
     else:
-        path.write_bytes(NOTES.encode() if found == "notes" else PLAN_MARK + b"step,action\n")
+        plan = b"step,action,pan_steps,tilt_steps,target,experiment,point\n"
+        path.write_bytes(NOTES.encode() if found == "notes" else plan)
     with pytest.raises(InputError, match="would be replaced: a f") as refused:
         require_own(path, "report")
     assert (refused.value.code, refused.value.exit_code) == ("occupied", 2) and "--force" in refused.value.remedy

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 
 from tvsbayes.errors import InputError
+from tvsbayes.files.own_outputs import require_own
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, continued, read_plan, run_plan, write_plan
 
 PLAN = (
@@ -28,17 +29,17 @@ def test_plan_round_trip(tmp_path):
     assert read_plan(tmp_path / "plan.csv") == PLAN  # home counters default to 0
 
 
-def test_a_plan_says_who_wrote_it_and_lines_are_counted_with_that(tmp_path):
+def test_a_plan_is_known_by_its_columns_and_lines_are_counted_with_remarks(tmp_path):
     path = tmp_path / "plan.csv"
     write_plan(PLAN, path)
-    first, names, *rest = path.read_text().splitlines()
-    assert first == "# plan by tvsbayes" and names.startswith("step,action")
-    path.write_text("\n".join([first, names, rest[0], rest[1].replace("place", "wait"), *rest[2:]]))
+    require_own(path, "plan")
+    names, *rest = path.read_text().splitlines()
+    path.write_text("\n".join(["# bench 3", names, rest[0], rest[1].replace("place", "wait"), *rest[2:]]))
     with pytest.raises(InputError) as refused:
         read_plan(path)
     assert refused.value.line == 4
-    path.write_text("\n".join([names, *rest]))
-    assert read_plan(path) == PLAN
+    with pytest.raises(InputError, match="would be replaced"):
+        require_own(path, "plan")
 
 
 PLAN_REFUSED = {

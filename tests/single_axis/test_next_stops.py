@@ -33,7 +33,7 @@ def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
     for stop in plan.next:
         for command in (stop.command, stop.via):
             assert command is None or -2300 <= command <= 2300
-    assert plan.plan_bytes().startswith(b"# plan by tvsbayes\nstep,command,direction,read\n0,")
+    assert plan.plan_bytes().startswith(b"step,command,direction,read\n0,")
     json.dumps(plan.as_json(), allow_nan=False)
 
 

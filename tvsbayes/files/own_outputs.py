@@ -10,12 +10,11 @@ from pathlib import Path
 
 from tvsbayes.errors import InputError, escaped, shown
 
-PLAN_MARK = b"# plan by tvsbayes\n"
-"""First line of a plan; readers of tables leave such lines out."""
 PDF_MARK = b"\n% report by tvsbayes\n"
 """Last line of a printed report: a PDF is read from its end, where it may be followed by remarks."""
 KINDS = {
-    "plan": rb"\A# plan by tvsbayes\n",
+    # The names of its columns are those of no other table.
+    "plan": rb"\Astep,(?:action,[a-z0-9_]+_steps,|command,direction,read\r?\n)",
     "compensation": rb"compensation by tvsbayes ",
     "model of a head": rb'<xacro:property name="head_corrects"|made by tvsbayes ',
     "calibration in C": rb"\A/\* Laser positioner calibration, written by tvsbayes ",

@@ -94,7 +94,7 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     table = _resting_rows(table, columns, wishes, assumed)
     cells, notations = FieldCells(table, columns).with_plain("command", "value", "u")
     assumed += [column.remark for column in notations.values() if column.remark]
-    units = units_of(cells, {f: c.unit for f, c in notations.items()}, wishes)
+    units = units_of(cells, {f: c.unit for f, c in notations.items()}, wishes, assumed)
     commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
     read = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
     given_u = [u or 0.0 for u in cells.numbers("u", 0.0, NUMBER_MAX, optional=True)]

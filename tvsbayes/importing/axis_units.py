@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from tvsbayes.errors import Candidate, escaped, question, refusal
+from tvsbayes.errors import Candidate, Question, escaped, question, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.cells import FieldCells
 from tvsbayes.importing.columns import columns_of
-from tvsbayes.importing.words import Unit, name_of, parse_unit
+from tvsbayes.importing.table import ForeignTable
+from tvsbayes.importing.words import Unit, name_of, parse_unit, plain
 
 UNIT_SLOPE = 0.05
 """Largest deviation from 1 of the slope of readings over commands, where both are taken to be in one unit."""
@@ -59,7 +61,9 @@ def stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:
     return unit
 
 
-def units_of(cells: FieldCells, written: Mapping[str, Unit | None], wishes: Wishes) -> dict[str, Unit | None]:
+def units_of(
+    cells: FieldCells, written: Mapping[str, Unit | None], wishes: Wishes, assumed: list[str]
+) -> dict[str, Unit | None]:
     """Units of command, reading and u: stated, of the cells, or of the names.
 
     Raises:
@@ -87,7 +91,24 @@ def units_of(cells: FieldCells, written: Mapping[str, Unit | None], wishes: Wish
                 code="unit",
             )
         units[name] = unit
+    if units["value"] is None and (unit := unit_above(cells.table)) is not None:
+        units["value"] = unit
+        assumed.append(f"unit: {unit.name}, as a line above the names says; --unit value=mm says another")
     return units
+
+
+_ABOVE = re.compile(
+    r"(?:\b(?:in|en)|\b(?:unit|units|einheit|einheiten|unidad|unidades|unite|unites)\s*[:=])\s*(\S+)\s*$"
+)
+"""A unit at the end of a line: "all values in mm", "Unit: mm"."""
+
+
+def unit_above(table: ForeignTable) -> Unit | None:
+    """The only unit of length or angle that lines above the names state for all readings."""
+    matches = [_ABOVE.search(plain(line)) for line in table.above]
+    units = {unit for match in matches if match and (unit := parse_unit(match[1])) is not None}
+    units = {unit for unit in units if unit.kind in ("length", "angle", "count")}
+    return units.pop() if len(units) == 1 else None
 
 
 def in_one_unit(
@@ -118,6 +139,8 @@ def in_one_unit(
             given = unit
             how = "that of the commands, which the readings follow 1 to 1; --unit value=mm says another"
             assumed.append(f"unit: {unit.name}, {how}")
+    if unit is None and command_unit is not None and command_unit.kind in ("length", "angle"):
+        raise _unit_of_readings(cells, commands, values, command_unit)
     if unit is None and _are_counts(cells.text("value")):
         unit = given = Unit("counts", "count", 1.0)
         assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
@@ -168,6 +191,33 @@ def _unit_of_command(
     c, v = np.array(pairs, float).T
     slope = float(np.polyfit(c, v, 1)[0])
     return command_unit if abs(slope - 1.0) <= UNIT_SLOPE else None
+
+
+def _unit_of_readings(
+    cells: FieldCells, commands: Sequence[float], values: Sequence[float | None], command_unit: Unit
+) -> Question:
+    """The question of the unit of readings that do not follow commands of a length or an angle 1 to 1."""
+    pairs = np.array([(c, v) for c, v in zip(commands, values, strict=True) if v is not None], float)
+    slope = abs(float(np.polyfit(*pairs.T, 1)[0])) if len(np.unique(pairs[:, 0])) > 1 else 1.0
+    usual = {
+        "length": ("nm", "um", "1/1000 mm", "1/100 mm", "1/10 mm", "mm", "cm", "thou", "inch", "deg"),
+        "angle": ("arcsec", "arcmin", "mrad", "rad", "deg", "gon", "turn", "mm"),
+    }[command_unit.kind]
+    scales = {
+        text: factor for text in usual if (unit := parse_unit(text)) and (factor := unit.in_units_of(command_unit))
+    }
+    # Those in which the readings follow the commands come first.
+    near = sorted(usual, key=lambda text: abs(np.log(slope * scales[text])) if text in scales and slope else np.inf)
+    column, table = cells.columns["value"], cells.table
+    found = (
+        f"readings without a unit in column {escaped(column)}, {slope:.4g} for each {command_unit.name} of the commands"
+    )
+    names = (*near[:3], "counts")
+    candidates = [Candidate(f"they are in {text}", ("--unit", f"value={text}")) for text in names]
+    allowed = "a unit of the readings"
+    return question(
+        file=table.file, line=table.first_line, found=found, allowed=allowed, candidates=candidates, code="unit"
+    )
 
 
 def _are_counts(cells: Sequence[str]) -> bool:

@@ -42,6 +42,7 @@ class ForeignTable:
         lines: row in the file of each row.
         columns: cells by name of column; "column 1" ... where the file has no names.
         first_line: row of the file with the names, or the first row where there are none.
+        above: texts of the lines above.
     """
 
     file: str
@@ -49,6 +50,7 @@ class ForeignTable:
     lines: tuple[int, ...]
     columns: dict[str, tuple[str, ...]]
     first_line: int = 1
+    above: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -79,10 +81,11 @@ class Row(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows of a file, the first with the names where it has some, and what was found, in words."""
+    """Rows of a file, the first with the names where it has some, what was found in words, and the lines above."""
 
     rows: list[Row]
     notes: list[str]
+    above: tuple[str, ...] = ()
 
 
 def table_of(file: str, kind: str, columns: Mapping[str, Sequence[object]], lines: Sequence[int]) -> ForeignTable:
@@ -150,7 +153,8 @@ def headed(found: Rows) -> Rows:
         return Rows(rows, notes)
     text = " ".join(cell for cell in rows[0].cells if cell)
     amount = f"{first} lines" if first > 1 else "a line"
-    return Rows(rows[first:], [*notes, f'{amount} above the names left out ("{escaped(text, 40)}")'])
+    above = tuple(" ".join(cell for cell in row.cells if cell) for row in rows[:first])
+    return Rows(rows[first:], [*notes, f'{amount} above the names left out ("{escaped(text, 40)}")'], above)
 
 
 def _first_data(rows: Sequence[Row]) -> int:
@@ -191,7 +195,9 @@ def _is_group_row(above: Sequence[str], names: Sequence[str]) -> bool:
     return is_gapped and not any(map(is_number, above)) and filled[-1] < len(names)
 
 
-def table_of_rows(file: str, rows: Sequence[Row], description: Sequence[str]) -> ForeignTable:
+def table_of_rows(
+    file: str, rows: Sequence[Row], description: Sequence[str], above: Sequence[str] = ()
+) -> ForeignTable:
     """Make a table of rows under their names, with decimal points.
 
     Raises:
@@ -227,7 +233,9 @@ def table_of_rows(file: str, rows: Sequence[Row], description: Sequence[str]) ->
         if name is not None:
             texts = (row[k] if isinstance(row[k], Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
             columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in texts)
-    return ForeignTable(file, ", ".join(description), tuple(line for line, _ in body), columns, rows[0].line)
+    return ForeignTable(
+        file, ", ".join(description), tuple(line for line, _ in body), columns, rows[0].line, tuple(above)
+    )
 
 
 def _without_sums(rows: Sequence[Row]) -> tuple[Sequence[Row], str]:

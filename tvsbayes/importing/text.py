@@ -76,6 +76,7 @@ def _text_rows(text: str, file: str) -> tuple[list[Row], str, list[tuple[int, st
     remarks = [(n, line) for n, line in remarks if body and n < body[0][0]]
     if _is_markdown([line for _, line in body]):
         body, declared = _markdown_rows(lines), "|"
+        remarks = [(n, line.strip()) for n, line in lines if "|" not in line]
     if len(body) > CSV_ROWS_MAX + 1:
         allowed, remedy = f"at most {CSV_ROWS_MAX} rows", "split it"
         raise refusal("size", file=file, found=f"{len(body)} rows", allowed=allowed, remedy=remedy)
@@ -203,13 +204,13 @@ def text_table_rows(decoded: Decoded, file: str) -> Rows:
         InputError: rows that are damaged, or too many.
     """
     rows, separator, remarks = _text_rows(decoded.text, file)
-    headed_rows, notes = headed(Rows(rows, []))
+    headed_rows, notes, above = headed(Rows(rows, []))
     names = _names_in_remark(remarks, headed_rows, separator)
     if names is not None:
         headed_rows, notes = [names, *rows], [*notes, "names in the remark above the first row"]
     _refuse_wide(headed_rows, separator, file)
     kind = f"CSV with {SEPARATORS.get(separator, separator)} between cells"
-    return Rows(headed_rows, [kind, decoded.encoding, *notes])
+    return Rows(headed_rows, [kind, decoded.encoding, *notes], (*above, *(line for _, line in remarks)))
 
 
 def is_foreign(head: bytes) -> bool:

@@ -18,7 +18,6 @@ from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_kind import Column, CsvKind, Values, counted
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
 from tvsbayes.files.disk import read_bytes, write_atomically
-from tvsbayes.files.own_outputs import PLAN_MARK
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, Axis, PanApproach, TiltApproach, direction_of
 from tvsbayes.instrument.campaign import Move, next_move
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
@@ -116,7 +115,7 @@ def write_plan(steps: Sequence[PlanStep], path: Path, mechanism: Mechanism = TWO
     """Write `plan.csv` atomically; refuse steps that `read_plan` would refuse."""
     data = PLANS.content(steps)
     parse_plan(data, escaped(Path(path).name), mechanism)
-    write_atomically(path, PLAN_MARK + data)
+    write_atomically(path, data)
 
 
 def counters_planned(plan: Sequence[PlanStep]) -> dict[str, tuple[int, int]]:

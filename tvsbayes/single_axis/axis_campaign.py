@@ -29,7 +29,6 @@ from tvsbayes.files.csv_kind import (
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.files.own_outputs import PLAN_MARK
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.conditions import check_power, powered_on_s
@@ -469,4 +468,4 @@ def stops_csv(stops: Iterable[AxisStop]) -> bytes:
         if via is not None:
             rows.append((len(rows), via, "backward" if direction == "forward" else "forward", 0))
         rows.append((len(rows), command, direction, 1))
-    return PLAN_MARK + csv_bytes(("step", "command", "direction", "read"), rows)
+    return csv_bytes(("step", "command", "direction", "read"), rows)
