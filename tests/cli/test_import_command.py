@@ -247,7 +247,7 @@ def test_readings_have_the_unit_of_their_column(ask, say, tmp_path, column, unit
     assert "0, 40000" in say("check", out)[1], "counters are no powers of ten"
 
 
-@pytest.mark.parametrize(("first", "names"), [("Leadscrew test,,", "column 1"), ("steps,foo,bar", "foo")])
+@pytest.mark.parametrize(("first", "names"), [("Leadscrew test,,", "column 1"), ("steps,foo,bar", "bar")])
 def test_a_title_holds_no_names(ask, tmp_path, first, names):
     log = tmp_path / "log.csv"
     log.write_text(f"{first}\n0,0,1\n5,1,3\n")

@@ -8,6 +8,10 @@ ROWS_MIN = 4
 """Rows of one command, in the median of all commands, from which a table is telemetry."""
 TAIL_SHARE = 1 / 3
 """Last share of the rows of a command, in which the axis should rest."""
+QUIET_SHARE = 0.8
+"""Share of the commands, the quieter ones, whose last rows give the noise at rest."""
+MOVING_SHARE = 0.3
+"""Least share of commands with rows in motion: with fewer, rows of a command are readings of one stop."""
 NOISE_SDS, DIGITS = 5.0, 3.0
 """Largest distance from rest of a row at rest: standard deviations of last rows, and digits of the readings."""
 STEP_SHARE = 0.02
@@ -30,12 +34,14 @@ def at_rest(command: np.ndarray, value: np.ndarray) -> np.ndarray:
     blocks = [block[np.isfinite(value[block])] for block in blocks]
     if len(blocks) < 2 or np.median([len(block) for block in blocks]) < ROWS_MIN:
         return rests
-    tails = [block[-max(2, round(TAIL_SHARE * len(block))) :] for block in blocks]
+    tails = [block[-max(3, round(TAIL_SHARE * len(block))) :] for block in blocks]
     levels = [float(np.median(value[tail])) if len(tail) else np.nan for tail in tails]
-    noise = [float(np.std(value[tail])) for tail in tails]
+    variances = sorted(float(np.var(value[tail], ddof=1)) for tail in tails if len(tail) > 1)
+    # An axis that never came to rest adds nothing to the noise at rest.
+    noise = np.sqrt(np.mean(variances[: max(1, round(QUIET_SHARE * len(variances)))]))
     steps = np.diff(np.unique(value[np.isfinite(value)]))
     resolution = float(steps.min()) if len(steps) else 0.0
-    tolerance = max(NOISE_SDS * float(np.median(noise)), DIGITS * resolution)
+    tolerance = max(NOISE_SDS * float(noise), DIGITS * resolution)
     for k, (block, level) in enumerate(zip(blocks, levels, strict=True)):
         if len(block) < 2:
             continue
@@ -50,4 +56,5 @@ def at_rest(command: np.ndarray, value: np.ndarray) -> np.ndarray:
             rests[block[: max(settled, int(run[-1]) + 1)]] = False
         if len(block) >= ROWS_MIN and abs(value[block[-1]] - value[block[-2]]) > tolerance and off.mean() > 0.5:
             rests[block] = False
-    return rests
+    under_way = np.mean([not rests[block].all() for block in blocks[1:]])
+    return rests if under_way >= MOVING_SHARE else np.ones(len(command), bool)

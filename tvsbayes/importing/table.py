@@ -239,10 +239,10 @@ def table_of_rows(
 
 
 def _without_sums(rows: Sequence[Row]) -> tuple[Sequence[Row], str]:
-    """The rows without those whose first text is a word of a summary, as "Mean", and a note on these."""
+    """The rows without those that begin with a word of a summary, as "Mean", and a note on these."""
     sums = []
     for row in rows:
-        text = next((cell for cell in row.cells if cell and not is_number(cell)), "")
+        text = next((cell for cell in row.cells if cell), "")
         words = words_of(text)
         is_sum = words and len(words) <= 2 and place_of(words[:1], "summary") is not None
         if is_sum and any(map(is_number, row.cells)):
