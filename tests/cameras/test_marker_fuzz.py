@@ -5,11 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from cameras.test_marker_boards import DRAWN, NAMED
 from hypothesis import given
 from hypothesis import strategies as st
 from support.damaged_files import WORDS, few
-from support.drawn_boards import POSES, pictures, write_pair
+from support.drawn_boards import CHARUCO, DRAWN_CHARUCO, POSES, pictures, write_pair
 
 from tvsbayes.cameras.boards import Board, find_views
 from tvsbayes.errors import InputError, NothingToEstimate
@@ -31,7 +30,7 @@ EDITS = {
 
 @pytest.fixture(scope="module")
 def good():
-    return [pictures(pose, DRAWN) for pose in POSES[:2]]
+    return [pictures(pose, DRAWN_CHARUCO) for pose in POSES[:2]]
 
 
 EDIT = st.tuples(st.sampled_from(sorted(EDITS)), st.integers(0, 639), st.integers(0, 479), st.integers(1, 10))
@@ -53,12 +52,12 @@ def test_damaged_pictures_are_views_or_refused(tmp_path_factory, good, edits, fi
         data[byte % len(data)] ^= 0x55
         path.write_bytes(data)
     try:
-        found = find_views(folder, NAMED)
+        found = find_views(folder, CHARUCO)
     except (InputError, NothingToEstimate) as error:
         assert error.remedy
     else:
         corners = [side for view in found.views for side in (view.left, view.right) if side is not None]
-        assert all(side.shape == (NAMED.corners, 2) for side in corners)
+        assert all(side.shape == (CHARUCO.corners, 2) for side in corners)
 
 
 SIZES = (*["9x8"] * 9, "9 x 8", "60x60", "61x4", "1x1")

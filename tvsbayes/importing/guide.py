@@ -19,7 +19,7 @@ from itertools import pairwise
 from statistics import median
 from typing import Any, NamedTuple
 
-from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
+from tvsbayes.errors import Candidate, escaped, question, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.axis import AxisRows
 from tvsbayes.importing.columns import columns_of
