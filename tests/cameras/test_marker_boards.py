@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from support.drawn_boards import CHARUCO as NAMED
+from support.drawn_boards import DRAWN_CHARUCO as DRAWN
 from support.drawn_boards import PAIR, POSES, SIZE, pictures, true_corners, write_pair
 
 from tvsbayes.cameras.boards import Board, find_views
@@ -16,8 +17,6 @@ from tvsbayes.cameras.marker_boards import CORNERS_MIN, fitted_markers, marker_b
 from tvsbayes.cameras.stereo_calibration import calibrate_stereo
 from tvsbayes.errors import InputError, NothingToEstimate
 
-NAMED = Board.with_markers("9x8", "5X5_100", 40.0)
-DRAWN = replace(NAMED, markers=replace(NAMED.markers, share=0.7, legacy=True))
 FOUND_PX = 0.6
 """The warp interpolates, and the window beside markers is narrow: 0.11 px rms, the worst of 500 coordinates 0.43; a
 corner that is taken for its neighbour is off by 20 px."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given
-from importing.samples import KEYS, sample
+from importing.samples import KEYS, guide_log, sample
 from support.damaged_files import damaged, few
 
 from tvsbayes.cli.axis_import import FileOptions, import_readings
@@ -17,6 +17,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.sightings import SightingWishes, sighting_rows
 from tvsbayes.importing.workbook import CELLS_MAX
+from tvsbayes.single_axis.axis_campaign import read_axis
 
 MEMORY_BYTES = 300 * 2**20
 """For a file below 10 MB."""
@@ -50,6 +51,37 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, case):
     path = folder / "file"
     path.write_bytes(data)
     imported(path, folder)
+
+
+GUIDES = {
+    "PHD2": guide_log(12),
+    "PHD2, two runs": guide_log(12) + guide_log(12, "-20.5 deg"),
+    "KStars": "KStars version 3.7\n" + guide_log(12),
+    "calibrated": "Calibration Begins at 2026-01-02 20:00:00\nWest,1,2,3,4,5\n"
+    "Calibration guide speeds: RA = 7.5 a-s/s, Dec = 7.5 a-s/s\n" + guide_log(12),
+    "normal rates": guide_log(12).replace("RA Guide Speed", "Norm rates RA = 6.2a-s/s @ dec 0\nRA Guide Speed"),
+    "events": guide_log(12).replace("\n5,", "\nINFO: DITHER by 1.0, 2.0\nINFO: Settling started\n5,").replace(
+        "\n8,", "\nINFO: Settling complete\n8,"
+    ),
+}
+"""Short logs of guiders: most edits fall into their headers."""
+
+
+@few(400)
+@given(damaged({name: text.encode() for name, text in GUIDES.items()}))
+def test_damaged_guide_logs_are_read_or_refused(tmp_path_factory, case):
+    """What is written can be read."""
+    folder = tmp_path_factory.mktemp("damaged")
+    path, out = folder / "guide.txt", folder / "out"
+    path.write_bytes(case[1])
+    try:
+        found = import_readings(path, out, {}, None, FileOptions(), yes=True, as_json=True)
+    except InputError as error:
+        assert error.remedy or error.message
+        return
+    if found is not None:
+        found.write()
+        read_axis(out)
 
 
 FLOODS = {

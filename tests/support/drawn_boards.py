@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from tvsbayes.cameras.boards import Board
+from tvsbayes.cameras.marker_boards import Markers
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.twin.physics import project
 
 BOARD = Board(7, 6, 25.0)
+CHARUCO = Board.with_markers("9x8", "5X5_100", 40.0)
+DRAWN_CHARUCO = replace(CHARUCO, markers=Markers((9, 8), "5X5_100", share=0.7, legacy=True))
+"""What a user states, and what is drawn."""
 SIZE = (640, 480)
 SQUARE_PX = 40
 """Pixels of a square in the drawn board, which is then warped into the image."""

@@ -126,7 +126,8 @@ class Board:
         if match is None:
             raise _bad_option("--charuco", escaped(squares), "COLUMNSxROWS of squares", "write for example 15x10")
         columns, rows = int(match[1]), int(match[2])
-        share = None if marker_mm is None else marker_mm / pitch_mm
+        # A board refuses such a pitch below.
+        share = None if marker_mm is None or not pitch_mm > 0 else marker_mm / pitch_mm
         name = dictionary.strip().removeprefix("DICT_")
         return cls(columns - 1, rows - 1, pitch_mm, pitch_u_mm, Markers((columns, rows), name, share))
 

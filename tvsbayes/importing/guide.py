@@ -19,7 +19,7 @@ from itertools import pairwise
 from statistics import median
 from typing import Any, NamedTuple
 
-from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
+from tvsbayes.errors import Candidate, escaped, question, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.axis import AxisRows
 from tvsbayes.importing.columns import columns_of
@@ -36,6 +36,8 @@ RATES_EQUAL = 0.05
 """Largest relative difference of rates between which nothing needs to decide."""
 BEGINS, ENDS = "Guiding Begins at ", "Guiding Ends"
 NEEDED = ("Time", "RARawDistance", "RADuration", "RADirection")
+TIME_MAX_S, RAW_MAX_PX, PULSE_MAX_MS, PIXEL_MAX_ARCSEC = 1e6, 1e5, 1e6, 1e4
+"""Far beyond any night, camera and guider: larger numbers are damage."""
 DECLINATION_MAX_DEG = 85.0
 """Largest declination: above it 1 / cos(declination) magnifies the seeing beyond the errors of the axis."""
 PRIORS = {"per_command": {"value": 1.0, "u": 1e-3}, "transmission_error": {"value": 0.0, "u": 10.0}}
@@ -148,8 +150,8 @@ def read_runs(text: str, file: str) -> list[GuideRun]:
         elif line.startswith("Calibration Begins at"):
             calibrating, run = True, None
         elif calibrating:
-            if match := _CALIBRATED.search(line):
-                calibration["calibrated_speed"] = float(match[1])
+            if (match := _CALIBRATED.search(line)) and math.isfinite(speed := float(match[1])):
+                calibration["calibrated_speed"] = speed
             calibration_steps += line.startswith(("West,", "East,", "North,", "South,", "Backlash,"))
         elif run is None or not line:
             continue
@@ -177,8 +179,8 @@ def read_runs(text: str, file: str) -> list[GuideRun]:
 
 def _header(run: GuideRun, line: str) -> None:
     for name, pattern in _HEADER.items():
-        if (match := pattern.search(line)) and name not in run.header:
-            run.header[name] = float(match[1])
+        if (match := pattern.search(line)) and name not in run.header and math.isfinite(number := float(match[1])):
+            run.header[name] = number
     if match := _MOUNT.search(line):
         run.mount = match[1].strip()
     if match := _PIER.search(line):
@@ -210,7 +212,7 @@ def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settli
         cells = dict(zip(columns, next(csv.reader([line])), strict=False))
         time_s, device = float(cells["Time"]), cells.get("mount", "Mount")
         last = max((run.frames[-1].time_s if run.frames else 0.0, run.dropped_s[-1] if run.dropped_s else 0.0))
-        if time_s < last or not math.isfinite(time_s):
+        if not last <= time_s <= TIME_MAX_S:
             run.counts["damaged row"] += 1
         elif device == "DROP" or cells["RARawDistance"] == "":
             run.dropped_s.append(time_s)
@@ -219,6 +221,8 @@ def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settli
         else:
             raw, pulse_ms = float(cells["RARawDistance"]), float(cells["RADuration"] or 0)
             sign = {"W": 1.0, "E": -1.0, "": 0.0}[cells["RADirection"].strip()[:1].upper()]
+            if not (abs(raw) <= RAW_MAX_PX and abs(pulse_ms) <= PULSE_MAX_MS):
+                raise ValueError("no number of a guider")
             run.frames.append(GuideFrame(number, time_s, raw, sign * pulse_ms, settling))
             run.counts["frame with a saturated star"] += cells.get("ErrorCode") == "1"
     except (KeyError, ValueError, csv.Error, StopIteration):
@@ -272,8 +276,10 @@ def _scale(run: GuideRun, runs: Sequence[GuideRun], stated: Mapping[str, float],
         found, allowed = f"a declination of {declination:g} deg", f"at most {DECLINATION_MAX_DEG:g} deg"
         remedy = "take a run on a star nearer to the equator; or is another one right: --assume declination_deg=NUMBER"
         raise refusal("range", file=file, line=run.line, found=found, allowed=allowed, remedy=remedy)
-    if not pixel > 0:
-        raise InputError("usage", "--assume pixel_arcsec: allowed: above 0", remedy="state arcsec per pixel")
+    if not 0 < pixel <= PIXEL_MAX_ARCSEC:
+        found, allowed = f"a pixel scale of {pixel:g} arcsec", f"above 0, at most {PIXEL_MAX_ARCSEC:g}"
+        remedy = "state arcsec per pixel: --assume pixel_arcsec=NUMBER"
+        raise refusal("range", file=file, line=run.line, found=found, allowed=allowed, remedy=remedy)
     cosine = math.cos(math.radians(declination))
     assumed = [f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg="]
     assumed.append(f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=")
@@ -294,9 +300,9 @@ def _hypotheses(run: GuideRun, pixel: float, declination_deg: float) -> dict[str
     PHD2: px/s at the declination of the run or of the calibration. KStars: arcsec/s on the sky at the declination of
     the run (Ekos, internalguider: 1000 / raPulseMillisecondsPerArcsecond); before, px/s.
     """
-    if "x_rate" not in run.header:
+    cosine, rate = math.cos(math.radians(declination_deg)), run.header.get("x_rate", 0.0)
+    if not min(rate, pixel) > 0:
         return {}
-    cosine, rate = math.cos(math.radians(declination_deg)), run.header["x_rate"]
     if run.program == "KStars":
         return {"xRate in arcsec/s on the sky": rate / cosine, "xRate in px/s": rate * pixel / cosine}
     rates = {"xRate in px/s at the run's declination": rate * pixel / cosine}
@@ -325,7 +331,7 @@ def _logged_pulse(
         "the mount's guide speed": header.get("guide_speed"),
         "the calibration's guide speed": header["calibrated_speed"] / cosine if "calibrated_speed" in header else None,
     }
-    evidence = {name: rate for name, rate in stated.items() if rate}
+    evidence = {name: rate for name, rate in stated.items() if rate is not None and rate > 0}
     others = _other_rates(run, runs)
     if others is not None:
         evidence["the other runs"] = others

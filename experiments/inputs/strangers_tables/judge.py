@@ -244,8 +244,8 @@ def walk(document: Any) -> Iterator[str]:
         yield from (text for text in re.findall(r"`([^`]+)`", document) if text.startswith("tvsbayes "))
 
 
-def answers(error: dict[str, Any], line: Sequence[str]) -> list[list[str]]:
-    """Command lines that answer a question; of a remedy that names options alone, the line with these."""
+def answers(error: dict[str, Any]) -> list[list[str]]:
+    """Command lines that answer a question, as they are printed."""
     found = []
     for text in dict.fromkeys(walk(error)):
         try:
@@ -254,15 +254,10 @@ def answers(error: dict[str, Any], line: Sequence[str]) -> list[list[str]]:
             continue
         if words[:1] == ["import"]:
             found.append([*words, *(word for word in ("--yes", "--json") if word not in words)])
-    if not found:
-        for clause in re.split(r";|, or | or |, ", error.get("remedy") or ""):
-            option = re.search(r"(--[a-z-]+)(?: (\S.*))?$", clause.strip())
-            if option and "NAME" not in clause and "NUMBER" not in clause and "FOLDER" not in clause:
-                found.append([*line, option[1], *([option[2]] if option[2] else [])])
-    return found[:ANSWERS_MAX]
+    return [list(words) for words in dict.fromkeys(map(tuple, found))][:ANSWERS_MAX]
 
 
-def carried_out(line: Sequence[str], out: Path, truth: Truth) -> tuple[str, dict[str, Any]]:
+def carried_out(line: Sequence[str], out: Path) -> tuple[str, dict[str, Any]]:
     """Run a command: "written", "refused" or "crash", with its document; a folder before it is gone."""
     shutil.rmtree(out, ignore_errors=True)
     try:
@@ -286,24 +281,16 @@ def folder_difference(out: Path, truth: Truth) -> str:
         return f"folder of another kind: {type(error).__name__}"
 
 
-def answered(error: dict[str, Any], line: Sequence[str], out: Path, truth: Truth, depth: int = 0) -> tuple[bool, bool]:
+def answered(error: dict[str, Any], out: Path, truth: Truth, depth: int = 0) -> tuple[bool, bool]:
     """Is there an answer, and does one lead to the right folder?"""
-    lines = answers(error, line)
+    lines = answers(error)
     for answer in lines:
-        state, document = carried_out(answer, out, truth)
+        state, document = carried_out(answer, out)
         if state == "written" and not folder_difference(out, truth):
             return True, True
-        if state == "refused" and depth < DEPTH_MAX:
-            if answered(document.get("error", {}), answer, out, truth, depth + 1)[1]:
-                return True, True
+        if state == "refused" and depth < DEPTH_MAX and answered(document.get("error", {}), out, truth, depth + 1)[1]:
+            return True, True
     return bool(lines), False
-
-
-def asked(error: dict[str, Any]) -> str:
-    """What is asked, in short: the names of the questions, else the code of the refusal."""
-    questions = [q for q in error.get("questions") or () if isinstance(q, dict)]
-    names = [str(q.get("about") or q.get("name") or q.get("code") or q.get("question")) for q in questions]
-    return ", ".join(dict.fromkeys(names)) or str(error.get("code"))
 
 
 def judge(drawn: Drawn, folder: Path) -> Verdict:
@@ -311,7 +298,7 @@ def judge(drawn: Drawn, folder: Path) -> Verdict:
     path, out = folder / drawn.file.name, folder / "out"
     path.write_bytes(drawn.file.data)
     line = ["import", str(path), *drawn.words, "--to", str(out), "--yes", "--json"]
-    state, document = carried_out(line, out, drawn.truth)
+    state, document = carried_out(line, out)
     if state == "crash":
         return Verdict("crash", document.get("error", {}).get("message", "")[:200])
     if state == "written":
@@ -324,6 +311,5 @@ def judge(drawn: Drawn, folder: Path) -> Verdict:
         unlisted = tuple(name for name in drawn.file.heads if " ".join(name.split()) not in named)
         return Verdict("guessed" if drawn.truth.answer == "ask" else "right", unlisted=unlisted)
     error = document.get("error", {})
-    question = asked(error)
-    has, right = answered(error, line, out, drawn.truth)
-    return Verdict("asked" if right else "unanswered" if has else "refused", question=question)
+    has, right = answered(error, out, drawn.truth)
+    return Verdict("asked" if right else "unanswered" if has else "refused", question=str(error.get("code")))
