@@ -198,7 +198,8 @@ def _unit_of_readings(
 ) -> Question:
     """The question of the unit of readings that do not follow commands of a length or an angle 1 to 1."""
     pairs = np.array([(c, v) for c, v in zip(commands, values, strict=True) if v is not None], float)
-    slope = abs(float(np.polyfit(*pairs.T, 1)[0])) if len(np.unique(pairs[:, 0])) > 1 else 1.0
+    c, v = pairs.T
+    slope = abs(float(np.polyfit(c, v, 1)[0])) if len(np.unique(c)) > 1 else 1.0
     usual = {
         "length": ("nm", "um", "1/1000 mm", "1/100 mm", "1/10 mm", "mm", "cm", "thou", "inch", "deg"),
         "angle": ("arcsec", "arcmin", "mrad", "rad", "deg", "gon", "turn", "mm"),

@@ -144,9 +144,9 @@ def headed(found: Rows) -> Rows:
     first = data
     # "n", "v" and "w" are units too, where names stand above them.
     has_units = data > 1 and _all_units(rows[data - 1].cells) and _may_be_names(rows[data - 2].cells, rows[data].cells)
-    above = data - 2 if has_units else data - 1
-    if _may_be_names(rows[above].cells, rows[data].cells):
-        first = above
+    head = data - 2 if has_units else data - 1
+    if _may_be_names(rows[head].cells, rows[data].cells):
+        first = head
         if first and _is_group_row(rows[first - 1].cells, rows[first].cells):
             first -= 1
     if not first:

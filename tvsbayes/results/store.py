@@ -17,8 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from tvsbayes.errors import InputError, Reason, escaped, refusal
 from tvsbayes.files.disk import (
     RESULTS_BYTES_MAX,
@@ -34,6 +32,8 @@ from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
 from tvsbayes.files.packages import version_of
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from tvsbayes.results.records import HasFolder
 
 FIT, DRAWS, POSTERIOR, CHAIN, LOCK = "fit.json", "draws.npz", "posterior.nc", "chain.npz", "fit.lock"
@@ -80,6 +80,9 @@ def write_fit(
     """
     fit, draws = json.dumps(document, indent=1, allow_nan=False).encode(), io.BytesIO()
     tie = {"fit_id": document["fit_id"], "inputs_sha256": json.dumps(document["inputs"])}
+    # Within a command that writes: `--help` loads no array library.
+    import numpy as np
+
     np.savez(draws, allow_pickle=False, **{name: np.asarray(array) for name, array in {**arrays, **tie}.items()})
     make_folder(folder)
     write_together(folder, {DRAWS: draws.getvalue(), POSTERIOR: posterior, FIT: fit})
