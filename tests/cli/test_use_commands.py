@@ -335,6 +335,23 @@ def test_no_output_replaces_the_data_of_a_campaign(ask, tmp_path, command, name)
     assert (tmp_path / name).read_bytes() == b"mine"
 
 
+@pytest.mark.parametrize(
+    "command", [("detect",), ("report",), ("steps-for", "--export", "json", "-o"), ("view", "-o"), ("report", "-o")]
+)
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(ask, folder, tmp_path, monkeypatch, command):
+    """As of another user's folder: nothing is searched, fitted or drawn that could not be kept."""
+
+    def denied(**_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    for work in ("cameras.detection.detect", "report.page.page_html", "view.page.page_html"):
+        monkeypatch.setattr(f"tvsbayes.{work}", lambda *_, **__: pytest.fail("worked"), raising=False)
+    monkeypatch.setattr("tempfile.TemporaryFile", denied)
+    out = [tmp_path / "out.x"] if command[-1] == "-o" else []
+    code, document = ask(command[0], folder, *command[1:], *out)
+    assert (code, document["error"]["code"], document["error"]["found"]) == (2, "write", "Permission denied")
+
+
 @pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("plan",)])
 def test_an_output_without_a_folder_is_refused_before_the_fit(ask, tmp_path, command):
     """Refused before the campaign is read: this one is unreadable."""

@@ -37,6 +37,7 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, Axis, sides_of
 from tvsbayes.instrument.counter_limits import unseen
+from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import OPTICS_NAMES, names_of
 from tvsbayes.statistics.intervals import NORMAL_95
 
@@ -465,7 +466,7 @@ class Calibration(Shown):
         return replace(
             steps,
             xyz_mm=point,
-            aperture_deg=self.reading(point),
+            aperture_deg=None if "aperture_zero_deg" in mechanism_of(self.estimates).fixed else self.reading(point),
             rounding_mm=float(np.linalg.norm(target.xyz_mm - point)),
             u95_mm=self.beam_u95_mm(counters, sides, reach),
         )

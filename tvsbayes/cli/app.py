@@ -15,7 +15,7 @@ import typer
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import styled
 from tvsbayes.errors import InputError, Question, TvsError, escaped, refusal, typed
-from tvsbayes.files.disk import make_folder, write_atomically, write_folder
+from tvsbayes.files.disk import make_folder, require_writable, write_atomically, write_folder
 from tvsbayes.files.own_outputs import require_own
 from tvsbayes.files.packages import own_version
 
@@ -244,6 +244,7 @@ def check_output(out: Path | None, *inputs: Path | None, kind: str = "", force: 
         replaced = "a file that is read" if is_input else "data of the campaign in that folder"
         message = f"-o {name} would replace {replaced}"
         raise InputError("usage", message, found=name, allowed="another file", remedy="name another file")
+    require_writable(out.parent)
     if kind and not force:
         require_own(out, kind)
 

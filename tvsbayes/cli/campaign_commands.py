@@ -14,7 +14,7 @@ from tvsbayes.cli.app import CampaignFolder, Json, Seed, check_order, finish, fi
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
-from tvsbayes.files.disk import output_place, shipped_data, write_atomically, write_folder
+from tvsbayes.files.disk import output_place, require_writable, shipped_data, write_atomically, write_folder
 from tvsbayes.instrument.axes import DIRECTIONS, HOME_APPROACH
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import TARGETS
@@ -155,6 +155,7 @@ def detect(
 
     pictures = output_place(campaign, "results", "overlay") if overlay else None
     data = read_campaign(campaign)
+    require_writable(campaign)
     with waiting() as progress:
         result = find(data, method, speckle_contrast=speckle_contrast, dark=dark, overlay=pictures, progress=progress)
     write_atomically(campaign / "spots.csv", spots_bytes(result.campaign.spots))

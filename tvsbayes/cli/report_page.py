@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tvsbayes.cli.app import finish, print_part, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import TvsError
-from tvsbayes.files.disk import output_place
+from tvsbayes.files.disk import output_place, require_writable
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -90,6 +90,7 @@ def written_page(
     if pdf:
         find_browser()
     path = out or output_place(folder, "results") / "report.html"
+    require_writable(path.parent)
     files = {"report": str(path)}
     with waiting() as progress, Job({**stages, PRINTING: 3.0 if pdf else 0.0}, progress) as job:
         document = make(job)

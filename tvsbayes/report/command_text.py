@@ -360,6 +360,7 @@ def steps_text(steps: Steps) -> str:
     if steps.u95_mm is not None:
         half = ", ".join(map(two_digits, steps.u95_mm))
         lines.append(f"whole steps leave {steps.rounding_mm:.3g} mm; beam there +- ({half}) mm (95 %)")
+    if steps.aperture_deg is not None:
         lines.append(f"the aperture should read {steps.aperture_deg:.3f} deg")
     if steps.u95_deg is not None:
         half = ", ".join(map(two_digits, steps.u95_deg))
