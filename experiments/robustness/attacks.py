@@ -5,7 +5,8 @@
 A run is `acquire --simulate` of the first rows of the mounted rig's shipped plan, a process that may have 1024
 files open. On its live page: idle connections, parallel downloads, requests that must be refused. Memory is that
 of Linux' /proc. Then a run is killed at random moments and resumed, and a killed run's journal is damaged: where the
-run goes on, nothing that was acknowledged may be lost; where it is refused, no file may change.
+run goes on, nothing that was acknowledged may be lost; where it is refused, no file may change. Last (`further`)
+come commands that are killed or do not end, and inputs that could hurt.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from pathlib import Path
 from experiments.common.command_line import print_only
 from experiments.common.rows import ROOT, commit
 from experiments.common.watched import listing
+from experiments.robustness.command_attacks import further
 
 RIG = ROOT / "data" / "rigs" / "mounted"
 COMMAND = (sys.executable, "-c", "from tvsbayes.cli.main import main; main()")
@@ -277,6 +279,7 @@ def main() -> None:
         print("\n## Kills\n", *(f"- {line}" for line in killed(place)), sep="\n")
         print("\n## Damaged journals\n\n| journal | `check` | `acquire --resume` | |\n|---|---|---|---|")
         print(*(damaged(place, what) for what in DAMAGES), sep="\n")
+    further()
 
 
 if __name__ == "__main__":
