@@ -114,14 +114,14 @@ def placed(place: Path) -> list[str]:
     """Place commands that do not end: below a wrapper, and in a flood."""
     plan, alive = place / "slow.csv", place / "alive"
     (place / "stub.sh").write_text(f"#!/bin/sh\ntrap '' TERM\nsleep 400 & echo $! > {alive}\nwait; wait\n")
-    (place / "flood.sh").write_text("#!/bin/sh\nyes AAAAAAAA\n")
+    (place / "flood.sh").write_text(f"#!/bin/sh\nyes AAAAAAAA & echo $! > {alive}\nwait\n")
     lines = []
     for name in ("stub", "flood"):
         (place / f"{name}.sh").chmod(0o755)
         words = ("--simulate", "--centroids", "--place-command", place / f"{name}.sh", "--place-seconds", 2)
         done = said("acquire", RIG / "rig.toml", plan, place / name, *words, folder=place)
         kept = sum(path.stat().st_size for path in (place / name).rglob("*") if path.is_file())
-        words_of = "its process runs on" if name == "stub" and runs(int(alive.read_text())) else "nothing runs on"
+        words_of = "its process runs on" if runs(int(alive.read_text())) else "nothing runs on"
         size = f"{kept / 1e3:.0f} kB in the folder"
         lines.append(f"place command, {name}: exit code {done.returncode}, {words_of}, {size}")
     return lines
