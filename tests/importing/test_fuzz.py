@@ -60,9 +60,9 @@ GUIDES = {
     "calibrated": "Calibration Begins at 2026-01-02 20:00:00\nWest,1,2,3,4,5\n"
     "Calibration guide speeds: RA = 7.5 a-s/s, Dec = 7.5 a-s/s\n" + guide_log(12),
     "normal rates": guide_log(12).replace("RA Guide Speed", "Norm rates RA = 6.2a-s/s @ dec 0\nRA Guide Speed"),
-    "events": guide_log(12).replace("\n5,", "\nINFO: DITHER by 1.0, 2.0\nINFO: Settling started\n5,").replace(
-        "\n8,", "\nINFO: Settling complete\n8,"
-    ),
+    "events": guide_log(12)
+    .replace("\n5,", "\nINFO: DITHER by 1.0, 2.0\nINFO: Settling started\n5,")
+    .replace("\n8,", "\nINFO: Settling complete\n8,"),
 }
 """Short logs of guiders: most edits fall into their headers."""
 

@@ -156,13 +156,11 @@ def in_order(truth: Truth, told: Sequence[Reading]) -> str:
             pairs.append((expected, reading))
         if len(pairs) < truth.kept:
             return "readings: fewer than are sound"
-    segment = pairs[0][1].segment
     for expected, reading in pairs:
         # A homing forgets the side.
-        forgotten = truth.segments == "any" and reading.segment != segment and reading.side == 0
+        forgotten = truth.segments == "any" and reading.side == 0
         if wrong := _one(truth, expected._replace(side=0) if forgotten else expected, reading):
             return wrong
-        segment = reading.segment
     if truth.segments == "exact" and truth.kept is None:
         changes = [[b.segment != a.segment for a, b in pairwise(r)] for r in (truth.readings, told)]
         if changes[0] != changes[1]:

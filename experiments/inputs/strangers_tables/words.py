@@ -102,7 +102,7 @@ SIDES = {
         ("adelante", "atrás"),
     ),
     "fr": (("aller", "retour"), ("avant", "arrière"), ("montée", "descente"), ("croissant", "décroissant")),
-    "all": (("+", "-"), ("+1", "-1"), ("↑", "↓"), ("→", "←"), ("1", "-1"), ("[+]", "[-]")),
+    "all": (("+", "-"), ("+1", "-1"), ("↑", "↓"), ("→", "←"), ("1", "-1")),
 }
 """Of commands that rise, and that fall."""
 RUN_SIDES = {
