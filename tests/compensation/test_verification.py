@@ -124,7 +124,7 @@ def test_a_verification_stays_within_the_limits():
     for limits, (low, high) in ((None, (-24.0, 24.0)), ((-20.0, 20.0), (-20.0, 20.0)), ((-20.0, 7.0), (-20.0, 7.0))):
         fit = replace(results().fit, campaign=replace(results().fit.campaign, limits=limits))
         plan = plan_verification(fit, table())
-        rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[2:]]
+        rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[1:]]
         commands = [float(row[1]) for row in rows]
         assert low <= min(commands) and max(commands) <= high and {side for _, side in plan.stops} == {-1, 1}
     narrow = replace(results().fit, campaign=replace(results().fit.campaign, limits=(30.0, 40.0)))
@@ -144,7 +144,7 @@ def test_plan_spreads_its_stops_and_states_whether_they_are_enough():
     plan = plan_verification(results().fit, table())
     assert plan.enough and len(plan.stops) >= 6 and {side for _, side in plan.stops} == {-1, 1}
     assert np.ptp([command for command, _ in plan.stops]) > 30
-    rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[2:]]
+    rows = [line.split(",") for line in plan.plan_bytes().decode().splitlines()[1:]]
     at = [float(row[1]) for row in rows]
     for k, row in enumerate(rows):
         if row[3] == "1":

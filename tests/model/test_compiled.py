@@ -180,7 +180,7 @@ def test_other_code_has_other_traces(traces, tmp_path, monkeypatch):
     (package / "one.py").write_text("x = 2\n")
     subject.sources_of.cache_clear()
     second = Traces(tmp_path).name("key")
-    monkeypatch.setattr(subject, "version", lambda library: "0")
+    monkeypatch.setattr(subject, "version_of", lambda library: "0")
     assert len({name, first, second, Traces(tmp_path).name("key")}) == 4
 
 
