@@ -34,7 +34,7 @@ def test_one_file_keeps_designs_apart(job, quick, tmp_path, mounted_rig, monkeyp
     for other in others:
         assert StudyRows(path).of(other.key) == {}
     # Rows of another release answer another question.
-    monkeypatch.setattr("tvsbayes.studies.study_job.version_of", lambda _package: "0.0.1")
+    monkeypatch.setattr("tvsbayes.studies.study_job.own_version", lambda: "0.0.1")
     assert StudyRows(path).of(replace(job).key) == {}
     assert sorted(StudyRows(path).of(job.key)) == [0, 1, 2]
 

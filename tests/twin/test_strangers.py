@@ -17,7 +17,7 @@ from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12, VECTOR
 from experiments.intervals import strange_bench, strange_optics, strangers
 from experiments.intervals.strange_bench import Bench, bench, true_values
 from experiments.intervals.strange_optics import Gear, Head, turn
-from tvsbayes.inference import stored_posterior
+from tvsbayes import pipeline
 from tvsbayes.instrument.stereo_pair import parse_stereo
 
 SEED, BENCHES = 7, 6
@@ -227,7 +227,7 @@ def test_a_skewed_posterior_is_judged_by_the_probability_below_the_truth(monkeyp
     draws = rng.uniform(0, 12, 4000)
     weights = np.exp(-draws) / np.exp(-draws).sum()
     loaded = SimpleNamespace(weights=weights, by_name={"backlash_deg.pan": draws})
-    monkeypatch.setattr(stored_posterior, "load_posterior", lambda folder, anyway: loaded)
+    monkeypatch.setattr(pipeline, "load_posterior", lambda folder, anyway: loaded)
     truths = rng.exponential(size=400)
     rows = []
     for truth in truths:
