@@ -142,8 +142,8 @@ def test_opencv_pairs(pairs, pairs_calibration):
     assert 82.5 < np.linalg.norm(c.stereo.T) < 84.0
     assert abs(c.triangulated_pitch_mm[0] - 25.0) < 0.1
     assert c.outliers == () == c.excluded == pairs.without_board == pairs.by_fallback
-    # The folder also holds left.jpg and right.jpg, of another size and subject.
-    assert pairs.other_size == ("left.jpg", "right.jpg")
+    # The folder also holds pictures of other sizes and subjects whose names say a camera.
+    assert pairs.other_size == ("aloeL.jpg", "aloeR.jpg", "imageTextR.png", "left.jpg", "right.jpg")
     assert sum("poor coverage" in warning for warning in c.warnings) == 2
 
 
