@@ -1,32 +1,27 @@
-// The page of a run: what it says twice a second, and what may be asked of it. Closing the page changes nothing.
+// The page of a run: what it says twice a second. It shows, the terminal acts.
 
-const KEY = "tvsbayes-key";
+const TOKEN = "tvsbayes-token";
 const POLL_MS = 500;
 const LATE_MS = 3000;
 const GONE_AFTER = 4;
 const WINDOW_PX = 48;
 const DIRECTIONS = ["left", "right", "up", "down"];
-/** What every browser may ask for, whichever controls: as in view/watched.py. */
-const SAFER = ["pause", "laser off"];
-const WAITS = "waits for the next exchange with the device: after a motion, or once the sheet is placed";
-const WORDS = { running: "the run goes on", paused: "PAUSED: laser off, nothing moves until resume or stop", ended: "the run has ended" };
+const WORDS = { running: "the run goes on", ended: "the run has ended" };
 const NOISY = 2;
 
-/** The key of this tab: kept over a reload, else given for the token behind the #. */
-async function keyOf() {
+/** The token of the link behind the #, kept over a reload of this tab. */
+function tokenOf() {
   const token = location.hash.slice(1);
   if (token) {
     history.replaceState(null, "", "/");
-    const answer = await fetch("/key", { method: "POST", body: JSON.stringify({ token }) });
-    if (!answer.ok) throw new Error(await answer.text());
-    sessionStorage.setItem(KEY, (await answer.json()).key);
+    sessionStorage.setItem(TOKEN, token);
   }
-  return sessionStorage.getItem(KEY) ?? "";
+  return sessionStorage.getItem(TOKEN) ?? "";
 }
 
 /** An answer of the page's own server; `how` as of fetch. */
-async function asked(path, key, how = {}) {
-  const answer = await fetch(path, { ...how, headers: { "X-Tvsbayes-Key": key } });
+async function asked(path, token, how = {}) {
+  const answer = await fetch(path, { ...how, headers: { "X-Tvsbayes-Token": token } });
   if (!answer.ok) throw new Error(await answer.text());
   return answer;
 }
@@ -67,27 +62,14 @@ function rows(table, heads, lines) {
 }
 
 class LivePage {
-  constructor(key) {
-    this.key = key;
-    this.shown = { requests: "", estimates: 0, look: null };
-    for (const button of document.querySelectorAll("#buttons button")) {
-      button.addEventListener("click", () => this.ask(button.dataset.what));
-    }
+  constructor(token) {
+    this.token = token;
+    this.shown = { estimates: 0, look: null };
     this.panels = {};
   }
 
-  /** Put a request; what became of it is told with the next snapshots. */
-  async ask(what) {
-    try {
-      await asked("/ask", this.key, { method: "POST", body: JSON.stringify({ what }), signal: AbortSignal.timeout(LATE_MS) });
-      await this.refresh();
-    } catch (error) {
-      by("rights").textContent = `not sent: ${error.message}`;
-    }
-  }
-
   async refresh() {
-    this.latest = await (await asked("/live", this.key, { signal: AbortSignal.timeout(LATE_MS) })).json();
+    this.latest = await (await asked("/live", this.token, { signal: AbortSignal.timeout(LATE_MS) })).json();
     await this.show(this.latest);
   }
 
@@ -110,7 +92,6 @@ class LivePage {
     document.body.dataset.state = "gone";
     by("notes").textContent = "no answer any more: this page no longer shows the run. The terminal knows; Ctrl-C there stops it";
     by("notes").classList.add("refused");
-    for (const button of document.querySelectorAll("#buttons button")) button.disabled = true;
   }
 
   async show(told) {
@@ -118,14 +99,12 @@ class LivePage {
     document.title = `${told.state}: ${told.name} - tvsbayes acquire`;
     const reason = told.state === "ended" ? `: ${told.reason}` : "";
     by("notes").textContent = `${told.simulated ? "simulated; " : ""}${WORDS[told.state]}${reason}`;
-    this.allow(told);
     by("fault").hidden = told.fault === null;
     if (told.fault) {
       const { message, remedy } = told.fault;
       by("fault").textContent = remedy && !message.includes(remedy) ? `${message}; ${remedy}` : message;
     }
     this.showRun(told);
-    this.showRequests(told.requests);
     this.showEstimates(told);
     const remarks = [...told.warnings.map((text) => `warning: ${text}`), ...told.remarks.toReversed()];
     by("remarks").replaceChildren(...(remarks.length ? remarks : ["none"]).map((text) => {
@@ -136,43 +115,19 @@ class LivePage {
     await this.showLook(told);
   }
 
-  /** Which buttons make sense now, and whether this browser may press them. */
-  allow({ state, controls, requests }) {
-    const waits = (what) => requests.some((request) => request.what === what && request.state === "requested");
-    const sensible = { pause: state === "running", resume: state === "paused", stop: state !== "ended", "laser off": state !== "ended" };
-    for (const button of document.querySelectorAll("#buttons button")) {
-      const what = button.dataset.what;
-      button.disabled = !(controls || SAFER.includes(what)) || !sensible[what] || waits(what);
-    }
-    by("rights").textContent = controls ? "this browser controls"
-      : "another browser controls; Pause and Laser off work here too, and control comes here once the other is silent for 10 s";
-    document.body.dataset.controls = controls;
-  }
-
   showRun({ progress, coming, device, state }) {
     if (!progress) return rows(by("facts"), [], [["before the first step"]]);
     by("bar").max = progress.steps;
     by("bar").value = state === "ended" ? Math.max(progress.step, by("bar").value) : progress.step;
-    const light = device ? `${device.status} at pan ${device.pan_steps}, tilt ${device.tilt_steps}, laser ${device.laser_on ? "ON" : "off"}` : "not asked yet";
+    const place = device ? `${device.status} at pan ${device.pan_steps}, tilt ${device.tilt_steps}` : "not asked yet";
     rows(by("facts"), [], [
-      ["now", state === "paused" ? `paused; begun last: ${progress.doing}` : state === "ended" ? "ended" : progress.doing],
+      ["now", state === "ended" ? "ended" : progress.doing],
       ["then", state === "ended" ? "" : coming.join(", ") || "the end of the plan"],
       ["step", `${progress.step} of ${progress.steps}`],
       ["look", `${progress.looks} of ${progress.looks_total}; ${progress.refused} refused, ${progress.retries} repeated`],
       ["time left", state === "ended" ? "" : `about ${time(progress.seconds_left)} by [costs] of the rig file`],
-      ["device", light],
+      ["device", place],
     ].filter(([, text]) => text));
-  }
-
-  showRequests(requests) {
-    const text = JSON.stringify(requests);
-    if (text === this.shown.requests) return;
-    this.shown.requests = text;
-    if (!requests.length) return rows(by("requests"), [], [["nothing yet"]]);
-    rows(by("requests"), ["", "asked for", "", "after", "answer"], requests.toReversed().map((request) => [
-      String(request.number), request.what, [request.state, request.state],
-      request.waited_s === null ? "" : `${request.waited_s.toFixed(2)} s`, request.state === "requested" ? WAITS : request.answer,
-    ]));
   }
 
   showEstimates(told) {
@@ -262,7 +217,7 @@ class LivePage {
   /** A picture as an address of this page; null where a newer look has taken its place. */
   async fetched(path) {
     try {
-      const blob = await (await asked(path, this.key, { signal: AbortSignal.timeout(LATE_MS) })).blob();
+      const blob = await (await asked(path, this.token, { signal: AbortSignal.timeout(LATE_MS) })).blob();
       if (!blob.size) return null;
       return await new Promise((done) => {
         const reader = new FileReader();
@@ -277,9 +232,9 @@ class LivePage {
 
 async function start() {
   try {
-    const key = await keyOf();
-    await asked("/live", key);
-    await new LivePage(key).watch();
+    const token = tokenOf();
+    await asked("/live", token);
+    await new LivePage(token).watch();
   } catch (error) {
     by("notes").textContent = error.message;
     by("notes").classList.add("refused");

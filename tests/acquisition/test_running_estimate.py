@@ -10,7 +10,6 @@ import pytest
 from msgspec import structs
 from support.bench_runs import Run, small_plan
 from support.fits_beside import endless, killed, two_directions, waiting
-from support.live_runs import scripted_run
 from support.small_results import small_summary
 
 from tvsbayes.acquisition import running_estimate
@@ -75,34 +74,20 @@ def test_fits_share_a_process_and_another_takes_over_from_one_that_was_killed(tm
 
 
 @pytest.mark.usefixtures("ctrl_c_works")
-@pytest.mark.parametrize("what", ["laser off", "stop"])
-def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, monkeypatch, what):
-    """Laser off is acknowledged while the fit still works: only then is the fit let go. A stop ends the fit."""
+def test_a_stop_ends_the_fit_that_is_waited_for(mounted_rig, tmp_path, monkeypatch):
     monkeypatch.setattr(running_estimate, "FIT_MAX_S", 60.0)
     os.mkfifo(tmp_path / "go")
-    live, states = scripted_run("resume"), []
-    settle = live.requests.settle
 
-    class Asking(RunningEstimate):
+    class Stopping(RunningEstimate):
         def _arguments(self, looks):
-            if not states:
-                live.ask(what)
+            run.stop.requested = True
             return super()._arguments(looks)
 
-    def settled(request, state, answer):
-        states.append((request.what, state, len(multiprocessing.active_children())))
-        if request.what == "laser off":
-            (tmp_path / "go").write_text("go")
-            (tmp_path / "go").unlink()
-            (tmp_path / "go").write_text("later fits need not wait")
-        return settle(request, state, answer)
-
-    monkeypatch.setattr(live.requests, "settle", settled)
-    with Asking(tmp_path / "c", waiting, None, {"left"}, wait=True) as estimate:
-        outcome = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate, live=live).engine.run()
-        assert len(multiprocessing.active_children()) == (what != "stop"), "a stop ends the fit"
-    assert states[0] == (what, "acknowledged", 1)
-    assert (outcome.reason, outcome.looks) == (("interrupted", 12) if what == "stop" else ("done", 16))
+    with Stopping(tmp_path / "c", waiting, None, {"left"}, wait=True) as estimate:
+        run = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate)
+        outcome = run.engine.run()
+        assert not multiprocessing.active_children()
+    assert (outcome.reason, outcome.looks) == ("interrupted", 12)
 
 
 def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path, monkeypatch):

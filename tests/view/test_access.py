@@ -1,75 +1,28 @@
-"""Access: browsers with the link, from this page alone; one of them controls."""
+"""Access: browsers with the link, from this page alone."""
 
 from __future__ import annotations
 
 import pytest
 
-from tvsbayes.view.access import BROWSERS_MAX, KEY_HEADER, SECURITY_HEADERS, SILENT_S, Access
-
-
-class Clock:
-    """A clock that the test advances, s."""
-
-    def __init__(self):
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
+from tvsbayes.view.access import SECURITY_HEADERS, TOKEN_HEADER, Access
 
 
 @pytest.fixture
-def clock():
-    return Clock()
-
-
-@pytest.fixture
-def access(clock):
-    return Access(4711, clock)
+def access():
+    return Access(4711)
 
 
 def token_of(access: Access) -> str:
     return access.link.partition("#")[2]
 
 
-def carrying(access: Access) -> dict[str, str]:
-    """The headers of a new browser with the link."""
-    return {KEY_HEADER: access.key_for(token_of(access))}
-
-
-def test_every_browser_with_the_token_gets_a_key_of_its_own(access):
+def test_only_the_token_of_the_link_is_known(access):
     token = token_of(access)
     assert access.link == f"http://127.0.0.1:4711/#{token}" and len(token) >= 43
-    for wrong in (token[:-1], "", "ä", "\ud800"):
-        assert access.key_for(wrong) is None
-    first, second = carrying(access), carrying(access)
-    assert len({token, first[KEY_HEADER], second[KEY_HEADER]}) == 3
-    assert access.knows(first) and access.knows(second)
-    assert not any(access.knows(wrong) for wrong in ({KEY_HEADER: token}, {}, {KEY_HEADER: ""}, {KEY_HEADER: "ä"}))
-    assert access.controls(first) and not access.controls(second) and not access.controls({})
-
-
-def test_control_passes_once_who_has_it_is_silent(access, clock):
-    first, second = carrying(access), carrying(access)
-    clock.now_s += 0.6 * SILENT_S
-    assert not access.takes_over(first) and not access.takes_over({}) and not access.takes_over({KEY_HEADER: "x"})
-    clock.now_s += 0.6 * SILENT_S
-    assert not access.takes_over(second) and access.controls(first), "it asked a while ago"
-    clock.now_s += 0.6 * SILENT_S
-    assert access.takes_over(second) and access.controls(second) and not access.controls(first)
-    assert not access.takes_over(second), "once"
-    assert not access.takes_over(first) and access.controls(second), "who comes back watches"
-
-
-def test_keys_are_bounded_and_control_is_not_lost_by_it(access, clock):
-    first, second = carrying(access), carrying(access)
-    for _ in range(BROWSERS_MAX):
-        clock.now_s += 0.001
-        last = carrying(access)
-    assert access.controls(first) and access.knows(last) and not access.knows(second)
-
-
-def test_no_two_pages_share_a_token(access):
-    assert token_of(access) != token_of(Access(4711))
+    assert access.knows({TOKEN_HEADER: token})
+    for wrong in (token[:-1], token + "x", "", "ä", "\ud800", token_of(Access(4711))):
+        assert not access.knows({TOKEN_HEADER: wrong})
+    assert not access.knows({})
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:4711", "localhost:4711"])

@@ -1,4 +1,4 @@
-"""The page of a run in headless Chromium: every button, who may press it, faults, a browser that is killed."""
+"""The page of a run in headless Chromium: what it shows, to whom, faults, a browser that is killed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
 from tvsbayes.errors import DeviceFault
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name, read_campaign
-from tvsbayes.view import access
 from tvsbayes.view.live_server import LivePage
 
 pytestmark = [
@@ -36,7 +35,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.usefixtures("ctrl_c_works"),
 ]
-ENABLED = "[...document.querySelectorAll('#buttons button')].filter((b) => !b.disabled).map((b) => b.id).join()"
 
 
 class Gated(TwinObserver):
@@ -126,7 +124,7 @@ def going(mounted_rig, tmp_path) -> Iterator[Going]:
         try:
             yield going
         finally:
-            live.ask("stop")
+            run.stop.requested = True
             gate.go.set()
             thread.join(SECONDS_MAX)
 
@@ -156,7 +154,7 @@ def wait_for(browsed: Browsed, name: str, part: str) -> None:
 def test_page_shows_the_run_and_requests_no_other_host(going, browsed):
     assert browsed.opened(going.link) == "running"
     assert text(browsed, "name") == "test" and "simulated" in text(browsed, "notes")
-    assert "3 of 8" in text(browsed, "facts") and "laser ON" in text(browsed, "facts")
+    assert "3 of 8" in text(browsed, "facts")
     assert "min by [costs]" in text(browsed, "facts")
     browsed.until("document.querySelectorAll('.camera image').length === 4")
     assert browsed.js("return document.querySelectorAll('#left .trail').length") == 3
@@ -168,110 +166,35 @@ def test_page_shows_the_run_and_requests_no_other_host(going, browsed):
     assert browsed.complaints() == [] and browsed.requested_hosts() == {urlsplit(going.link).netloc}
 
 
-def test_every_button_is_acknowledged_by_the_device(going, browsed, tmp_path):
+def test_only_the_link_opens_the_page(going, browsed):
     assert browsed.opened(going.link) == "running"
-    browsed.until(f"{ENABLED} === 'pause,stop,laser-off'")
-    browsed.click("laser-off")
-    browsed.until("document.querySelectorAll('#requests td.requested').length === 1")
-    browsed.until(f"{ENABLED} === 'pause,stop'")
-    assert going.run.instrument.mechanics.laser_on, "the look still waits"
-    going.gate.go.set()
-    browsed.until("document.querySelectorAll('#requests td.acknowledged').length === 1")
-    assert not going.run.instrument.mechanics.laser_on
-    browsed.until("document.body.dataset.state === 'paused'")
-    assert "laser off" in text(browsed, "facts")
-    browsed.until(f"{ENABLED} === 'resume,stop,laser-off'")
-    going.gate.go.clear(), going.gate.there.clear()
-    going.gate.at = 5
-    browsed.click("resume")
-    assert going.gate.there.wait(SECONDS_MAX)
-    browsed.until("document.body.dataset.state === 'running'")
-    browsed.click("pause")
-    browsed.until("document.querySelectorAll('#requests td.requested').length === 1")
-    going.gate.go.set()
-    browsed.until("document.body.dataset.state === 'paused'")
-    browsed.click("stop")
-    browsed.until("document.body.dataset.state === 'ended'")
-    browsed.until(f"{ENABLED} === ''")
-    assert "interrupted" in text(browsed, "notes")
-    assert going.finish().reason == "interrupted"
-    requests = [r.data["what"] for r in read_journal(tmp_path / "c").records if r.event == "asked"]
-    assert requests == ["laser off", "resume", "pause", "stop"]
-    assert browsed.complaints() == []
-
-
-def test_second_browser_watches_and_may_make_the_run_safer(going, browsed):
-    assert browsed.opened(going.link) == "running"
-    browsed.driver.switch_to.new_window("tab")
-    try:
-        assert browsed.opened(going.link) == "running"
-        wait_for(browsed, "rights", "another browser controls")
-        assert browsed.js(f"return {ENABLED}") == "pause,laser-off"
-        # Nor past its own buttons.
-        code = (
-            "const done = arguments[0]; fetch('/ask', {method: 'POST', body: '{\"what\": \"stop\"}', headers:"
-            " {'X-Tvsbayes-Key': sessionStorage.getItem('tvsbayes-key')}}).then((got) => done(got.status))"
-        )
-        assert browsed.driver.execute_async_script(code) == 403
-        for wrong in (going.link + "x", going.link.partition("#")[0] + "#"):
-            browsed.js("sessionStorage.clear()")
-            assert browsed.opened(wrong) == "refused" and "403" in text(browsed, "notes")
-    finally:
-        browsed.driver.close()
-        browsed.driver.switch_to.window(browsed.driver.window_handles[0])
     browsed.driver.refresh()
-    browsed.until("document.body?.dataset.controls === 'true'")
-    assert going.live.requests.recent() == () and going.finish().ok == 8
-
-
-def test_control_comes_to_who_is_there_once_the_other_browser_is_gone(going, browsed, tmp_path_factory, monkeypatch):
-    """The red button stays within reach; the silence that is waited for is shortened."""
-    monkeypatch.setattr(access, "SILENT_S", 1.5)
-    with browser(tmp_path_factory.mktemp("saved")) as doomed:
-        assert doomed.opened(going.link) == "running"
-        assert browsed.opened(going.link) == "running"
-        wait_for(browsed, "rights", "another browser controls")
-        os.kill(doomed.driver.capabilities["goog:processID"], signal.SIGKILL)
-    browsed.until("document.body?.dataset.controls === 'true'")
-    wait_for(browsed, "requests", "control passed on")
-    assert "Closing this page changes nothing" in browsed.js("return document.querySelector('header').textContent")
+    browsed.until("document.body?.dataset.state === 'running'")
+    for wrong in (going.link + "x", going.link.partition("#")[0] + "#"):
+        browsed.js("sessionStorage.clear()")
+        assert browsed.opened(wrong) == "refused" and "403" in text(browsed, "notes")
     assert going.finish().ok == 8
-    requests = [r.data["what"] for r in read_journal(going.run.engine.journal.folder).records if r.event == "asked"]
-    assert requests == ["control passed on"]
 
 
-def test_another_origin_asks_for_nothing(going, browsed):
-    """Neither with a plain request, nor with a form, nor by a name that leads here."""
+def test_another_origin_reads_nothing(going, browsed):
+    """Neither with a plain request nor by a name that leads here."""
     tried = """
       const [own, done] = [arguments[0], arguments[1]];
-      const asks = (path, how) => fetch(own + path, how).then((got) => got.type, () => "refused");
-      const form = document.createElement("form");
-      const frame = document.createElement("iframe");
-      frame.name = "there";
-      document.body.append(frame, form);
-      Object.assign(form, {action: own + "ask", method: "post", enctype: "text/plain", target: "there"});
-      const field = document.createElement("input");
-      Object.assign(field, {name: '{"what": "stop", "x": "', value: '"}'});
-      form.append(field);
-      frame.onload = () => Promise.all([
-        asks("live", {}), asks("ask", {method: "POST", body: '{"what": "stop"}'}),
-        asks("ask", {method: "POST", body: '{"what": "stop"}', headers: {"X-Tvsbayes-Key": "x"}}),
-      ]).then(done);
-      form.submit();
+      const asks = (how) => fetch(own + "live", how).then((got) => got.type, () => "refused");
+      Promise.all([asks({}), asks({headers: {"X-Tvsbayes-Token": "x"}})]).then(done);
     """
     with foreign_page() as foreign:
         assert browsed.opened(foreign) == "foreign"
         browsed.driver.set_script_timeout(SECONDS_MAX)
         address = going.link.partition("#")[0]
-        assert browsed.driver.execute_async_script(tried, address) == ["refused"] * 3
+        assert browsed.driver.execute_async_script(tried, address) == ["refused"] * 2
         browsed.driver.get(address.replace("127.0.0.1", "localhost."))
         assert "403" in browsed.driver.page_source
     assert browsed.opened(going.link) == "running"
-    assert going.live.requests.recent() == ()
 
 
 def test_browser_that_is_killed_changes_nothing(going, tmp_path_factory, tmp_path):
-    """Its controls are gone with it; the run ends as it would have."""
+    """The run ends as it would have."""
     with browser(tmp_path_factory.mktemp("saved")) as doomed:
         assert doomed.opened(going.link) == "running"
         os.kill(doomed.driver.capabilities["goog:processID"], signal.SIGKILL)
@@ -284,7 +207,7 @@ def test_page_says_when_its_server_is_gone(going, browsed):
     assert browsed.opened(going.link) == "running"
     going.page.end()
     browsed.until("document.body.dataset.state === 'gone'")
-    assert "Ctrl-C" in text(browsed, "notes") and browsed.js(f"return {ENABLED}") == ""
+    assert "Ctrl-C" in text(browsed, "notes")
     assert going.finish().ok == 8
 
 
@@ -328,6 +251,5 @@ def test_nothing_is_cut_off(going, browsed, scheme, width):
         assert browsed.opened(going.link) == "running"
         browsed.until("document.querySelectorAll('#history path[data-name=estimates]').length === 2")
         assert browsed.js("return document.documentElement.scrollWidth") <= width
-        for place in ("figure", "button:not(:disabled)"):
-            ink, ground = browsed.brightness(place)
-            assert (ground > 600 > ink + 150) if scheme == "light" else (ink > 350 > ground + 150)
+        ink, ground = browsed.brightness("figure")
+        assert (ground > 600 > ink + 150) if scheme == "light" else (ink > 350 > ground + 150)

@@ -1,4 +1,4 @@
-"""The page of a run over a real socket: one browser controls, others may make it safer, strangers get nothing."""
+"""The page of a run over a real socket: browsers with the link read, strangers get nothing, nobody acts."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from tvsbayes.acquisition.live_run import LiveRun, SeenLook
 from tvsbayes.errors import InputError
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name, read_campaign
-from tvsbayes.view import access, live_server
-from tvsbayes.view.access import KEY_HEADER, SECURITY_HEADERS
+from tvsbayes.view import live_server
+from tvsbayes.view.access import SECURITY_HEADERS, TOKEN_HEADER
 from tvsbayes.view.live_server import PAGE_FILES, LivePage, connections_max, page_files
 
 
@@ -46,14 +46,13 @@ class Asker:
         finally:
             connection.close()
 
+    @property
     def key(self) -> dict[str, str]:
-        """The header that the next browser with the link sends."""
-        status, content = self.answer("/key", "POST", {"token": self.token})
-        assert status == 200
-        return {KEY_HEADER: json.loads(content)["key"]}
+        """The header that the page sends."""
+        return {TOKEN_HEADER: self.token}
 
-    def now(self, key: dict[str, str]) -> dict:
-        status, content = self.answer("/live", **key)
+    def now(self) -> dict:
+        status, content = self.answer("/live", **self.key)
         assert status == 200
         return json.loads(content)
 
@@ -74,68 +73,27 @@ def asker(live):
         yield Asker(int(address.rpartition(":")[2]), token)
 
 
-def test_first_browser_controls_and_others_make_it_safer(asker, live):
-    first, second = asker.key(), asker.key()
-    assert asker.now(first)["controls"] is True and asker.now(second)["controls"] is False
-    for what in ("stop", "resume"):
-        status, content = asker.answer("/ask", "POST", {"what": what}, **second)
-        assert status == 403 and b"this browser only watches" in content and live.requests.recent() == ()
-    for what in ("pause", "laser off"):
-        assert asker.answer("/ask", "POST", {"what": what}, **second)[0] == 202
-    assert asker.answer("/ask", "POST", {"what": "stop"}, **first)[0] == 202
-    for key in (first, second):
-        assert [one["what"] for one in asker.now(key)["requests"]] == ["pause", "laser off", "stop"]
-
-
-def test_control_passes_on_and_is_written_down(asker, live, monkeypatch):
-    first, second = asker.key(), asker.key()
-    assert asker.now(first)["controls"] and live.requests.recent() == ()
-    # From now on every client without a request at this moment counts as silent.
-    monkeypatch.setattr(access, "SILENT_S", -1.0)
-    assert asker.now(second)["controls"] is True
-    monkeypatch.undo()
-    assert asker.now(first)["controls"] is False
-    assert [request.what for request in live.requests.recent()] == ["control passed on"]
-    assert asker.answer("/ask", "POST", {"what": "stop"}, **second)[0] == 202
-
-
-def test_without_a_key_nothing_is_shown_or_requested(asker, live):
-    for key in ({}, {KEY_HEADER: "x"}, {KEY_HEADER: asker.token}, {KEY_HEADER: ""}):
+def test_without_the_token_nothing_is_shown(asker):
+    for key in ({}, {TOKEN_HEADER: "x"}, {TOKEN_HEADER: asker.token + "x"}, {TOKEN_HEADER: ""}):
         for path in ("/live", "/live/3/left/whole"):
-            assert asker.answer(path, **key)[0] == 403
-        assert asker.answer("/ask", "POST", {"what": "pause"}, **key)[0] == 403
-    assert asker.answer("/key", "POST", {"token": asker.token + "x"})[0] == 403
-    assert live.requests.recent() == ()
+            status, content = asker.answer(path, **key)
+            assert status == 403 and b"open the link" in content
 
 
 @pytest.mark.parametrize(
     "headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Sec_Fetch_Site": "cross-site"}]
 )
-def test_another_page_with_the_key_asks_for_nothing(asker, live, headers):
+def test_another_page_with_the_token_gets_nothing(asker, headers):
     """DNS rebinding, another origin, a form of another site."""
-    key = asker.key()
-    assert asker.answer("/ask", "POST", {"what": "resume"}, **key, **headers)[0] == 403
-    assert asker.answer("/live", **key, **headers)[0] == 403
-    assert live.requests.recent() == ()
+    assert asker.answer("/live", **asker.key, **headers)[0] == 403
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        *(b"", b"{}", b"[]", b"\xff", b"[" * 4000, b'{"what": 1}', b'{"what": []}', b'{"what": "laser on"}'),
-        b'{"what": "control passed on"}',
-    ],
-)
-def test_impossible_requests_are_refused(asker, live, body):
-    assert asker.answer("/ask", "POST", body, **asker.key())[0] == 400
-    assert live.requests.recent() == ()
-
-
-def test_requests_are_posted_only(asker, live):
-    key = asker.key()
-    for method in ("GET", "PUT", "DELETE", "OPTIONS"):
-        assert asker.answer("/ask", method, b"" if method == "PUT" else None, **key)[0] == 405
-    assert live.requests.recent() == ()
+def test_no_request_acts_on_the_run(asker, live):
+    before = live.latest
+    for path in ("/live", "/", "/live/3/left/whole"):
+        for method in ("POST", "PUT", "DELETE", "OPTIONS"):
+            assert asker.answer(path, method, {} if method in ("POST", "PUT") else None, **asker.key)[0] == 405
+    assert live.latest is before
 
 
 @pytest.mark.parametrize(
@@ -146,17 +104,10 @@ def test_requests_are_posted_only(asker, live):
     ],
 )
 def test_no_path_leads_out_of_the_list(asker, path):
-    key = asker.key()
+    key = asker.key
     assert asker.answer(path, **key)[0] == 404
     assert asker.answer("/live/3/left/whole", **key)[1].startswith(b"\xff\xd8")
     assert asker.answer("/live/4/left/whole", **key) == (204, b"")
-
-
-def test_nothing_is_taken_once_the_run_has_ended(asker, live):
-    key = asker.key()
-    live.ended("done")
-    assert asker.answer("/ask", "POST", {"what": "pause"}, **key)[0] == 409
-    assert asker.now(key)["state"] == "ended"
 
 
 def test_files_of_the_page(asker):
@@ -165,21 +116,15 @@ def test_files_of_the_page(asker):
     assert set(page_files()) == set(PAGE_FILES)
 
 
-@pytest.mark.parametrize("body", [b'{"token": "wrong"}', b'{"token": 1}', b"{}", b"[]", b"\xff", b"", b"[" * 4000])
-def test_wrong_token_gets_no_key(asker, body):
-    status, content = asker.answer("/key", "POST", body)
-    assert status == 403 and b"the link is wrong" in content
-
-
 def test_preflight_of_another_origin_is_refused(asker):
-    headers = {"Origin": "http://evil.example", "Access_Control_Request_Headers": KEY_HEADER}
+    headers = {"Origin": "http://evil.example", "Access_Control_Request_Headers": TOKEN_HEADER}
     assert asker.answer("/live", "OPTIONS", **headers)[0] == 403
 
 
 def test_large_request_is_cut_off(asker):
     connection = http.client.HTTPConnection("127.0.0.1", asker.port, timeout=20)
     try:
-        connection.request("POST", "/key", b"x" * 1_000_000)
+        connection.request("POST", "/live", b"x" * 1_000_000)
         status = connection.getresponse().status
     except (ConnectionError, http.client.RemoteDisconnected):
         return
@@ -195,12 +140,12 @@ def test_it_listens_on_this_machine_alone(asker):
 
 def test_idle_connections_neither_pile_up_nor_keep_a_browser_out(asker):
     """Each new one closes the oldest: of twice as many as allowed the first half is closed, and the page answers."""
-    key, most = asker.key(), connections_max()
+    most = connections_max()
     with ExitStack() as stack:
         idle = []
         for _ in range(2 * most):
             idle.append(stack.enter_context(socket.create_connection(("127.0.0.1", asker.port), timeout=20)))
-        assert asker.now(key)["controls"]
+        assert asker.now()["state"] == "running"
         assert [one.recv(1) for one in idle[:most]] == [b""] * most
 
 
@@ -264,7 +209,7 @@ def test_a_reader_that_never_reads_and_one_that_hangs_delay_nothing(mounted_rig,
     with LivePage(live, 0) as page:
         address, _, token = page.link.partition("/#")
         asker = Asker(int(address.rpartition(":")[2]), token)
-        reader = threading.Thread(target=asker.now, args=(asker.key(),))
+        reader = threading.Thread(target=asker.now)
         reader.start()
         assert hanging.wait(60)
         outcome = Run(mounted_rig, tmp_path / "c", live=live).engine.run()

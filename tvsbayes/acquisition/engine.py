@@ -19,9 +19,8 @@ from msgspec import structs
 
 from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.journal import Journal
-from tvsbayes.acquisition.journal_events import Asked, Four, Homed, Looked, Moved, Placed, Start
-from tvsbayes.acquisition.live_control import Control, HeedingPositioner, LightRefused
-from tvsbayes.acquisition.live_run import COMING_MAX, PAUSED, REMARKS_MAX, RUNNING, LiveRun, SeenLook
+from tvsbayes.acquisition.journal_events import Four, Homed, Looked, Moved, Placed, Start
+from tvsbayes.acquisition.live_run import COMING_MAX, REMARKS_MAX, LiveRun, SeenLook
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
 from tvsbayes.acquisition.place_command import PlaceCommand, require_placed
@@ -83,7 +82,7 @@ class Acquisition:
         stop: the stop key, active while `run` runs.
         show: called with the progress.
         estimate: the running estimate; a run that meets its target ends.
-        live: publishes the run and receives requests; by default the run is not shown.
+        live: publishes the run; by default it is not shown.
         place_command: a program that places the sheet before the operator is asked; by default there is none.
     """
 
@@ -106,10 +105,9 @@ class Acquisition:
         self._place_command, self._retries, self._check_depth, self._placement = place_command, 0, False, -1
         self._log = RunLog(journal, rig, bench.utc)
         self._live = live or LiveRun()
-        self._control = Control(self._live.requests, bench.positioner, self._stop, self._write_request, self._publish)
+        self.bench = bench
         if estimate is not None:
-            estimate.meanwhile = self._control.meanwhile
-        self.bench = replace(bench, positioner=HeedingPositioner(bench.positioner, self._control))
+            estimate.meanwhile = self._goes_on
         self._spot = self._log.next_spot()
 
     def run(self) -> Outcome:
@@ -167,7 +165,6 @@ class Acquisition:
         """Follows the plan from a row on, with its changes; returns why it ended."""
         while row < len(self.plan):
             step = self.plan[row]
-            self._control.heed()
             if self._stop.requested:
                 return "interrupted"
             if isinstance(self._estimate, Replanning) and self._minutes(row + 1) > self._estimate.minutes:
@@ -228,6 +225,7 @@ class Acquisition:
         self._log.close_segment(report)
         switches = report.state.pan_steps, report.state.tilt_steps
         state = self.bench.positioner.move_to(*counters)
+        self._live.publish(device=state)
         self.bench.clock.sleep(self._settle_s)
         legs = zip(AXES, counters, switches, strict=True)
         pan, tilt = (_approach(axis, target - start, report.ends_negative) for axis, target, start in legs)
@@ -245,9 +243,9 @@ class Acquisition:
     def _place(self, target: str, placement: int, remark: str, step: int | None) -> None:
         if self._place_command is not None:
             self.bench.positioner.laser(False)
-            event = self._place_command.run(target, self.rig.sheets_mm[target], placement, self._control.meanwhile)
+            event = self._place_command.run(target, self.rig.sheets_mm[target], placement, self._goes_on)
             self._log.write(structs.replace(event, time_s=self._log.now_s()))
-            self._heed_stop()
+            self._require_going()
             require_placed(event)
         if not self.bench.operator.place(target, self.rig.sheets_mm[target], placement, remark):
             raise _Stopped
@@ -257,6 +255,7 @@ class Acquisition:
     def _move(self, pan: int, tilt: int, step: int | None, **entries: Any) -> None:
         self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
         state = self.bench.positioner.move_to(pan, tilt)
+        self._live.publish(device=state)
         self.bench.clock.sleep(self._settle_s)
         counters: dict[str, Any] = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
         entries |= self.bench.annotate()
@@ -306,20 +305,14 @@ class Acquisition:
 
     def _observe(self) -> Observation:
         """Take a look, repeated while no spot is found; the last one counts."""
-        attempt = 0
-        while True:
-            try:
-                observation = self.bench.observer.observe(self.bench.positioner, self._spot)
-            except LightRefused:
-                # Laser off was requested during the look: it is repeated once the run continues.
-                self._heed_stop()
-                continue
-            attempt += 1
+        for attempt in range(1, ATTEMPTS_PER_LOOK + 1):
+            observation = self.bench.observer.observe(self.bench.positioner, self._spot)
             status = observation.spot.status
             if status in ("ok", UNDETECTED) or self._stop.requested or attempt == ATTEMPTS_PER_LOOK:
-                return observation
+                break
             self._retries += 1
             self._live.remarked(f"look {self._spot}: {status}; taken again")
+        return observation
 
     def _misplaced(self, observation: Observation) -> str | None:
         """Why the sheet seems misplaced, judged by the first spot after its placement; None if it does not."""
@@ -373,13 +366,13 @@ class Acquisition:
                 move = record.moves[spot.move]
                 candidates.setdefault((move.pan_steps, move.tilt_steps), spot)
         for (pan, tilt), spot in list(candidates.items())[:REFERENCE_LOOKS]:
-            self._heed_stop()
+            self._require_going()
             self._move(pan, tilt, None, reference=True)
             self._look(None, None, None, reference=spot)
 
     def _retake(self, step: PlanStep) -> None:
         """Repeats a look of the plan that a repair of the journal lost, reached by the same motions."""
-        self._heed_stop()
+        self._require_going()
         self._report(step)
         scene = self._scene(step.step)
         self._put_sheet(scene, "for a look that was lost")
@@ -392,8 +385,10 @@ class Acquisition:
         if scene.target and scene.target != self._log.recorder.state.target:
             self._place(scene.target, scene.placement, remark, None)
 
-    def _heed_stop(self) -> None:
-        self._control.heed()
+    def _goes_on(self) -> bool:
+        return not self._stop.requested
+
+    def _require_going(self) -> None:
         if self._stop.requested:
             raise _Stopped
 
@@ -414,11 +409,8 @@ class Acquisition:
         )
         self._show(progress)
         self._live.estimated(latest)
-        self._live.publish(progress=progress, coming=tuple(map(_step_text, remaining[1 : 1 + COMING_MAX])))
-        self._publish()
-
-    def _write_request(self, event: Asked) -> None:
-        self._log.write(structs.replace(event, time_s=self._log.now_s()))
+        coming = tuple(map(_step_text, remaining[1 : 1 + COMING_MAX]))
+        self._live.publish(progress=progress, coming=coming, warnings=tuple(self._log.warnings[-REMARKS_MAX:]))
 
     def _begin_live(self) -> None:
         """Publishes values that do not change during the run."""
@@ -430,11 +422,6 @@ class Acquisition:
             aim=Aim() if self._estimate is None else self._estimate.aim,
         )
         self._live.begun()
-
-    def _publish(self) -> None:
-        """Publishes device, pause and warnings."""
-        state = PAUSED if self._control.paused else RUNNING
-        self._live.publish(state=state, device=self._control.device, warnings=tuple(self._log.warnings[-REMARKS_MAX:]))
 
 
 def _step_text(step: PlanStep) -> str:

@@ -2,7 +2,7 @@
 
 `created` opens a journal. An `intent` precedes every motion of the plan, and every completed order has an event:
 `homed`, `placed`, `moved`, `looked`. `place_command` is a run of a program that places the sheet. `adapted` changes the
-plan, `confirmed` states whether the posterior meets the target, `asked` is a request from the live page, `verified`
+plan, `confirmed` states whether the posterior meets the target, `asked` (to 0.3.0) is a request of a page, `verified`
 closes a segment, `start` and `stop` enclose a run, `gap` replaces lines lost in a repair. Counters in motor steps, raw
 px, degrees and seconds by suffix; `utc` and `created` are ISO 8601. Fields have the order in which they are written;
 fields that are UNSET by default may be missing.
@@ -191,7 +191,7 @@ class Confirmed(Event, frozen=True):
 
 
 class AskedDevice(Struct, frozen=True):
-    """The device's answer to a request: status, laser, boot id and counters."""
+    """A device's answer to a request: status, laser, boot id and counters."""
 
     status: str
     laser_on: bool
@@ -201,11 +201,7 @@ class AskedDevice(Struct, frozen=True):
 
 
 class Asked(Event, frozen=True, kw_only=True):
-    """A request to a run in progress (pause, resume, stop, laser off), once the device has answered.
-
-    `control passed on`: another browser controls, because the previous one was silent for a while. `number` counts the
-    requests of a run from 1; `time_s` is the time of the device's answer since the campaign was created.
-    """
+    """A request of a page to a run, as journals of releases up to 0.3.0 hold it; nothing follows from it."""
 
     time_s: float | UnsetType = UNSET
     number: int

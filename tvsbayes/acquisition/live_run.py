@@ -1,7 +1,7 @@
-"""A run in progress as its readers see it: the engine publishes snapshots, readers take the latest and send requests.
+"""A run in progress as its readers see it: the engine publishes snapshots, readers take the latest.
 
-Publication is one assignment: slow, many or dead readers cost the engine nothing, and miss unread snapshots. Requests
-return only through the queue of `live_control`. The reader scales pictures down. Snapshots are frozen, and bounded for
+Publication is one assignment: slow, many or dead readers cost the engine nothing, and miss unread snapshots. Nothing
+returns from a reader to the run. The reader scales pictures down. Snapshots are frozen, and bounded for
 a run of any length: the last look with its pictures, the last centres, estimates and remarks. Raw px, counters
 in motor steps, degrees per step, seconds where a name says `_s`.
 """
@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from tvsbayes.acquisition.journal_events import Four
-from tvsbayes.acquisition.live_control import CONTROL_PASSED, REQUESTS, Requests
 from tvsbayes.acquisition.operator import Progress
 from tvsbayes.acquisition.running_estimate import Aim, Estimate
 from tvsbayes.files.images import decode_image, small_picture
@@ -27,7 +26,7 @@ ESTIMATES_MAX = 100
 REMARKS_MAX = 20
 COMING_MAX = 6
 """Number of coming steps of the plan that are shown."""
-RUNNING, PAUSED, ENDED = "running", "paused", "ended"
+RUNNING, ENDED = "running", "ended"
 
 
 @dataclass(frozen=True)
@@ -69,10 +68,10 @@ class Snapshot:
         name: name of the campaign.
         image_px: width and height of the pictures of both cameras.
         simulated: whether the instrument is the twin.
-        state: running, paused or ended.
+        state: running or ended.
         progress: None before the first step.
         coming: the next steps, in words.
-        device: its last state.
+        device: its state after the last motion.
         look: the last look.
         trail: centres of the last looks that count.
         estimates: oldest first.
@@ -139,19 +138,17 @@ KINDS = ("whole", "spot")
 
 
 class LiveRun:
-    """Publishes the snapshots of one run and receives its requests.
+    """Publishes the snapshots of one run.
 
     Args:
         begun: called once when the run begins.
 
     Attributes:
-        requests: requests to the run.
         latest: the newest snapshot; replaced as a whole.
     """
 
     def __init__(self, begun: Callable[[], None] = lambda: None):
         self.begun = begun
-        self.requests = Requests()
         self.latest = Snapshot()
 
     def publish(self, **changes: Any) -> None:
@@ -176,31 +173,14 @@ class LiveRun:
 
     def ended(self, reason: str, error: BaseException | None = None) -> None:
         """Publish the end of the run, with its fault where there was one."""
-        fault, answer = None, "the run has ended, its last order was laser off"
+        fault = None
         if error is not None:
-            # It is unknown whether the last order arrived.
-            answer = "the run has ended in a fault: cut the laser's supply, it may be on"
             code, remedy = getattr(error, "code", type(error).__name__), getattr(error, "remedy", None)
             fault = Fault(str(code), str(error) or str(code), remedy or "")
-        self.requests.close(answer)
         self.publish(state=ENDED, reason=reason, fault=fault)
 
-    def ask(self, what: str) -> bool:
-        """Puts a request in the queue; False once the run has ended.
-
-        Raises:
-            ValueError: not one of `REQUESTS`.
-        """
-        if what not in REQUESTS:
-            raise ValueError(what)
-        return self.requests.ask(what) is not None
-
-    def control_passed(self) -> None:
-        """Another browser controls from now on; the engine logs it like a request."""
-        self.requests.ask(CONTROL_PASSED)
-
     def document(self) -> dict[str, Any]:
-        """The newest snapshot and the requests as a JSON document."""
+        """The newest snapshot as a JSON document."""
         snapshot = self.latest
         fields = asdict(replace(snapshot, look=None, trail=()))
         look = None
@@ -213,7 +193,6 @@ class LiveRun:
             "look": look,
             "trail": [list(centre) for centre in snapshot.trail],
             "temperature": None if agreement is None else asdict(agreement),
-            "requests": [asdict(request) for request in self.requests.recent()],
         }
 
     def picture(self, spot: int, camera: str, kind: str) -> bytes | None:

@@ -17,7 +17,6 @@ from typing import Protocol
 import numpy as np
 
 from tvsbayes.acquisition.journal_events import Four
-from tvsbayes.acquisition.live_control import LightRefused
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import StereoCamera, StereoImage
 from tvsbayes.cameras.contour import epipolar_refused
@@ -109,17 +108,12 @@ class CameraObserver:
         Raises:
             DeviceFault: a camera repeats a picture, or the laser went off during the exposure, stayed on, or was on
                 before.
-            LightRefused: laser off was requested; it is off.
         """
         positioner.laser(False)
         dark = self._grab()
         try:
             positioner.laser(True)
             lit, on = self._lit(positioner, dark)
-        except LightRefused:
-            # The buffers must hold no lit picture when the look is repeated; darkness also proves the laser off.
-            self._wait_for_darkness(dark)
-            raise
         finally:
             positioner.laser(False)
         if not on:

@@ -223,8 +223,6 @@ FAULTS = (
           "test_pictures_of_the_twin"),
     Fault("a laser that was left on stays on in motion", "SerialPositioner.move_to", Never("_lit"),
           "test_a_laser_left_on_is_off_in_motion"),
-    Fault("the live page's laser-off waits for the end of the look", "HeedingPositioner.laser", Never("darken"),
-          "test_laser_off_breaks_off_the_look_which_is_taken_again"),
     Fault("the firmware's guard darkens the laser and replies say light", "Core::darkened", Uncalled("set_laser"),
           "test_replies_say_that_the_guard_has_darkened_the_laser"),
     Fault("the sketch has no watchdog of the processor", "setup", Uncalled("start_watchdog"),
