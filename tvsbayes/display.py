@@ -22,12 +22,16 @@ ROWS = 24
 """Largest number of rows shown of a table; `to_dataframe` returns all."""
 
 
+ROUNDING = 1e-13
+"""Largest relative rounding error of a computed value."""
+
+
 def concise(value: float, sd: float) -> str:
     """Format `0.059394(81)`: two digits of the standard uncertainty in units of the last place (GUM 7.2.2).
 
-    From 1 on the uncertainty keeps its decimal point, as in `21.3(1.5)`.
+    From 1 on the uncertainty keeps its decimal point, as in `21.3(1.5)`. An sd below the rounding of values is none.
     """
-    if not 0 < sd < math.inf:
+    if not ROUNDING * abs(value) < sd < math.inf:
         return f"{value:.6g}"
     # Digits are those of the rounded sd: 0.0996 has the digits 10, not 100.
     mantissa, exponent = f"{sd:.1e}".split("e")

@@ -15,7 +15,7 @@ rig is declared, without knowledge of the mounting, with N(0, 0.005 deg/step) fo
 excludes literal ratios beforehand. Three models are fitted: gears with play and one ratio per axis; ratios per
 direction without play; both. log10 of the Bayes factor = difference of the Laplace evidences of the first two. It is
 called separated beyond 100 to 1, called the other rig with more than 20 to 1 against the truth. Effective ratios are
-those of the model with both, by Laplace with all ways of homing weighed. Campaigns:
+those of the model with both, by Laplace with all homing hypotheses weighed. Campaigns:
 
 * paper, as published: |N| = 200, 24 in each direction, every experiment from a homing at its start counters, ended on
   the right and on the upper side, and the sides NOT recorded;
@@ -67,7 +67,7 @@ NOTES = """\
 True contrasts of the literal rigs: about -2.6 (pan) and +1.1 (tilt) in 1e-3 deg/step, of the others 0. True backlashes
 of the rigs with lost motion: about 0.53 and 0.20 deg, of the others 0. Tilt over pan ratio: 1.000, and about 1.135.
 
-Where the sides are not recorded every way of homing is fitted (each side, or anywhere in the band at every start)
+Where the sides are not recorded every homing hypothesis is fitted (each side, or anywhere in the band at every start)
 and weighed by its evidence. What tells the two apart is where the beam stands after moves both ways, against homings
 that are good to 0.05 deg (the model's fixed value)."""
 
@@ -85,7 +85,7 @@ def forget_sides(campaign: Campaign) -> Campaign:
 
 
 def effective_ratios(joint: JointFit) -> dict[str, list[float]]:
-    """Mode, sd and 95 % interval of the effective ratio of every direction, all ways of homing weighed."""
+    """Mode, sd and 95 % interval of the effective ratio of every direction, all homing hypotheses weighed."""
     rows = summarise(joint).effective if joint.converged else {}
     return {d: [e.value, e.sd, *e.interval95] for d, e in rows.items() if e is not None}
 

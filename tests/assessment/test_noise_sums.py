@@ -32,7 +32,7 @@ def known_sum_of(*parts: str) -> np.ndarray:
         ((LEFT, LOOK), "only the sum of the variances of stop scatter left and look scatter pan is known ("),
         (
             (LEFT, LOOK, NOISE),
-            "the sums of the variances of stop scatter left, look scatter pan and noise / stated are",
+            "the sums of the variances of stop scatter left, look scatter pan and noise, estimated / stated are",
         ),
     ],
 )
@@ -46,7 +46,7 @@ def test_what_is_known_in_a_sum_alone_is_named(parts, text):
 
 def test_noise_and_looks_without_stops_ask_for_no_second_look():
     (weak,) = sum_directions(FREE, known_sum_of(LOOK, NOISE), EVEN)
-    assert "look scatter pan and noise / stated is known" in weak.text and "look twice" not in weak.text
+    assert "look scatter pan and noise, estimated / stated is known" in weak.text and "look twice" not in weak.text
 
 
 def test_what_is_separated_or_fixed_is_not_named():

@@ -1,4 +1,4 @@
-"""Mixture over ways of homing: draws shared or of a way's own, and rounds where the error comes from."""
+"""Mixture over homing hypotheses: draws shared or of a way's own, and rounds where the error comes from."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ class FitOfOneWay:
 
 
 def posterior_of_two_ways() -> Posterior:
-    """Two ways of homing, as probable: of the first the coordinate of every draw is 0, of the second 1."""
+    """Two homing hypotheses, as probable: of the first the coordinate of every draw is 0, of the second 1."""
     campaign, count = small_campaign(), 50
     used = np.ones(len(ordered_spots(campaign)), dtype=bool)
     one, other = (

@@ -68,9 +68,9 @@ def test_scales_known_only_in_their_sum_are_not_set_by_the_data():
     for details in (False, True):
         lines = fit_text(shared, details).splitlines()
         origin = {line.split("  ")[0]: line.split(" ")[-1] for line in lines}
-        assert lines.count(f"set by sum: {text}") == 1
+        assert lines.count(f"not separated: {text}") == 1
         assert origin["stop scatter left, deg"] == origin["look scatter pan, deg"] == "sum"
-        assert origin["stop scatter right, deg"] == origin["noise / stated"] == "data"
+        assert origin["stop scatter right, deg"] == origin["noise, estimated / stated"] == "data"
         assert not any(line.startswith("weak") and text in line for line in lines)
     assert "1 weak direction," in fit_text(shared) and "sum" not in fit_text(summary)
 

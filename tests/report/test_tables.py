@@ -25,6 +25,7 @@ from tvsbayes.report.tables import TableView, chance_text, interval_text, two_di
         (0.2, math.nan, "0.2"),
         (0.2, math.inf, "0.2"),
         (0.0, 1e-12, "0.0000000000000(10)"),
+        (1.1000000000000003, 1.2e-15, "1.1"),
     ],
 )
 def test_concise_shows_two_digits_of_the_uncertainty(value, sd, expected):

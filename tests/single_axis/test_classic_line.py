@@ -7,6 +7,7 @@ import pytest
 from support.axes import campaign, runs
 
 from tvsbayes.metrology.iso230 import figures_of
+from tvsbayes.report.axis_document import classic_text
 from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.classic_line import classic_axis, fit_line, position_runs, positioning_of
@@ -30,6 +31,22 @@ def test_the_line_is_that_of_least_squares():
     classic = classic_axis(rows)
     stated = [classic.per_command, classic.u_per_command, classic.backlash, classic.u_backlash, classic.residual_sd]
     np.testing.assert_allclose(stated, [solved[1], u[1], solved[2], u[2], scatter], rtol=1e-9)
+
+
+def test_as_many_stops_as_unknowns_leave_u_and_scatter_open():
+    """Both sides have three unknowns, one side has two."""
+    commands, values = (0.0, 1.0, 2.0, 1.0), [0.0, 1.0, 2.1, 1.3]
+    moves = [AxisMove(k, 0, 0.0, c, "" if k else "forward") for k, c in enumerate(commands)]
+    for count in (3, 4):
+        line = classic_axis(rows_of(campaign(moves[:count], values[:count])))
+        assert line.degrees_of_freedom == 1 and line.u_per_command > 0 and line.residual_sd > 0
+    turned = [moves[0], moves[1], AxisMove(2, 0, 0.0, 0.5, "")]
+    line = classic_axis(rows_of(campaign(turned, [0.0, 1.0, 0.6])))
+    assert line.per_command == pytest.approx(1.0) and line.backlash == pytest.approx(0.1)
+    assert line.degrees_of_freedom == 0
+    assert line.u_per_command is line.u_backlash is line.residual_sd is None
+    text = classic_text(line, "deg")
+    assert text.startswith("1 deg per command\nbacklash 0.1 deg\n") and "not determined" in text
 
 
 def test_rows_of_one_side_give_zero_reversal():

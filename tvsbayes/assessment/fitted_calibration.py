@@ -112,8 +112,8 @@ def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str, widest_deg: np
 def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: int = 0) -> Calibration:
     """Build the calibration of a fit: from the posterior's draws if converged, else from the Laplace approximation's.
 
-    With several ways of homing, the draws are of all of them; causes and the scales of the gears' errors are those of
-    the most probable one.
+    With several homing hypotheses, the draws are of all of them; causes and the scales of the gears' errors are those
+    of the most probable one.
 
     Args:
         fit: a converged fit.

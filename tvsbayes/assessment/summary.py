@@ -72,14 +72,14 @@ def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws:
 
 
 class LaplaceDraws(NamedTuple):
-    """Draws of the Laplace approximations under all fitted ways of homing; weights (n,) of sum 1."""
+    """Draws of the Laplace approximations under all fitted homing hypotheses; weights (n,) of sum 1."""
 
     draws: Derived
     weights: np.ndarray
 
 
 def draws_of_ways(fit: JointFit) -> LaplaceDraws:
-    """Concatenate the draws of all ways of homing; those of the fit alone where the sides were recorded."""
+    """Concatenate the draws of all homing hypotheses; those of the fit alone where the sides were recorded."""
     parts = [(way.probability, way.fit.draws) for way in fit.mixture if way.fit is not None]
     counts = [len(part.physical) for _, part in parts]
     weights = np.concatenate([np.full(n, p / n) for n, (p, _) in zip(counts, parts, strict=True)])
@@ -136,7 +136,7 @@ def _absent(fit: JointFit) -> set[str]:
 def _parameters(source: _Source) -> dict[str, Estimate]:
     """Estimate the parameters; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps.
 
-    For a mixture of ways of homing they are quantiles of its draws, as for a posterior.
+    For a mixture of homing hypotheses they are quantiles of its draws, as for a posterior.
     """
     fit = source.fit
     low, high = fit.ends95

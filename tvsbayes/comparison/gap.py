@@ -99,7 +99,7 @@ class _Chosen:
         mode_first: whether the first row is the mode; else the estimate is the mean of the draws.
         ratios: effective ratios of all draws, shape (N, 4), deg/step.
         weights: weights of all draws, sum 1, shape (N,).
-        ways: ways of homing of the draws, several where it was not recorded.
+        ways: homing hypotheses of the draws, several where it was not recorded.
     """
 
     z: np.ndarray

@@ -10,12 +10,12 @@ import numpy as np
 from tvsbayes.instrument.homing import ANYWHERE, Sides, every_way, ways
 
 WORTH_A_FIT = 0.02
-"""Least probability of a way of homing in the posterior: one below shifts a mean by at most 1/50 of its difference."""
+"""Least probability of a homing hypothesis: one below shifts a mean by at most 1/50 of its difference."""
 
 
 @dataclass(frozen=True)
 class WeighedWay:
-    """A way of homing, side by axis, and its probability among all ways that were fitted."""
+    """A homing hypothesis, side by axis, and its probability among all ways that were fitted."""
 
     sides: Sides
     probability: float
@@ -27,7 +27,7 @@ def most_fits(axes: Sequence[str]) -> int:
 
 
 def weighed(axes: Sequence[str], evidence: Callable[[Sides], float]) -> tuple[WeighedWay, ...]:
-    """Compute the probabilities of ways of homing, most probable first.
+    """Compute the probabilities of homing hypotheses, most probable first.
 
     Ways of one axis are compared with the other axis' homing left open, then likely ways jointly.
 

@@ -50,9 +50,9 @@ wrong counters, not noise."""
 NEWTON, DIAGNOSING = "Newton steps to the mode", "diagnosing the fit"
 LAST_SECONDS = {NEWTON: 0.8, DIAGNOSING: 0.3}
 """Seconds of the stages after the search, for the progress display."""
-HOMING = "weighing ways of homing"
+HOMING = "weighing homing hypotheses"
 HOMING_SECONDS = 1.5
-"""Seconds of the fit under one way of homing."""
+"""Seconds of the fit under one homing hypothesis."""
 
 
 def fit_stages(robust: bool, moves: Sequence[Move]) -> dict[str, float]:
@@ -63,7 +63,7 @@ def fit_stages(robust: bool, moves: Sequence[Move]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Alternative:
-    """A possible way of homing.
+    """A homing hypothesis.
 
     Attributes:
         sides: side of the homing by axis.
@@ -107,7 +107,7 @@ class JointFit(Shown):
         converged: the mode was reached and is a maximum.
         problems: sentences on what failed; empty when converged.
         sides: sides of unrecorded homings by axis, as this fit assumes them.
-        alternatives: ways of homing considered, this fit's first; empty where the sides were recorded.
+        alternatives: homing hypotheses considered, this fit's first; empty where the sides were recorded.
     """
 
     campaign: Campaign
@@ -186,7 +186,7 @@ class JointFit(Shown):
 
     @property
     def laplace_evidence(self) -> float:
-        """Compute the log evidence of this fit and its way of homing, integrated over the estimated coordinates.
+        """Compute the log evidence of this fit and its homing hypothesis, integrated over the estimated coordinates.
 
         By the Laplace approximation, without `campaign_arrays.spot_constants`.
         """
@@ -195,12 +195,12 @@ class JointFit(Shown):
 
     @property
     def log_evidence(self) -> float:
-        """Compute the log evidence of all ways of homing together."""
+        """Compute the log evidence of all homing hypotheses together."""
         return self.laplace_evidence - float(np.log(self.mixture[0].probability))
 
     @property
     def mixture(self) -> tuple[Alternative, ...]:
-        """Return the components of the posterior, this fit first: only itself, or the fitted ways of homing."""
+        """Return the components of the posterior, this fit first: only itself, or the fitted homing hypotheses."""
         counted = tuple(way for way in self.alternatives if way.fit is not None)
         return counted or (Alternative(self.sides, 1.0, self),)
 
@@ -285,7 +285,7 @@ def fit(
 
 
 def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: int, advance: Advance) -> JointFit:
-    """Fit under each way of homing; return the most probable fit with all alternatives.
+    """Fit under each homing hypothesis; return the most probable fit with all alternatives.
 
     Args:
         first: fit under "anywhere" for every axis.

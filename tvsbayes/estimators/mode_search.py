@@ -43,7 +43,7 @@ SCALE_STEP = 0.3
 NOISE_SETTLED = 0.05
 """Largest change of a noise coordinate (prior sds) at which the alternation stops: half a posterior sd."""
 HOPELESS = 20.0
-"""Loss of log density beyond which a way of homing is negligible and needs no more accurate mode."""
+"""Loss of log density beyond which a homing hypothesis is negligible and needs no more accurate mode."""
 GATE_PROBABILITY = 1e-6
 """Probability that the robust option excludes a clean spot."""
 HUBER_CORE = 0.8214
@@ -257,13 +257,13 @@ class Problem:
         return replace(optimum, covariance=covariance)
 
     def mode_beside(self, known: Mode) -> Mode:
-        """Find the mode from that of another way of homing, usually near, at fixed scales of repeating errors."""
+        """Find the mode from that of another homing hypothesis, usually near, at fixed scales of repeating errors."""
         optimum = neighbouring_mode(self.negative_log_density, known, self.free & ~self.repeated)
         if optimum is not None:
             return optimum
         z = self.alternate(known.z.copy())
         value = float(self.negative_log_density(z[None])[0])
-        # With so low a density the last Newton steps do not matter: the way of homing has no weight.
+        # With so low a density the last Newton steps do not matter: the homing hypothesis has no weight.
         if not value < known.negative_log_density + HOPELESS:
             return Mode(z, known.covariance, value, ())
         return self.mode(z)

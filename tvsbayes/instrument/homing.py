@@ -36,7 +36,7 @@ def has_play(priors: Mapping[str, Prior], axis: str) -> bool:
 
 
 def ways(axis: str) -> dict[str, float]:
-    """Possible ways of homing of an axis, with their prior probabilities."""
+    """Homing hypotheses of an axis, with their prior probabilities."""
     return {**dict.fromkeys(reversed(SIDES[axis]), ONE_SIDED_CHANCE), ANYWHERE: 1 - 2 * ONE_SIDED_CHANCE}
 
 

@@ -85,8 +85,8 @@ class Posterior(Shown):
         convergence: the diagnosis.
         seed: seed of all random numbers.
         seconds: time spent sampling, earlier runs of a resumed chain included.
-        way: index in `JointFit.mixture` of each draw's way of homing, shape (chain, draw); None where all draws are of
-            `fit`.
+        way: index in `JointFit.mixture` of each draw's homing hypothesis, shape (chain, draw); None where all draws are
+            of `fit`.
     """
 
     fit: JointFit

@@ -1,4 +1,4 @@
-"""The posterior over unrecorded ways of homing: weighted draws under each, mixed by evidence and prior probability.
+"""The posterior over unrecorded homing hypotheses: weighted draws under each, mixed by evidence and prior probability.
 
 The draws of the most probable way usually serve the others, weighed anew under each: their posteriors overlap. A way
 for which they do not serve has draws of its own. Rounds go where the error of the mixture comes from.
@@ -42,7 +42,7 @@ MARGIN = 1.1
 
 @dataclass(frozen=True)
 class WayDraws:
-    """Weighted draws under one way of homing.
+    """Weighted draws under one homing hypothesis.
 
     Attributes:
         target: its density.
@@ -96,7 +96,7 @@ class WayDraws:
 
 
 def _weighed_anew(target: Target, pool: Pool, first: Pool, seed: int, way: int) -> Pool:
-    """Extend a pool by the next round of `first`, under another way of homing, of this number."""
+    """Extend a pool by the next round of `first`, under another homing hypothesis, of this number."""
     begin, before = sum(pool.counts), target.invalid
     subset = first.drawn.taken(slice(begin, begin + ROUND))
     mapped = Mapped(subset.parts["z"], subset.parts["log_jacobian"])
@@ -113,7 +113,7 @@ def _weighed_anew(target: Target, pool: Pool, first: Pool, seed: int, way: int) 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Weighted draws under several ways of homing.
+    """Weighted draws under several homing hypotheses.
 
     Attributes:
         ways: the draws; those of the first may be shared by others.
@@ -234,7 +234,7 @@ class Mixture:
         return Mixture((*self.ways[:place], way, *self.ways[place + 1 :]), self.left - drawn)
 
     def _alone(self, way: WayDraws, place: int) -> WayDraws:
-        """Draw from another way of homing itself, by its own map and the proposal fitted for the most probable way."""
+        """Draw from another homing hypothesis, by its own map and the proposal fitted for the most probable one."""
         first = self.ways[0]
         target = Target(way.target.fit, transport_beside(way.target.fit, first.target.path))
         # Numbers of its own: the same ones in the proposal of the first way would tie the draws of both.
@@ -259,7 +259,7 @@ class Mixture:
 
 
 def homing_mixture(run: ImportanceRun[Target]) -> Posterior:
-    """Compute the posterior over all ways of homing of a fit, from the draws of the most probable one."""
+    """Compute the posterior over all homing hypotheses of a fit, from the draws of the most probable one."""
     began = time.monotonic()
     shared = [
         WayDraws(
@@ -278,7 +278,7 @@ def homing_mixture(run: ImportanceRun[Target]) -> Posterior:
 
 
 def mixed(parts: Sequence[Posterior], probabilities: np.ndarray) -> Posterior:
-    """Mix the posteriors under several ways of homing; the diagnosis stays that of the first.
+    """Mix the posteriors under several homing hypotheses; the diagnosis stays that of the first.
 
     Args:
         parts: posteriors by importance sampling, in the order of `JointFit.mixture`.

@@ -147,14 +147,14 @@ def move_log_density(
 
 @dataclass(frozen=True)
 class OneWay:
-    """A way of homing: the fit under it, and the rows of its draws, shape (n,)."""
+    """A homing hypothesis: the fit under it, and the rows of its draws, shape (n,)."""
 
     fit: JointFit
     rows: np.ndarray
 
 
 def ways_of(posterior: Posterior, places: np.ndarray) -> tuple[OneWay, ...]:
-    """Group draws at indices (n,) of a posterior by their way of homing."""
+    """Group draws at indices (n,) of a posterior by their homing hypothesis."""
     if posterior.way is None:
         return (OneWay(posterior.fit, np.arange(len(places))),)
     own = posterior.way.ravel()[places]
@@ -164,10 +164,10 @@ def ways_of(posterior: Posterior, places: np.ndarray) -> tuple[OneWay, ...]:
 
 
 def by_way(ways: Sequence[OneWay], function: Callable[[JointFit, np.ndarray], np.ndarray]) -> np.ndarray:
-    """Evaluate a function of draws, each by the fit under its way of homing.
+    """Evaluate a function of draws, each by the fit under its homing hypothesis.
 
     Args:
-        ways: ways of homing of the draws.
+        ways: homing hypotheses of the draws.
         function: function of a fit and the rows of its draws, which returns a row for each.
     """
     values = np.concatenate([function(way.fit, way.rows) for way in ways])

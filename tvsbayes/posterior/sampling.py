@@ -102,5 +102,5 @@ def sample(
         convergence = walked.convergence
         assert isinstance(convergence, Convergence)
         agrees = convergence.agreement is None or convergence.agreement.agrees
-        # A chain has one way of homing only; where others have weight, the weighted draws of all are the result.
+        # A chain has one homing hypothesis only; where others have weight, the weighted draws of all are the result.
         return early if len(early.fit.mixture) > 1 and walked.converged and agrees else better(early, walked)

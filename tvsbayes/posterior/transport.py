@@ -514,7 +514,7 @@ def transport(fit: JointFit) -> Transport:
 
 
 def transport_beside(fit: JointFit, path: Transport) -> Transport:
-    """Build the map of another way of homing, with order, centring and curvature of a known map.
+    """Build the map of another homing hypothesis, with order, centring and curvature of a known map.
 
     A proposal fitted in w there is valid here, and no second differences are needed.
     """

@@ -114,7 +114,7 @@ def ratio_table(summary: AxisSummary) -> TableView:
     line = f"line from {low:.10g} to {high:.10g}"
     rows += [_row(_of_side(line, side, sides), summary.effective_per_command[side]) for side in sides]
     classic = summary.classic
-    rows.append(["classic: least-squares line", concise(classic.per_command, classic.u_per_command), ""])
+    rows.append(["classic: least-squares line", concise(classic.per_command, classic.u_per_command or 0.0), ""])
     return TableView(f"{unit} per command, value(u)", ["", "value(u)", "95 % interval"], rows)
 
 
@@ -209,17 +209,25 @@ def iso230_table(classic: ClassicAxis, unit: str) -> TableView | None:
     return TableView(caption, ["", "value"], rows)
 
 
+def _scatter(classic: ClassicAxis, unit: str) -> str:
+    """Scatter about the line; where no degree of freedom is left, what is not determined."""
+    if classic.residual_sd is None:
+        unknowns = "offset, unit per command" + ", backlash" * (classic.backlash is not None)
+        return f"their u and the scatter are not determined: as many stops as unknowns ({unknowns}); read more stops"
+    return f"scatter about the line {two_digits(classic.residual_sd)} {unit}"
+
+
 def classic_text(classic: ClassicAxis, unit: str) -> str:
     """The classic estimate of an axis as text."""
     unit_text = escaped(unit)
     play = None
-    if classic.backlash is not None and classic.u_backlash is not None:
-        play = f"backlash {concise(classic.backlash, classic.u_backlash)} {unit_text}"
+    if classic.backlash is not None:
+        play = f"backlash {concise(classic.backlash, classic.u_backlash or 0.0)} {unit_text}"
     table = iso230_table(classic, unit)
     return terminal(
-        f"{concise(classic.per_command, classic.u_per_command)} {unit_text} per command",
+        f"{concise(classic.per_command, classic.u_per_command or 0.0)} {unit_text} per command",
         play,
-        f"scatter about the line {two_digits(classic.residual_sd)} {unit_text}; stops taken as independent",
+        f"{_scatter(classic, unit_text)}; stops taken as independent",
         None if table is None else "",
         table,
     )
@@ -382,8 +390,8 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
     """Sections in the order of the page; `figures` are those after the first page."""
     summary, campaign = results.summary, results.fit.campaign
     unit, classic, waves = summary.unit, summary.classic, period_table(summary)
-    line = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
-    line += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
+    line = f"Least-squares line: {concise(classic.per_command, classic.u_per_command or 0.0)} {unit} per command, "
+    line += f"stops independent; {_scatter(classic, unit)}."
     parameters = [ratio_table(summary) if waves else None, parameter_table(summary)]
     result_texts = [sentence(text) for text in (result_lines(summary) if summary.explained else ())]
     deviations = [deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None]

@@ -63,7 +63,7 @@ def fit_text(
     if summary.few_stops:
         lines.append(few_stops_line(summary.few_stops, summary.estimator))
     lines += homing_lines(summary)
-    lines += [f"set by sum: {weak.text}" for weak in summary.weak_directions if weak.of_sums]
+    lines += [f"not separated: {weak.text}" for weak in summary.weak_directions if weak.of_sums]
     lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
     if summary.excluded_spots:
         lines.append(f"excluded {summary.looks}: {', '.join(map(str, summary.excluded_spots))}")

@@ -33,7 +33,7 @@ from tvsbayes.report.uncertainty_sections import uncertainty_sections
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
-NO_CLASSIC = "cannot see it"
+NO_CLASSIC = "not estimated"
 ASYMMETRY_MAX = 1.5
 """Largest ratio of the distances of an interval's ends from the value for which half the interval is stated as U."""
 CAUSES_LISTED = 3

@@ -61,7 +61,7 @@ class MonteCarloError:
 class Importance:
     """Diagnosis of importance sampling: its draws and their weights.
 
-    Where homings are not recorded, the limits are those of the mixture of all ways of homing, with the largest tail
+    Where homings are not recorded, the limits are those of the mixture of all homing hypotheses, with the largest tail
     index of the ways that count; numbers of draws and evidence are those of the way that is most probable by Laplace.
 
     Attributes:

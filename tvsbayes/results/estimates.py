@@ -307,7 +307,7 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
         contrasts: effective left - right and up - down, deg/step.
         local: gear ratio times the slope of the mirrors at the reference pose, without transmission error; deg/step.
         range_steps: lowest and highest counter of each axis in the looks used: the range of the effective ratios.
-        homing_side: probability of each way of homing, for an axis without recorded homing sides.
+        homing_side: probability of each homing hypothesis, for an axis without recorded homing sides.
         reference_pose_deg: mean mirror angles, pan and tilt, of the looks used.
         jacobian: d(azimuth, elevation)/d(pan, tilt) at that pose.
         parameters: every estimated or derived parameter by its name.

@@ -116,7 +116,7 @@ def mode_of(arrays: Mapping[str, np.ndarray], spots: int) -> StoredMode | None:
             raise ValueError("a mode that is not finite")
         sides = tuple(map(str, arrays["mode_sides"].tolist())) if "mode_sides" in arrays else ("", "")
         if any(side not in ("", ANYWHERE, *SENSES[axis]) for axis, side in zip(AXES, sides, strict=True)):
-            raise ValueError("a way of homing that there is not")
+            raise ValueError("a homing hypothesis that there is not")
     except (KeyError, TypeError, ValueError) as error:
         raise damaged_draws(error) from error
     return StoredMode(names, log_density=float(numbers.pop("log_density")), sides=sides, **numbers)

@@ -18,18 +18,20 @@ class ClassicAxis(Shown, Record, frozen=True):
 
     Attributes:
         per_command: slope of the line.
-        u_per_command: its standard error.
-        backlash, u_backlash: reversal and its standard error; None where stops were reached from one side only.
-        residual_sd: scatter of the rows about the line.
+        backlash: reversal; None where stops were reached from one side only.
+        u_per_command, u_backlash: standard errors; None where no degree of freedom is left.
+        residual_sd: scatter of the rows about the line; None likewise.
         iso230: figures by name; None where positions were not read twice from both sides.
+        degrees_of_freedom: rows less unknowns of the line; None in results of 0.3.0.
     """
 
     per_command: float
-    u_per_command: float
+    u_per_command: float | None
     backlash: float | None
     u_backlash: float | None
-    residual_sd: float
+    residual_sd: float | None
     iso230: dict[str, float] | None
+    degrees_of_freedom: int | None = None
 
     def shown(self) -> View:
         """Show slope, backlash, scatter and ISO 230-2 figures."""
@@ -50,11 +52,13 @@ class LineFit:
         solution: offset, unit per command, backlash; undetermined values are 0.
         covariance: shape (3, 3); 0 for undetermined values.
         scatter: scatter of the rows about the line, unit.
+        freedom: degrees of freedom; with none, scatter and covariance are 0 and say nothing.
     """
 
     solution: np.ndarray
     covariance: np.ndarray
     scatter: float
+    freedom: int
 
 
 def fit_line(rows: AxisRows, included: np.ndarray | None = None) -> LineFit:
@@ -64,24 +68,27 @@ def fit_line(rows: AxisRows, included: np.ndarray | None = None) -> LineFit:
     design = line_design(rows)[used][:, determined]
     solution, covariance = np.zeros(3), np.zeros((3, 3))
     solution[determined] = np.linalg.lstsq(design, rows.value[used], rcond=None)[0]
-    freedom = max(int(used.sum()) - int(determined.sum()), 1)
-    scatter = float(np.sqrt(np.sum((rows.value[used] - design @ solution[determined]) ** 2) / freedom))
+    freedom = max(int(used.sum()) - int(determined.sum()), 0)
+    square = float(np.sum((rows.value[used] - design @ solution[determined]) ** 2))
+    # Without freedom the residuals are rounding errors.
+    scatter = float(np.sqrt(square / freedom)) if freedom else 0.0
     covariance[np.ix_(determined, determined)] = scatter**2 * np.linalg.pinv(design.T @ design)
-    return LineFit(solution, covariance, scatter)
+    return LineFit(solution, covariance, scatter, freedom)
 
 
 def classic_axis(rows: AxisRows) -> ClassicAxis:
     """Compute the least-squares line with a reversal, and the ISO 230-2 figures."""
     line = fit_line(rows)
-    u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0))
+    u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0)).tolist() if line.freedom else [None] * 3
     has_backlash = rows.both_sides
     return ClassicAxis(
         per_command=float(line.solution[1]),
-        u_per_command=float(u[1]),
+        u_per_command=u[1],
         backlash=float(line.solution[2]) if has_backlash else None,
-        u_backlash=float(u[2]) if has_backlash else None,
-        residual_sd=line.scatter,
+        u_backlash=u[2] if has_backlash else None,
+        residual_sd=line.scatter if line.freedom else None,
         iso230=iso230_figures(rows),
+        degrees_of_freedom=line.freedom,
     )
 
 

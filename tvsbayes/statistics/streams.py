@@ -34,7 +34,7 @@ class Stream(IntEnum):
     WATCHED_CHANGES = 15
     """Directions of the changes that looks of `plan --watch` should detect."""
     OTHER_HOMING = 16
-    """Errors of the gears at places, for draws weighted under another way of homing."""
+    """Errors of the gears at places, for draws weighted under another homing hypothesis."""
     HELD_OUT = 17
     """Looks predicted for held-out experiments, fold by fold."""
     PROMISE = 22

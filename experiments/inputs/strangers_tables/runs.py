@@ -109,7 +109,7 @@ def grouped_runs(rng: np.random.Generator, language: str) -> Drawn:
 
 
 def turning_runs(rng: np.random.Generator, language: str) -> Drawn:
-    """CW 1, CCW 1 ...: which of them rises is told by the order of the columns alone, the first rising."""
+    """CW 1, CCW 1 ...: which of them rises follows from the order of the columns alone, the first rising."""
     axis = draw_axis(rng, rotary=True)
     pair, pairs = pick(rng, words.TURNS), int(rng.integers(1, 3))
     names = [f"{word} {k + 1}" for k in range(pairs) for word in pair]
@@ -193,7 +193,7 @@ def deviations(rng: np.random.Generator, language: str) -> Drawn:
     truth = in_positions(runs, errors, unit, answer="ask")
     name, plain = pick(rng, words.DEVIATION[language]), unit not in ("mm", "deg") and chance(rng, 0.3)
     if plain:
-        # That they are deviations is told by their size alone.
+        # That they are deviations follows from their size alone.
         name = names_of(rng, axis, language)[1]
     if chance(rng, 0.5):
         names = [f"{'' if plain else name + ' '}{word} {k + 1}" for k in range(pairs) for word in pair]

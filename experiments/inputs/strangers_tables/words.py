@@ -117,7 +117,7 @@ RUN_SIDES = {
 }
 """The same at the heads of runs side by side."""
 TURNS = (("CW", "CCW"), ("CCW", "CW"), ("clockwise", "counterclockwise"), ("rechts", "links"))
-"""Which of them is rising is told by the order alone."""
+"""Which of them is rising follows from the order alone."""
 RUN = {
     "en": ("Run", "Set", "Trial", "Cycle", "Pass", "Test", "Series"),
     "de": ("Messung", "Lauf", "Reihe", "Messreihe", "Durchgang", "Zyklus"),

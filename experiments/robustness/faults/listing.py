@@ -134,7 +134,7 @@ FAULTS = (
     Fault("rounds of importance sampling of other sizes count the same", "Pool.log_weights",
           Local("share", "0 * value - np.log(len(value))"),
           "test_weights_are_the_target_over_the_mixture_of_all_proposals"),
-    Fault("ways of homing are as probable as their evidence alone", "WayDraws.log_evidence",
+    Fault("homing hypotheses are as probable as their evidence alone", "WayDraws.log_evidence",
           Returns("value - np.log(prior_chance(self.target.fit.sides))"),
           "test_a_way_is_as_probable_as_firmware_homes_that_way"),
     Fault("what is integrated out is drawn from the same numbers for every seed", "Pool.extended",
