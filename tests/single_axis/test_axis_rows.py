@@ -10,7 +10,6 @@ from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.single_axis import axis_rows
 from tvsbayes.single_axis.axis_campaign import DEGREES, AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import legs_are_long, play_places, reversal_of, rows_of, turn_jumps
-from tvsbayes.single_axis.classic_line import iso230_figures
 
 
 def line(commands, k=0.01):
@@ -211,18 +210,3 @@ def test_repeats_at_one_stop_share_its_error():
     assert rows_of(campaign(moves, values, 0.01)).redrawn.tolist() == [True, False, True, False, True]
     # Without a known scatter of readings, the scatter of stops includes it.
     assert rows_of(campaign(moves, values)).redrawn.all()
-
-
-def test_figures_of_the_whole_axis_have_the_terms_of_the_standard():
-    """Keys of `fit.json`, in order; a reversal of 0.2 everywhere without scatter is one without spread."""
-    moves = runs(3)
-    side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
-    values = [0.01 * m.command - 0.1 * s for m, s in zip(moves, side, strict=True)]
-    figures = iso230_figures(rows_of(campaign(moves, values)))
-    assert list(figures) == [
-        *("reversal", "mean_reversal", "repeatability_forward", "repeatability_backward", "repeatability"),
-        *("systematic_forward", "systematic_backward", "systematic", "mean_systematic"),
-        *("accuracy_forward", "accuracy_backward", "accuracy"),
-    ]
-    # Rounding of positions of 20.
-    assert figures["reversal"] == pytest.approx(0.2, abs=1e-9) and figures["repeatability_forward"] < 1e-9

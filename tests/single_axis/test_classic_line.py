@@ -1,16 +1,14 @@
-"""The least-squares line of an axis and its ISO 230-2 table, by hand."""
+"""The least-squares line of an axis, by hand."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from support.axes import campaign, runs
 
-from tvsbayes.metrology.iso230 import figures_of
 from tvsbayes.report.axis_document import classic_text
 from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
-from tvsbayes.single_axis.classic_line import classic_axis, fit_line, position_runs, positioning_of
+from tvsbayes.single_axis.classic_line import classic_axis, fit_line
 
 
 def rows_with(seed: int, places: tuple[float, ...] = (0.0, 500.0, 1400.0), cycles: int = 3) -> AxisRows:
@@ -57,29 +55,4 @@ def test_rows_of_one_side_give_zero_reversal():
     assert not forward.covariance[2].any() and np.all(np.diag(forward.covariance)[:2] > 0)
     moves = [AxisMove(k, 0, 0.0, c, "" if k else "forward") for k, c in enumerate((0.0, 1.0, 2.0, 4.0))]
     alone = classic_axis(rows_of(campaign(moves, [0.0, 1.1, 1.9, 4.0])))
-    assert alone.backlash is alone.u_backlash is alone.iso230 is None
-
-
-def test_runs_are_deviations_from_the_line_by_position_and_side():
-    """Both ends are read from one side; missing runs are NaN."""
-    rows = rows_with(3)
-    left_out = np.zeros(len(rows.value), dtype=bool)
-    left_out[np.flatnonzero((rows.command == 500.0) & (rows.side > 0))[0]] = True
-    rows = rows.without(left_out)
-    off = rows.value - (rows.line.offset + rows.line.slope * rows.command)
-    deviations = position_runs(rows)
-    assert deviations.position.tolist() == [0.0, 500.0, 1400.0]
-    assert deviations.forward.shape == deviations.backward.shape == (3, 3)
-    for row, position in enumerate(deviations.position):
-        for table, side in ((deviations.forward, 1), (deviations.backward, -1)):
-            wanted = off[(rows.command == position) & (rows.side == side)]
-            np.testing.assert_allclose(table[row][~np.isnan(table[row])], wanted, atol=1e-12)
-    assert np.isnan(deviations.forward).sum() == 1 and not np.isnan(deviations.backward).any()
-    figures = positioning_of(rows)
-    assert figures is not None
-    assert figures.accuracy_deg == pytest.approx(figures_of(deviations.forward, deviations.backward).accuracy_deg)
-
-
-def test_two_runs_from_either_side_are_enough_and_one_is_not():
-    assert positioning_of(rows_with(4, cycles=2)) is not None
-    assert positioning_of(rows_with(4, cycles=1)) is None
+    assert alone.backlash is alone.u_backlash is None

@@ -42,6 +42,8 @@ OVERSHOOT_SHARE = 0.05
 """Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
 CONTRARY_MIN = 4
 """Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
+SCALES = ("length", "angle")
+"""Kinds of units in which commands are target positions."""
 STATUS_SHARE = 0.5
 """Share of rows that a status of 0 and 1 may leave out without a question."""
 
@@ -120,8 +122,10 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     readings, wrapped = unwrapped(stops.moves, readings, folder_unit or unit or "deg", wishes.counts_per_turn)
     assumed += wrapped
     shown = Understood(columns, tuple(dict.fromkeys((*known.unused, *runs.unused))))
-    lines = tuple(table_lines(table, shown, FIELDS, shown_units(units, unit, cells)))
-    return AxisRows(stops.moves, readings, unit, tuple(assumed), lines=lines, document=table_document(table, shown))
+    lines, document = table_lines(table, shown, FIELDS, shown_units(units, unit, cells)), table_document(table, shown)
+    of_commands = units["command"]
+    axis = {} if of_commands is None or of_commands.kind not in SCALES else {"command_unit": of_commands.text}
+    return AxisRows(stops.moves, readings, unit, tuple(assumed), axis=axis, lines=tuple(lines), document=document)
 
 
 # --- rows that count -------------------------------------------------------------------------------------------------

@@ -117,6 +117,11 @@ class Unit(NamedTuple):
         return self.scale * self.per_number / (other.scale * other.per_number)
 
     @property
+    def text(self) -> str:
+        """Its name, with the part of it that the numbers count."""
+        return self.name if self.per_number == 1.0 else f"{self.per_number:g} {self.name}"
+
+    @property
     def whole(self) -> Unit:
         """The unit itself, without its parts."""
         return self._replace(per_number=1.0)

@@ -31,6 +31,7 @@ from tvsbayes.report.document import (
     terminal,
 )
 from tvsbayes.report.drawing import DIRECTION_STYLE, drawing, legend
+from tvsbayes.report.iso230_views import iso230_figure, iso230_table, targets_table
 from tvsbayes.report.page import digest_number, numbered
 from tvsbayes.report.position_figures import banded
 from tvsbayes.report.result_tables import WAVE_COLUMNS, WAVES, percent, wave_row
@@ -42,6 +43,7 @@ from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_fit import AxisFit
+from tvsbayes.single_axis.axis_iso230 import target_runs
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
 from tvsbayes.single_axis.axis_record import (
@@ -197,18 +199,6 @@ def deviation_table(deviations: Sequence[PositionDeviation], unit: str, limit: i
     return TableView(caption, ["command", "value(u)", "95 % interval"], rows)
 
 
-def iso230_table(classic: ClassicAxis, unit: str) -> TableView | None:
-    """ISO 230-2-style figures; None where the runs do not allow them."""
-    if classic.iso230 is None:
-        return None
-    rows = [
-        [name.replace("_", " "), two_digits(abs(v)) if v >= 0 else f"-{two_digits(-v)}"]
-        for name, v in classic.iso230.items()
-    ]
-    caption = f"ISO 230-2 figures of the deviations from the least-squares line, {escaped(unit)}"
-    return TableView(caption, ["", "value"], rows)
-
-
 def _scatter(classic: ClassicAxis, unit: str) -> str:
     """Scatter about the line; where no degree of freedom is left, what is not determined."""
     if classic.residual_sd is None:
@@ -229,6 +219,7 @@ def classic_text(classic: ClassicAxis, unit: str) -> str:
         play,
         f"{_scatter(classic, unit_text)}; stops taken as independent",
         None if table is None else "",
+        None if table is None else classic.iso230_basis,
         table,
     )
 
@@ -405,9 +396,19 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
         *([] if is_drive(summary) else [Section("What repeats by position", tables=deviations)]),
         *compensation_sections,
         Section("What the readings do not determine", items=summary.weak_directions or ["No remarks."]),
-        Section("Classic", [line], tables=[iso230_table(classic, unit)]),
+        Section("Classic", [line]),
+        *([] if is_drive(summary) else [iso230_section(results)]),
         Section("Method", METHOD),
     ]
+
+
+def iso230_section(results: AxisResults) -> Section:
+    """The test by ISO 230-2."""
+    classic, unit = results.summary.classic, results.summary.unit
+    runs = target_runs(results.fit.rows).runs
+    figures = [] if runs is None else [iso230_figure(runs, unit)]
+    tables = [iso230_table(classic, unit), targets_table(classic, unit)]
+    return Section("ISO 230-2", [sentence(classic.iso230_basis)], tables=tables, figures=figures)
 
 
 def _play_number(summary: AxisSummary) -> Number:

@@ -38,6 +38,11 @@ def three_digits(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
+def three_digits_fixed(value: float) -> str:
+    """Exactly three significant digits, without an exponent."""
+    return f"{Decimal(f'{value:.2e}'):f}" if math.isfinite(value) and value else f"{value:g}"
+
+
 def signed(value: float, sd: float) -> str:
     """A difference as `concise`, always with its sign."""
     text = concise(value, sd)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tvsbayes.results.records import AxisName, ClosedRecord, EstimatorName, NotNegative
+from tvsbayes.results.records import AxisName, ClosedRecord, Count, EstimatorName, NotNegative, Record
 
 
 class BudgetRow(ClosedRecord, frozen=True):
@@ -111,6 +111,27 @@ class Positioning(ClosedRecord, frozen=True):
     accuracy_up_deg: np.ndarray
     accuracy_down_deg: np.ndarray
     accuracy_deg: np.ndarray
+
+
+class IsoTarget(Record, frozen=True):
+    """A position of a test by ISO 230-2; null where its runs do not give a number.
+
+    Attributes:
+        position: the target, a command.
+        mean_forward, mean_backward: mean deviation of the runs from one side, actual less target.
+        s_forward, s_backward: its standard deviation (n - 1).
+        reversal: B_i, forward less backward, signed.
+        runs_forward, runs_backward: number of runs.
+    """
+
+    position: float
+    mean_forward: float | None
+    s_forward: float | None
+    mean_backward: float | None
+    s_backward: float | None
+    reversal: float | None
+    runs_forward: Count
+    runs_backward: Count
 
 
 class Predicted(ClosedRecord, frozen=True):

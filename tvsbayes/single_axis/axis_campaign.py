@@ -39,6 +39,7 @@ from tvsbayes.single_axis.waves import WavePeriods
 FORMAT = "tvsbayes-axis/1"
 Approach = Literal["forward", "backward", "unknown"]
 """Forward means an increasing command, for either sign of the unit per command."""
+UNIT_CHARS_MAX = 20
 COMMAND_MAX = 1e12
 """Largest absolute command or reading."""
 DEGREES = {
@@ -52,8 +53,8 @@ _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "s
 """Log-normal parameters by which the model divides: the density is undefined where they are fixed at 0."""
 PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that define waves."""
-LIMITS = "limits"
-"""Key of `[axis]`: the commands that a plan may give."""
+LIMITS, COMMAND_UNIT = "limits", "command_unit"
+"""Keys of `[axis]`: the commands that a plan may give; their unit."""
 PERIODS_MAX, RANGES_MAX = 8, 4
 """Largest numbers of stated and of unknown periods; each period adds two sampled coordinates."""
 
@@ -154,6 +155,7 @@ class AxisCampaign(Shown):
         limits: lowest and highest command that a plan may give, as `[axis]` states them; None where it does not.
         path: the folder; None where it was never written.
         absolute: whether the encoder keeps its zero over a homing.
+        command_unit: unit of the commands; None where `[axis]` does not state it.
     """
 
     unit: str
@@ -165,6 +167,7 @@ class AxisCampaign(Shown):
     path: Path | None = None
     absolute: bool = False
     limits: tuple[float, float] | None = None
+    command_unit: str | None = None
 
     @property
     def priors(self) -> dict[str, AxisPrior]:
@@ -271,10 +274,11 @@ def _parse_header(keys: Keys) -> dict[str, object]:
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
     """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and its fixed value."""
-    keys.only((*AXIS_KEYS, *PERIODS, LIMITS, "absolute"))
+    others = ("absolute", LIMITS, COMMAND_UNIT, *PERIODS)
+    keys.only((*AXIS_KEYS, *others))
     stated: dict[str, AxisPrior] = {}
     for name in keys.values:
-        if name in ("absolute", LIMITS, *PERIODS):
+        if name in others:
             continue
         kind = AXIS_KEYS[name].kind
         low = -COMMAND_MAX if kind == "normal" else 0.0
@@ -338,7 +342,7 @@ def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
 def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     keys = parse_toml(files["campaign.toml"], "campaign.toml")
     keys.word("format", (FORMAT,))
-    header, unit = _parse_header(keys), keys.text_value("unit", 20)
+    header, unit = _parse_header(keys), keys.text_value("unit", UNIT_CHARS_MAX)
     if not unit.strip():
         raise keys.refuse("unit", "text", 'the unit of readings, such as "deg" or "mm"', "name it")
     axis = keys.table("axis")
@@ -349,7 +353,9 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
         raise axis.refuse("home_sd", "absolute", allowed, "leave one of them out: no homing sets an absolute zero")
     moves = parse_axis_moves(files["moves.csv"])
     readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
-    return AxisCampaign(unit, moves, readings, stated, header, periods, path, absolute, _parse_limits(axis))
+    command_unit = axis.text_value(COMMAND_UNIT, UNIT_CHARS_MAX) if COMMAND_UNIT in axis else None
+    limits = _parse_limits(axis)
+    return AxisCampaign(unit, moves, readings, stated, header, periods, path, absolute, limits, command_unit)
 
 
 def unit_of_folder(folder: Path) -> str | None:
@@ -404,9 +410,10 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
     """The content of `campaign.toml`."""
     lines = [toml_line("format", FORMAT), toml_line("unit", campaign.unit)]
     lines += [toml_line(key, value) for key, value in campaign.header.items()]
-    # No estimate depends on the limits: they are no part of the hash of the inputs.
-    limits = [] if campaign.limits is None else [toml_line(LIMITS, list(campaign.limits))]
-    return ("\n".join([*lines, "[axis]", *limits, *_axis_table_lines(campaign)]) + "\n").encode()
+    # No estimate depends on them: they are no part of the hash of the inputs.
+    besides = [] if campaign.limits is None else [toml_line(LIMITS, list(campaign.limits))]
+    besides += [] if campaign.command_unit is None else [toml_line(COMMAND_UNIT, campaign.command_unit)]
+    return ("\n".join([*lines, "[axis]", *besides, *_axis_table_lines(campaign)]) + "\n").encode()
 
 
 def axis_bytes(campaign: AxisCampaign) -> dict[str, bytes]:

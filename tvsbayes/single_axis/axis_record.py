@@ -36,6 +36,7 @@ from tvsbayes.single_axis.axis_doubts import axis_warnings
 from tvsbayes.single_axis.axis_fit import AxisFit, conflict_text, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_PARTS, kind_of, prior_sd
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
+from tvsbayes.single_axis.axis_rows import rows_of
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.streams import AxisStream, random_stream
@@ -481,6 +482,8 @@ def results_for(
         if "answer" not in document.values and summary.estimator == "posterior":
             # 0.2.0 had accepted samples only.
             summary = structs.replace(summary, answer="accepted")
+        # Depends on no draw; files of 0.3.0 hold other figures by the same names.
+        summary = structs.replace(summary, classic=classic_axis(rows_of(campaign)))
         origin = read_record(Provenance, document, AGAIN, held=True)
         model = model_of(campaign, more)
         names = model.coordinates.names

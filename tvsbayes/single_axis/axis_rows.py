@@ -79,6 +79,7 @@ class AxisRows:
         width_s: time over which the readings of a row in motion were averaged; 0 at a stop.
         rate: commands per second of a drive at constant rate; None for stops.
         reading_u: u of a typical reading, unit; 0 where no u is known.
+        command_unit: unit of the commands, as the folder states it; None where it does not.
     """
 
     unit: str
@@ -102,6 +103,7 @@ class AxisRows:
     width_s: np.ndarray
     rate: float | None
     reading_u: float
+    command_unit: str | None = None
 
     @property
     def in_motion(self) -> bool:
@@ -275,6 +277,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         width_s=np.zeros(len(moves)),
         rate=None,
         reading_u=float(np.median(stated_u)) if stated_u else 0.0,
+        command_unit=campaign.command_unit,
     )
     return rows if legs_are_long(rows) else _line_with_play(rows)
 
@@ -366,6 +369,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
         width_s=np.sqrt(12.0) * spread,
         rate=rate,
         reading_u=float(np.median(u)),
+        command_unit=campaign.command_unit,
     )
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import field
 
 from tvsbayes.display import Shown, View
-from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
-from tvsbayes.results.metrology_tables import FIGURES, Positioning
+from tvsbayes.results.metrology_tables import IsoTarget
 from tvsbayes.results.records import Record
+from tvsbayes.single_axis.axis_iso230 import AXIS_SYMBOLS, iso_targets, runs_about_line, target_runs
 from tvsbayes.single_axis.axis_rows import AxisRows, line_design
 
 
@@ -21,8 +22,13 @@ class ClassicAxis(Shown, Record, frozen=True):
         backlash: reversal; None where stops were reached from one side only.
         u_per_command, u_backlash: standard errors; None where no degree of freedom is left.
         residual_sd: scatter of the rows about the line; None likewise.
-        iso230: figures by name; None where positions were not read twice from both sides.
+        iso230: figures by name, actual less target; null where commands are no targets. R and A are null with fewer
+            than two runs a side, figures of a side, or of both, where it was not read.
         degrees_of_freedom: rows less unknowns of the line; None in results of 0.3.0.
+        iso230_about_line: the same figures of the deviations from the least-squares line.
+        iso230_targets: the positions of `iso230`.
+        iso230_basis: how targets are known, or why there are no figures.
+        symbols: letters of the standard by the names of the figures.
     """
 
     per_command: float
@@ -30,8 +36,12 @@ class ClassicAxis(Shown, Record, frozen=True):
     backlash: float | None
     u_backlash: float | None
     residual_sd: float | None
-    iso230: dict[str, float] | None
+    iso230: dict[str, float | None] | None
     degrees_of_freedom: int | None = None
+    iso230_about_line: dict[str, float | None] | None = None
+    iso230_targets: tuple[IsoTarget, ...] = ()
+    iso230_basis: str = ""
+    symbols: dict[str, str] = field(default_factory=dict)
 
     def shown(self) -> View:
         """Show slope, backlash, scatter and ISO 230-2 figures."""
@@ -81,56 +91,17 @@ def classic_axis(rows: AxisRows) -> ClassicAxis:
     line = fit_line(rows)
     u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0)).tolist() if line.freedom else [None] * 3
     has_backlash = rows.both_sides
+    (targets, basis), about_line = target_runs(rows), runs_about_line(rows)
     return ClassicAxis(
         per_command=float(line.solution[1]),
         u_per_command=u[1],
         backlash=float(line.solution[2]) if has_backlash else None,
         u_backlash=u[2] if has_backlash else None,
         residual_sd=line.scatter if line.freedom else None,
-        iso230=iso230_figures(rows),
+        iso230=None if targets is None else targets.figures,
         degrees_of_freedom=line.freedom,
+        iso230_about_line=None if about_line is None else about_line.figures,
+        iso230_targets=() if targets is None else iso_targets(targets),
+        iso230_basis=basis,
+        symbols=AXIS_SYMBOLS,
     )
-
-
-@dataclass(frozen=True)
-class PositionRuns:
-    """Positions (m,) read twice from both sides, and the deviations of their readings from the least-squares line.
-
-    `forward` and `backward` have shape (m, runs), NaN where there are fewer runs.
-    """
-
-    position: np.ndarray
-    forward: np.ndarray
-    backward: np.ndarray
-
-
-def position_runs(rows: AxisRows) -> PositionRuns:
-    """The runs for ISO 230-2."""
-    deviations = rows.value - rows.command * rows.line.slope - rows.line.offset
-    by_side = [[deviations[(rows.command == p) & (rows.side == side)] for p in rows.positions] for side in (1, -1)]
-    complete = [k for k in range(len(rows.positions)) if min(len(by_side[0][k]), len(by_side[1][k])) >= RUNS_MIN]
-    tables = []
-    for runs in by_side:
-        table = np.full((len(complete), max((len(runs[k]) for k in complete), default=0)), np.nan)
-        for row, k in enumerate(complete):
-            table[row, : len(runs[k])] = runs[k]
-        tables.append(table)
-    return PositionRuns(rows.positions[complete], *tables)
-
-
-def positioning_of(rows: AxisRows) -> Positioning | None:
-    """ISO 230-2 figures of the deviations from the line; None where no position was read twice from both sides.
-
-    Fields named `_deg` are in the folder's unit; "up" is forward.
-    """
-    runs = position_runs(rows)
-    return figures_of(runs.forward, runs.backward) if len(runs.position) else None
-
-
-def iso230_figures(rows: AxisRows) -> dict[str, float] | None:
-    """ISO 230-2 figures of the axis, by name, in the folder's unit."""
-    positioning = positioning_of(rows)
-    if positioning is None:
-        return None
-    field_of = {name.replace("_up", "_forward").replace("_down", "_backward"): name for name in FIGURES}
-    return {name.removesuffix("_deg"): float(getattr(positioning, field)) for name, field in field_of.items()}

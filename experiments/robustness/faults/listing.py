@@ -181,8 +181,11 @@ FAULTS = (
     Fault("a study's assurance leaves out the fits that failed", "study_result", Keyword("assurance", "hits / n"),
           "test_failures_count_against_the_assurance"),
     # Reports, certificates, exit codes.
-    Fault("ISO 230-2 accuracy is taken with one sd", "figures_of", Local("high_up", "mean_up + sd_up"),
+    Fault("ISO 230-2 accuracy is taken with one sd", "iso230.iso230", Local("high_up", "mean_up + s_up"),
           "test_figures_of_the_published_readings"),
+    Fault("deviations of ISO 230-2 are taken off a line", "position_runs",
+          Argument("deviation", "value - np.polyval(np.polyfit(rows.command, value, 1), rows.command)"),
+          "test_figures_are_those_of_the_standard"),
     Fault("a certificate states the whole width as expanded uncertainty", "dcc_real", Local("expanded", "2 * value"),
           "test_ratios_stand_with_expanded_uncertainty_and_backlash_with_its_own"),
     Fault("uncertainties are printed twice as large", "display.concise", Argument("sd", "2 * value"),
