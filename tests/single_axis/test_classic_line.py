@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from support.axes import campaign, runs
 
 from tvsbayes.report.axis_document import classic_text
