@@ -32,7 +32,7 @@ from tvsbayes.results.compensation_record import APPLIED, BROKEN, KEPT, OTHER_MA
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
-from tvsbayes.single_axis.predicted_stops import predicted_stops
+from tvsbayes.single_axis.predicted_stops import PredictedAxis
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import AxisTruth, draw_axis
 
@@ -100,10 +100,9 @@ def one_axis(task: tuple[int]) -> dict[str, object]:
             check = verify_readings(results.fit, table, fresh, seed=seed)
             verdicts[world] = [check.verdict, check.world, check.worlds[check.world], check.p]
             if world == APPLIED:
-                which = [r.move for r in fresh.readings]
-                u = np.full(len(which), READ_U)
-                mean, covariance = predicted_stops(results.fit, applied.moved(fresh.moves), which, u).pooled()
-                off = predicted_stops(results.fit, fresh.moves, which, u).pooled().mean - mean
+                machine = PredictedAxis(results.fit)
+                mean, covariance = machine.read(replace(fresh, moves=tuple(applied.moved(fresh.moves)))).pooled()
+                off = machine.read(fresh).pooled().mean - mean
                 verdicts["distance"] = float(np.sqrt(off @ np.linalg.solve(covariance, off)))  # type: ignore[assignment]
         row[name] |= {"verify": verdicts}  # type: ignore[operator]
     return {**row, "seconds": time.perf_counter() - began}

@@ -11,9 +11,9 @@ from support.compensated import driven, results, table, to_and_fro, true_axis
 
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
-from tvsbayes.compensation.promise import Since, compensate, compensation_of
+from tvsbayes.compensation.promise import compensate, compensation_of
 from tvsbayes.errors import InputError, NotConverged
-from tvsbayes.single_axis.axis_campaign import AxisMove
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_record import AxisResults, summarise_axis
 
@@ -73,16 +73,6 @@ def test_nominal_is_what_is_stated_or_one_or_the_fit():
     assert result.table[-1].add_forward - result.table[0].add_forward == pytest.approx(0.32, abs=0.1)
 
 
-def test_time_and_travel_since_homing_are_the_longest_segment():
-    moves = [
-        AxisMove(0, 0, 0.0, 0.0),
-        AxisMove(1, 0, 3600.0, 5.0),
-        AxisMove(2, 1, 9000.0, 0.0),
-        AxisMove(3, 1, 9001.0, 9.0),
-    ]
-    assert Since.of(moves) == Since(1.0, 9.0)
-
-
 @pytest.mark.parametrize(
     ("wish", "message"),
     [
@@ -130,3 +120,38 @@ def test_python_makes_the_file_in_one_call(monkeypatch):
     monkeypatch.setattr("tvsbayes.compensation.promise.results_for", fitted_before)
     result = compensate(replace(results().fit.campaign, header={"serial": "A 7"}), "linuxcnc")
     assert result.machine == "A 7" and "machine: A 7" in result.text and result.text.startswith("-20.0")
+
+
+def growing_screw(seed: int = 1) -> AxisCampaign:
+    """Eleven positions read up and down in five cycles, while the zero grows by 1 um a cycle and it gets warmer."""
+    rng = np.random.default_rng(seed)
+    places = np.linspace(3.2, 401.1, 11)
+    error = 0.008 * np.sin(2 * np.pi * places / 390 + 1.0) + 0.004 * np.cos(2 * np.pi * places / 150)
+    path = [1.0, *[c for _ in range(5) for c in (*places, 403.0, *places[::-1], 1.0)]]
+    moves, readings = [], []
+    for k, command in enumerate(path):
+        moves.append(AxisMove(k, 0, 30.0 * k, command, "" if k else "backward", 20 + 1.5 * (1 - np.exp(-k / 80))))
+        if command in places:
+            play = -0.003 * np.sign(command - path[k - 1])
+            value = command + np.interp(command, places, error) + play + 0.001 * k / 24
+            readings.append(Reading(len(readings), k, value + 0.0004 * float(rng.standard_normal()), 0.0003))
+    return AxisCampaign("mm", tuple(moves), tuple(readings))
+
+
+def test_a_table_is_of_one_state_while_the_zero_grows():
+    """Node k in run k would hold the growth as a saw-tooth of some um over the positions."""
+    fit = fit_axis(growing_screw(), sampled=False)
+    results = AxisResults(structs.replace(summarise_axis(fit), answer="accepted"), fit)
+    made, rows = compensation_of(results, Wish("csv")), fit.rows
+    at = [row for row in made.table if row.command in rows.positions]
+    for side, number in (("forward", 1), ("backward", -1)):
+        means = [rows.value[(rows.command == row.command) & (rows.side == number)].mean() for row in at]
+        off = np.array([getattr(row, side) for row in at]) - means
+        # Means of a cycle hold half a um of growth between both ends, and a fifth of the scatter of stops.
+        assert np.ptp(off) < 1e-3 and np.std(off) < 3e-4
+    for promise in made.promise.values():
+        # One homing: its prior, 0.1 % of the travel, is not in the first figure.
+        assert promise.error95 == promise.shift_free95 < 0.05 < promise.error95_with_homing
+        assert promise.causes["creep"] > 0 and promise.causes["temperature"] > 0 and made.kelvin is not None
+    # Run-up: the play and the scatter of stops.
+    assert 0.006 < made.reversal_command < 0.012

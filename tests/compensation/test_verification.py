@@ -58,19 +58,23 @@ def test_sizes_are_those_of_the_readings():
     assert check.before.rms > 5 * check.after.rms and check.promised95 < 0.1 and check.readings == 12
 
 
-def test_with_one_homing_errors_are_given_without_their_shift_too():
-    """The prior of the next homing then dominates all others; the zero of a dial gauge is reset as well."""
-    new = fresh(3)
-    assert verify_readings(results().fit, table(), new).shift_free is None
-    shifted = replace(new, readings=tuple(replace(reading, value=reading.value + 0.05) for reading in new.readings))
-    check = verify_readings(results().fit, structs.replace(table(), homings=1), shifted)
+def test_with_one_homing_errors_are_less_one_shift():
+    """The prior of the next homing would dominate all others; the zero of a dial gauge is reset as well."""
+    new, once = fresh(3), structs.replace(table(), homings=1)
+    several = verify_readings(results().fit, table(), new)
+    assert several.shift_free is None and several.promised95_with_homing is None
+    shifted = replace(new, readings=tuple(replace(reading, value=reading.value + 0.5) for reading in new.readings))
+    check = verify_readings(results().fit, once, shifted)
     aim = table().offset + np.array([new.moves[r.move].command for r in new.readings])
-    left, promised = check.shift_free.after, check.shift_free.promised95
-    assert left.rms == pytest.approx(np.std([r.value for r in new.readings] - aim)) and left.rms < 0.5 * check.after.rms
-    assert promised < check.promised95
-    assert "but for one shift common to all" in verification_text(check)
-    page = compensation_section(structs.replace(table(), homings=1), check)
-    assert "as within one homing, at most: forward" in page.items[-1]
+    assert check.verdict == KEPT and check.after.rms == pytest.approx(np.std([r.value for r in new.readings] - aim))
+    assert check.shift_free.after == check.after and check.shift_free.promised95 == check.promised95
+    assert check.after_with_homing.rms > 0.4 and check.promised95 < check.promised95_with_homing
+    assert check.promised95_with_homing == pytest.approx(several.promised95)
+    assert verify_readings(results().fit, table(), shifted).verdict == BROKEN
+    text = verification_text(check)
+    assert "but for one shift common to all" in text and "with the error of a homing" in text
+    page = compensation_section(once, check)
+    assert "as within one homing" in page.items[-1]
     assert "one homing" not in " ".join(compensation_section(table(), None).items)
 
 

@@ -1,4 +1,4 @@
-"""Prediction of the readings of further moves, against simulated axes and with the posterior of the fit."""
+"""Predicted readings of an axis: of another campaign, at one state, over a use; by its draws and by cause."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from scipy.special import ndtri
 from support.axes import drawn, runs
 from support.compensated import driven, results, to_and_fro, true_axis
 
+from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
-from tvsbayes.single_axis.predicted_stops import DRAWS, predicted_stops
+from tvsbayes.single_axis.axis_rows import rows_of
+from tvsbayes.single_axis.predicted_stops import DRAWS, PredictedAxis, longest_use
+from tvsbayes.statistics.predicted_readings import State, Use
 
 
 def test_further_readings_agree_with_their_prediction():
     fit = results().fit
     commands, read = to_and_fro(np.linspace(-17.3, 17.3, 6))
-    prediction = predicted_stops(fit, commands, read, np.full(len(read), 0.002))
+    prediction = PredictedAxis(fit).read(driven(true_axis(), commands, read, 0))
     mean, covariance = prediction.pooled()
     squares = []
     for seed in range(20):
@@ -30,7 +33,7 @@ def test_further_readings_agree_with_their_prediction():
 def test_draws_have_the_moments_of_the_mixture_and_its_density():
     fit = results().fit
     commands, read = to_and_fro(np.array([-5.0, 5.0]))
-    prediction = predicted_stops(fit, commands, read, np.full(4, 0.002))
+    prediction = PredictedAxis(fit).read(driven(true_axis(), commands, read, 0))
     mean, covariance = prediction.pooled()
     drawn = prediction.drawn(16000, np.random.default_rng(0))
     sd = np.sqrt(np.diag(covariance))
@@ -49,7 +52,46 @@ def test_the_scatter_of_homings_is_spread_evenly():
     prior, at = once.model.priors["home_sd"], (np.arange(DRAWS) + 0.5) / DRAWS
     of_prior = prior.value * np.exp(prior.u * ndtri(at))
     of_fit = np.sort(known.draws["home_sd"])[(at * len(known.w)).astype(int)]
-    commands, read = to_and_fro(np.array([-5.0, 5.0]))
     for fit, even in ((known, of_fit), (once, of_prior)):
-        scales = predicted_stops(fit, commands, read, np.full(4, 0.002)).scales
-        np.testing.assert_allclose(np.sort(scales["home_sd"]), even, rtol=1e-9)
+        np.testing.assert_allclose(np.sort(PredictedAxis(fit).scales["home_sd"]), even, rtol=1e-9)
+
+
+def test_time_and_travel_since_homing_are_those_of_the_longest_segment():
+    moves = [
+        AxisMove(0, 0, 0.0, 0.0),
+        AxisMove(1, 0, 3600.0, 5.0),
+        AxisMove(2, 1, 9000.0, 0.0),
+        AxisMove(3, 1, 9001.0, 9.0),
+    ]
+    assert longest_use(moves) == (1.0, 9.0)
+
+
+def test_the_parts_of_a_reading_are_those_of_a_whole_campaign():
+    """A run predicted stop by stop, and as expected readings at its states plus what does not repeat."""
+    machine = PredictedAxis(results().fit)
+    commands, read = to_and_fro(np.linspace(-17.3, 17.3, 6))
+    whole = machine.read(driven(true_axis(), commands, read, 0))
+    rows = rows_of(driven(true_axis(), commands, read, 0))
+    use = State(rows.time_s / 3600, rows.path, rows.warm_s / 3600, 0.0)
+    parts = machine.expected(rows.command, rows.side, use)
+    parts = parts.plus(sum(machine.scatter(rows.side, use, 0.002).values()))
+    np.testing.assert_allclose(parts.mean, whole.mean, atol=1e-9)
+    np.testing.assert_allclose(parts.covariance, whole.covariance, atol=1e-12)
+
+
+def test_what_a_state_adds_is_said_by_cause():
+    """Creep and travel: their sum is the change of the expected reading, whatever its place."""
+    machine = PredictedAxis(results().fit)
+    later = State(1.0, 400.0, 2.0, 0.0)
+    command, side = np.array([-3.0, 3.0]), np.array([1, -1])
+    added = machine.expected(command, side, later).mean - machine.expected(command, side).mean
+    shifts = machine.shifts(later, machine.state)
+    assert set(shifts) == {"creep", "travel"}
+    np.testing.assert_allclose(sum(each.mean for each in shifts.values()) * np.ones(2), added, atol=1e-9)
+
+
+def test_states_of_a_use_fill_its_ranges():
+    states = Use(2.0, 50.0, np.array([0.0, 5.0]), (-1.0, 3.0)).states(4, 100, np.random.default_rng(0))
+    assert np.ptp(states.hours) == pytest.approx(1.98) and np.ptp(states.travel) == pytest.approx(49.5)
+    assert np.ptp(states.kelvin) == pytest.approx(3.96) and states.warm_hours.shape == (4, 100)
+    np.testing.assert_allclose(states.warm_hours[1] - states.warm_hours[0], 5.0)

@@ -54,36 +54,3 @@ class Correction:
         legs = legs_of(moves)
         sent = self.sent(legs.command, legs.side, common, play)
         return [replace(move, command=float(to)) for move, to in zip(moves, sent, strict=True)]
-
-
-@dataclass(frozen=True)
-class Cycles:
-    """Runs up and down through some commands, with readings distributed over the runs.
-
-    Attributes:
-        moves: moves in order of time, of one segment.
-        read: numbers of moves with a reading, ascending, shape (r,): every command once from each side.
-        index, side: index of the command, and 1 or -1, of each reading, shape (r,).
-    """
-
-    moves: tuple[AxisMove, ...]
-    read: np.ndarray
-    index: np.ndarray
-    side: np.ndarray
-
-
-def cycles(commands: np.ndarray, run_up: float, hours: float, count: int) -> Cycles:
-    """Build `count` runs up and down through ascending commands, beyond both ends by `run_up`.
-
-    Command k is read in run k modulo count.
-    """
-    m = len(commands)
-    run = [commands[0] - run_up, *commands, commands[-1] + run_up, *commands[::-1]]
-    path = [*run * count]
-    sides = np.tile(np.r_[0, np.ones(m, int), 0, -np.ones(m, int)], count)
-    index = np.tile(np.r_[0, np.arange(m), 0, np.arange(m)[::-1]], count)
-    number = np.repeat(np.arange(count), len(run))
-    read = np.flatnonzero((sides != 0) & (index % count == number))
-    seconds = 3600.0 * hours / (len(path) - 1)
-    moves = tuple(AxisMove(k, 0, k * seconds, float(c), "" if k else "backward") for k, c in enumerate(path))
-    return Cycles(moves, read, index[read], sides[read])

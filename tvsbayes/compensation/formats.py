@@ -58,9 +58,10 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
     ]
     for side, left in made.sides.items():
         before = f"{left.without95:.3g} without"
-        lines.append(f"promise, {side}: 95 % of errors at most {left.error95:.3g} {unit} ({before})")
-        if made.shift_matters and left.shift_free95 is not None:
-            lines[-1] += f"; but for one shift common to all at most {left.shift_free95:.3g}"
+        shift = ", but for one shift common to all," if made.shift_free and not made.in_motion else ""
+        lines.append(f"promise, {side}: 95 % of errors{shift} at most {left.error95:.3g} {unit} ({before})")
+        if made.shift_matters and left.error95_with_homing is not None:
+            lines[-1] += f"; with the next homing, by its prior, {left.error95_with_homing:.3g}"
     if made.in_motion:
         lines.append(f"within {number(made.travel_command, 6)} commands, off the drive's own line, but for one shift")
     else:
@@ -199,7 +200,9 @@ def _urdf_yaml(made: Compensation, origin: Origin) -> str:
             "covariance": [[variances[0], between], [between, variances[1]]],
             "backlash": settings["axis_backlash"],
         },
-        "left_after_applying_95": {side: promise.error95 for side, promise in made.promise.items()},
+        "left_after_applying_95": {
+            side.removeprefix("arriving "): promise.error95 for side, promise in made.sides.items()
+        },
     }
     said = [*_commented(made, origin), f"# axis_corrects: {APPLIED_ONCE}"]
     return "\n".join([*said, yaml.safe_dump(document, sort_keys=False)])

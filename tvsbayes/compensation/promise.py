@@ -1,96 +1,80 @@
 """A two-sided table from a fit in the terms of a format, and the promise: the bound of errors after applying it.
 
-The promise is a prediction of readings, not of means. It includes error by position, play and its variation, scatter of
-stops, homing and drift since then, and the uncertainty of all of them. Limits of the format and rounding by the
-controller are included too. Commands in the campaign's counts, all else in its unit. No JAX.
+The table is of one state, the campaign's mean, for all positions and both sides. The promise is the 95 % quantile of
+single readings over the posterior and over use: time since homing, travel and temperature as in the campaign, the
+limits of the format and rounding by the controller included. Where no second homing was read, or an encoder keeps the
+zero, it is of errors less one common shift, since nothing but a prior tells how homings scatter. Commands in the
+campaign's counts, all else in its unit. No JAX.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from msgspec import structs
 
-from tvsbayes.compensation.correction import Correction, Cycles, cycles
+from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, Origin, Wish, checked, number
 from tvsbayes.compensation.periodic_error import drive_compensation, known_waves, strongest_period
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.files.packages import own_version
 from tvsbayes.progress import Job, Show
-from tvsbayes.results.compensation_record import Compensation, SidePromise, TableRow
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
+from tvsbayes.results.compensation_record import CAUSES, Compensation, SidePromise, TableRow
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis
 from tvsbayes.single_axis.axis_density import line_weights
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
-from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
-from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.single_axis.axis_rows import AxisRows
+from tvsbayes.single_axis.predicted_stops import PredictedAxis
 from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
-from tvsbayes.statistics.predicted_readings import PredictedReadings
+from tvsbayes.statistics.predicted_readings import PredictedMachine, PredictedReadings
 from tvsbayes.statistics.streams import Stream, random_stream
 
 NODES_FEW, NODES_MANY = 13, 41
 """Least and largest number of lines of a table: positions read, and midpoints where these are few."""
 PERIOD_NODES = 129
 """Nodes of a period's table over the range."""
-TRIED = 20
-"""Number of commands at which the promise is evaluated, from each side."""
+TRIED, STATES = 20, 2
+"""Number of commands at which the promise is evaluated, from each side, and of states of use at each."""
 UNIT_COMMANDS = 0.2
 """Largest difference of the ratio from 1 or -1 for commands to count in the unit of readings."""
 ONE_SIDED = "every stop was read from one side: the play is not determined; its prior sets the error on the other side"
-RUNS_MAX = 20
-"""Largest number of runs up and down in a prediction; a longer travel is not predicted."""
 SIDES = (("forward", 1), ("backward", -1))
 
 
 @dataclass(frozen=True)
 class _Expected:
-    """Readings expected at commands (m,): mean and u by side, (2, m) each, forward first; whether both were read."""
+    """Readings expected at commands (m,) at the table's state: mean and variance by side, (2, m) each, forward first."""
 
     command: np.ndarray
     mean: np.ndarray
-    u: np.ndarray
+    variance: np.ndarray
     both_sides: bool
 
 
-def _expected(fit: AxisFit, commands: np.ndarray, run_up: float, since: Since, seed: int) -> _Expected:
-    """Predict readings at the table's commands, without the noise of a reading."""
-    run = since.cycles(commands, run_up)
-    mean, covariance = _predicted(fit, run, None, 0.0, seed).pooled()
-    order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
-    u = np.sqrt(np.diag(covariance))
-    return _Expected(commands, np.array([mean[o] for o in order]), np.array([u[o] for o in order]), fit.rows.both_sides)
+def _expected(machine: PredictedMachine, commands: np.ndarray, both_sides: bool) -> _Expected:
+    mean, covariance = machine.expected(np.tile(commands, 2), np.repeat([1, -1], len(commands))).pooled()
+    return _Expected(commands, mean.reshape(2, -1), np.diag(covariance).reshape(2, -1), both_sides)
 
 
-@dataclass(frozen=True)
-class Since:
-    """Use of a machine between two homings: hours, and commands travelled."""
+def _run_up(machine: PredictedMachine, commands: np.ndarray, fitted: float, resolution: float) -> float:
+    """Compute the travel, commands, after which an arrival is on one side: the play's upper end, and a margin.
 
-    hours: float
-    travel: float
-
-    @classmethod
-    def of(cls, moves: Sequence[AxisMove]) -> Since:
-        """Return the largest values over a campaign's segments."""
-        legs = legs_of(moves)
-        time_s = np.array([move.time_s for move in moves])
-        each = [np.flatnonzero(legs.segment == segment) for segment in np.unique(legs.segment)]
-        hours = max(float(np.ptp(time_s[members])) for members in each) / HOUR_S
-        return cls(hours, max(float(np.abs(legs.step[members]).sum()) for members in each))
-
-    def cycles(self, commands: np.ndarray, run_up: float) -> Cycles:
-        """Build as many runs through commands as make up the travel."""
-        once = 2.0 * (float(np.ptp(commands)) + 2.0 * run_up)
-        return cycles(commands, run_up, self.hours, max(1, min(round(self.travel / once), RUNS_MAX)))
-
-
-def _predicted(fit: AxisFit, run: Cycles, applied: Correction | None, u: float, seed: int) -> PredictedStops:
-    """Predict runs up and down, under a correction."""
-    moves = run.moves if applied is None else applied.moved(run.moves)
-    return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed)
+    The margin is a step of the controller where one is known, else the scatter of stops.
+    """
+    readings = machine.expected(np.tile(commands, 2), np.repeat([1, -1], len(commands)))
+    apart = np.concatenate([np.eye(len(commands)), -np.eye(len(commands))], axis=1)
+    variance = np.diagonal(apart @ readings.covariance @ apart.T, axis1=1, axis2=2)
+    gap = np.abs(readings.mean @ apart.T) + NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+    counts = np.array_equal(commands, np.round(commands)) and abs(abs(fitted) - 1.0) > UNIT_COMMANDS
+    step = resolution or float(counts)
+    if not step:
+        scatter = machine.scatter(np.array([1, -1]), machine.state, 0.0)["stops"]
+        step = NORMAL_95 * float(np.sqrt(np.diagonal(scatter, axis1=1, axis2=2).mean(axis=0).max())) / abs(fitted)
+    return float(np.quantile(gap, 0.975, axis=0).max()) / abs(fitted) + step
 
 
 def refuse_answer(answer: str, remedy: str = "run `tvsbayes fit` again, without --no-sample or --quick") -> None:
@@ -239,46 +223,77 @@ def bound_of(stops: PredictedReadings, aim: np.ndarray, members: np.ndarray, shi
         members: numbers of the stops.
         shift: whether one shift common to all stops is removed.
     """
-    mean, covariance = stops.mean - aim, stops.covariance
-    if shift:
-        centre = np.eye(mean.shape[1]) - 1.0 / mean.shape[1]
-        mean, covariance = mean @ centre, centre @ covariance @ centre
-    variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
-    return absolute_bound95(mean[:, members].ravel(), np.sqrt(variance[:, members]).ravel())
+    errors = PredictedReadings(stops.mean - aim, stops.covariance)
+    errors = errors.centred() if shift else errors
+    variance = np.maximum(np.diagonal(errors.covariance, axis1=1, axis2=2), 0.0)
+    return absolute_bound95(errors.mean[:, members].ravel(), np.sqrt(variance[:, members]).ravel())
 
 
-def _promise(
-    after: PredictedStops, before: PredictedStops, run: Cycles, aim: np.ndarray, u: float, shift: bool
-) -> dict[str, SidePromise]:
-    """Compute the remaining errors by side, and those due to each cause alone."""
+@dataclass(frozen=True)
+class _Tried:
+    """Stops of a use at which the promise is evaluated.
+
+    Attributes:
+        side: side of arrival, shape (r,).
+        after, before: repeatable part with the table and without it, at the states of the use.
+        table: the same with the table, at the table's state.
+        shifts: what the states add, by cause.
+        scatter: covariances of what does not repeat, by cause.
+        aim: aimed readings, shape (r,).
+    """
+
+    side: np.ndarray
+    after: PredictedReadings
+    before: PredictedReadings
+    table: PredictedReadings
+    shifts: dict[str, PredictedReadings]
+    scatter: dict[str, np.ndarray]
+    aim: np.ndarray
+
+    def homed(self, stops: PredictedReadings) -> PredictedReadings:
+        """Single readings after a homing."""
+        return stops.plus(sum(self.scatter.values()))
+
+    def added_variance(self, shift: bool) -> np.ndarray:
+        """Variance (r,) of a single arrival beyond that of the table; without the homing where a shift is free."""
+        parts = [each for cause, each in self.scatter.items() if cause != "readings" and not (shift and cause == "homing")]
+        scatter = np.diagonal(sum(parts), axis1=1, axis2=2).mean(axis=0)
+        ends = [stops.centred() if shift else stops for stops in (self.after, self.table)]
+        used, at_state = (
+            np.mean(np.diagonal(e.covariance, axis1=1, axis2=2) + (e.mean - ends[1].mean.mean(axis=0)) ** 2) for e in ends
+        )
+        return scatter + max(float(used - at_state), 0.0)
+
+
+def _promise(tried: _Tried, shift: bool, zero_free: bool) -> dict[str, SidePromise]:
+    """Compute the remaining errors by side, and those due to each cause alone.
+
+    Args:
+        tried: stops of a use.
+        shift: whether the first figure is of errors less one common shift.
+        zero_free: whether every figure is.
+    """
+    after, before = tried.homed(tried.after), tried.homed(tried.before)
+    none = np.zeros_like(tried.aim)
+    pooled = tried.table.pooled().mean
+    left = pooled - tried.aim - (np.mean(pooled - tried.aim) if shift else 0.0)
+    alone = {"table": PredictedReadings(tried.table.mean - pooled, tried.table.covariance), **tried.shifts}
+    alone |= {c: PredictedReadings(np.zeros_like(tried.table.mean), v) for c, v in tried.scatter.items()}
+    used = PredictedReadings(after.mean - tried.aim, after.covariance)
+    used = used.centred() if shift else used
     sides = {}
-    scales = after.scales
-    pooled, covariance = after.pooled()
-    hours = np.array([run.moves[k].time_s for k in run.read]) / HOUR_S
     for name, side in SIDES:
-        mine = np.flatnonzero(run.side == side)
-        n = len(mine)
-        stops = scales[f"stop_sd.{name}"][:, None] * np.ones(n)
-        home = scales["home_sd"][:, None] * np.ones(n)
-        drift = scales["drift_per_root_hour"][:, None] * np.sqrt(hours[mine])
-        reading = scales["reading_scale"][:, None] * u * np.ones(n)
-        variance = np.diagonal(after.covariance, axis1=1, axis2=2)[:, mine]
-        rest = np.sqrt(np.maximum(variance - stops**2 - home**2 - drift**2 - reading**2, 0.0))
-        zero = np.zeros_like(rest)
-        causes = {
-            "table": absolute_bound95((after.mean - pooled)[:, mine].ravel(), rest.ravel()),
-            "format": float(NORMAL_95 * np.sqrt(np.mean((pooled - aim)[mine] ** 2))),
-            **{
-                cause: absolute_bound95(zero.ravel(), sd.ravel())
-                for cause, sd in (("stops", stops), ("homing", home), ("drift", drift), ("readings", reading))
-            },
-        }
+        mine = np.flatnonzero(tried.side == side)
+        causes = {c: bound_of(each, none, mine, shift and c != "homing") for c, each in alone.items()}
+        causes["format"] = float(NORMAL_95 * np.sqrt(np.mean(left[mine] ** 2)))
+        variance = np.diagonal(used.covariance, axis1=1, axis2=2)
         sides[name] = SidePromise(
-            error95=bound_of(after, aim, mine, shift),
-            rms=float(np.sqrt(np.mean((pooled - aim)[mine] ** 2 + np.diag(covariance)[mine]))),
-            without95=bound_of(before, aim, mine, shift),
-            causes=causes,
-            shift_free95=bound_of(after, aim, mine, shift=True),
+            error95=bound_of(after, tried.aim, mine, shift),
+            rms=float(np.sqrt(np.mean((used.mean**2 + variance)[:, mine]))),
+            without95=bound_of(before, tried.aim, mine, shift),
+            causes={cause: causes.get(cause, 0.0) for cause in CAUSES},
+            shift_free95=bound_of(after, tried.aim, mine, True),
+            error95_with_homing=bound_of(after, tried.aim, mine, zero_free),
         )
     return sides
 
@@ -306,9 +321,8 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     if fit.rows.in_motion:
         checked(wish)
         return drive_compensation(fit, wish)
-    rows, since = fit.rows, Since.of(campaign.moves)
-    draws = fit.draws["effective_per_command"]
-    fitted = float(draws.mean())
+    rows, machine = fit.rows, PredictedAxis(fit, seed)
+    fitted = float(fit.draws["effective_per_command"].mean())
     form = checked(wish)
     if form.holds == "period" and wish.period is None:
         wish = replace(wish, period=strongest_period(rows, known_waves(fit)))
@@ -317,25 +331,21 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")
     nominal = _nominal(campaign, fitted, wish)
     low, high = float(rows.positions[0]), float(rows.positions[-1])
+    homings = len(np.unique(rows.zero))
+    shift = form.zero_free or homings == 1
     with Job({"table": 1.0, "promise": 2.0}, progress) as job:
         job.begin("table")
-        far = 0.05 * (high - low) + 2.0 * abs(float(fit.draws["backlash"].mean()) / fitted)
-        at = _expected(fit, table_commands(rows), far, since, seed)
-        gap = np.abs(at.mean[0] - at.mean[1]) + NORMAL_95 * np.hypot(*at.u)
-        run_up = float(np.max(gap)) / abs(fitted)
+        at = _expected(machine, table_commands(rows), rows.both_sides)
         shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
         job.begin("promise")
-        u = reading_u(campaign)
-        # Commands between the lines of the table are tested too.
-        tried = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
-        run = since.cycles(tried, max(far, run_up))
-        after = _predicted(fit, run, shaped.correction, u, seed)
-        job.at(0.5)
-        before = _predicted(fit, run, None, u, seed)
-        tried_aim = nominal * tried[run.index]
-        offset = _offset(at, nominal) if form.holds == "table" else float((after.pooled().mean - tried_aim).mean())
-        promise = _promise(after, before, run, offset + tried_aim, u, form.zero_free)
-    table = _table(at, shaped.correction)
+        aimed = (_offset(at, nominal) if form.holds == "table" else None, nominal)
+        offset, tried = _tried(machine, shaped.correction, (low, high), aimed, reading_u(campaign), seed)
+        promise = _promise(tried, shift, form.zero_free)
+        run_up = _run_up(machine, rows.positions, fitted, wish.resolution)
+    added = tried.added_variance(shift)
+    by_side = np.array([added[tried.side == side].mean() for _, side in SIDES])
+    table = _table(replace(at, variance=at.variance + by_side[:, None]), shaped.correction)
+    use, state = machine.use, machine.state
     return Compensation(
         target=wish.target,
         machine=str(campaign.header.get("serial") or campaign.header.get("name") or ""),
@@ -347,13 +357,45 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         range_command=(low, high),
         resolution=wish.resolution,
         reversal_command=run_up,
-        hours=since.hours,
-        travel_command=since.travel,
-        homings=len(np.unique(rows.segment)),
+        hours=use.hours,
+        travel_command=use.travel,
+        homings=homings,
         table=table,
         settings=shaped.settings,
         promise=promise,
         unsaid=(*form.unsaid, *(() if rows.both_sides else (ONE_SIDED,)), *_unreachable(campaign, low, high, run_up)),
+        state={name: float(value) for name, value in state._asdict().items()},
+        kelvin=use.kelvin if rows.kelvin is not None else None,
+    )
+
+
+def _tried(
+    machine: PredictedMachine,
+    correction: Correction,
+    between: tuple[float, float],
+    aimed: tuple[float | None, float],
+    u: float,
+    seed: int,
+) -> tuple[float, _Tried]:
+    """Predict a use; offset and stops. `aimed` is the line of the aim; without its offset errors have the mean 0."""
+    low, high = between
+    # Commands between the lines of the table are tested too.
+    places = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
+    command, side = np.tile(np.repeat(places, 2), STATES), np.tile([1, -1], TRIED * STATES)
+    sent = correction.sent(command, side)
+    table = machine.expected(sent, side)
+    offset, nominal = aimed
+    if offset is None:
+        offset = float((table.pooled().mean - nominal * command).mean())
+    states = machine.use.states(len(table.mean), len(command), random_stream(seed, Stream.PROMISE, 1))
+    return offset, _Tried(
+        side=side,
+        after=machine.expected(sent, side, states),
+        before=machine.expected(command, side, states),
+        table=table,
+        shifts=machine.shifts(states, machine.state),
+        scatter=machine.scatter(side, states, u),
+        aim=offset + nominal * command,
     )
 
 
@@ -371,7 +413,7 @@ def _unreachable(campaign: AxisCampaign, low: float, high: float, run_up: float)
 def _table(at: _Expected, correction: Correction) -> tuple[TableRow, ...]:
     """Build the lines of the table at the commands of the correction."""
     mean = [np.interp(correction.command, at.command, side) for side in at.mean]
-    u = [np.interp(correction.command, at.command, side) for side in at.u]
+    u = [np.interp(correction.command, at.command, np.sqrt(side)) for side in at.variance]
     columns = (correction.command, *mean, *u, correction.forward, correction.backward)
     return tuple(TableRow(*map(float, values)) for values in zip(*columns, strict=True))
 

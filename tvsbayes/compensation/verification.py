@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.promise import Since, bound_of, reading_u, refuse_answer
+from tvsbayes.compensation.promise import bound_of, reading_u, refuse_answer
 from tvsbayes.errors import InputError, NothingToEstimate, refusal
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import (
@@ -42,8 +42,8 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisStop, axis_hash
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, rows_of
-from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
-from tvsbayes.statistics.predicted_readings import PredictedReadings, log_mean
+from tvsbayes.single_axis.predicted_stops import PredictedAxis, longest_use
+from tvsbayes.statistics.predicted_readings import PredictedReadings, State, log_mean
 from tvsbayes.statistics.streams import Stream, random_stream
 
 SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003
@@ -90,8 +90,8 @@ def other_axis(command: np.ndarray, side: np.ndarray) -> np.ndarray:
 
 
 def _shift(made: Compensation, travel: float, count: int) -> np.ndarray:
-    """Compute the covariance of one shift common to all readings, for formats with an undetermined zero."""
-    return (travel**2 if made.zero_free else 0.0) * np.ones((count, count))
+    """Compute the covariance of one shift common to all readings, where the promise is of errors without it."""
+    return (travel**2 if made.shift_free else 0.0) * np.ones((count, count))
 
 
 @dataclass(frozen=True)
@@ -201,14 +201,6 @@ def needed_readings(promised: PredictedReadings, off: np.ndarray, noise: np.ndar
     return None
 
 
-def _visit_noise(promised: PredictedStops, side: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Compute the variance that is independent at every visit: scatter of stops, and of readings."""
-    scales = promised.scales
-    ahead, back = (float(np.mean(scales[f"stop_sd.{name}"] ** 2)) for name in ("forward", "backward"))
-    reading = float(np.mean(scales["reading_scale"] ** 2)) * u**2
-    return np.where(side > 0, ahead, np.where(side < 0, back, 0.5 * (ahead + back))) + reading
-
-
 def _remarks(made: Compensation, fresh: AxisRows, campaign: AxisCampaign) -> tuple[str, ...]:
     """Return further remarks for the user."""
     low, high = made.range_command
@@ -219,10 +211,10 @@ def _remarks(made: Compensation, fresh: AxisRows, campaign: AxisCampaign) -> tup
             f"{outside} of {len(fresh.command)} stops lie outside {low:.10g} to {high:.10g}: the promise does not hold "
             "there; larger errors are expected of them"
         )
-    since = Since.of(campaign.moves)
-    if since.hours > BEYOND * made.hours or since.travel > BEYOND * made.travel_command:
+    hours, travel = longest_use(campaign.moves)
+    if hours > BEYOND * made.hours or travel > BEYOND * made.travel_command:
         remarks.append(
-            f"the fresh readings go on for {since.hours:.3g} h and {since.travel:.4g} commands of travel after a "
+            f"the fresh readings go on for {hours:.3g} h and {travel:.4g} commands of travel after a "
             f"homing, the promise for {made.hours:.3g} h and {made.travel_command:.4g}: larger errors are expected"
         )
     named = campaign.header.get("serial") or campaign.header.get("name")
@@ -251,11 +243,11 @@ def verify_readings(
         message = f"the fresh readings are in {campaign.unit[:20]!r}, the table is in {made.unit[:20]!r}"
         raise InputError("unit", message, remedy="give readings in the unit of the table")
     fresh, applied = rows_of(campaign), Correction.of(made)
-    aim, u = made.offset + made.per_command * fresh.command, np.sqrt(fresh.variance)
+    aim, machine = made.offset + made.per_command * fresh.command, PredictedAxis(fit, seed)
 
     @cache
-    def at(common: float, play: float) -> PredictedStops:
-        return predicted_stops(fit, applied.moved(campaign.moves, common, play), fresh.move.tolist(), u, seed)
+    def at(common: float, play: float) -> PredictedReadings:
+        return machine.read(replace(campaign, moves=tuple(applied.moved(campaign.moves, common, play))))
 
     with Job({"worlds": 1.0}, progress) as job:
         job.begin("worlds")
@@ -266,24 +258,26 @@ def verify_readings(
             other=other_axis(fresh.command, fresh.side),
             travel=fit.rows.travel,
             shift=_shift(made, fit.rows.travel, len(fresh.value)),
-            noise=_visit_noise(at(1.0, 1.0), fresh.side, u),
+            noise=machine.noise(fresh.side, fresh.variance),
         )
         judgement = judged(trial, seed)
-    stops, shift_free = np.arange(len(aim)), None
-    if made.shift_matters:
-        shift_free = ShiftFree(size_of(fresh.value - aim, True), bound_of(judgement.promised, aim, stops, True))
+    stops, error, before = np.arange(len(aim)), fresh.value - aim, judgement.without.pooled().mean - aim
+    free = made.shift_free
+    after, promised95 = size_of(error, free), bound_of(judgement.promised, aim, stops, free)
     return Verification(
         verdict=judgement.verdict,
         p=judgement.p,
         worlds=judgement.worlds,
-        before=size_of(judgement.without.pooled().mean - aim, made.zero_free),
-        after=size_of(fresh.value - aim, made.zero_free),
-        promised95=bound_of(judgement.promised, aim, stops, made.zero_free),
+        before=size_of(before, free),
+        after=after,
+        promised95=promised95,
         readings=len(fresh.value),
         unit=campaign.unit,
         needed=judgement.needed,
         remarks=_remarks(made, fresh, campaign),
-        shift_free=shift_free,
+        shift_free=ShiftFree(after, promised95) if made.shift_matters else None,
+        after_with_homing=size_of(error) if made.shift_matters else None,
+        promised95_with_homing=bound_of(judgement.promised, aim, stops) if made.shift_matters else None,
     )
 
 
@@ -455,16 +449,19 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         remedy = "state `limits` in [axis] if the machine may go further"
         raise NothingToEstimate("limits", message, file="campaign.toml", remedy=remedy)
     nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), CANDIDATES)).round().astype(int)]
-    run = Since(made.hours, 0.0).cycles(nodes, run_up)
-    u = np.full(len(run.read), reading_u(fit.campaign))
+    command, side = np.r_[nodes, nodes[::-1]], np.repeat([1, -1], len(nodes))
+    machine, variance = PredictedAxis(fit, seed), np.full(len(command), reading_u(fit.campaign) ** 2)
+    state = machine.state
+    use = State(np.linspace(0.0, made.hours, len(command)), state.travel, state.warm_hours, state.kelvin)
+    scatter = sum(machine.scatter(side, use, np.sqrt(variance)).values())
 
-    def at(common: float, play: float) -> PredictedStops:
-        return predicted_stops(fit, applied.moved(run.moves, common, play), run.read.tolist(), u, seed)
+    def at(common: float, play: float) -> PredictedReadings:
+        return machine.expected(applied.sent(command, side, common, play), side, use).plus(scatter)
 
     promised = at(1.0, 1.0)
     mean, covariance = promised.pooled()
     shift = _shift(made, fit.rows.travel, len(mean))
-    noise = np.minimum(_visit_noise(promised, run.side, u), 0.999 * np.diag(covariance))
+    noise = np.minimum(machine.noise(side, variance), 0.999 * np.diag(covariance))
     off = [at(0.0, 0.0).pooled().mean - mean]
     play = at(1.0, 0.0).pooled().mean - mean
     if _distance(play, covariance + shift) > SEPARATE:
@@ -473,12 +470,12 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
     # Stops over the whole range first: a fault in a part of the table shows only there.
     spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
-    starts = nodes[run.index] - run.side * run_up
+    starts = command - side * run_up
     reach = np.flatnonzero((starts >= low) & (starts <= high))
     common = (covariance - np.diag(noise) + shift)[np.ix_(reach, reach)]
-    first = np.isin(run.index[reach], spread)
+    first = np.isin(command[reach], nodes[spread])
     chosen = discriminating_visits([o[reach] for o in off], common, noise[reach], first)
     reached = chosen.reached
     order = [k for k, visits in zip(reach.tolist(), chosen.visits, strict=True) for _ in range(int(visits))]
-    stops = tuple(VerifyStop(float(nodes[run.index[k]]), int(run.side[k])) for k in order)
+    stops = tuple(VerifyStop(float(command[k]), int(side[k])) for k in order)
     return VerifyPlan(stops, run_up, reached >= IDENTIFIED, float(np.sqrt(reached)))

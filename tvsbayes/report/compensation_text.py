@@ -51,6 +51,9 @@ HELPS = {
     "table": "the table itself; read more, at more positions",
     "format": "what the format cannot hold; csv, linuxcnc and header hold both sides by position",
     "drift": "the walk of the zero; home more often, or guide",
+    "creep": "the creep of a zero that warms up; use it warm, or home it again",
+    "temperature": "the shift with the temperature; read at a temperature of its own what creeps, or keep the room steady",
+    "travel": "two ratios, forward and backward; of gears whose teeth keep step state `ratio_contrast` 0, u 0 in [axis]",
     "readings": "the readings themselves; a better reference",
 }
 """Remedies by the largest cause of the remaining error."""
@@ -62,14 +65,16 @@ DRIVE_HELPS = {
 
 
 def promise_table(result: Compensation) -> TableView:
-    """Remaining error by side, and the error that each cause alone would leave."""
+    """Remaining error by side, and the error that each cause alone would leave; causes that leave none are left out."""
+    sides = result.sides
+    causes = [cause for cause in CAUSES if any(promise.causes.get(cause, 0.0) for promise in sides.values())]
     rows = []
-    for side, remainder in result.sides.items():
-        causes = [two_digits(remainder.causes[cause]) for cause in CAUSES]
-        sizes = [two_digits(remainder.without95), two_digits(remainder.error95)]
-        rows.append([side.removeprefix("arriving "), *sizes, *causes])
-    caption = f"95 % of errors are at most, {escaped(result.unit)}; each cause alone"
-    return TableView(caption, ["" if result.in_motion else "arriving", "without", "after applying", *CAUSES], rows)
+    for side, promise in sides.items():
+        sizes = [promise.without95, promise.error95, *(promise.causes.get(cause, 0.0) for cause in causes)]
+        rows.append([side.removeprefix("arriving "), *map(two_digits, sizes)])
+    shift = ", but for one shift common to all," if result.shift_free else ""
+    caption = f"95 % of errors{shift} are at most, {escaped(result.unit)}; each cause alone"
+    return TableView(caption, ["" if result.in_motion else "arriving", "without", "after applying", *causes], rows)
 
 
 def sizes_table(verification: Verification) -> TableView:
@@ -82,9 +87,8 @@ def sizes_table(verification: Verification) -> TableView:
         ],
         ["after (read)", two_digits(verification.after.rms), two_digits(verification.after.worst)],
     ]
-    if verification.shift_free is not None:
-        left = verification.shift_free.after
-        rows.append(["after, but for one shift common to all", two_digits(left.rms), two_digits(left.worst)])
+    if (homed := verification.after_with_homing) is not None:
+        rows.append(["after, with the shift common to all", two_digits(homed.rms), two_digits(homed.worst)])
     columns = ["", "RMS", "worst"]
     if (points := verification.millimetres) is not None:
         columns += [f"RMS at {points.distance_mm:.10g} mm, mm", "worst, mm"]
@@ -97,17 +101,17 @@ def sizes_table(verification: Verification) -> TableView:
 def _promise_text(verification: Verification) -> str:
     mm = verification.millimetres
     points = "" if mm is None else f", of points at {mm.distance_mm:.10g} mm {two_digits(mm.promised95)} mm"
-    unit, shift_free = escaped(verification.unit), ""
-    if verification.shift_free is not None:
-        promised95 = two_digits(verification.shift_free.promised95)
-        shift_free = f"; but for one shift common to all at most {promised95} {unit}"
-    return f"promised: 95 % of errors at most {two_digits(verification.promised95)} {unit}{points}{shift_free}"
+    unit, homed = escaped(verification.unit), verification.promised95_with_homing
+    shift = "" if homed is None else ", but for one shift common to all,"
+    with_homing = "" if homed is None else f"; with the error of a homing, by its prior, {two_digits(homed)} {unit}"
+    return f"promised: 95 % of errors{shift} at most {two_digits(verification.promised95)} {unit}{points}{with_homing}"
 
 
 def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
     """A compensation as text."""
-    unit, (low, high) = escaped(result.unit), result.range_command
-    largest = max(CAUSES, key=lambda cause: max(bounds.causes[cause] for bounds in result.promise.values()))
+    unit, (low, high), sides = escaped(result.unit), result.range_command, result.sides.values()
+    counted = [cause for cause in CAUSES if cause != "homing" or not result.shift_free]
+    largest = max(counted, key=lambda cause: max(promise.causes.get(cause, 0.0) for promise in sides))
     shift = ", but for one shift common to all" if result.zero_free else ""
     lines: list[Part] = [
         f"compensation for {result.target}: {len(result.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
@@ -125,17 +129,17 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
 
 
 def _homing_remarks(result: Compensation) -> list[str]:
-    """What the promise rests on where one homing alone was read, and how small errors are within one."""
-    if result.homings > 1 or result.in_motion:
+    """What the promise rests on where one homing alone was read, and what the next one may add."""
+    if not result.shift_matters:
         return []
-    remarks = ["only one homing was read: the error of the next one is set by its prior, home_sd in [axis]"]
-    bounds = [
-        f"{side} {two_digits(p.shift_free95)}" for side, p in result.promise.items() if p.shift_free95 is not None
+    homed = [
+        f"{side} {two_digits(promise.error95_with_homing)}"
+        for side, promise in result.sides.items()
+        if promise.error95_with_homing is not None
     ]
-    if bounds and result.shift_matters:
-        listed = f"{', '.join(bounds)} {escaped(result.unit)}"
-        remarks.append(f"but for one shift common to all, as within one homing, at most: {listed}")
-    return remarks
+    remark = "one homing was read, or none: the promise is of errors but for one shift common to all, as within one homing"
+    prior = "with the next homing's error, which its prior alone determines, home_sd in [axis], 95 % are at most: "
+    return [f"{remark}; {prior}{', '.join(homed)} {escaped(result.unit)}"]
 
 
 def _validity(result: Compensation) -> list[str]:
@@ -149,9 +153,11 @@ def _validity(result: Compensation) -> list[str]:
             f"the error that repeats every {result.settings['period_command']:.6g} commands{seconds}: {size} "
             f"{escaped(result.unit)} peak to peak",
         ]
+    low, high = result.kelvin or (0.0, 0.0)
+    kelvin = f", at temperatures as read, over {two_digits(high - low)} K" if result.kelvin else ""
     return [
         f"the promise holds between these commands, within {two_digits(result.hours)} h and "
-        f"{result.travel_command:.4g} commands of travel since homing",
+        f"{result.travel_command:.4g} commands of travel since homing{kelvin}",
         f"arrive with at least {result.reversal_command:.4g} commands of travel on a side",
     ]
 

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
-from msgspec import Meta, structs
+from msgspec import Meta, field, structs
 
 from tvsbayes.display import Shown, View
 from tvsbayes.results.records import (
@@ -36,9 +36,10 @@ APPLIED, NOT_APPLIED, TWICE, WRONG_SIGN = "applied", "not applied", "applied twi
 OTHER_MACHINE = "another machine"
 WORLDS = (APPLIED, NOT_APPLIED, TWICE, WRONG_SIGN, OTHER_MACHINE)
 """Hypotheses on a table in use; the last also stands for a machine that changed."""
-CAUSES = ("table", "format", "stops", "homing", "drift", "readings")
+CAUSES = ("table", "format", "stops", "homing", "drift", "creep", "temperature", "travel", "readings")
 """Causes of the errors that remain after applying: uncertainty of the table, resolution of the format, scatter of stops
-and of homings, the walk of the zero since the last homing, scatter of the readings that verify it."""
+and of homings, the walk of the zero since the last homing, its creep, its shift with the temperature and, by a contrast
+of the directions, with the travel, each off the table's state, and scatter of the readings that verify it."""
 
 
 class TableRow(Record, frozen=True):
@@ -60,16 +61,18 @@ class TableRow(Record, frozen=True):
     add_backward: float
 
 
-class SidePromise(Record, frozen=True):
-    """Errors that remain after applying, for readings from one side within the range.
+class SidePromise(Record, frozen=True, omit_defaults=True):
+    """Errors that remain after applying, for readings from one side within the range, over posterior and use.
 
     Attributes:
-        error95: 95 % of errors are at most this size, either sign.
-        rms: root mean square of the expected errors.
+        error95: 95 % of errors are at most this size, either sign; after removing one common shift where one homing
+            was read, or none, or the format leaves the zero open.
+        rms: root mean square of the same errors.
         without95: `error95` without compensation.
         causes: error that each cause alone would leave, 95 %.
         shift_free95: `error95` of errors after removing one common shift, as within one homing; None in older
             files.
+        error95_with_homing: the same with the next homing's error; None in files of 0.3, whose `error95` is that.
     """
 
     error95: NotNegative
@@ -77,12 +80,13 @@ class SidePromise(Record, frozen=True):
     without95: NotNegative
     causes: dict[str, NotNegative]
     shift_free95: NotNegative | None = None
+    error95_with_homing: NotNegative | None = None
 
 
 type Sides = Annotated[dict[str, SidePromise], Meta(extra_json_schema={"required": ("forward", "backward")})]
 
 
-class Compensation(Shown, Record, frozen=True, kw_only=True):
+class Compensation(Shown, Record, frozen=True, kw_only=True, omit_defaults=True):
     """A two-sided table for one controller, and the promised bound of the errors that remain after applying it.
 
     Attributes:
@@ -96,11 +100,15 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
         resolution: least command that the controller carries out; 0 where it is fine.
         reversal_command: travel, in commands, after which an arrival is on one side whatever came before.
         hours, travel_command: limits since homing for which the promise holds: the campaign's longest segment.
-        homings: number in the campaign; with a single one, the prior alone determines the scatter of homings.
+        homings: number in the campaign, 1 of an encoder that keeps its zero: the promise is then of errors less one
+            common shift, since the prior alone determines the scatter of homings.
         table: rows by increasing command.
         settings: numbers of formats that hold no table, by name.
         promise: promised errors, by side.
         unsaid: corrections that the format cannot express, in words.
+        state: state of the table, for all commands: hours and travel since the homing, `warm_hours` since the machine
+            was switched on, `kelvin` less the temperature of the campaign's first move; empty in files of 0.3.
+        kelvin: range of temperatures of the promise, less that of the first move; None where none was recorded.
         text: content of the file; not part of the document.
     """
 
@@ -121,6 +129,8 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
     settings: dict[str, float]
     promise: Sides
     unsaid: tuple[str, ...]
+    state: dict[str, float] = field(default_factory=dict)
+    kelvin: tuple[float, float] | None = None
     text: str = ""
     beside: ClassVar = ("text",)
 
@@ -136,15 +146,29 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
 
     @property
     def sides(self) -> dict[str, SidePromise]:
-        """The promise by kind of motion, in words: by side of arrival, of a drive once."""
+        """The promise by kind of motion, in words: by side of arrival, of a drive once.
+
+        Those of 0.3 are read as later ones: `error95` less one shift where `shift_free`.
+        """
         if self.in_motion:
             return {"while it drives": self.promise["forward"]}
-        return {f"arriving {side}": promise for side, promise in self.promise.items()}
+        sides = {}
+        for side, promise in self.promise.items():
+            if promise.error95_with_homing is None and promise.shift_free95 is not None:
+                first = promise.shift_free95 if self.shift_free else promise.error95
+                promise = structs.replace(promise, error95=first, error95_with_homing=promise.error95)
+            sides[f"arriving {side}"] = promise
+        return sides
 
     @property
     def shift_matters(self) -> bool:
-        """Whether the prior alone determines the scatter of homings, so that errors within one homing are smaller."""
+        """Whether nothing but a prior tells how homings scatter: the promise is of errors less one common shift."""
         return self.homings == 1 and not self.in_motion and not self.zero_free
+
+    @property
+    def shift_free(self) -> bool:
+        """Whether one shift common to all readings does not count in a verification."""
+        return self.zero_free or self.shift_matters
 
     @property
     def shown_by(self) -> str:
@@ -156,7 +180,7 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
     def shown(self) -> View:
         """Show the table."""
         rows = [(r.command, r.forward, r.backward, r.u_forward, r.u_backward) for r in self.table]
-        left = ", ".join(f"{side} {self.promise[side].error95:.3g}" for side in ("forward", "backward"))
+        left = ", ".join(f"{side} {promise.error95:.3g}" for side, promise in self.sides.items())
         title = f"Compensation for {self.target}: left after applying, 95 %: {left} {self.unit}"
         return View(title, ("command", "forward", "backward", "u_forward", "u_backward"), rows)
 
@@ -198,10 +222,12 @@ class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         worlds: probability of each hypothesis of `WORLDS`.
         before: errors of the same stops without the table, as predicted from the campaign.
         after: errors of the fresh readings.
-        promised95: 95 % of errors of these stops are at most this size, by the promise.
+        promised95: 95 % of errors of these stops are at most this size, by the promise; this, `before`, `after` and `p`
+            are of errors less one shift common to all where one homing was read, or none.
         readings: number used; for a scanner looks, each of which shows both axes.
         millimetres: the same for points; only for a scanner.
-        shift_free: the same but for one shift common to all readings; None where the scatter of homings was read.
+        shift_free: `after` and `promised95` again, the name of 0.3; None where the scatter of homings was read.
+        after_with_homing, promised95_with_homing: the same with the error of the homing; None as `shift_free`.
         unit: unit of errors; it and what follows are not part of the document.
         needed: readings needed for a verdict; None where no number suffices, 0 where these do.
         remarks: further remarks, in sentences.
@@ -217,6 +243,8 @@ class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
     readings: Count
     millimetres: Millimetres | None = None
     shift_free: ShiftFree | None = None
+    after_with_homing: ErrorSize | None = None
+    promised95_with_homing: Positive | None = None
     unit: str = ""
     needed: int | None = 0
     remarks: tuple[str, ...] = ()

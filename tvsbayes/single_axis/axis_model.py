@@ -315,7 +315,7 @@ class AxisModel:
         rows = self.rows
         reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
         exact = rows.in_motion or self.places.exact
-        return reading if exact else reading + self._between_nodes(values)[:, None]
+        return reading if exact else reading + self.between_nodes(values)[:, None]
 
     def _carry(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Share of the previous row's stop error (in motion: seeing) in each row: shape (n or 1, rows)."""
@@ -329,7 +329,7 @@ class AxisModel:
         carry = np.exp(-gap) * mean_factor**2 / averaged_variance(ratio)
         return np.where(rows.redrawn, 0.0, np.minimum(carry, 1.0))
 
-    def _between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    def between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Variance (n,) of both processes midway between nodes, as lost by cubic interpolation."""
         spacing = abs(self.rows.line.slope) * (self.places.command[1] - self.places.command[0])
         length = values["transmission_error_length"]

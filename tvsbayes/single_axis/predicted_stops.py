@@ -1,34 +1,35 @@
-"""Predict readings of further moves from a fit: stops after another homing, with their complete uncertainty.
+"""Predicted readings of an axis: the adapter of `statistics.predicted_readings.PredictedMachine`.
 
-The moves are added to those of the fit, as their own segment, and their rows are left out (formulation 8). The
-prediction thus includes ratio, play, error by position, homing, drift, scatter of stops and of readings in the model.
-Commands as in the folder, readings in its unit.
+Given the scales, every reading is a linear functional of the line, the contrast, the play, the processes, the creep and
+the thermal shift, whose joint posterior is normal, plus homing, drift, stop error and noise (formulation 8). Commands as
+in the folder, readings in its unit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
+from tvsbayes.instrument.conditions import kelvin_at
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_model import AxisModel
-from tvsbayes.single_axis.axis_rows import rows_of
-from tvsbayes.statistics.predicted_readings import PredictedReadings
+from tvsbayes.single_axis.axis_model import BACKLASH, CONTRAST, FLOOR, OFFSET, SLOPE, AxisModel, LinearPosterior
+from tvsbayes.single_axis.axis_parameters import SAMPLED, AxisCoordinates
+from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, PlayPlaces, legs_of, play_places, rows_of, warm_from
+from tvsbayes.single_axis.waves import wave_columns
+from tvsbayes.statistics.predicted_readings import PredictedReadings, State, Use
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 DRAWS = 160
 """Number of draws of the scales in a prediction."""
-
-
-@dataclass(frozen=True)
-class PredictedStops(PredictedReadings):
-    """Readings of stops, with the draws of the scales by name, each (n,)."""
-
-    scales: dict[str, np.ndarray]
+OF_USE = ("home_sd", "drift_per_root_hour", "stop_sd.forward", "stop_sd.backward")
+"""Scales that a use needs even where the campaign has none of it, as of homings with a single one: by their prior."""
+SHIFTS = {"creep": "creep", "thermal_per_K": "temperature"}
+"""Cause of each shift of the zero in time; the contrast of the directions adds with the travel."""
 
 
 def transferred_scales(source: AxisModel, draws: np.ndarray, target: AxisModel, rng: np.random.Generator) -> np.ndarray:
@@ -58,49 +59,188 @@ def _spread_draws(fit: AxisFit) -> np.ndarray:
     return fit.w[order[((np.arange(DRAWS) + 0.5) * len(order) / DRAWS).astype(int)]]
 
 
-def predicted_stops(
-    fit: AxisFit, moves: Sequence[AxisMove], read: Sequence[int], u: np.ndarray, seed: int = 0
-) -> PredictedStops:
-    """Predict readings of moves that follow those of a fit after another homing.
+def _first_degC(campaign: AxisCampaign) -> float | None:
+    """Temperature at the first move; None where none is known."""
+    known = next((move for move in campaign.moves if move.temperature_degC is not None), None)
+    clock = np.array([move.time_s for move in campaign.moves], dtype=float)
+    since = None if known is None else kelvin_at(campaign.moves, np.array([known.time_s]), clock)
+    return None if known is None or since is None else float(known.temperature_degC or 0.0) - float(since[0])
 
-    Args:
-        fit: fit of an axis.
-        moves: moves of a separate campaign, in time order; commands as sent to the mechanics.
-        read: numbers of the moves with readings, ascending, shape (r,).
-        u: standard uncertainties of these readings, shape (r,); 0 where unknown.
-        seed: seed of quantities without draws in the fit.
+
+class PredictedAxis:
+    """A fitted axis as a `PredictedMachine`.
+
+    Attributes:
+        fit: the fit.
+        w: coordinates of the draws, shape (n, d).
+        scales: values of all scales by name, each (n,).
 
     Raises:
         NothingToEstimate: the drive never stops.
     """
-    if fit.rows.in_motion:
-        raise NothingToEstimate(
-            "in-motion",
-            "the readings are of a drive at constant rate: they contain no stops and no reversal",
-            file="campaign.toml",
-            remedy="read stops from both directions into a folder without `rate`",
-        )
-    known, rng = fit.campaign, random_stream(seed, AxisStream.PREDICTED_STOPS)
-    last, number = known.moves[-1], max(r.reading for r in known.readings) + 1
-    count, start_s = len(known.moves), moves[0].time_s
-    joined = [
-        replace(
-            move,
-            move=count + move.move,
-            segment=last.segment + 1 + move.segment,
-            time_s=last.time_s + move.time_s - start_s,
-        )
-        for move in moves
-    ]
-    # The value of a left-out row is arbitrary; a value on the line leaves all that depends on the line unchanged.
-    line = fit.rows.line
-    readings = [
-        Reading(number + k, count + m, line.offset + line.slope * moves[m].command, float(u[k]))
-        for k, m in enumerate(read)
-    ]
-    extended = replace(known, moves=(*known.moves, *joined), readings=(*known.readings, *readings))
-    rows = replace(rows_of(extended), line=line)
-    model = AxisModel.of(rows, fit.model.priors, None, fit.model.coordinates.waves)
-    w = transferred_scales(fit.model, _spread_draws(fit), model, rng)
-    stops = model.left_out(w, np.flatnonzero(rows.move >= count))
-    return PredictedStops(stops.mean, stops.covariance, model.coordinates.values(w))
+
+    def __init__(self, fit: AxisFit, seed: int = 0):
+        if fit.rows.in_motion:
+            raise NothingToEstimate(
+                "in-motion",
+                "the readings are of a drive at constant rate: they contain no stops and no reversal",
+                file="campaign.toml",
+                remedy="read stops from both directions into a folder without `rate`",
+            )
+        self.fit, self.unit, self.w = fit, fit.campaign.unit, _spread_draws(fit)
+        model, known = fit.model, fit.model.coordinates
+        absent = frozenset(SAMPLED) - set(known.names) - set(OF_USE)
+        target = replace(model, coordinates=AxisCoordinates.of(model.priors, absent, known.waves))
+        w = transferred_scales(model, self.w, target, random_stream(seed, AxisStream.PREDICTED_STOPS))
+        self.scales = target.coordinates.values(w)
+        linear, play = model.linear(self.w), model.line_terms(backlash=1.0)[None]
+        self._backlash = linear.drawn(play, random_stream(seed, AxisStream.PREDICTED_STOPS, 1))[:, 0]
+
+    @cached_property
+    def state(self) -> State:
+        """Mean state of the rows."""
+        rows = self.fit.rows
+        kelvin = 0.0 if rows.kelvin is None else float(rows.kelvin.mean())
+        return State(float(_since_homing(rows).mean()), float(rows.path.mean()), float(rows.warm_s.mean()) / HOUR_S, kelvin)
+
+    @cached_property
+    def use(self) -> Use:
+        """Use as in the campaign."""
+        moves, kelvin = self.fit.campaign.moves, self.fit.rows.kelvin
+        hours, travel = longest_use(moves)
+        times_s = np.array([move.time_s for move in moves])[legs_of(moves).first]
+        between = (0.0, 0.0) if kelvin is None else (float(kelvin.min()), float(kelvin.max()))
+        return Use(hours, travel, (times_s - warm_from(self.fit.campaign)) / HOUR_S, between)
+
+    def expected(self, command: np.ndarray, side: np.ndarray, state: State | None = None) -> PredictedReadings:
+        """Predict the repeatable part of readings."""
+        state = state or self.state
+        travel = np.broadcast_to(np.asarray(state.travel, dtype=float), np.shape(command))[None]
+        out = -float(np.sign(self.fit.rows.line.slope)) * np.asarray(side, dtype=float)[None]
+        play = PlayPlaces(command[None], travel, out, out, np.zeros_like(out))
+        return self._readings(command, play, state)
+
+    def shifts(self, use: State, at: State) -> dict[str, PredictedReadings]:
+        """Predict what the state adds: creep, temperature, and travel by the contrast of the directions."""
+        model, linear, later, earlier = self.fit.model, self._linear, self._in_time(use), self._in_time(at)
+        columns = {SHIFTS[name]: (model.shift_columns[name], later[name] - earlier[name]) for name in later}
+        if model.priors["ratio_contrast"].u:
+            columns["travel"] = CONTRAST, np.atleast_2d(0.5 * (np.asarray(use.travel) - np.asarray(at.travel)))
+        return {
+            cause: PredictedReadings(
+                linear.mean[:, column, None] * by,
+                linear.covariance[:, column, column, None, None] * by[:, :, None] * by[:, None, :],
+            )
+            for cause, (column, by) in columns.items()
+        }
+
+    def scatter(self, side: np.ndarray, use: State, u: np.ndarray | float) -> dict[str, np.ndarray]:
+        """Compute what does not repeat, by cause, of readings after one homing, each at a stop of its own."""
+        hours = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side))
+        return self._scattered(np.zeros(len(side)), hours, np.arange(len(side)), side, np.asarray(u) ** 2)
+
+    def read(self, campaign: AxisCampaign) -> PredictedReadings:
+        """Predict the readings of another campaign of this axis, after homings of its own, at its own states.
+
+        Its commands are those that the mechanics got; the values of its readings are not used.
+        """
+        rows = replace(rows_of(campaign), line=self.fit.rows.line)
+        play = play_places(rows, self._backlash)
+        known_degC, its_degC = _first_degC(self.fit.campaign), _first_degC(campaign)
+        kelvin, unknown = self.state.kelvin, 0.0
+        if rows.kelvin is not None and known_degC is not None and its_degC is not None:
+            kelvin = rows.kelvin + its_degC - known_degC
+        elif self.fit.rows.kelvin is not None:
+            # Somewhere in the range that was read.
+            unknown = float(np.ptp(self.fit.rows.kelvin)) ** 2 / 12
+        hours = _since_homing(rows)
+        repeated = self._readings(rows.command, play, State(hours, rows.path, rows.warm_s / HOUR_S, kelvin))
+        scatter = self._scattered(rows.zero, hours, np.cumsum(rows.redrawn), rows.side, rows.variance)
+        covariance = repeated.covariance + sum(scatter.values())
+        if "thermal_per_K" in self.fit.model.shifts:
+            column = self.fit.model.shift_columns["thermal_per_K"]
+            second = self._linear.mean[:, column] ** 2 + self._linear.covariance[:, column, column]
+            covariance = covariance + unknown * second[:, None, None]
+        # The start of a segment from an unknown side is uniform within the play.
+        together = np.equal.outer(rows.segment, rows.segment)
+        covariance = covariance + play.spread[:, :, None] * play.spread[:, None, :] * together / 3
+        return PredictedReadings(repeated.mean, covariance)
+
+    def noise(self, side: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """Mean variance (r,) drawn anew at every visit: of stops, and of readings with stated variances (r,)."""
+        count = np.arange(len(side))
+        scatter = self._scattered(count, np.zeros(len(side)), count, side, variance)
+        return np.diagonal(scatter["stops"] + scatter["readings"], axis1=1, axis2=2).mean(axis=0)
+
+    @cached_property
+    def _linear(self) -> LinearPosterior:
+        return self.fit.model.linear(self.w)
+
+    def _in_time(self, state: State) -> dict[str, np.ndarray]:
+        """Factors of the shifts of the zero at a state: (1 or n, 1 or r)."""
+        factors = {}
+        if "creep" in self.fit.model.shifts:
+            minutes = self.scales["creep_minutes"][:, None]
+            factors["creep"] = -np.expm1(-60.0 * np.atleast_2d(state.warm_hours) / minutes)
+        if "thermal_per_K" in self.fit.model.shifts:
+            factors["thermal_per_K"] = np.atleast_2d(np.asarray(state.kelvin, dtype=float))
+        return factors
+
+    def _readings(self, command: np.ndarray, play: PlayPlaces, state: State) -> PredictedReadings:
+        """Predict the repeatable part at places of the play, with the processes at the commands."""
+        known = self.fit.model
+        model = AxisModel.of(known.rows, known.priors, command, known.coordinates.waves)
+        in_time = self._in_time(state)
+        drawn = model.coordinates.wave_draws(self.w)
+        waves, line = [], model.rows.line
+        for wave, draws in zip(model.coordinates.waves, drawn, strict=True):
+            x = model.clock(wave, command, np.zeros(len(command)), line.offset + line.slope * command)
+            waves.append(wave_columns(x, draws.period, model.record(wave)))
+        size = max(len(each) for each in (play.anchor, *in_time.values(), *waves))
+        functionals = np.zeros((size, len(command), model.columns))
+        functionals[..., OFFSET], functionals[..., SLOPE] = 1.0, play.anchor - model.middle
+        functionals[..., CONTRAST], functionals[..., BACKLASH] = 0.5 * play.path, 0.5 * play.side
+        functionals[..., model.layout["homed"]] = 1.0 / (len(model.homed) + 1)
+        for name, factor in in_time.items():
+            functionals[..., model.shift_columns[name]] = factor
+        for k, wave_factors in enumerate(waves):
+            functionals[..., model.of_wave(k)] = wave_factors
+        weights = model.places.weights(command)
+        functionals[..., model.layout["error"]] = weights
+        functionals[..., model.layout["play"]] = 0.5 * play.share[..., None] * weights
+        linear = model.linear(self.w)
+        functionals = functionals[0] if size == 1 else functionals
+        covariance = functionals @ linear.covariance @ np.swapaxes(functionals, -1, -2)
+        if not model.places.exact:
+            covariance = covariance + model.between_nodes(self.scales)[:, None, None] * np.eye(len(command))
+        return PredictedReadings(linear.mean_of(functionals), covariance)
+
+    def _scattered(
+        self, zero: np.ndarray, hours: np.ndarray, stop: np.ndarray, side: np.ndarray, variance: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Covariances by cause of readings with numbers of their homing and their stop."""
+        scales, one_zero, one_stop = self.scales, np.equal.outer(zero, zero), np.equal.outer(stop, stop)
+        forward = 0.5 * (1.0 + side)
+        stops = scales["stop_sd.forward"][:, None] ** 2 * forward + scales["stop_sd.backward"][:, None] ** 2 * (1 - forward)
+        reading = scales["reading_scale"][:, None] ** 2 * variance + (FLOOR * self.fit.rows.travel) ** 2
+        return {
+            "homing": scales["home_sd"][:, None, None] ** 2 * one_zero,
+            "drift": scales["drift_per_root_hour"][:, None, None] ** 2 * np.minimum.outer(hours, hours) * one_zero,
+            "stops": np.sqrt(stops[:, :, None] * stops[:, None, :]) * one_stop,
+            "readings": (reading * np.ones(len(side)))[:, :, None] * np.eye(len(side)),
+        }
+
+
+def _since_homing(rows: AxisRows) -> np.ndarray:
+    """Hours since the homing of each row's zero."""
+    hours = np.cumsum(rows.hours)
+    first = np.searchsorted(rows.zero, rows.zero)
+    return hours - hours[first] + rows.hours[first]
+
+
+def longest_use(moves: Sequence[AxisMove]) -> tuple[float, float]:
+    """Longest time, hours, and travel, commands, of the segments of moves."""
+    legs, time_s = legs_of(moves), np.array([move.time_s for move in moves])
+    each = [np.flatnonzero(legs.segment == segment) for segment in np.unique(legs.segment)]
+    hours = max(float(np.ptp(time_s[members])) for members in each) / HOUR_S
+    return hours, max(float(np.abs(legs.step[members]).sum()) for members in each)
