@@ -47,7 +47,7 @@ SIDES = (("forward", 1), ("backward", -1))
 
 @dataclass(frozen=True)
 class _Expected:
-    """Readings expected at commands (m,) at the table's state: mean and variance by side, (2, m) each, forward first."""
+    """Readings expected at commands (m,) at the table's state: mean and variance by side, (2, m), forward first."""
 
     command: np.ndarray
     mean: np.ndarray
@@ -256,13 +256,16 @@ class _Tried:
 
     def added_variance(self, shift: bool) -> np.ndarray:
         """Variance (r,) of a single arrival beyond that of the table; without the homing where a shift is free."""
-        parts = [each for cause, each in self.scatter.items() if cause != "readings" and not (shift and cause == "homing")]
-        scatter = np.diagonal(sum(parts), axis1=1, axis2=2).mean(axis=0)
-        ends = [stops.centred() if shift else stops for stops in (self.after, self.table)]
-        used, at_state = (
-            np.mean(np.diagonal(e.covariance, axis1=1, axis2=2) + (e.mean - ends[1].mean.mean(axis=0)) ** 2) for e in ends
+        left_out = {"readings", "homing"} if shift else {"readings"}
+        parts = [each for cause, each in self.scatter.items() if cause not in left_out]
+        used, table = (stops.centred() if shift else stops for stops in (self.after, self.table))
+        centre = table.mean.mean(axis=0)
+        used_square, table_square = (
+            np.mean(np.diagonal(stops.covariance, axis1=1, axis2=2) + (stops.mean - centre) ** 2)
+            for stops in (used, table)
         )
-        return scatter + max(float(used - at_state), 0.0)
+        scatter: np.ndarray = np.diagonal(sum(parts), axis1=1, axis2=2).mean(axis=0)
+        return scatter + max(float(used_square - table_square), 0.0)
 
 
 def _promise(tried: _Tried, shift: bool, zero_free: bool) -> dict[str, SidePromise]:

@@ -52,8 +52,8 @@ HELPS = {
     "format": "what the format cannot hold; csv, linuxcnc and header hold both sides by position",
     "drift": "the walk of the zero; home more often, or guide",
     "creep": "the creep of a zero that warms up; use it warm, or home it again",
-    "temperature": "the shift with the temperature; read at a temperature of its own what creeps, or keep the room steady",
-    "travel": "two ratios, forward and backward; of gears whose teeth keep step state `ratio_contrast` 0, u 0 in [axis]",
+    "temperature": "the shift with the temperature; read cold and warm, or keep the room steady",
+    "travel": "a contrast of the directions; of gears whose teeth keep step state `ratio_contrast` 0, u 0 in [axis]",
     "readings": "the readings themselves; a better reference",
 }
 """Remedies by the largest cause of the remaining error."""
@@ -137,7 +137,9 @@ def _homing_remarks(result: Compensation) -> list[str]:
         for side, promise in result.sides.items()
         if promise.error95_with_homing is not None
     ]
-    remark = "one homing was read, or none: the promise is of errors but for one shift common to all, as within one homing"
+    remark = (
+        "one homing was read, or none: the promise is of errors but for one shift common to all, as within one homing"
+    )
     prior = "with the next homing's error, which its prior alone determines, home_sd in [axis], 95 % are at most: "
     return [f"{remark}; {prior}{', '.join(homed)} {escaped(result.unit)}"]
 

@@ -101,7 +101,9 @@ class PredictedAxis:
         """Mean state of the rows."""
         rows = self.fit.rows
         kelvin = 0.0 if rows.kelvin is None else float(rows.kelvin.mean())
-        return State(float(_since_homing(rows).mean()), float(rows.path.mean()), float(rows.warm_s.mean()) / HOUR_S, kelvin)
+        return State(
+            float(_since_homing(rows).mean()), float(rows.path.mean()), float(rows.warm_s.mean()) / HOUR_S, kelvin
+        )
 
     @cached_property
     def use(self) -> Use:
@@ -221,7 +223,9 @@ class PredictedAxis:
         """Covariances by cause of readings with numbers of their homing and their stop."""
         scales, one_zero, one_stop = self.scales, np.equal.outer(zero, zero), np.equal.outer(stop, stop)
         forward = 0.5 * (1.0 + side)
-        stops = scales["stop_sd.forward"][:, None] ** 2 * forward + scales["stop_sd.backward"][:, None] ** 2 * (1 - forward)
+        stops = scales["stop_sd.forward"][:, None] ** 2 * forward + scales["stop_sd.backward"][:, None] ** 2 * (
+            1 - forward
+        )
         reading = scales["reading_scale"][:, None] ** 2 * variance + (FLOOR * self.fit.rows.travel) ** 2
         return {
             "homing": scales["home_sd"][:, None, None] ** 2 * one_zero,

@@ -50,7 +50,7 @@ class Use(NamedTuple):
 
     def states(self, draws: int, count: int, rng: np.random.Generator) -> State:
         """Draw `count` states of one use by draw, stratified: each after a homing of the same age."""
-        hours, travel, kelvin = (rng.permuted(np.tile((np.arange(count) + 0.5) / count, (3, 1)), axis=1))
+        hours, travel, kelvin = rng.permuted(np.tile((np.arange(count) + 0.5) / count, (3, 1)), axis=1)
         begun = np.asarray(self.warm_hours)[np.arange(draws) % len(self.warm_hours), None]
         low, high = self.kelvin
         return State(self.hours * hours, self.travel * travel, begun + self.hours * hours, low + (high - low) * kelvin)
