@@ -1,8 +1,8 @@
 """Predicted readings of an axis: the adapter of `statistics.predicted_readings.PredictedMachine`.
 
-Given the scales, every reading is a linear functional of the line, the contrast, the play, the processes, the creep and
-the thermal shift, whose joint posterior is normal, plus homing, drift, stop error and noise (formulation 8). Commands as
-in the folder, readings in its unit.
+Given the scales, a reading is a linear functional of line, contrast, play, processes, creep and thermal shift, whose
+joint posterior is normal, plus homing, drift, stop error and noise (formulation 8). Commands as in the folder, readings
+in its unit.
 """
 
 from __future__ import annotations

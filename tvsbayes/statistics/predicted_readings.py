@@ -139,5 +139,7 @@ class PredictedMachine(Protocol):
         """Predict what readings at the states `use` have more than at the state `at`, by cause, in `expected`."""
 
     def scatter(self, side: np.ndarray, use: State, u: np.ndarray | float) -> dict[str, np.ndarray]:
-        """Compute covariances (n, r, r) of what does not repeat, by cause: "homing" (one, for all), "drift" since then,
-        "stops", "readings" with stated uncertainties u."""
+        """Compute covariances (n, r, r) of what does not repeat, by cause, of readings after one homing.
+
+        Causes: "homing", "drift" since then, "stops", "readings" with stated uncertainties u.
+        """
