@@ -22,7 +22,8 @@ from experiments.common.command_line import study
 from experiments.common.page import heading, share
 from experiments.common.rigs import mounted_rig
 from tvsbayes.comparison import watched_looks
-from tvsbayes.comparison.watched_looks import CHANGES, FALSE_ALARM_RATE, NOISE_DRAWS, StatedChange
+from tvsbayes.comparison.departures import FALSE_ALARM_RATE, StatedChange, null_distribution, powers
+from tvsbayes.comparison.watched_looks import CHANGES, NOISE_DRAWS
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.noise_scales import noise_draws
@@ -87,8 +88,8 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
         days.append(day(result, first.campaign, truth, what, times, 1000 * (seed + 1) + number, planned.steps))
     taken = simulate(rig, planned.steps, 1000 * (seed + 1), truth=first.truth).campaign
     departure = watched_looks.WatchedLooks(result, taken).departure(noise.centre)
-    limit = watched_looks.null_distribution(departure, 0).limit
-    row["stated"] = {"1": [c.power for c in planned.changes], "4": watched_looks.powers(departure, limit, 0, 4.0)}
+    limit = null_distribution(departure, 0).limit
+    row["stated"] = {"1": [c.power for c in planned.changes], "4": powers(departure, limit, 0, 4.0)}
     row["looks"], row["needed"] = planned.looks, [c.looks_needed for c in planned.changes]
     return {**row, "homings": planned.homings, "minutes": planned.minutes, "days": days}
 

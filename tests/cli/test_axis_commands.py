@@ -81,7 +81,6 @@ def test_simulate_and_new(ask, folder, tmp_path):
         ("fit", "AXIS", "--robust"),
         ("fit", "AXIS", "--no-sample", "--quick"),
         ("compare", "AXIS", "--by", "steps"),
-        ("compare", "AXIS", "AXIS"),
         ("report", "AXIS", "--limit-mm", "1"),
         ("plan", "--given", "AXIS", "--target", "speed"),
         ("plan", "AXIS"),
@@ -98,6 +97,27 @@ def test_options_of_scanners_are_refused(ask, folder, tmp_path, line):
     assert code == 2 and assert_error(document, "target" if "speed" in line else "usage")
     if line[0] in ("locate", "steps-for", "detect", "export"):
         assert "is an axis folder" in document["error"]["message"] and "report" in document["error"]["remedy"]
+
+
+def test_later_readings_are_compared_and_watched(ask, say, folder, tmp_path):
+    later = drawn(7, runs(1), backlash=AxisPrior(0.0, 0.1))
+    later.write(tmp_path / "later")
+    code, document = ask("fit", folder, "--quick")
+    assert code == 0 and "doubts" in document
+    code, document = ask("compare", folder, tmp_path / "later")
+    assert code == 0 and document["kind"] == "two calibrations"
+    assert [change["quantity"] for change in document["changes"]] == ["effective_per_command", "effective_backlash"]
+    code, document = ask("watch", folder, tmp_path / "later", "--append", tmp_path / "nights.csv")
+    assert code == {"OK": 0, "MOVED": 1, "CANNOT TELL": 3}[document["verdict"]]
+    jsonschema.validate(document, shipped_schema("watch-1"))
+    assert [change["what"] for change in document["changes"]] == ["ratio", "play"]
+    assert document["verdict"] in (tmp_path / "nights.csv").read_text()
+    assert "new stops against the calibration" in say("watch", folder, tmp_path / "later")[1]
+    for command in ("compare", "watch"):
+        code, document = ask(command, folder, folder)
+        assert code == 2 and assert_error(document, "same-looks")
+        code, document = ask(command, folder, tmp_path)
+        assert code == 2 and assert_error(document, "usage")
 
 
 def test_two_positions_leave_nothing_to_predict(ask, tmp_path):

@@ -10,19 +10,17 @@ import pytest
 from support.dense_spots import dense_covariance
 from support.fit_documents import shipped_schema
 
-from tvsbayes.comparison import watched_looks
-from tvsbayes.comparison.watched_looks import (
-    CHANGES,
+from tvsbayes.comparison import departures
+from tvsbayes.comparison.departures import (
     FALSE_ALARM_RATE,
-    SIGHTED_CHANGES,
     Departure,
     DrawnDepartures,
-    WatchedLooks,
     columns_of,
+    log_chances,
     null_distribution,
     powers,
-    watch,
 )
+from tvsbayes.comparison.watched_looks import CHANGES, SIGHTED_CHANGES, WatchedLooks, watch
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.instrument.campaign import Campaign, write_campaign
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
@@ -112,7 +110,7 @@ def test_nothing_has_moved(mounted_rig, mixed_fit, truth, monkeypatch):
     test = watch(mixed_fit, looks)
     assert test.verdict == CANNOT_TELL and test.p > FALSE_ALARM_RATE and not test.moved and test.same_cameras
     assert "ratio: pan" in {change.what for change in test.unseen(0.8)}
-    monkeypatch.setattr(watched_looks, "POWER_MIN", 0.0)
+    monkeypatch.setattr(departures, "POWER_MIN", 0.0)
     assert watch(mixed_fit, looks).verdict == OK
     unseen = replace(looks, spots=tuple(replace(s, status="saturated") for s in looks.spots[3:]) + looks.spots[:3])
     with pytest.raises(NothingToEstimate, match="3 new looks"):
@@ -126,7 +124,7 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
     columns = generator.standard_normal((40, rows[-1].stop)) * 0.6
     # A size of 1 mm beside one of 0.05 deg: all changes about as visible.
     columns /= np.concatenate([np.full(len(c.names), c.size) for c in CHANGES])
-    known = Departure(0.0, 40, np.zeros(columns.shape[1]), columns.T @ columns)
+    known = Departure(0.0, 40, np.zeros(columns.shape[1]), columns.T @ columns, CHANGES)
     null, trials, shifted = null_distribution(known, 1), 400, rows[6]
     stated = powers(known, null.limit, 1)[6]
     alarms = noticed = 0
@@ -135,7 +133,7 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
         for moved in (False, True):
             sample = noise + moved * columns[:, shifted] @ [CHANGES[6].size]
             trial = replace(known, chi2=float(sample @ sample), score=columns.T @ sample)
-            logs = watched_looks.log_chances(DrawnDepartures(trial, (trial,), np.ones(1)), [])
+            logs = log_chances(DrawnDepartures(trial, (trial,), np.ones(1)), [])
             alarms += (not moved) and bool(logs[1:].min() <= null.limit)
             noticed += moved and bool(logs[1 + 6] <= null.limit)
     low, high = binomial_bounds(trials, FALSE_ALARM_RATE)

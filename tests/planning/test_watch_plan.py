@@ -10,7 +10,8 @@ import pytest
 from support.commands import MOUNTED
 from support.fit_documents import shipped_schema
 
-from tvsbayes.comparison.watched_looks import CHANGES, POWER_MIN, WatchedLooks, null_distribution, powers
+from tvsbayes.comparison.departures import POWER_MIN, null_distribution, powers
+from tvsbayes.comparison.watched_looks import CHANGES, WatchedLooks
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.plan import plan_minutes, read_plan

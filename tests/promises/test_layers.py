@@ -49,6 +49,7 @@ JAX_FREE_MODULES = (
     *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),
     *("estimators.findings", "estimators.counter_pattern"),
     *("comparison.gap", "comparison.changes", "comparison.held_out"),
+    *("comparison.departures", "comparison.axis_sessions"),
 )
 """Free of JAX until a function that fits is called, in packages that are not."""
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
@@ -56,6 +57,7 @@ OF_ONE_INSTRUMENT = {
     "single_axis": "an axis",
     "head": "a head with sightings",
     "compensation": "tables of an axis",
+    "comparison.axis_sessions": "an axis and its later readings",
     "cli": "finds the instrument of a folder, and runs its commands",
     "pipeline": "the same for Python: `read_campaign`, `verify`",
     "instrument.mechanisms": "the table of instruments with two axes",

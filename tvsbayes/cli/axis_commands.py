@@ -155,10 +155,10 @@ def _parts(folder: Path, issue: Issue, quick: bool, no_sample: bool, seed: int, 
 
 
 def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_json: bool) -> None:
-    """Hold out each position in turn, for the fit and the classic line."""
+    """Hold out each position in turn, for the fit and the classic line; with `other`, what has changed since."""
     if other is not None:
-        message = "B is a later campaign of a scanner; axes are compared one by one"
-        raise InputError("usage", message, remedy="leave out B")
+        _compare_later(folder, other, seed, as_json)
+        return
     from tvsbayes.report.axis_document import axis_hold_out_text
     from tvsbayes.results.comparison_record import hold_out_document
     from tvsbayes.single_axis.held_out_positions import hold_out_positions
@@ -172,6 +172,39 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
     document = hold_out_document(holdout, data.unit) | {"inputs": axis_hashes(data), "seed": seed}
     place = output_place(folder, "results") / "compare.json"
     finish_kept(document, axis_hold_out_text(holdout, data.unit), place, as_json)
+
+
+def _compare_later(folder: Path, other: Path, seed: int, as_json: bool) -> None:
+    """Print what changed between two campaigns of an axis."""
+    from tvsbayes.comparison.axis_sessions import compare_axes, refuse_other_axis, shared_positions
+    from tvsbayes.report.command_text import changes_text
+    from tvsbayes.single_axis.axis_record import results_for
+
+    first, second = read_axis(folder), read_axis(other)
+    refuse_other_axis(first, second)
+    positions = shared_positions(rows_of(first), rows_of(second))
+    stages = [f"{FITTING} of {escaped(str(each), 60)}" for each in (folder, other)]
+    with waiting() as progress, Job(dict.fromkeys(stages, 1.0), progress) as job:
+        fits = [
+            results_for(data, positions, progress=job.part(stage), seed=seed, notify=report_line).fit
+            for data, stage in zip((first, second), stages, strict=True)
+        ]
+    changes = compare_axes(*fits)
+    finish(changes.as_json(), changes_text(changes), as_json)
+
+
+def watch(folder: Path, *, looks: Path, append: Path | None, seed: int, as_json: bool) -> None:
+    """Test whether the fit of an axis still holds for the readings of a second folder."""
+    from tvsbayes.cli.watch_command import WATCHING, finish_watch
+    from tvsbayes.comparison.axis_sessions import watch_axis
+    from tvsbayes.single_axis.axis_record import results_for
+
+    known, new = read_axis(folder), read_axis(looks)
+    with waiting() as progress, Job({FITTING: 1.0, WATCHING: 1.0}, progress) as job:
+        results = results_for(known, progress=job.part(FITTING), seed=seed, notify=report_line)
+        job.begin(WATCHING)
+        result = watch_axis(results.fit, new, seed=seed)
+    finish_watch(result, append, as_json, "stops")
 
 
 def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:

@@ -22,7 +22,7 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
-from tvsbayes.cli.instruments import serve
+from tvsbayes.cli.instruments import refuse_mixed, serve
 from tvsbayes.cli.progress_bar import chain_progress, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
@@ -177,6 +177,7 @@ def compare(
 
     if other is not None:
         refuse_options("for one campaign: with B nothing is left out", "leave it out, or leave out B", by=by, seed=seed)
+        refuse_mixed(campaign, other)
     if serve("compare", campaign, other=other, by=by, seed=seed or 0, as_json=as_json):
         return
     if by not in (None, "steps", "regions", "positions"):

@@ -67,11 +67,10 @@ INSTRUMENTS = {
         "an axis",
         "an axis folder",
         "tvsbayes.cli.axis_commands",
-        "of an axis: check, classic, fit, calibrate, compare --by positions, report, plan --given",
+        "of an axis: check, classic, fit, calibrate, compare, watch, report, plan --given",
         {
             "fit": "leave it out, or state priors in [axis]",
             "view": "`tvsbayes report` makes the page of an axis",
-            "watch": "use compare --by positions",
         },
     ),
     "pan-tilt": Instrument(
@@ -102,6 +101,19 @@ def instrument_of(path: Path | None) -> Instrument | None:
     from tvsbayes.instrument.campaign_header import mechanism_key
 
     return None if path is None else INSTRUMENTS.get(mechanism_key(path))
+
+
+def refuse_mixed(first: Path, second: Path) -> None:
+    """Refuse two folders of which one is that of an axis.
+
+    Raises:
+        InputError: they are.
+    """
+    kinds = [instrument_of(folder) is INSTRUMENTS["axis"] for folder in (first, second)]
+    if kinds[0] != kinds[1]:
+        named = escaped(str(second if kinds[1] else first), 200)
+        message = f"{named} is an axis folder, and the other folder is not"
+        raise InputError("usage", message, remedy="name two folders of one instrument")
 
 
 def serve(command: str, campaign: Path | None, **options: object) -> bool:

@@ -17,7 +17,7 @@ COLOUR_STARTS = (
     ("red", ("verdict: VALIDATION FAILED", "verdict: UNCONVERGED", "verdict: PRIOR CONFLICT", "NO NUMBER OF LOOKS")),
     ("red", ("MOVED (p ",)),
     ("yellow", ("warning:", "weak", "prior conflict:", "depends on one stop:", "few stops", "spots that disagree")),
-    ("yellow", ("CANNOT TELL (p ",)),
+    ("yellow", ("CANNOT TELL (p ", "verdict: DOUBTFUL", "doubt:")),
     ("green", ("verdict: usable", "OK (p ")),
     ("cyan", ("next:", "what to do:", "what helps:")),
 )

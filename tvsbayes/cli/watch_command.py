@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, report_line
-from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
+from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, refuse_mixed, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.csv_table import append_line
@@ -25,7 +25,7 @@ TABLE_COLUMNS = ("time", "verdict", "p", "looks", "moved")
 
 def watch(
     campaign: CampaignFolder,
-    looks: Annotated[Path, typer.Argument(metavar="LOOKS", help="Campaign folder of at least 4 new looks.")],
+    looks: Annotated[Path, typer.Argument(metavar="LOOKS", help="Campaign folder of at least 4 new looks or stops.")],
     append: Annotated[
         Path | None, typer.Option("--append", metavar="TABLE.csv", help="Add a line to this table, for a nightly job.")
     ] = None,
@@ -34,9 +34,10 @@ def watch(
 ) -> None:
     """Test whether a calibration still holds: OK, MOVED or CANNOT TELL.
 
-    Exit 0, 1 or 3. What moved (cameras, positioner, ratio, play), by how much, and what the looks can see.
+    Exit 0, 1 or 3. What moved (cameras, positioner, zero, ratio, play), by how much, and what the looks can see.
     """
-    if serve("watch", **locals()) or serve("watch", looks):
+    refuse_mixed(campaign, looks)
+    if serve("watch", **locals()):
         return
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.copies import refuse_same_looks
@@ -47,17 +48,22 @@ def watch(
     with waiting() as progress, Job({FITTING: 1.0, WATCHING: 1.0}, progress) as job:
         fitted = StoredOrFitted(known, report_line, job.part(FITTING)).fit
         job.begin(WATCHING)
-        from tvsbayes.comparison.watched_looks import POWER_MIN
         from tvsbayes.comparison.watched_looks import watch as watch_looks
 
         result = watch_looks(fitted, new, seed=seed)
     if not result.same_cameras:
         report_line("warning: the new looks state other cameras; those of the campaign are used")
+    finish_watch(result, append, as_json)
+
+
+def finish_watch(result: Watch, append: Path | None, as_json: bool, looks: str = "looks") -> None:
+    """Print the result, add it to a table, and end with its exit code; `looks` is what the new data are."""
+    from tvsbayes.comparison.departures import POWER_MIN
     from tvsbayes.report.watch_text import watch_text
     from tvsbayes.results.watch_record import CANNOT_TELL, OK
 
     error = None if append is None else _append(append, result)
-    finish(result.as_json(), watch_text(result, POWER_MIN), as_json, error)
+    finish(result.as_json(), watch_text(result, POWER_MIN, looks), as_json, error)
     if result.verdict != OK:
         raise Ended(NothingToEstimate.exit_code if result.verdict == CANNOT_TELL else TARGET_MISSED)
 

@@ -1,18 +1,19 @@
-"""Comparison of two campaigns of one rig: ratios and backlashes that have changed significantly.
+"""Comparison of two campaigns of one instrument: ratios and backlashes that have changed significantly.
 
-Local ratios in deg/step at the reference pose of the first, backlashes in deg. Effective ratios are not compared, since
-lines through looks at other counters are other quantities. JAX is loaded by a comparison, not by the import.
+Of two axes local ratios in deg/step at the reference pose of the first, backlashes in deg. Effective ratios are not
+compared, since lines through looks at other counters are other quantities. JAX is loaded by a comparison, not by the
+import.
 """
 
 from __future__ import annotations
 
 import datetime
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tvsbayes.comparison.gap import camera_influence
-from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import TARGETS, unit_of
 from tvsbayes.instrument.stereo_pair import stereo_covariance, stereo_parameters
 from tvsbayes.results.comparison_record import Change, Comparison
@@ -43,26 +44,55 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         first: converged fit of A.
         second: converged fit of B.
     """
-    from scipy import special
-
     pose = first.reference_pose_rad
     ours, theirs = first.campaign.stereo, second.campaign.stereo
     shared = all(np.array_equal(part(ours), part(theirs)) for part in (stereo_parameters, stereo_covariance))
     before, after = _draws_at(first, pose), _draws_at(second, pose)
-    limit = -float(special.ndtri(0.5 * (1 - 0.95 ** (1 / len(COMPARED)))))
-    variance = before[1:].var(axis=0, ddof=1) + after[1:].var(axis=0, ddof=1)
+    common = np.zeros(len(COMPARED))
     if shared:
         influence = camera_influence(first, before[1:]), camera_influence(second, after[1:])
-        variance = variance - 2 * np.sum(influence[0] * influence[1], axis=1)
+        common = 2 * np.sum(influence[0] * influence[1], axis=1)
+    pan, tilt = np.degrees(pose)
+    return compared(
+        [(name, unit_of(name)) for name in COMPARED],
+        before,
+        after,
+        common,
+        reference_pose_deg=(float(pan), float(tilt)),
+        shared_cameras=shared,
+        days=days_between(first.campaign.header, second.campaign.header),
+    )
+
+
+def compared(
+    quantities: Sequence[tuple[str, str]],
+    before: np.ndarray,
+    after: np.ndarray,
+    common: np.ndarray | float = 0.0,
+    **about: Any,
+) -> Comparison:
+    """Test whether quantities differ between two calibrations.
+
+    Args:
+        quantities: name and unit of each.
+        before: estimate, then draws, of A, shape (1 + draws, quantities).
+        after: those of B.
+        common: what a common error takes from the variance of each difference.
+        about: further fields of `Comparison`.
+    """
+    from scipy import special
+
+    limit = -float(special.ndtri(0.5 * (1 - 0.95 ** (1 / len(quantities)))))
+    variance = before[1:].var(axis=0, ddof=1) + after[1:].var(axis=0, ddof=1) - common
     changes = []
-    for k, name in enumerate(COMPARED):
+    for k, (name, unit) in enumerate(quantities):
         a, b = float(before[0, k]), float(after[0, k])
         # A quantity fixed in both has changed if the stated values differ; its variance is zero except for rounding.
         fixed = np.ptp(before[1:, k]) == np.ptp(after[1:, k]) == 0
         u = 0.0 if fixed else float(np.sqrt(max(variance[k], 0.0)))
         ratio = (b - a) / u if u > 0 else None
         significant = a != b if ratio is None else abs(ratio) > limit
-        changes.append(Change(name, unit_of(name), a, b, b - a, u, ratio, significant))
+        changes.append(Change(name, unit, a, b, b - a, u, ratio, significant))
     moved = [c for c in changes if c.significant]
     listed = ", ".join(
         f"{c.label} by {c.difference:+.3g} {c.unit} "
@@ -70,16 +100,14 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         for c in moved
     )
     verdict = f"changed: {listed}" if moved else "no significant change"
-    days = _days_between(first.campaign, second.campaign)
-    pan, tilt = np.degrees(pose)
-    return Comparison((float(pan), float(tilt)), tuple(changes), shared, days, limit, verdict)
+    return Comparison(changes=tuple(changes), limit=limit, verdict=verdict, **about)
 
 
-def _days_between(first: Campaign, second: Campaign) -> float | None:
-    """Compute the days between two campaigns that both state when they were made; dates count from midnight, UTC."""
+def days_between(first: Mapping[str, object], second: Mapping[str, object]) -> float | None:
+    """Compute the days between two campaigns whose headers both state a date; dates count from midnight, UTC."""
     made = []
-    for campaign in (first, second):
-        when = campaign.header.get("created")
+    for header in (first, second):
+        when = header.get("created")
         if not isinstance(when, datetime.date):
             return None
         if not isinstance(when, datetime.datetime):

@@ -17,7 +17,8 @@ from tvsbayes.calibration.aiming import Direction, mirror_angles
 from tvsbayes.calibration.calibration_file import calibration_of_arrays
 from tvsbayes.calibration.optics import beam_components, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
-from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
+from tvsbayes.comparison.departures import LOOKS_MIN
+from tvsbayes.comparison.watched_looks import WatchedLooks
 from tvsbayes.compensation.promise import bound_of, refuse_answer
 from tvsbayes.compensation.verification import (
     IDENTIFIED,

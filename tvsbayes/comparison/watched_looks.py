@@ -7,11 +7,11 @@ them; nothing is refitted. A change is a shift of parameters for the new looks a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from tvsbayes.comparison.departures import LOOKS_MIN, Departure, DrawnDepartures, StatedChange, single_change, tested
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.campaign_arrays import in_sight
@@ -27,41 +27,10 @@ from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import physical_at
-from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK, MovedPart, SeenChange, Verdict, Watch
-from tvsbayes.statistics.chances import log_chance
+from tvsbayes.results.watch_record import Watch
 
-LOOKS_MIN = 4
-"""Least number of usable new looks."""
-FALSE_ALARM_RATE = 0.01
-POWER_MIN = 0.8
-"""Power for a change of the stated size that a verdict of OK requires."""
 NOISE_DRAWS = 32
 """Draws of the noise scales, geometry and cameras integrated out, over which probabilities are averaged."""
-NULL_DRAWS, DIRECTIONS_ASKED = 20_000, 200
-"""Draws of the joint null distribution, and directions of a change over which its power is averaged."""
-FOLLOWED = 1e-6
-"""Share of a direction's information below which the old parameters can explain it entirely."""
-TOLD_U = 2.0
-"""Components of a change above this many u are reported."""
-
-
-@dataclass(frozen=True)
-class StatedChange:
-    """A change that is tested.
-
-    Attributes:
-        what: its name in reports.
-        names: parameters that it shifts.
-        parts: names of their shifts in reports.
-        size: length of the shift that must be detected, in `unit`.
-        unit: unit of the shift.
-    """
-
-    what: str
-    names: tuple[str, ...]
-    parts: tuple[str, ...]
-    size: float
-    unit: str
 
 
 def _pose(what: str, block: str) -> tuple[StatedChange, StatedChange]:
@@ -73,31 +42,24 @@ def _pose(what: str, block: str) -> tuple[StatedChange, StatedChange]:
     )
 
 
-def _single(what: str, name: str, size: float, unit: str) -> StatedChange:
-    return StatedChange(what, (name,), (what,), size, unit)
-
-
 _GEARS = (
-    *(_single(f"ratio: {axis}", f"degrees_per_step.{axis}", 0.3, "%") for axis in AXES),
-    *(_single(f"play: {axis}", f"backlash_deg.{axis}", 0.1, "deg") for axis in AXES),
+    *(single_change(f"ratio: {axis}", f"degrees_per_step.{axis}", 0.3, "%") for axis in AXES),
+    *(single_change(f"play: {axis}", f"backlash_deg.{axis}", 0.1, "deg") for axis in AXES),
 )
 CHANGES = (*_pose("cameras", "stereo"), *_pose("positioner", "extrinsics"), *_GEARS)
 """Tested changes of what a stereo pair sees, with the sizes that must be detected."""
 _LEAN = tuple(f"azimuth_axis_tilt_deg.{side}" for side in ("north", "east"))
 SIGHTED_CHANGES = (
     # These sizes exceed the uncertainty of a homing.
-    *(_single(f"zero: {angle}", f"{angle}_zero_deg", 5 * HOME_SD_DEG, "deg") for angle in ("azimuth", "elevation")),
+    *(
+        single_change(f"zero: {angle}", f"{angle}_zero_deg", 5 * HOME_SD_DEG, "deg")
+        for angle in ("azimuth", "elevation")
+    ),
     StatedChange("base: lean", _LEAN, ("base: lean to azimuth 0", "base: lean to azimuth 90"), 0.1, "deg"),
-    _single("beam: not square", "beam_not_square_deg", 0.1, "deg"),
+    single_change("beam: not square", "beam_not_square_deg", 0.1, "deg"),
     *_GEARS,
 )
 """The same of a head that says where it points."""
-
-
-def columns_of(changes: Sequence[StatedChange]) -> tuple[slice, ...]:
-    """Return the columns of each change among the shifts of all."""
-    ends = np.cumsum([len(change.names) for change in changes])
-    return tuple(slice(int(end) - len(change.names), int(end)) for end, change in zip(ends, changes, strict=True))
 
 
 def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
@@ -109,75 +71,6 @@ def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
     )
     second = tuple(s.renumbered(s.spot + spots, s.move + moves) for s in looks.spots)
     return replace(campaign, moves=(*campaign.moves, *later), spots=(*campaign.spots, *second))
-
-
-@dataclass(frozen=True)
-class Departure:
-    """Residuals of new looks from their prediction by the first session, at one set of noise scales.
-
-    Attributes:
-        chi2: squared length of the residuals in units of their covariance.
-        dof: its number of observations.
-        score: score of the shifts, in the units of `changes`, shape (q,).
-        information: information of the looks on them, shape (q, q).
-        changes: changes of these shifts.
-    """
-
-    chi2: float
-    dof: int
-    score: np.ndarray
-    information: np.ndarray
-    changes: tuple[StatedChange, ...] = CHANGES
-
-    @property
-    def columns(self) -> tuple[slice, ...]:
-        """Return the columns of each change among the shifts."""
-        return columns_of(self.changes)
-
-    def given(self, known: list[slice]) -> Departure:
-        """Condition on some changes being free; score and information of the others remain."""
-        if not known:
-            return self
-        rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
-        load = self.information[:, rows] @ _inverse(self.information[np.ix_(rows, rows)])
-        information = self.information - load @ self.information[rows]
-        return replace(self, score=self.score - load @ self.score[rows], information=information)
-
-
-@dataclass(frozen=True)
-class DrawnDepartures:
-    """Departures over the distribution of the noise scales.
-
-    Attributes:
-        centre: departure at their most probable values.
-        drawn: departures at draws of them.
-        weights: weights of the draws, sum 1.
-    """
-
-    centre: Departure
-    drawn: tuple[Departure, ...]
-    weights: np.ndarray
-
-
-def _directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute eigenvalues of the scaled information not explained by old parameters, and unscaled vectors."""
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    kept = values > FOLLOWED
-    return values[kept], vectors[:, kept] / scale[:, None]
-
-
-def _inverse(information: np.ndarray) -> np.ndarray:
-    values, vectors = _directions(information)
-    return (vectors / values) @ vectors.T
-
-
-def _log_chances(score: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Compute log p of chi-squares of scores (..., q); 0 where the information has no direction."""
-    values, vectors = _directions(information)
-    if not len(values):
-        return np.zeros(score.shape[:-1])
-    return log_chance(np.sum((score @ vectors) ** 2 / values, axis=-1), len(values))
 
 
 @dataclass(frozen=True)
@@ -283,105 +176,6 @@ def rows_of(spots: LinearSpots, rows: slice) -> LinearSpots:
     return LinearSpots(**{part.name: getattr(spots, part.name)[rows] for part in fields(spots)})
 
 
-def log_chances(departures: DrawnDepartures, known: list[slice]) -> np.ndarray:
-    """Compute log p of all residuals, then of every change given known ones, averaged over noise scales, (1 + c,)."""
-    chances = []
-    for departure in departures.drawn:
-        left, logs = departure.given(known), [log_chance(departure.chi2, departure.dof)]
-        for rows in departure.columns:
-            own = _log_chances(left.score[rows], left.information[rows, rows])
-            logs.append(np.zeros(()) if rows in known else own)
-        chances.append(np.array(logs))
-    with np.errstate(divide="ignore"):
-        weights = np.log(departures.weights)
-    return np.logaddexp.reduce(np.array(chances) + weights[:, None], axis=0)
-
-
-@dataclass(frozen=True)
-class NullDistribution:
-    """Null distribution of the least log p of all changes, sorted, shape (draws,); `tests` is their number."""
-
-    least: np.ndarray
-    tests: int
-
-    @property
-    def limit(self) -> float:
-        """Compute the limit of log p of single tests at the false-alarm rate of all together."""
-        return float(np.quantile(self.least, FALSE_ALARM_RATE))
-
-    def probability(self, log_p: float) -> float:
-        """Compute the p-value of a least log p; beyond the draws by Bonferroni's bound."""
-        counted = np.searchsorted(self.least, log_p, side="right")
-        if not counted:
-            return float(min(1 / len(self.least), self.tests * np.exp(log_p)))
-        return float(counted / len(self.least))
-
-
-def null_distribution(departure: Departure, seed: int) -> NullDistribution:
-    """Simulate the linear model: scores ~ N(0, information)."""
-    generator = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(departure.information)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    scores = generator.standard_normal((NULL_DRAWS, len(root))) @ root.T
-    own = [_log_chances(scores[:, rows], departure.information[rows, rows]) for rows in departure.columns]
-    return NullDistribution(np.sort(np.min([np.zeros(NULL_DRAWS), *own], axis=0)), len(departure.changes))
-
-
-def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) -> list[float]:
-    """Compute the power of each change's own test, averaged over directions of the shift.
-
-    It is a lower bound of the power of all tests together.
-
-    Args:
-        departure: only its information is used, so it may be that of a plan.
-        limit: of log p.
-        seed: seed of the directions.
-        times: size of the change as a multiple of the stated one.
-    """
-    from scipy import special
-
-    generator, shares = np.random.default_rng(seed), []
-    for change, rows in zip(departure.changes, departure.columns, strict=True):
-        block = departure.information[rows, rows]
-        values, _ = _directions(block)
-        dof = len(values)
-        if not dof:
-            shares.append(0.0)
-            continue
-        ways = generator.standard_normal((DIRECTIONS_ASKED, len(change.names)))
-        ways *= times * change.size / np.linalg.norm(ways, axis=1, keepdims=True)
-        critical = special.chdtri(dof, np.exp(limit))
-        off = np.einsum("ni,ij,nj->n", ways, block, ways)
-        shares.append(float(np.mean(1 - special.chndtr(critical, dof, off))))
-    return shares
-
-
-def _moved(departures: DrawnDepartures, limit: float) -> tuple[MovedPart, ...]:
-    """Find changes that explain the looks, the best first, each given those before it."""
-    moved: list[int] = []
-    places = departures.centre.columns
-    while len(moved) < len(places):
-        logs = log_chances(departures, [places[k] for k in moved])[1:]
-        best = int(np.argmin(logs))
-        if logs[best] > limit:
-            break
-        moved.append(best)
-    if not moved:
-        return ()
-    rows = np.concatenate([np.arange(places[k].start, places[k].stop) for k in moved])
-    covariance = _inverse(departures.centre.information[np.ix_(rows, rows)])
-    sizes, us = covariance @ departures.centre.score[rows], np.sqrt(np.diag(covariance))
-    parts: list[MovedPart] = []
-    start = 0
-    for change in (departures.centre.changes[k] for k in moved):
-        own = slice(start, start := start + len(change.parts))
-        value, u = sizes[own], us[own]
-        ratio = np.abs(value) / u
-        significant = [k for k in np.argsort(-ratio).tolist() if ratio[k] > TOLD_U] or [int(np.argmax(ratio))]
-        parts += [MovedPart(change.parts[k], float(value[k]), float(u[k]), change.unit) for k in significant]
-    return tuple(parts)
-
-
 def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
     """Test whether a calibration still holds for new looks.
 
@@ -405,25 +199,5 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
             remedy=looks.look_again,
         )
     watched = WatchedLooks(fit, looks)
-    departures = watched.departures(seed)
-    null = null_distribution(departures.centre, seed)
-    logs = log_chances(departures, [])
-    able = powers(departures.centre, null.limit, seed)
-    changes = tuple(
-        SeenChange(change.what, change.size, change.unit, power, float(np.exp(log_p)))
-        for change, power, log_p in zip(watched.changes, able, logs[1:], strict=True)
-    )
-    # The test of all residuals raises no alarm, since single bad looks have many causes other than a change.
-    moved = bool(logs[1:].min() <= null.limit)
-    verdict: Verdict = MOVED if moved else OK if min(able) >= POWER_MIN else CANNOT_TELL
     hashes = input_hashes(fit.campaign)["stereo"], input_hashes(looks)["stereo"]
-    return Watch(
-        verdict=verdict,
-        p=null.probability(float(logs[1:].min())),
-        false_alarm_rate=FALSE_ALARM_RATE,
-        p_all=float(np.exp(logs[0])),
-        moved=_moved(departures, null.limit) if moved else (),
-        changes=changes,
-        looks=watched.looks,
-        same_cameras=hashes[0] == hashes[1],
-    )
+    return tested(watched.departures(seed), watched.looks, hashes[0] == hashes[1], seed)

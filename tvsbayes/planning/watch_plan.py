@@ -14,17 +14,16 @@ from functools import cached_property
 
 import numpy as np
 
-from tvsbayes.comparison.watched_looks import (
+from tvsbayes.comparison.departures import (
     FALSE_ALARM_RATE,
     LOOKS_MIN,
     POWER_MIN,
     Departure,
-    WatchedLooks,
     columns_of,
     null_distribution,
     powers,
-    rows_of,
 )
+from tvsbayes.comparison.watched_looks import WatchedLooks, rows_of
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information

@@ -229,9 +229,10 @@ def _lines(title: str, texts: Sequence[str]) -> list[str]:
 
 
 def warnings_note(summary: AxisSummary) -> str:
-    """A reference to the warnings, at the end of a verdict."""
-    count = len(summary.warnings)
-    return f"; see the {count} warnings" if count > 1 else "; see the warning" * count
+    """A reference to doubts and warnings, at the end of a verdict."""
+    counts = {"doubt": len(summary.doubts), "warning": len(summary.warnings)}
+    named = [f"the {count} {word}s" if count > 1 else f"the {word}" for word, count in counts.items() if count]
+    return f"; see {' and '.join(named)}" if named else ""
 
 
 def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence[str] = ()) -> str:
@@ -253,6 +254,7 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
         parts = [f"--details and the report say more: {count} weak direction{'s' * (count > 1)}"]
     title = "not accepted" if summary.explained else "NOT CONVERGED"
     parts += [*_lines(title, summary.problems), *_lines("warning", summary.warnings)]
+    parts += _lines("doubt", [doubt.text for doubt in summary.doubts])
     parts += _lines("prior conflict", summary.prior_conflicts)
     parts += [f"written: {', '.join(written)}"] if written else []
     data = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {method}"
@@ -273,6 +275,8 @@ def axis_verdict(summary: AxisSummary) -> str:
         return "NOT CONVERGED, use none of these numbers"
     if summary.prior_conflicts:
         return f"PRIOR CONFLICT, {CONFLICT_TEXT}"
+    if any(not doubt.usable for doubt in summary.doubts):
+        return f"DOUBTFUL, not usable as it is{warnings_note(summary)}"
     if not summary.converged:
         return f"{UNSAMPLED}{warnings_note(summary)}"
     return f"{ROUGH if summary.answer == 'rough' else 'usable'}{warnings_note(summary)}"
@@ -282,7 +286,9 @@ def hold_out_table(hold_out: AxisHoldOut, unit: str) -> TableView:
     """Positions left out, with their predictions."""
     rows = []
     for p in hold_out.positions:
-        row = [f"{p.position:.10g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{p.z:+.1f}"]
+        # To the digits of u.
+        mean = concise(p.mean, p.u).partition("(")[0]
+        row = [f"{p.position:.10g}", p.direction, str(p.n), mean, concise(p.predicted, p.u), f"{p.z:+.1f}"]
         rows.append([*row, f"{p.classic_z:+.1f}"])
     caption = f"positions left out and predicted, {escaped(unit)}; z in stated uncertainties"
     return TableView(caption, ["position", "direction", "n", "mean", "predicted(u)", "z", "z classic"], rows)
@@ -448,7 +454,12 @@ def axis_document(results: AxisResults, issue: Issue) -> Document:
             picture=figures[0] if figures else None,
             steps=_steps(summary, folder),
             traceable="The readings are taken as stated.",
-            warnings=[*summary.problems, *summary.warnings, *_lines("Prior conflict", summary.prior_conflicts)],
+            warnings=[
+                *summary.problems,
+                *_lines("Doubt", [doubt.text for doubt in summary.doubts]),
+                *summary.warnings,
+                *_lines("Prior conflict", summary.prior_conflicts),
+            ],
             versions=origin.shown_versions,
             sections=axis_sections(results, figures[1:]),
             title="Calibration of an axis",

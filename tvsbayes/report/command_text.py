@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import UNSET
 
 from tvsbayes.calibration.pointing import Steps
 from tvsbayes.display import concise
@@ -401,21 +402,29 @@ def changes_text(comparison: Comparison) -> str:
     """Changes between two calibrations of one instrument as text."""
     rows = []
     for c in comparison.changes:
-        cells = [c.label, f"{c.first:.6f}", f"{c.second:.6f}", concise(c.difference, c.u), c.unit]
+        # To the digits of the difference's u.
+        values = [concise(value, c.u).partition("(")[0] for value in (c.first, c.second)]
+        cells = [c.label, *values, concise(c.difference, c.u), escaped(c.unit)]
         normalised = "fixed" if c.normalised is None else f"{c.normalised:+.2f}"
         rows.append([*cells, normalised, "yes" if c.significant else "no"])
-    pan, tilt = comparison.reference_pose_deg
-    title = f"A and B at pan {pan:.2f} deg, tilt {tilt:.2f} deg"
+    title = "A and B"
+    if comparison.reference_pose_deg is not UNSET:
+        pan, tilt = comparison.reference_pose_deg
+        title += f" at pan {pan:.2f} deg, tilt {tilt:.2f} deg"
+    if comparison.range_command is not UNSET:
+        low, high = comparison.range_command
+        title += f" from command {low:.10g} to {high:.10g}"
     table = TableView(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows)
     days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
-    cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
-    verdict = f"{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
-    ratios = [c for c in comparison.changes if c.unit == "deg/step" and c.u > 0]
+    cameras = {True: "; the same stereo calibration: its error is left out of u", False: "; two cameras"}
+    shared = cameras.get(comparison.shared_cameras is True) if comparison.shared_cameras is not UNSET else ""
+    verdict = f"{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together{shared})"
+    ratios = [c for c in comparison.changes if "per" in c.quantity and c.u > 0]
     if ratios and not any(c.significant for c in comparison.changes):
         share = max(comparison.limit * c.u / abs(c.first) for c in ratios)
         verdict += (
             f"\nsmaller changes are not excluded: a ratio may have changed by up to {100 * share:.2g} % undetected; "
-            "`tvsbayes watch A B` compares the looks of B with A and detects smaller changes"
+            "`tvsbayes watch A B` compares what was seen in B with A and detects smaller changes"
         )
     return terminal(table, verdict)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from tvsbayes.display import concise
+from tvsbayes.errors import escaped
 from tvsbayes.report.document import terminal
 from tvsbayes.report.tables import TableView
 from tvsbayes.results.watch_record import CANNOT_TELL, LOOKS_MAX, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
@@ -22,6 +23,9 @@ HELPS = {
     "ratio: tilt": "tilt counters further apart, each reached several times",
     "play: pan": "each pan counter from both sides, several times",
     "play: tilt": "each tilt counter from both sides, several times",
+    "zero": "more homings, each with its stops: the scatter of homings has the same effect",
+    "ratio": "stops further apart, each reached several times",
+    "play": "each command from both sides, several times",
 }
 """Looks that detect a change better, by change."""
 LINEAR = {"deg": 1.0, "mm": 10.0}
@@ -40,27 +44,30 @@ REMEDIES = {
 
 def moved_text(part: MovedPart) -> str:
     """Format a moved part, e.g. `cameras: rotation about y 0.052(6) deg`."""
-    return f"{part.what} {concise(part.value, part.u)} {part.unit}"
+    return f"{part.what} {concise(part.value, part.u)} {escaped(part.unit)}"
 
 
-def watch_text(watch: Watch, power_min: float) -> str:
+def watch_text(watch: Watch, power_min: float, looks: str = "looks") -> str:
     """A watched calibration as text.
 
     Args:
         watch: the result.
         power_min: with less power a change counts as undetectable.
+        looks: what the new data are.
     """
     rows = [
-        [c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", "< 1e-9" if c.p < 1e-9 else f"{c.p:.2g}"]
+        [c.what, f"{c.size:g} {escaped(c.unit)}", f"{100 * c.power:.0f} %", "< 1e-9" if c.p < 1e-9 else f"{c.p:.2g}"]
         for c in watch.changes
     ]
     table = TableView(
-        f"{watch.looks} new looks against the calibration", ["change", "of", "would be noticed by", "p"], rows
+        f"{watch.looks} new {looks} against the calibration", ["change", "of", "would be noticed by", "p"], rows
     )
     p = "< 1e-9" if watch.p < 1e-9 else f"= {watch.p:.2g}"
     lines = [f"{watch.verdict} (p {p}; false alarms {100 * watch.false_alarm_rate:g} %)"]
     lines += [f"moved: {moved_text(part)}" for part in watch.moved]
-    if any(abs(part.value) > LINEAR.get(part.unit, math.inf) for part in watch.moved):
+    # The readings of an axis are linear in its changes.
+    linear = LINEAR if looks == "looks" else {}
+    if any(abs(part.value) > linear.get(part.unit, math.inf) for part in watch.moved):
         lines.append(
             "sizes are linearised about the calibration: so large ones are inaccurate by more than the stated u"
         )
@@ -72,9 +79,9 @@ def watch_text(watch: Watch, power_min: float) -> str:
             lines.append(f"then watch again: {others} may show residuals of the first cause only")
     unseen = watch.unseen(power_min)
     if watch.verdict == CANNOT_TELL:
-        lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
+        lines += [f"cannot see {c.size:g} {escaped(c.unit)} of {c.what}: {HELPS[c.what]}" for c in unseen]
     if watch.verdict != MOVED and watch.p_all < watch.false_alarm_rate:
-        lines.append(f"warning: the looks scatter more than the calibration says (p = {watch.p_all:.2g})")
+        lines.append(f"warning: the {looks} scatter more than the calibration says (p = {watch.p_all:.2g})")
     return terminal(*lines, "", table)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated
 
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from tvsbayes.display import Shown, View
 from tvsbayes.instrument.campaign import Campaign
@@ -250,21 +250,23 @@ class Change(Record, frozen=True):
         return self.quantity.replace("effective_deg_per_step", "local_deg_per_step")
 
 
-class Comparison(Shown, Record, frozen=True, tag_field="kind", tag="two calibrations"):
-    """Two calibrations of one instrument at one pose.
+class Comparison(Shown, Record, frozen=True, kw_only=True, tag_field="kind", tag="two calibrations"):
+    """Two calibrations of one instrument.
 
     Attributes:
-        reference_pose_deg: pose (pan, tilt) of A at which both are compared.
-        changes: changes of the local ratios at that pose and of the backlashes.
-        shared_cameras: both campaigns state the same stereo calibration; its error is common.
+        reference_pose_deg: of two axes, pose (pan, tilt) of A at which both are compared.
+        range_command: of one axis, first and last of the positions of A at which both are compared.
+        changes: changes of the ratios there and of the backlashes.
+        shared_cameras: of two axes, whether both campaigns state the same stereo calibration; its error is common.
         days: time from A to B where both state their date.
         limit: limit of |normalised|.
         verdict: conclusion, in words.
     """
 
-    reference_pose_deg: tuple[float, float]
+    reference_pose_deg: tuple[float, float] | UnsetType = UNSET
+    range_command: tuple[float, float] | UnsetType = UNSET
     changes: tuple[Change, ...]
-    shared_cameras: bool
+    shared_cameras: bool | UnsetType = UNSET
     days: float | None
     limit: float
     verdict: str

@@ -17,7 +17,7 @@ Verdict = Literal["OK", "MOVED", "CANNOT TELL"]
 OK: Verdict = "OK"
 MOVED: Verdict = "MOVED"
 CANNOT_TELL: Verdict = "CANNOT TELL"
-type Unit = Annotated[str, Meta(extra_json_schema={"enum": ("deg", "mm", "%")})]
+type Unit = Annotated[str, Meta(min_length=1, description="deg, mm or %; of an axis the unit of its readings or %")]
 type Looks = Annotated[int, Meta(ge=4)]
 LOOKS_MAX = 384
 """Largest number of looks in a plan for `watch`; a larger need is reported, not planned."""
@@ -57,7 +57,7 @@ class Watch(Shown, Record, frozen=True):
         p: probability of a largest deviation at least this large if nothing has moved, for all changes together.
         false_alarm_rate: probability of `MOVED` if nothing has moved.
         moved: detected changes, the best explanation first; empty unless `MOVED`.
-        looks: usable new looks.
+        looks: usable new looks, of an axis stops.
         p_all: probability of residuals this large at the fitted noise; it raises no alarm.
         changes: every change that is tested.
         same_cameras: whether the new looks state the campaign's stereo calibration.

@@ -38,6 +38,7 @@ from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_PARTS
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.axis_rows import rows_of
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
+from tvsbayes.single_axis.fit_doubts import AxisDoubt, doubts_of, without_processes
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
@@ -91,6 +92,7 @@ class AxisSummary(Shown, Record, frozen=True):
         monte_carlo_error: errors of every headline, in its sd.
         effective_backlash: mean of the play over the positions read; `backlash` is the mean of all positions, read or
             not; None where no play was read.
+        doubts: results that physics excludes or that rest on the priors.
     """
 
     unit: str
@@ -117,6 +119,7 @@ class AxisSummary(Shown, Record, frozen=True):
     encoder_periods: tuple[PeriodEstimate, ...] = ()
     periods_in: PeriodClock = "unit"
     effective_backlash: Estimate | None = None
+    doubts: tuple[AxisDoubt, ...] = ()
 
     @property
     def explained(self) -> bool:
@@ -193,7 +196,7 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
     linear = [name for name, quantity in AXIS_QUANTITIES.items() if quantity.line and not quantity.parts]
     names = [*sampled, *fit.model.shifts, *linear]
     samples = wave_samples(fit)
-    return AxisSummary(
+    summary = AxisSummary(
         unit=fit.campaign.unit,
         estimator=fit.estimator,
         tier=fit.tier,
@@ -225,6 +228,7 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         periods_in="seconds" if fit.campaign.periods.in_seconds else "unit",
         effective_backlash=_effective_backlash(fit, diagnoses[""]),
     )
+    return structs.replace(summary, doubts=doubts_of(summary, without_processes(fit)))
 
 
 def _effective_backlash(fit: AxisFit, diagnosis: Mapping[str, float | None]) -> Estimate | None:

@@ -61,6 +61,8 @@ class AxisStream(IntEnum):
     PERIODS = 9
     EFFECTIVE_BACKLASH = 10
     PRIOR_CONFLICTS = 11
+    DOUBTS = 12
+    COMPARISON = 13
     PREDICTED_STOPS = 21
 
 

@@ -162,6 +162,12 @@ FAULTS = (
           "test_false_alarms_and_power_are_those_of_the_linear_model"),
     Fault("a watched change was there from the first day", "WatchedLooks.linear", Reads("self.first", "0"),
           "test_the_departure_is_that_of_a_dense_gaussian"),
+    Fault("the play of a watched axis has the sign of a lead", "watch_axis", Local("columns", "{**value, 'backlash': "
+          "-value['backlash']}"), "test_what_moved_is_named_with_its_size"),
+    Fault("a u that the fit shrinks to a tenth goes unsaid", "Facts.scale", Returns("max(value, 1.0)"),
+          "test_the_scatter_of_readings_far_below_their_u_is_doubted"),
+    Fault("classic states certainty without a degree of freedom", "classic_axis", Reads("line.freedom", "1"),
+          "test_as_many_stops_as_unknowns_leave_u_and_scatter_open"),
     # Locating, aiming, loading a robot.
     Fault("a stop is taken for one from the other side", "Calibration.noisy_beam",
           Argument("sides", "tuple(-side for side in value)"), "test_every_draw_goes_through_the_twins_optics"),

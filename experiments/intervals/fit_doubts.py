@@ -1,0 +1,99 @@
+"""How often does a fit of a clean axis raise a doubt, and how often does one of an axis with a planted fault?
+
+    python -m experiments.intervals.fit_doubts run --n 200 --cores 0 1     # 2 s of processor an axis, resumable
+    python -m experiments.intervals.fit_doubts table > experiments/intervals/fit_doubts.md
+
+Axes are drawn from the priors (`twin/simulated_axis`), with a play that is negative nowhere, read at nine places to and
+fro twice, and fitted by Laplace. Planted: a stated u that is ten times all scatter; a reader that turns with the axis
+and errs once and twice a turn, by five plays each.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from experiments.common.command_line import study
+from experiments.common.page import line
+from experiments.common.rows import commit, commits_of
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.axis_record import summarise_axis
+from tvsbayes.single_axis.fit_doubts import RULES
+from tvsbayes.single_axis.waves import WavePeriods
+from tvsbayes.statistics.chances import binomial_bounds
+from tvsbayes.twin.simulated_axis import simulate_axis
+
+CLEAN, WAVE, WIDE_U, POSE = "clean", "clean, a wave of 60 deg stated", "u is ten times the scatter", "reader errs"
+KINDS = {CLEAN: "", WAVE: "idle processes", WIDE_U: "stated u", POSE: "play by position, error by position"}
+"""Drawn axes, and the doubts that are right: of a wave, where processes are drawn that explain nothing."""
+PLACES = np.linspace(-180.0, 180.0, 9)
+
+
+def _moves() -> tuple[AxisMove, ...]:
+    """Two cycles beyond both ends, a move a minute."""
+    cycle = [*PLACES, 200.0, *PLACES[::-1], -200.0]
+    commands = [-200.0, *cycle, *cycle]
+    return tuple(AxisMove(k, 0, 60.0 * k, float(c), "" if k else "backward") for k, c in enumerate(commands))
+
+
+def drawn_axis(kind: str, seed: int) -> AxisCampaign:
+    """An axis with its readings; the play is stated to the simulation alone."""
+    rng = np.random.default_rng([seed, 7])
+    periods = WavePeriods((60.0,)) if kind == WAVE else WavePeriods()
+    while True:
+        play = abs(rng.normal(0.0, 0.01 * 360.0))
+        stated = {"per_command": AxisPrior(1.0, 0.01), "backlash": AxisPrior(play, 0.0)}
+        axis = simulate_axis(AxisCampaign("deg", _moves(), (), stated, periods=periods), seed=int(rng.integers(2**31)))
+        if play + axis.truth.play_variation.min() > 0:
+            break
+    readings = axis.campaign.readings
+    if kind == WIDE_U:
+        sides = [axis.truth.parameters[f"stop_sd.{side}"] for side in ("forward", "backward")]
+        readings = tuple(replace(each, u=10.0 * max(each.u, *sides)) for each in readings)
+    elif kind == POSE:
+        phases, turn = rng.uniform(0.0, 2 * np.pi, 2), np.array([1.0, 2.0])
+        values = np.array([float(each.value or 0.0) for each in readings])
+        values += 5.0 * play * np.sin(np.radians(np.outer(values, turn)) + phases).sum(axis=1)
+        readings = tuple(replace(each, value=float(value)) for each, value in zip(readings, values, strict=True))
+    return replace(axis.campaign, readings=readings, stated={"per_command": stated["per_command"]})
+
+
+def one_axis(task: tuple[str, int]) -> dict[str, object]:
+    """Draw and fit one axis."""
+    kind, seed = task
+    summary = summarise_axis(fit_axis(drawn_axis(kind, seed), sampled=False, seed=seed))
+    names = [doubt.name for doubt in summary.doubts]
+    usable = all(doubt.usable for doubt in summary.doubts)
+    return {"kind": kind, "seed": seed, "commit": commit(), "doubts": names, "usable": usable}
+
+
+TEXT = """# Doubts about fits of axes
+
+Made by `python -m experiments.intervals.fit_doubts`: drawn axes, read at nine places to and fro twice, fitted by
+Laplace. How many fits raise each doubt, and how many are called doubtful (DOUBTFUL in the verdict; other doubts leave
+them usable). {axes} axes, commit {commit}.
+"""
+
+
+def table(rows: list[dict]) -> None:
+    """Shares by kind and doubt, with their 99.9 % bounds."""
+    print(TEXT.format(axes=len(rows), commit=commits_of(rows)))
+    print(line("axes", "n", *(rule.name for rule in RULES), "doubtful", "95 % of 0.01 in"))
+    print(line(*["---"] * (len(RULES) + 4)))
+    for kind in KINDS:
+        mine = [row for row in rows if row["kind"] == kind]
+        if not mine:
+            continue
+        counts = Counter(name for row in mine for name in row["doubts"])
+        doubtful = sum(not row["usable"] for row in mine)
+        low, high = binomial_bounds(len(mine), 0.01)
+        bounds = f"{low * len(mine):.0f} to {high * len(mine):.0f}"
+        print(line(kind, len(mine), *(counts[rule.name] for rule in RULES), doubtful, bounds))
+
+
+if __name__ == "__main__":
+    study(__file__, __doc__, one_axis, ("kind", "seed"), KINDS, table, 200)

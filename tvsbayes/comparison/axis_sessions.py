@@ -1,0 +1,154 @@
+"""An axis and its later readings: what changed between two fits, and whether a fit still holds for a few new stops.
+
+Both sessions were homed apart, but for an absolute encoder. Commands as sent to the mechanics: readings with a table in
+force are verified instead. Units of the folder. No JAX.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tvsbayes.comparison.changes import compared, days_between
+from tvsbayes.comparison.departures import (
+    LOOKS_MIN,
+    Departure,
+    DrawnDepartures,
+    StatedChange,
+    single_change,
+    tested,
+)
+from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.results.comparison_record import Comparison
+from tvsbayes.results.watch_record import Watch
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_readings
+from tvsbayes.single_axis.axis_fit import AxisFit
+from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
+from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.statistics.streams import AxisStream, random_stream
+
+SCATTERS, HOME_SDS = 4.0, 5.0
+"""Size of a change that must be detected, in scatters of a stop, at the end of the travel; of the zero also in scatters
+of homings, which have the same effect."""
+POSITIONS_MAX = 100
+"""Largest number of positions of a comparison."""
+
+
+def refuse_other_axis(known: AxisCampaign, new: AxisCampaign) -> None:
+    """Refuse readings in another unit, and readings of the first folder.
+
+    Raises:
+        InputError: they are.
+    """
+    if new.unit != known.unit:
+        message = f"the later readings are in {new.unit[:20]!r}, the first in {known.unit[:20]!r}"
+        raise InputError("unit", message, remedy="give readings in the unit of the first folder")
+    refuse_same_readings(known, new)
+
+
+def shared_positions(first: AxisRows, second: AxisRows) -> np.ndarray:
+    """Positions of the first session within the range of the second, shape (t,).
+
+    Raises:
+        NothingToEstimate: fewer than two, or a drive at constant rate, which has no positions.
+    """
+    inside = (first.positions >= second.command.min()) & (first.positions <= second.command.max())
+    positions = first.positions[inside]
+    if first.in_motion or second.in_motion or len(positions) < 2:
+        found = "a drive at constant rate" if first.in_motion or second.in_motion else f"{len(positions)} positions"
+        message = f"{found}: two axes are compared at positions of A within the range read of B"
+        raise NothingToEstimate("too-few-positions", message, remedy="read stops of B over the range of A")
+    return positions[np.linspace(0, len(positions) - 1, min(len(positions), POSITIONS_MAX)).round().astype(int)]
+
+
+def _line_and_play(fit: AxisFit, positions: np.ndarray) -> np.ndarray:
+    """Slope of the line through positions (t,) and mean play there, shape (1 + draws, 2): their means, then draws."""
+    model, centred = fit.model, positions - positions.mean()
+    slope = (centred / (centred @ centred)) @ model.functional(positions, fit.w) + model.line_terms(per_command=1.0)
+    play = model.line_terms(backlash=1.0)
+    play[model.layout["play"]] = model.places.weights(positions).mean(axis=0)
+    functionals = np.stack(np.broadcast_arrays(slope, play), axis=-2)
+    drawn = fit.linear.drawn(functionals, random_stream(fit.seed, AxisStream.COMPARISON))
+    return np.vstack([drawn.mean(axis=0), drawn])
+
+
+def compare_axes(first: AxisFit, second: AxisFit) -> Comparison:
+    """Test whether the line and the play of an axis have changed.
+
+    Args:
+        first: converged fit of A.
+        second: converged fit of B, made with `shared_positions` as `more`.
+
+    Raises:
+        NothingToEstimate: as `shared_positions`.
+    """
+    positions, unit = shared_positions(first.rows, second.rows), first.campaign.unit
+    quantities = [("effective_per_command", f"{unit} per command"), ("effective_backlash", unit)]
+    both = first.rows.both_sides and second.rows.both_sides
+    quantities = quantities[: 1 + both]
+    before, after = (_line_and_play(fit, positions)[:, : len(quantities)] for fit in (first, second))
+    return compared(
+        quantities,
+        before,
+        after,
+        range_command=(float(positions[0]), float(positions[-1])),
+        days=days_between(first.campaign.header, second.campaign.header),
+    )
+
+
+def _changes(fit: AxisFit, stops: PredictedStops, fresh: AxisRows) -> tuple[StatedChange, ...]:
+    """Changes that are tested: ratio, play, and the zero where its scatter is known."""
+    scales, unit = stops.scales, fit.campaign.unit
+    reading = np.mean(scales["reading_scale"] ** 2) * float(np.mean(fresh.variance))
+    stop = np.mean(scales["stop_sd.forward"] ** 2 + scales["stop_sd.backward"] ** 2) / 2
+    size = SCATTERS * float(np.sqrt(stop + reading))
+    changes = [single_change("ratio", "per_command", _rounded(100.0 * size / fit.rows.travel), "%")]
+    if fresh.both_sides:
+        changes.append(single_change("play", "backlash", _rounded(size), unit))
+    if fit.campaign.absolute or len(np.unique(fit.rows.zero)) > 1:
+        home = HOME_SDS * float(np.sqrt(np.mean(scales["home_sd"] ** 2)))
+        changes.append(single_change("zero", "offset", _rounded(max(size, home)), unit))
+    return tuple(changes)
+
+
+def _rounded(size: float) -> float:
+    return float(f"{size:.1e}")
+
+
+def watch_axis(fit: AxisFit, campaign: AxisCampaign, *, seed: int = 0) -> Watch:
+    """Test whether a fit still holds for new stops.
+
+    Args:
+        fit: converged fit of the axis.
+        campaign: new readings, from a homing on.
+        seed: seed of all draws.
+
+    Raises:
+        InputError: the readings are those of the fit, or have another unit.
+        NothingToEstimate: fewer than `LOOKS_MIN` stops, or readings of a drive.
+    """
+    refuse_other_axis(fit.campaign, campaign)
+    fresh = rows_of(campaign)
+    if fresh.in_motion or len(fresh.value) < LOOKS_MIN:
+        message = f"readings.csv: {len(fresh.value)} new stops; an axis is watched with at least {LOOKS_MIN} stops"
+        raise NothingToEstimate(
+            "too-few-looks", message, file="readings.csv", remedy="read more stops, from both sides"
+        )
+    stops = predicted_stops(fit, campaign.moves, fresh.move.tolist(), np.sqrt(fresh.variance), seed)
+    changes = _changes(fit, stops, fresh)
+    # Reading by a unit of each change; the play lags on the side of arrival.
+    columns = {
+        "per_command": 0.01 * fit.rows.line.slope * fresh.command,
+        "backlash": -0.5 * np.sign(fit.rows.line.slope) * fresh.side,
+        "offset": np.ones(len(fresh.value)),
+    }
+    shifts = np.column_stack([columns[change.names[0]] for change in changes])
+
+    def departure(mean: np.ndarray, covariance: np.ndarray) -> Departure:
+        off = fresh.value - mean
+        left = np.linalg.solve(covariance, np.column_stack([off, shifts]))
+        score, information = shifts.T @ left[:, 0], shifts.T @ left[:, 1:]
+        return Departure(float(off @ left[:, 0]), len(off), score, information, changes)
+
+    drawn = tuple(departure(*each) for each in zip(stops.mean, stops.covariance, strict=True))
+    centre = departure(*stops.pooled())
+    return tested(DrawnDepartures(centre, drawn, np.full(len(drawn), 1 / len(drawn))), len(fresh.value), True, seed)
