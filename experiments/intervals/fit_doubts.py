@@ -28,8 +28,7 @@ from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import simulate_axis
 
 CLEAN, WAVE, WIDE_U, POSE = "clean", "clean, a wave of 60 deg stated", "u is ten times the scatter", "reader errs"
-KINDS = {CLEAN: "", WAVE: "idle processes", WIDE_U: "stated u", POSE: "play by position, error by position"}
-"""Drawn axes, and the doubts that are right: of a wave, where processes are drawn that explain nothing."""
+KINDS = (CLEAN, WAVE, WIDE_U, POSE)
 PLACES = np.linspace(-180.0, 180.0, 9)
 
 
@@ -74,15 +73,15 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
 TEXT = """# Doubts about fits of axes
 
 Made by `python -m experiments.intervals.fit_doubts`: drawn axes, read at nine places to and fro twice, fitted by
-Laplace. How many fits raise each doubt, and how many are called doubtful (DOUBTFUL in the verdict; other doubts leave
-them usable). {axes} axes, commit {commit}.
+Laplace. How many fits raise each doubt, and how many are called DOUBTFUL; other doubts leave them usable. Right are idle
+processes where they are drawn so small, the stated u, and the error by position of a reader. {axes} axes, commit {commit}.
 """
 
 
 def table(rows: list[dict]) -> None:
     """Shares by kind and doubt, with their 99.9 % bounds."""
     print(TEXT.format(axes=len(rows), commit=commits_of(rows)))
-    print(line("axes", "n", *(rule.name for rule in RULES), "doubtful", "95 % of 0.01 in"))
+    print(line("axes", "n", *(rule.name for rule in RULES), "DOUBTFUL", "bounds of 1 %"))
     print(line(*["---"] * (len(RULES) + 4)))
     for kind in KINDS:
         mine = [row for row in rows if row["kind"] == kind]

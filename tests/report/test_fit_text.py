@@ -75,6 +75,24 @@ def test_scales_known_only_in_their_sum_are_not_set_by_the_data():
     assert "1 weak direction," in fit_text(shared) and "sum" not in fit_text(summary)
 
 
+def test_a_play_that_varies_by_more_than_itself_is_doubted():
+    """Of the axis that it is of; a play that may be none is not doubted."""
+    summary = small_summary()
+    play = structs.replace(next(iter(summary.parameters.values())), value=0.2, sd=0.01, contraction=0.9)
+
+    def lines(mean, low, variation):
+        named = {
+            "backlash_deg.pan": structs.replace(play, value=mean, interval95=(low, mean + 0.02)),
+            "play_variation_deg.pan": structs.replace(play, value=variation, interval95=(variation - 0.02, 0.4)),
+        }
+        text = fit_text(structs.replace(summary, parameters={**summary.parameters, **named}))
+        return [line for line in text.splitlines() if line.startswith("doubt: ")]
+
+    [line] = lines(0.2, 0.18, 0.25)
+    assert "the play of pan varies by 0.250(10) deg (sd), more than the play itself, 0.200(10)" in line
+    assert lines(0.2, 0.18, 0.19) == lines(0.2, -0.01, 0.25) == []
+
+
 def test_the_ratio_of_fine_steps_is_stated_for_many_counts():
     summary = small_summary()
     known = next(iter(summary.parameters.values()))

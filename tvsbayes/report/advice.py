@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tvsbayes.display import concise
 from tvsbayes.errors import listed
 from tvsbayes.estimators.findings import Finding
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import QUANTITIES, REGISTRY, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import ASSUMED_REMEDY, Stereo
 from tvsbayes.report.document import sentence
 from tvsbayes.report.parameter_words import sentence_in_words
-from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
+from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection, varies_beyond
 from tvsbayes.results.metrology_tables import BudgetTable
 
 LOOKS = ("spots", "sightings")
@@ -108,6 +109,20 @@ def noise_line(summary: FitSummary) -> str | None:
     stated = {"spots": "su and sv of spots.csv say", "sightings": "u_deg of sightings.csv says"}[summary.looks]
     said = f"the {summary.looks} scatter {scale:.2g} times as much as {stated}"
     return f"{said}; the fit allows for it: state {worse} ones if you know them"
+
+
+def play_lines(summary: FitSummary) -> list[str]:
+    """Remarks on plays that vary by more than themselves."""
+    lines = []
+    for axis in AXES:
+        names = (f"backlash_deg.{axis}", f"play_variation_deg.{axis}")
+        play, variation = map(summary.parameters.get, names)
+        if play is not None and variation is not None and varies_beyond(variation, play):
+            told, itself = (concise(each.value, each.sd) for each in (variation, play))
+            said = f"the play of {axis} varies by {told} deg (sd), more than the play itself, {itself}, and no play is "
+            said += "negative: "
+            lines.append(f"{said}the {summary.looks} have errors that depend on counter and side, or steps were lost")
+    return lines
 
 
 def assumed_stereo(stereo: Stereo | None, budgets: Sequence[BudgetTable]) -> str | None:

@@ -11,7 +11,7 @@ from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import QUANTITIES
-from tvsbayes.report.advice import SPOTS_LISTED, factor_text, failed, noise_line, remedy, verdict_line
+from tvsbayes.report.advice import SPOTS_LISTED, factor_text, failed, noise_line, play_lines, remedy, verdict_line
 from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.result_tables import (
     KEY_PARAMETERS,
@@ -72,6 +72,7 @@ def fit_text(
     # Where the model fails, the residual scatter is not noise.
     if failed(summary) is None and (noise := noise_line(summary)) is not None:
         lines.append(noise)
+    lines += [f"doubt: {line}" for line in play_lines(summary)]
     if (encoder := encoder_line(summary)) is not None:
         lines.append(encoder)
     if written:

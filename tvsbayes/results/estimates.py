@@ -108,6 +108,18 @@ class Estimate(Measured, frozen=True, forbid_unknown_fields=True):
         return self.contraction is not None and self.contraction >= CONTRACTION_LIMIT
 
 
+def varies_beyond(variation: Estimate | None, play: Estimate | None) -> bool:
+    """Whether a play that is there varies by more than itself, so that it would be negative at some positions.
+
+    Args:
+        variation: sd of its variation by position; None where there is none.
+        play: its mean; None where none was seen.
+    """
+    if variation is None or play is None or not variation.informed or not play.interval95[0] > 0:
+        return False
+    return variation.value > play.value and variation.interval95[0] > 0.5 * play.value
+
+
 class WeakDirection(ClosedRecord, frozen=True):
     """A combination of parameters that the data do not constrain beyond the prior; loadings are in prior sds."""
 

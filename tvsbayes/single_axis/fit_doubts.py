@@ -13,6 +13,7 @@ import numpy as np
 
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped
+from tvsbayes.results.estimates import varies_beyond
 from tvsbayes.results.records import Record
 from tvsbayes.single_axis.axis_campaign import TURNS
 from tvsbayes.single_axis.axis_fit import DRAWS, AxisFit
@@ -124,11 +125,8 @@ class Facts:
 
     @property
     def play_varies(self) -> bool:
-        """Whether a play that is there varies by more than itself, so that it would be negative at some positions."""
-        variation = self.sd("play_variation")
-        if variation is None or self.play is None or not self.play.interval95[0] > 0:
-            return False
-        return variation.value > self.play.value and variation.interval95[0] > 0.5 * self.play.value
+        """Whether the play varies by more than itself."""
+        return varies_beyond(self.summary.parameters.get("play_variation"), self.play)
 
     @property
     def error(self) -> float:
