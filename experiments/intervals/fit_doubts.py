@@ -73,8 +73,10 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
 TEXT = """# Doubts about fits of axes
 
 Made by `python -m experiments.intervals.fit_doubts`: drawn axes, read at nine places to and fro twice, fitted by
-Laplace. How many fits raise each doubt, and how many are called DOUBTFUL; other doubts leave them usable. Right are idle
-processes where they are drawn so small, the stated u, and the error by position of a reader. {axes} axes, commit {commit}.
+Laplace. How many fits raise each doubt, and how many are called DOUBTFUL; other doubts leave them usable. Right are
+idle processes where they are drawn so small, the stated u, and the error by position of a reader.
+
+{axes} axes, commit {commit}.
 """
 
 

@@ -169,5 +169,6 @@ def test_the_command_keeps_a_table(ask, say, mounted_rig, mixed_fit, truth, tmp_
     code, document = ask("watch", old, same, "--append", other)
     assert (code, document["verdict"], document["error"]["code"]) == (2, "CANNOT TELL", "header")
     assert other.read_text() == "night,what\n"
-    assert set(HELPS) == {change.what for change in (*CHANGES, *SIGHTED_CHANGES)}
+    of_axis = {"ratio", "play", "zero"}
+    assert set(HELPS) == {change.what for change in (*CHANGES, *SIGHTED_CHANGES)} | of_axis
     assert set(REMEDIES) == {what.split(":")[0] for what in HELPS}

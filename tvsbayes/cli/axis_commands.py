@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from tvsbayes.cli.app import command_line, finish, finish_kept, keep, report_line, write_new
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
+from tvsbayes.cli.watched import WATCHING, finish_watch
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import output_place, read_bytes, write_atomically
@@ -195,7 +196,6 @@ def _compare_later(folder: Path, other: Path, seed: int, as_json: bool) -> None:
 
 def watch(folder: Path, *, looks: Path, append: Path | None, seed: int, as_json: bool) -> None:
     """Test whether the fit of an axis still holds for the readings of a second folder."""
-    from tvsbayes.cli.watch_command import WATCHING, finish_watch
     from tvsbayes.comparison.axis_sessions import watch_axis
     from tvsbayes.single_axis.axis_record import results_for
 

@@ -1,26 +1,21 @@
-"""Command watch: compares new looks with a stored calibration; appends to a nightly table, and plans the looks."""
+"""Command watch: compares new looks with a stored calibration, and plans the looks."""
 
 from __future__ import annotations
 
-import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, report_line
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, refuse_mixed, serve
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, NothingToEstimate, escaped
-from tvsbayes.files.csv_table import append_line
+from tvsbayes.cli.watched import WATCHING, finish_watch
+from tvsbayes.errors import InputError, escaped
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
-if TYPE_CHECKING:
-    from tvsbayes.results.watch_record import Watch
-
-WATCHING, PLANNING = "looking at the new looks", "choosing looks"
-TABLE_COLUMNS = ("time", "verdict", "p", "looks", "moved")
+PLANNING = "choosing looks"
 
 
 def watch(
@@ -54,31 +49,6 @@ def watch(
     if not result.same_cameras:
         report_line("warning: the new looks state other cameras; those of the campaign are used")
     finish_watch(result, append, as_json)
-
-
-def finish_watch(result: Watch, append: Path | None, as_json: bool, looks: str = "looks") -> None:
-    """Print the result, add it to a table, and end with its exit code; `looks` is what the new data are."""
-    from tvsbayes.comparison.departures import POWER_MIN
-    from tvsbayes.report.watch_text import watch_text
-    from tvsbayes.results.watch_record import CANNOT_TELL, OK
-
-    error = None if append is None else _append(append, result)
-    finish(result.as_json(), watch_text(result, POWER_MIN, looks), as_json, error)
-    if result.verdict != OK:
-        raise Ended(NothingToEstimate.exit_code if result.verdict == CANNOT_TELL else TARGET_MISSED)
-
-
-def _append(table: Path, result: Watch) -> InputError | None:
-    """Append the current line (time in UTC); returns the error of a failure, so that the result is still printed."""
-    from tvsbayes.report.watch_text import moved_text
-
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    moved = "; ".join(map(moved_text, result.moved))
-    try:
-        append_line(table, TABLE_COLUMNS, (now, result.verdict, float(f"{result.p:.3g}"), result.looks, moved))
-    except InputError as error:
-        return error
-    return None
 
 
 def plan_watch(

@@ -38,8 +38,8 @@ from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_PARTS
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.axis_rows import rows_of
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
-from tvsbayes.single_axis.fit_doubts import AxisDoubt, doubts_of, without_processes
-from tvsbayes.statistics.intervals import NORMAL_95, interval95
+from tvsbayes.single_axis.fit_doubts import AxisDoubt, Facts, WithoutProcesses, doubts_of, without_processes
+from tvsbayes.statistics.intervals import NORMAL_95, WithSd, interval95
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
@@ -228,7 +228,23 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         periods_in="seconds" if fit.campaign.periods.in_seconds else "unit",
         effective_backlash=_effective_backlash(fit, diagnoses[""]),
     )
-    return structs.replace(summary, doubts=doubts_of(summary, without_processes(fit)))
+    return structs.replace(summary, doubts=doubts_of(facts_of(summary, without_processes(fit))))
+
+
+def facts_of(summary: AxisSummary, without: WithoutProcesses | None) -> Facts:
+    """What doubts ask of a fit; `without` is that without processes of position."""
+    worst = max(summary.deviations, key=lambda each: abs(each.value), default=None)
+    return Facts(
+        unit=summary.unit,
+        moves=summary.moves,
+        freedom=summary.classic.degrees_of_freedom,
+        parameters=summary.parameters,
+        play=summary.effective_backlash,
+        worst=None if worst is None else WithSd(worst.value, worst.sd),
+        worst_position=0.0 if worst is None else worst.position,
+        periods=summary.periods if summary.periods_in == "unit" else (),
+        without=without,
+    )
 
 
 def _effective_backlash(fit: AxisFit, diagnosis: Mapping[str, float | None]) -> Estimate | None:

@@ -5,26 +5,23 @@ A doubt is a condition on the facts of a fit and a sentence; all lengths in the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped
-from tvsbayes.results.estimates import varies_beyond
+from tvsbayes.results.estimates import Estimate, Measured, PeriodEstimate, varies_beyond
 from tvsbayes.results.records import Record
 from tvsbayes.single_axis.axis_campaign import TURNS
 from tvsbayes.single_axis.axis_fit import DRAWS, AxisFit
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.statistics.intervals import WithSd
 from tvsbayes.statistics.streams import AxisStream, random_stream
-
-if TYPE_CHECKING:
-    from tvsbayes.results.estimates import Estimate, PeriodEstimate
-    from tvsbayes.single_axis.axis_record import AxisSummary
 
 PROCESSES = ("transmission_error", "play_variation")
 FREEDOM_MIN = 5
@@ -60,8 +57,8 @@ class WithoutProcesses(NamedTuple):
     """A fit with both processes of position stated 0: `odds` against them, unit per command and play with their sd."""
 
     odds: float
-    per_command: tuple[float, float]
-    backlash: tuple[float, float]
+    per_command: WithSd[float]
+    backlash: WithSd[float]
 
 
 def without_processes(fit: AxisFit) -> WithoutProcesses | None:
@@ -81,7 +78,7 @@ def without_processes(fit: AxisFit) -> WithoutProcesses | None:
     drawn = plain.linear(w).drawn(lines, rng)
     (ratio, play), (u_ratio, u_play) = drawn.mean(axis=0).tolist(), drawn.std(axis=0).tolist()
     odds = float(np.exp(np.clip(_log_evidence(mode) - _log_evidence(fit.mode), -50.0, 50.0)))
-    return WithoutProcesses(odds, (ratio, u_ratio), (play, u_play))
+    return WithoutProcesses(odds, WithSd(ratio, u_ratio), WithSd(play, u_play))
 
 
 def _log_evidence(mode: AxisMode) -> float:
@@ -94,100 +91,83 @@ class Facts:
     """What doubts ask of a fit.
 
     Attributes:
-        summary: the fit.
-        without: the fit without processes of position; None where that was not asked.
+        unit: unit of the readings.
+        moves: moves with readings.
+        freedom: degrees of freedom of the line; None where unknown.
+        parameters: estimates by name.
+        play: mean play over the positions read; None where no play was read.
+        worst: largest error by position, and `worst_position`, its command; None where none was read.
+        periods: waves by position.
+        without: the fit without processes of position; None where there is no such question.
     """
 
-    summary: AxisSummary
+    unit: str
+    moves: int
+    freedom: int | None
+    parameters: Mapping[str, Estimate]
+    play: Estimate | None
+    worst: WithSd[float] | None
+    worst_position: float
+    periods: Sequence[PeriodEstimate]
     without: WithoutProcesses | None
-
-    def sd(self, name: str) -> Estimate | None:
-        """The estimate of a parameter that the readings inform; None where they do not, or there is none."""
-        estimate = self.summary.parameters.get(name)
-        return estimate if estimate is not None and estimate.informed else None
-
-    @property
-    def freedom(self) -> int:
-        """Degrees of freedom of the line."""
-        freedom = self.summary.classic.degrees_of_freedom
-        return FREEDOM_MIN if freedom is None else freedom
 
     @property
     def scale(self) -> float:
-        """Scatter of the readings over their u; 1 where no u is stated."""
-        scale = self.sd("reading_scale")
-        return 1.0 if scale is None else scale.value
-
-    @property
-    def play(self) -> Estimate | None:
-        """Mean play over the positions read."""
-        return self.summary.effective_backlash
+        """Scatter of the readings over their u; 1 where the readings do not inform it."""
+        scale = self.parameters.get("reading_scale")
+        return scale.value if scale is not None and scale.informed else 1.0
 
     @property
     def play_varies(self) -> bool:
         """Whether the play varies by more than itself."""
-        return varies_beyond(self.summary.parameters.get("play_variation"), self.play)
-
-    @property
-    def error(self) -> float:
-        """Largest error by position, less two sds."""
-        return max((abs(each.value) - 2.0 * each.sd for each in self.summary.deviations), default=0.0)
+        return varies_beyond(self.parameters.get("play_variation"), self.play)
 
     @property
     def error_exceeds_play(self) -> bool:
         """Whether an angle errs by more than gears have room for; a screw's lead may err more than its nut's play."""
-        if self.summary.unit not in TURNS or self.play is None or not self.play.interval95[0] > 0:
+        if self.unit not in TURNS or self.worst is None or self.play is None or not self.play.interval95[0] > 0:
             return False
-        return self.error > ERROR_PLAYS * self.play.interval95[1]
+        return abs(self.worst.value) - 2.0 * self.worst.sd > ERROR_PLAYS * self.play.interval95[1]
 
     @property
     def wave(self) -> PeriodEstimate | None:
         """The strongest wave that stands on an unexplained error as large as itself, which could make it."""
-        error, length = self.sd("transmission_error"), self.summary.parameters.get("transmission_error_length")
-        if error is None or length is None or self.summary.periods_in != "unit":
+        error, length = map(self.parameters.get, ("transmission_error", "transmission_error_length"))
+        if error is None or length is None or not error.informed:
             return None
-        waves = [wave for wave in self.summary.periods if wave.probability > LIKELY]
+        waves = [wave for wave in self.periods if wave.probability > LIKELY]
         # A process that is smooth over half a period makes no such wave.
         waves = [w for w in waves if error.value > w.amplitude.value and length.value < 0.5 * w.period.value]
         return max(waves, key=lambda wave: wave.amplitude.value, default=None)
 
     @property
     def idle(self) -> bool:
-        """Whether the processes explain nothing beside a stated wave and make the results worse."""
-        if self.without is None or self.without.odds < ODDS_MIN or self.wave is not None:
+        """Whether the processes explain nothing beside a stated wave and widen the intervals."""
+        plain = self.without
+        if plain is None or plain.odds < ODDS_MIN or self.wave is not None:
             return False
-        u, plain = self.summary.parameters, self.without
-        return any(u[name].sd > WORSE * getattr(plain, name)[1] > 0 for name in ("per_command", "backlash"))
+        names = ("per_command", "backlash")
+        return any(self.parameters[name].sd > WORSE * getattr(plain, name).sd > 0 for name in names)
 
     def text(self, template: str) -> str:
         """A sentence with the facts in place."""
-        wave, without = self.wave, self.without
-        error = self.summary.parameters.get("transmission_error")
-        variation = self.summary.parameters.get("play_variation")
-        words: dict[str, object] = {
-            "unit": escaped(self.summary.unit),
-            "freedom": self.freedom,
-            "least": FREEDOM_MIN,
-            "moves": self.summary.moves,
-            "scale": f"{self.scale:.2g}",
-            "error": "" if error is None else concise(error.value, error.sd),
-            "variation": "" if variation is None else concise(variation.value, variation.sd),
-            "play": "" if self.play is None else concise(self.play.value, self.play.sd),
-        }
-        if self.summary.deviations:
-            worst = max(self.summary.deviations, key=lambda each: abs(each.value))
-            words |= {"worst": concise(abs(worst.value), worst.sd), "position": f"{worst.position:.10g}"}
-        if wave is not None:
-            words |= {
-                "amplitude": concise(wave.amplitude.value, wave.amplitude.sd),
-                "period": f"{wave.period.value:.6g}",
-            }
-        if without is not None:
-            words |= {"odds": f"{without.odds:.0f}", "line": concise(*without.per_command)}
-            words |= {"plain_play": concise(*without.backlash)}
-            now = self.summary.parameters["per_command"], self.summary.parameters["backlash"]
-            words |= dict(zip(("ratio", "backlash"), (concise(each.value, each.sd) for each in now), strict=True))
+        words: dict[str, object] = {f"now_{name}": _told(estimate) for name, estimate in self.parameters.items()}
+        words |= {"unit": escaped(self.unit), "moves": self.moves, "freedom": self.freedom, "least": FREEDOM_MIN}
+        words |= {"scale": f"{self.scale:.2g}", "position": f"{self.worst_position:.10g}"}
+        if self.play is not None:
+            words["play"] = _told(self.play)
+        if self.worst is not None:
+            words["worst"] = concise(abs(self.worst.value), self.worst.sd)
+        if self.wave is not None:
+            words |= {"amplitude": _told(self.wave.amplitude), "period": f"{self.wave.period.value:.6g}"}
+        if self.without is not None:
+            words |= {"odds": f"{self.without.odds:.0f}", "per_command": _told(self.without.per_command)}
+            words["backlash"] = _told(self.without.backlash)
         return template.format(**words)
+
+
+def _told(measured: Measured | WithSd[float]) -> str:
+    return concise(measured.value, measured.sd)
 
 
 class _Rule(NamedTuple):
@@ -202,7 +182,7 @@ class _Rule(NamedTuple):
 RULES = (
     _Rule(
         "few readings",
-        lambda facts: facts.freedom < FREEDOM_MIN,
+        lambda facts: facts.freedom is not None and facts.freedom < FREEDOM_MIN,
         False,
         "{moves} stops leave {freedom} of at least {least} degrees of freedom about the line: every u rests on default "
         "priors; read more stops, each position again and from both sides",
@@ -219,9 +199,9 @@ RULES = (
         "play by position",
         lambda facts: facts.play_varies,
         False,
-        "the play varies by {variation} {unit} (sd), more than the play itself, {play}, and no play is negative: the "
-        "readings have errors that depend on position and side, such as of a camera's pose or an encoder off centre, "
-        "or steps were lost",
+        "the play varies by {now_play_variation} {unit} (sd), more than the play itself, {play}, and no play is "
+        "negative: the readings have errors that depend on position and side, such as of a camera's pose or an encoder "
+        "off centre, or steps were lost",
     ),
     _Rule(
         "error by position",
@@ -235,8 +215,9 @@ RULES = (
         "wave",
         lambda facts: facts.wave is not None,
         True,
-        "the wave of {amplitude} {unit} every {period} stands on an unexplained error by position of {error} {unit} "
-        "(sd), as large as itself and as short: amplitude and phase hold only if that error has no part of this period",
+        "the wave of {amplitude} {unit} every {period} stands on an unexplained error by position of "
+        "{now_transmission_error} {unit} (sd), as large as itself and as short: amplitude and phase hold only if that "
+        "error has no part of this period",
     ),
     _Rule(
         "idle processes",
@@ -244,15 +225,13 @@ RULES = (
         True,
         "beside the stated wave an error and a play by position explain nothing (odds {odds} : 1 against them) and "
         "widen its intervals: with `transmission_error` and `play_variation` = {{ value = 0, u = 0 }} in [axis] the "
-        "gears turn {line} {unit} per command (now {ratio}) with a play of {plain_play} (now {backlash})",
+        "gears turn {per_command} {unit} per command (now {now_per_command}) with a play of {backlash} (now "
+        "{now_backlash})",
     ),
 )
 """Doubts in the order of the report."""
 
 
-def doubts_of(summary: AxisSummary, without: WithoutProcesses | None) -> tuple[AxisDoubt, ...]:
-    """The doubts about a fit; none where it must not be used at all."""
-    facts = Facts(summary, without)
-    if not summary.explained:
-        return ()
+def doubts_of(facts: Facts) -> tuple[AxisDoubt, ...]:
+    """The doubts about a fit."""
     return tuple(AxisDoubt(rule.name, facts.text(rule.sentence), rule.usable) for rule in RULES if rule.holds(facts))
