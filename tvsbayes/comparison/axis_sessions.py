@@ -23,7 +23,7 @@ from tvsbayes.results.watch_record import Watch
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_readings
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
-from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.single_axis.predicted_stops import PredictedAxis
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 SCATTERS, HOME_SDS = 4.0, 5.0
@@ -95,18 +95,16 @@ def compare_axes(first: AxisFit, second: AxisFit) -> Comparison:
     )
 
 
-def _changes(fit: AxisFit, stops: PredictedStops, fresh: AxisRows) -> tuple[StatedChange, ...]:
+def _changes(machine: PredictedAxis, fresh: AxisRows) -> tuple[StatedChange, ...]:
     """Changes that are tested: ratio, play, and the zero where its scatter is known."""
-    scales, unit = stops.scales, fit.campaign.unit
-    reading = np.mean(scales["reading_scale"] ** 2) * float(np.mean(fresh.variance))
-    stop = np.mean(scales["stop_sd.forward"] ** 2 + scales["stop_sd.backward"] ** 2) / 2
-    size = SCATTERS * float(np.sqrt(stop + reading))
+    fit = machine.fit
+    size = SCATTERS * float(np.sqrt(np.mean(machine.noise(fresh.side, fresh.variance))))
     changes = [single_change("ratio", "per_command", _rounded(100.0 * size / fit.rows.travel), "%")]
     if fresh.both_sides:
-        changes.append(single_change("play", "backlash", _rounded(size), unit))
+        changes.append(single_change("play", "backlash", _rounded(size), machine.unit))
     if fit.campaign.absolute or len(np.unique(fit.rows.zero)) > 1:
-        home = HOME_SDS * float(np.sqrt(np.mean(scales["home_sd"] ** 2)))
-        changes.append(single_change("zero", "offset", _rounded(max(size, home)), unit))
+        home = HOME_SDS * float(np.sqrt(np.mean(machine.scales["home_sd"] ** 2)))
+        changes.append(single_change("zero", "offset", _rounded(max(size, home)), machine.unit))
     return tuple(changes)
 
 
@@ -133,8 +131,8 @@ def watch_axis(fit: AxisFit, campaign: AxisCampaign, *, seed: int = 0) -> Watch:
         raise NothingToEstimate(
             "too-few-looks", message, file="readings.csv", remedy="read more stops, from both sides"
         )
-    stops = predicted_stops(fit, campaign.moves, fresh.move.tolist(), np.sqrt(fresh.variance), seed)
-    changes = _changes(fit, stops, fresh)
+    machine = PredictedAxis(fit, seed)
+    stops, changes = machine.read(campaign), _changes(machine, fresh)
     # Reading by a unit of each change; the play lags on the side of arrival.
     columns = {
         "per_command": 0.01 * fit.rows.line.slope * fresh.command,
