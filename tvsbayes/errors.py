@@ -113,12 +113,14 @@ def question(
     allowed: str,
     candidates: Sequence[Candidate],
     line: int | None = None,
+    column: str | None = None,
     code: str = "ambiguous",
 ) -> Question:
     """Build the `Question` whose message states the place, what was found and what is allowed."""
-    where = file + (f" line {line}" if line else "")
+    where = file + (f" line {line}" if line else "") + (f", {escaped(column)}" if column else "")
     message = f"{where}: found {found}; allowed: {allowed}"
-    return Question(code, message, candidates=candidates, file=file, line=line, found=found, allowed=allowed)
+    place = {"file": file, "line": line, "column": column, "found": found, "allowed": allowed}
+    return Question(code, message, candidates=candidates, **place)
 
 
 class NothingToEstimate(TvsError):

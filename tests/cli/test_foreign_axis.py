@@ -6,48 +6,15 @@ Files in tests/data/foreign have observed layouts and invented numbers; the test
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import openpyxl
 import pytest
+from importing.samples import FOREIGN, PLAY, RATIO, lines, readings
 from support.commands import assert_error
 
 from tvsbayes.single_axis.axis_campaign import read_axis
 from tvsbayes.single_axis.axis_rows import rows_of
 from tvsbayes.single_axis.classic_line import classic_axis
-
-FOREIGN = Path(__file__).parents[1] / "data" / "foreign"
-RATIO, PLAY = 0.0125, 0.05
-"""Unit per step, and unit: of the axis that the files below read."""
-
-
-def readings(runs: int = 2, stops: int = 9, every: int = 400) -> list[tuple[int, float, int]]:
-    """Command, reading and side of runs up and down; no stop is read twice in a row."""
-    rows = []
-    for _ in range(runs):
-        rows += [(every * k, RATIO * every * k, 1) for k in range(stops)]
-        rows += [(every * k, RATIO * every * k + PLAY, -1) for k in range(stops - 2, -2, -1)]
-    return rows
-
-
-def dms(degrees: float) -> str:
-    seconds = round(abs(degrees) * 3600)
-    return f"{'-' if degrees < 0 else ''}{seconds // 3600}\u00b0{seconds // 60 % 60:02d}'{seconds % 60:02d}\""
-
-
-def lines(form: str, **words: object) -> str:
-    """A line for each reading."""
-    rows = readings()
-    return "".join(
-        form.format(
-            **{"c": c, "v": v, "s": "+-"[s < 0], "word": ("up", "down")[s < 0], "d": dms(v), "k": k},
-            **{"dev": 1000 * (v - RATIO * c), "m": f"{'-' * (v < 0)}{int(abs(v))}\u00b0 {60 * (abs(v) % 1):.4f}'"},
-            # Past midnight.
-            h=f"{(23 + (50 + k) // 60) % 24:02d}:{(50 + k) % 60:02d}:00",
-        )
-        for k, (c, v, s) in enumerate(rows)
-    )
-
 
 WRITTEN = {
     "heading": "Serial no. 117\nOperator: A. B.\n\nsteps;reading (mm);direction\n" + lines("{c};{v:.4f};{s}\n"),
@@ -246,7 +213,7 @@ MISTAKES = {
     "an angle sensor alone": ('{"q": "angle:a", "params": {"data": [[1, 2]]}}\x03', (), "angle:a", "data_logger.py"),
     "minutes beyond 60": ("steps;angle\n0;1\u00b061'00\"\n1;2\u00b000'00\"\n", (), 'found "1', "correct the cell"),
     "two notations in a column": ("steps;angle\n0;1 mm\n1;2 deg\n", (), 'found "1 mm"', "correct the cell"),
-    "a guide log without --axis": (night(99), None, "PHD2 or KStars, which is of one axis", "with --axis"),
+    "a guide log without --axis": (night(99), None, "PHD2, KStars or MaxIm, which is of one axis", "with --axis"),
     "camonitor without --axis": (WRITTEN["camonitor"], None, "a log of EPICS", "with --axis"),
 }
 

@@ -47,6 +47,7 @@ def lines(form: str) -> str:
     return "".join(
         form.format(
             **{"c": c, "v": v, "s": "+-"[s < 0], "word": ("up", "down")[s < 0], "d": dms(v), "k": k},
+            **{"dev": 1000 * (v - RATIO * c), "m": f"{'-' * (v < 0)}{int(abs(v))}\u00b0 {60 * (abs(v) % 1):.4f}'"},
             # Past midnight.
             h=f"{(23 + (50 + k) // 60) % 24:02d}:{(50 + k) % 60:02d}:00",
         )
@@ -95,6 +96,28 @@ AXIS_TEXTS = {
     "statuses": "steps;encoder;ok\n0;0,5;1\n100;1,5;-\n200;;+ slipped\n",
     "deviations": "Target (mm),Dir,Deviation (um)\n"
     + "".join(f"{10 * k},{s:+d},{2 * k + 50 * (s < 0)}\n" for s in (1, -1) for k in range(0, 10)[::s]),
+    "blocks below each other": "".join(
+        f"{title} 1:\nsteps;reading (mm)\n"
+        + "".join(f"{c};{v:.4f}\n" for c, v, s in readings(runs=1) if s == side)
+        + "\n"
+        for title, side in (("Up", 1), ("Down", -1))
+    ),
+    "notes below the rows": TABLE.replace("8.0000", "", 1) + "\nChecked by: A. B.;;\n",
+    "positions across": "Sollweg (mm);0;10;20\nHin 1 (mm);0,01;10,02;20,01\nZurück 1 (mm);0,05;10,06;20,05\n",
+    "objects of JSON": "".join(
+        json.dumps({"t": 2.0 * k, "target_mm": c, "state": {"measured_mm": v}, "ok": True}) + "\n"
+        for k, (c, v, _) in enumerate(readings())
+    ),
+    "a table of objects of JSON": json.dumps([{"target_mm": c, "measured_mm": v} for c, v, _ in readings()], indent=1),
+    "a piezo's volts": "Voltage (V);Displacement (um)\n0;0,01\n10;3,02\n20;6,01\n10;3,25\n0;0,21\n",
+    "a sensor's volts": "target mm,probe (V)\n0,0.01\n1,0.51\n2,1.00\n1,0.52\n",
+    "one unknown word of direction": TABLE.replace(";-\n", ";x\n").replace(";+\n", ";x\n"),
+    "a good row without a reading": "steps,mm,ok\n0,0,yes\n10,,yes\n20,2,yes\n10,1.1,yes\n0,0.1,yes\n",
+    "turns by U": "Nennwinkel gon,Auf 1 [U],Ab 1 [U]\n0,0,0.002\n100,0.25,0.252\n200,0.5,0.502\n",
+    "two joints": "J1 target (deg),J1 actual (deg),J2 target (deg),J2 actual (deg)\n"
+    + lines("{c},{v:.4f},{c},{v:.3f}\n"),
+    "empty remarks at the ends": "Teórica [mm];Medida [mm];Notas\n"
+    + lines("{c};{v:.4f};\n").replace(".", ",").replace(";\n", ";x\n", 3),
 }
 """Tables and logs of one axis, imported with --axis --yes alone."""
 OBSERVED = {
@@ -172,6 +195,44 @@ def workbook() -> bytes:
     return stream.getvalue()
 
 
+def maxim_log(frames: int = 200) -> str:
+    """A track log of MaxIm: a mount with a wave of 12.3 arcsec, corrected along X; Y scatters."""
+    rows, corrected_px = ["Track Log Started at UT 2026-01-02 23:50:00", MAXIM_NAMES], 0.0
+    for k in range(frames):
+        second = 50 * 60 + 4 * k
+        clock = f"{(23 + second // 3600) % 24:02d}:{second // 60 % 60:02d}:{second % 60:02d}"
+        if k == 50:
+            rows.append(f"{clock}, Guide Star Fade")
+            continue
+        offset = maxim_wave_arcsec(4.0 * k) * MAXIM_PX_PER_ARCSEC + corrected_px
+        correction_s = round(-0.6 * offset / MAXIM_PX_PER_S, 2)
+        rows.append(f"{clock}, {500 + offset:.2f}, 384.00, {offset:.2f}, 0.10, {correction_s:.2f}, -0.04, 2036")
+        corrected_px += MAXIM_PX_PER_S * correction_s
+    return "\n".join([*rows, ""])
+
+
+MAXIM_NUMBERS = ("pixel_arcsec=2", "declination_deg=20", "ra_axis=1", "pulse_arcsec_per_s=3.192533")
+MAXIM_NAMES = "UT Time, Star X, Star Y, OffsetX, OffsetY, Corr X, Corr Y, Bright"
+MAXIM_PX_PER_ARCSEC, MAXIM_PX_PER_S = math.cos(math.radians(20)) / 2.0, 1.5
+"""On the axis, at 2 arcsec/px and 20 deg of declination."""
+
+
+def maxim_wave_arcsec(time_s: float) -> float:
+    return 12.3 * math.sin(2 * math.pi * time_s / 478.69)
+
+
+def two_sheets() -> bytes:
+    """Words first, then a table; a second one with numbers makes it two."""
+    book, stream = openpyxl.Workbook(), io.BytesIO()
+    for name in ("first", "second"):
+        sheet = book.create_sheet(name)
+        for k in range(5):
+            sheet.append([k, 1.1 * k])
+    book.active.append(["Operator: A. B."])
+    book.save(stream)
+    return stream.getvalue()
+
+
 def sightings(azimuth: str = "Az gemessen [deg]", scale: float = 1.0) -> str:
     steps = [(400 * k, 100 * (k * k % 7)) for k in range(12)]
     rows = [
@@ -207,6 +268,16 @@ OTHERS: dict[str, Callable[[], Sample]] = {
     ),
     "a guide log without declination": lambda: Sample("guide.txt", guide_log(99, "Unknown")),
     "a guide log without pixel scale": lambda: Sample("guide.txt", guide_log(99, pixel="?")),
+    "MaxIm's track log": lambda: Sample("track.log", maxim_log()),
+    "MaxIm's track log with its numbers": lambda: Sample(
+        "track.log",
+        maxim_log(),
+        ("--axis", *(w for n in MAXIM_NUMBERS for w in ("--assume", n))),
+    ),
+    "a sensor's volts with their scale": lambda: Sample(
+        "log.txt", AXIS_TEXTS["a sensor's volts"], ("--axis", "--unit", "value=2 mm")
+    ),
+    "sheets with two tables": lambda: Sample("book.xlsx", two_sheets()),
     "a table as a guide log": lambda: Sample("table.csv", TABLE, ("--axis", "--format", "phd2")),
     "a guide log without --axis": lambda: Sample("guide.txt", guide_log(99), ()),
     "a serial log": lambda: Sample("serial.txt", serial_log()),

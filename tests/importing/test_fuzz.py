@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given
-from importing.samples import KEYS, guide_log, sample
+from importing.samples import KEYS, MAXIM_NUMBERS, guide_log, maxim_log, sample
 from support.damaged_files import damaged, few
 
 from tvsbayes.cli.axis_import import FileOptions, import_readings
@@ -63,7 +63,9 @@ GUIDES = {
     "events": guide_log(12)
     .replace("\n5,", "\nINFO: DITHER by 1.0, 2.0\nINFO: Settling started\n5,")
     .replace("\n8,", "\nINFO: Settling complete\n8,"),
+    "MaxIm": maxim_log(12),
 }
+MAXIM = {name: float(number) for name, _, number in (text.partition("=") for text in MAXIM_NUMBERS)}
 """Short logs of guiders: most edits fall into their headers."""
 
 
@@ -75,7 +77,8 @@ def test_damaged_guide_logs_are_read_or_refused(tmp_path_factory, case):
     path, out = folder / "guide.txt", folder / "out"
     path.write_bytes(case[1])
     try:
-        found = import_readings(path, out, {}, None, FileOptions(), yes=True, as_json=True)
+        stated = FileOptions(assume=MAXIM if case[0] == "MaxIm" else {})
+        found = import_readings(path, out, {}, None, stated, yes=True, as_json=True)
     except InputError as error:
         assert error.remedy or error.message
         return
@@ -92,6 +95,8 @@ FLOODS = {
     "pairs": b"x: 1\n" * 60_000,
     "names": b"(" * 1_000_000 + b",b\n1,2\n3,4\n",
     "messages": b'{"q": "stepq:s", "params": {"data": [' + b"[1,1,1]," * 500_000 + b"[1,1,1]]}}\x03",
+    "objects": b'[{"a":1}' + b',{"a":1}' * 1_000_000 + b"]",
+    "lists in an object": b'[{"a":[[]' + b",[]" * 3_000_000 + b"]}]",
     "camonitor": b"M:axis 2026-03-01 10:00:00.000000 1\n" * 50_000,
 }
 

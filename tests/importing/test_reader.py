@@ -203,3 +203,29 @@ def test_files_that_are_no_table_are_refused(tmp_path, monkeypatch, data, match)
     (tmp_path / "text.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="no sheets"):
         read_foreign(tmp_path / "text.csv", "one")
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "note"),
+    [
+        # The experiment of a lab book stands alone above its rows: no title to leave out.
+        ("exp;point;pan\nE1;1;0\n;2;5\nE2;;\n;1;0\n", {"exp": ("E1", "", "E2", "")}, ""),
+        ("n;mm\n0;1\n5;2\nChecked by: A. B.;\n", {"n": ("0", "5"), "mm": ("1", "2")}, "line of text left out"),
+        ("n;mm\n0;1\nafter lunch;\n5;2\n9;3\n", {"n": ("0", "5", "9")}, 'left out ("after lunch")'),
+        (
+            "Run up\nn;mm\n0;1\n5;2\nRun down\nn;mm\n5;2\n0;1\n",
+            {"direction": ("forward",) * 2 + ("backward",) * 2},
+            "runs one",
+        ),
+        # A second heading without a direction: which side its rows have is open.
+        ("Run up\nn;mm\n0;1\n5;2\nRun 2\nn;mm\n5;2\n0;1\n", {"n": ("0", "5", "5", "0")}, 'left out ("Run 2")'),
+        ("target;0;5;9;12\nup 1;0,1;5,1;9,1;12,1\n", {"target": ("0", "5", "9", "12")}, "positions across"),
+        # Labels of rows, not names of columns.
+        ("point A;0;5;9\npoint A;1;5;9\n", {"column 1": ("point A",) * 2}, ""),
+        ('[{"a": 1, "b": {"c": "x"}}, {"a": null, "b": {"c": true}}]', {"a": ("1", ""), "b.c": ("x", "true")}, "JSON"),
+    ],
+)
+def test_titles_and_turned_tables(tmp_path, text, columns, note):
+    table = written(tmp_path / "t.txt", text.encode())
+    assert columns.items() <= table.columns.items() and note in table.kind
+    assert note or "left out" not in table.kind

@@ -18,7 +18,7 @@ from support.calibration_files import FOREIGN, listed, plain, read_json, written
 from tvsbayes.cameras.calibration_export import exported
 from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.errors import InputError
-from tvsbayes.importing.stereo_lenses import fitted_to_five
+from tvsbayes.importing.stereo import fitted_to_five
 from tvsbayes.importing.stereo_trees import read_trees
 from tvsbayes.instrument.stereo_pair import (
     Stereo,

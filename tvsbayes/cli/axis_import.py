@@ -9,10 +9,11 @@ from typing import Any
 
 from tvsbayes.cli.app import finish, refuse_options, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
-from tvsbayes.errors import Candidate, InputError, escaped, question, refusal, typed
+from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, read_bytes, write_folder
 from tvsbayes.files.documents import toml_line
+from tvsbayes.importing.asking import asked
 from tvsbayes.importing.axis import AxisRows, Wishes, axis_rows
 from tvsbayes.importing.guide import (
     GuideRun,
@@ -37,7 +38,7 @@ from tvsbayes.single_axis.axis_campaign import (
 )
 
 LOGS = {
-    "phd2": "a guide log of PHD2 or KStars",
+    "phd2": "a guide log of PHD2, KStars or MaxIm",
     "epics": "a log of EPICS",
     "klipper": "a log of Klipper",
     "pe": "a table of times and periodic errors",
@@ -126,7 +127,7 @@ def import_readings(
     kind = log_kind(data, name) if wish.kind == "auto" else wish.kind
     if kind == "phd2":
         _check_options(kind, wish, stated, sheet)
-        runs = read_runs(text_of(data, name).text, name)
+        runs = read_runs(text_of(data, name).text, name, wish.assume.get("ra_axis"))
         if wish.run is None and len(runs) > 1:
             _list_runs(file, to, runs, yes=yes, as_json=as_json)
             return None
@@ -204,12 +205,8 @@ def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_
     rows = run_rows(runs)
     longest = max(rows, key=lambda row: row["minutes"])["run"]  # type: ignore[arg-type, return-value]
     if yes:
-        candidates = [
-            Candidate(f"run {row['run']}, {row['minutes']} minutes", ("--run", str(row["run"])))
-            for row in sorted(rows, key=lambda row: -row["minutes"])[:6]  # type: ignore[operator]
-        ]
-        found, allowed = f"{len(runs)} runs", "one run a campaign"
-        raise question(file=escaped(file.name), found=found, allowed=allowed, candidates=candidates, code="usage")
+        longest_first = sorted(rows, key=lambda row: -row["minutes"])  # type: ignore[operator]
+        raise asked("run", escaped(file.name), each=longest_first, count=len(runs))
     command = f"tvsbayes import {typed(file)} --axis --run {longest} --to {typed(to)} --yes"
     cells = [["" if value is None else escaped(str(value), 40) for value in row.values()] for row in rows]
     caption = f"{escaped(file.name)}: guide log of {runs[0].program} with {len(runs)} runs, one campaign each"

@@ -17,7 +17,7 @@ from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
 from tvsbayes.files.disk import read_bytes, write_atomically, write_folder
-from tvsbayes.importing.words import listed as named
+from tvsbayes.importing.asking import listed as named
 from tvsbayes.instrument.mechanisms import WORDS
 from tvsbayes.progress import Job
 

@@ -19,7 +19,8 @@ from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, new_folder, read_bytes
 from tvsbayes.files.documents import toml_line
-from tvsbayes.importing.columns import table_document, table_lines
+from tvsbayes.importing.asking import listed
+from tvsbayes.importing.cells import table_document, table_lines
 from tvsbayes.importing.looks import (
     FIELDS,
     Claims,
@@ -32,7 +33,6 @@ from tvsbayes.importing.looks import (
 )
 from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import listed
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.progress import Job
 

@@ -16,17 +16,83 @@ from typing import Any
 
 import numpy as np
 
-from tvsbayes.errors import Candidate, escaped, question
+from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.asking import asked
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
 from tvsbayes.importing.axis_units import Wishes, in_one_unit, shown_units, stated_unit, units_of
-from tvsbayes.importing.cells import FieldCells, homings_of, left_out, seconds_of, status_of, temperatures_of
-from tvsbayes.importing.columns import Understood, ask_column, choice, columns_of, table_document, table_lines
-from tvsbayes.importing.rest import at_rest
+from tvsbayes.importing.cells import (
+    FieldCells,
+    Understood,
+    columns_of,
+    homings_of,
+    left_out,
+    seconds_of,
+    status_of,
+    table_document,
+    table_lines,
+    temperatures_of,
+)
 from tvsbayes.importing.runs import long_table
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, name_of, parse_unit, place_of, plain, words_of
 from tvsbayes.statistics.wrapped import turn_jumps
+
+ROWS_MIN = 4
+"""Rows of one command, in the median of all commands, from which a table is telemetry."""
+TAIL_SHARE = 1 / 3
+"""Last share of the rows of a command, in which the axis should rest."""
+QUIET_SHARE = 0.8
+"""Share of the commands, the quieter ones, whose last rows give the noise at rest."""
+MOVING_SHARE = 0.3
+"""Least share of commands with rows in motion: with fewer, rows of a command are readings of one stop."""
+NOISE_SDS, DIGITS = 5.0, 3.0
+"""Largest distance from rest of a row at rest: standard deviations of last rows, and digits of the readings."""
+STEP_SHARE = 0.02
+"""Least distance of the first row of a command from rest, as a share of its step, at which the axis was under way."""
+
+
+def at_rest(command: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Whether the axis rests at each row, by the readings of each command, shape (rows,).
+
+    The first rows of a command are left out while they differ from the last ones by more than the noise of these; all
+    rows of a command, where the last ones still differ. A table with few rows a command rests everywhere.
+
+    Args:
+        command: commands in time order, nan where missing, shape (rows,).
+        value: readings, nan where missing.
+    """
+    rests = np.ones(len(command), bool)
+    starts = np.flatnonzero(np.r_[True, command[1:] != command[:-1]]) if len(command) else np.array([], int)
+    blocks = [np.arange(a, b) for a, b in zip(starts, [*starts[1:], len(command)], strict=True)]
+    blocks = [block[np.isfinite(value[block])] for block in blocks]
+    if len(blocks) < 2 or np.median([len(block) for block in blocks]) < ROWS_MIN:
+        return rests
+    tails = [block[-max(3, round(TAIL_SHARE * len(block))) :] for block in blocks]
+    levels = [float(np.median(value[tail])) if len(tail) else np.nan for tail in tails]
+    variances = sorted(float(np.var(value[tail], ddof=1)) for tail in tails if len(tail) > 1)
+    # An axis that never came to rest adds nothing to the noise at rest.
+    noise = np.sqrt(np.mean(variances[: max(1, round(QUIET_SHARE * len(variances)))]))
+    steps = np.diff(np.unique(value[np.isfinite(value)]))
+    resolution = float(steps.min()) if len(steps) else 0.0
+    tolerance = max(NOISE_SDS * float(noise), DIGITS * resolution)
+    for k, (block, level) in enumerate(zip(blocks, levels, strict=True)):
+        if len(block) < 2:
+            continue
+        off = np.abs(value[block] - level) > tolerance
+        before = levels[k - 1] if k else np.nan
+        way = abs(level - before) if np.isfinite(before) else np.inf
+        if off[0] and (k == 0 or abs(value[block[0]] - level) > STEP_SHARE * way):
+            settled = int(np.argmax(~off)) if (~off).any() else len(block)
+            last = np.flatnonzero(off)
+            # Beyond a single outlier the axis came back: only the rows on its way count.
+            run = last[: np.argmax(np.diff(np.r_[last, len(block) + 1]) > 1) + 1]
+            rests[block[: max(settled, int(run[-1]) + 1)]] = False
+        if len(block) >= ROWS_MIN and abs(value[block[-1]] - value[block[-2]]) > tolerance and off.mean() > 0.5:
+            rests[block] = False
+    under_way = np.mean([not rests[block].all() for block in blocks[1:]])
+    return rests if under_way >= MOVING_SHARE else np.ones(len(command), bool)
+
 
 NUMBER_MAX = 1e12
 """Largest absolute command or reading."""
@@ -44,6 +110,8 @@ CONTRARY_MIN = 4
 """Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
 SCALES = ("length", "angle")
 """Kinds of units in which commands are target positions."""
+STATED_SHARE = 0.6
+"""Least mean sign of the steps at which a single word stands for their direction."""
 STATUS_SHARE = 0.5
 """Share of rows that a status of 0 and 1 may leave out without a question."""
 
@@ -107,16 +175,20 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     if times is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
     stops = _Stops(cells, commands, values, homings, assumed)
-    readings: list[dict[str, Any]] = []
+    readings, unread = list[dict[str, Any]](), 0
     for row, (command, value) in enumerate(zip(commands, values, strict=True)):
         stops.go(row, command, None if times is None else times[row])
-        if value is not None or statuses[row]:
+        is_read = value is not None or (statuses[row] and not means(statuses[row], "good"))
+        unread += not is_read and bool(statuses[row])
+        if is_read:
             status = status_of(cells, row, {"value": value}, "reading")
             move = stops.moves[-1]["move"]
             readings.append(
                 {"reading": len(readings), "move": move, "value": value, "u": stated_u[row], "status": status}
             )
     assumed += left_out(cells, statuses, "reading") + stops.remarks()
+    if unread:
+        assumed.append(f"status: {unread} row{'s' * (unread > 1)} called good without a reading: moves alone")
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
     readings, wrapped = unwrapped(stops.moves, readings, folder_unit or unit or "deg", wishes.counts_per_turn)
@@ -151,15 +223,9 @@ def _good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, ass
         return table
     coded = all(NUMBER.fullmatch(cell) or not cell for cell in cells)
     if coded and sum(bad) > STATUS_SHARE * len(cells):
-        found = f"column {escaped(name)}, which leaves out {sum(bad)} of {len(cells)} rows where 1 means good"
         known = columns_of(table)
-        candidates = [
-            Candidate(f"{code:g} is good", ("--assume", f"status_ok={code:g}"), {name: known[name].first})
-            for code in sorted(codes)
-        ]
-        raise ask_column(
-            table, found, [*candidates, choice({"status": ""}, known)], "a status whose good rows are known"
-        )
+        said = {"column": name, "bad": sum(bad), "rows": len(cells)}
+        raise table.ask("status", each=sorted(codes), first={name: known[name].first}, **said)
     return table
 
 
@@ -243,8 +309,7 @@ class _Stops:
         moved = [row for row, step in enumerate(steps, start=1) if step and self._sides[row] and not self._homings[row]]
         contrary = [row for row in moved if self._sides[row] * steps[row - 1] < 0]
         if len(contrary) >= CONTRARY_MIN and contrary == moved and {self._sides[row] for row in moved} == {-1, 1}:
-            remedy = "exchange the words; or --column approach= takes directions from the order of the commands"
-            raise self._cells.refuse(contrary[0], "approach", "forward where commands rise", remedy)
+            raise self._cells.ask("contrary", contrary[0], "approach")
 
     def go(self, row: int, command: float, at_s: float | None) -> None:
         """Add the moves of a row, timed by the table or by the number of the move."""
@@ -310,7 +375,7 @@ class _Stops:
 def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool], assumed: list[str]) -> list[int]:
     """Direction of each row: 1 forward, -1 backward, 0 unstated.
 
-    The order of the commands decides the meaning of two unknown words.
+    The order of the commands decides the meaning of one or two unknown words.
     """
     texts = cells.text("approach")
     words = [plain(text).strip() or text.strip() for text in texts]
@@ -319,23 +384,21 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
         for word, text in zip(words, texts, strict=True)
     }
     unknown = sorted(word for word, side in sides.items() if not side and word not in ("", "unknown"))
-    if len(unknown) == 2 and len(set(words) - {"", "unknown"}) == 2:
-        signs_of: dict[str, set[int]] = {word: set() for word in unknown}
-        for row in range(1, len(words)):
-            step = commands[row] - commands[row - 1]
-            if step and words[row] in signs_of and not homings[row]:
-                signs_of[words[row]].add(1 if step > 0 else -1)
-        signs = [next(iter(signs_of[word])) if len(signs_of[word]) == 1 else 0 for word in unknown]
-        if signs[0] * signs[1] < 0:
-            sides |= dict(zip(unknown, signs, strict=True))
-            forward, backward = (escaped(unknown[signs.index(side)], 24) for side in (1, -1))
-            assumed.append(f"approach: {forward} is forward and {backward} backward, as the commands rise and fall")
+    if 0 < len(unknown) < 3 and set(unknown) == set(words) - {"", "unknown"}:
+        steps = np.diff(commands) * ~np.array(homings[1:], bool)
+        # Of a single word the moves back to the beginning are not stated.
+        least = 1.0 if len(unknown) == 2 else STATED_SHARE
+        signs_of = {word: np.sign(steps[(np.array(words[1:]) == word) & (steps != 0)]) for word in unknown}
+        known = {word: int(np.sign(s.sum())) for word, s in signs_of.items() if len(s) and abs(s.mean()) >= least}
+        if len(known) == len(unknown) == len({*known.values()}):
+            sides |= known
+            named = sorted(((escaped(word, 24), side) for word, side in known.items()), key=lambda item: -item[1])
+            said = " and ".join(f"{word} {'forward' if side > 0 else 'backward'}" for word, side in named)
+            assumed.append(f"approach: {said.replace(' ', ' is ', 1)}, as the commands rise and fall")
             unknown = []
     for row, word in enumerate(words):
         if word in unknown:
-            allowed = "forward or backward, + or -, fwd or rev, up or down, unknown"
-            remedy = "forward is the direction of rising commands; or leave it out with --column approach="
-            raise cells.refuse(row, "approach", allowed, remedy)
+            raise cells.ask("side", row, "approach")
     return [sides[word] for word in words]
 
 
@@ -398,9 +461,6 @@ def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
     residuals = np.delete(rise - np.median(rise[step != 0] / step[step != 0]) * step, [row - 1 for row in jumps])
     if abs(typical - turn) <= JUMP_SDS * float(np.median(np.abs(residuals))) + 2.0:
         return turn
-    found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
     usual = [n for n in TURNS_USUAL if abs(n / typical - 1.0) <= TURN_TOLERANCE]
     turns = dict.fromkeys((*usual, turn, round(typical)))
-    candidates = [Candidate(f"the encoder restarts after {n:g}", ("--counts-per-turn", f"{n:g}")) for n in turns]
-    candidates.append(Candidate("these are motions", ("--counts-per-turn", "0")))
-    raise question(file="value", found=found, allowed=allowed, candidates=candidates, code="wrapped")
+    raise asked("wrapped", "value", each=turns, jump=typical, times=len(jumps))

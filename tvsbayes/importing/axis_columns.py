@@ -12,20 +12,24 @@ import numpy as np
 
 from tvsbayes.errors import Candidate, escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.cells import date_time, is_clock, is_segment, time_of_day
-from tvsbayes.importing.columns import (
+from tvsbayes.importing.asking import listed
+from tvsbayes.importing.cells import (
     Column,
     Understood,
     ask_column,
     check_stated,
     choice,
     columns_of,
+    date_time,
     factor_between,
+    is_clock,
+    is_segment,
     missing_column,
+    time_of_day,
 )
 from tvsbayes.importing.runs import counts_rows
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import listed, means
+from tvsbayes.importing.words import means
 
 FIELDS = ("command", "value", "u", "status", "segment", "time_s", "approach", "temperature_degC", "moving")
 """All fields of a table of an axis."""
@@ -40,7 +44,6 @@ SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 and scatter by more than the second share of their own span about a line."""
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
 """Options that say what the readings are."""
-AS_STATED = "positions, or deviations that are stated as such"
 
 
 def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: bool | None = None) -> Understood:
@@ -64,6 +67,14 @@ def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: boo
     for text, column in free.items():
         of_role.setdefault(_role(column), []).append(text)
     numbers = [name for role in ("command", "value", "position", "") for name in of_role.get(role, ())]
+    volts = [n for n in of_role.get("aside", ()) if (u := known[n].name.unit) and u.kind == "voltage"]
+    if len(numbers) == 1 and len(volts) == 1 and not {"command", "value"} & taken.keys():
+        ways = {"value": (volts[0], numbers[0]), "command": (numbers[0], volts[0])}
+        ways = {role: pair for role, pair in ways.items() if numbers[0] in of_role.get(role, ())} or ways
+        if len(ways) > 1:
+            candidates = [choice(dict(zip(("command", "value"), pair, strict=True)), known) for pair in ways.values()]
+            raise ask_column(table, f"positions and volts ({listed([*numbers, *volts])})", candidates)
+        taken |= dict(zip(("command", "value"), *ways.values(), strict=True))
     if len(numbers) < 2:
         # A column that counts the rows is no number of theirs, unless little else is there.
         of_role.setdefault("", []).extend(of_role.get("index", ()))
@@ -82,7 +93,7 @@ def _role(column: Column) -> str:
     kind = unit.kind if unit else ""
     if name.has("temperature") or kind == "temperature":
         return "temperature_degC" if _varied_number(column) else "aside"
-    if name.has("aside") or kind == "other":
+    if name.has("aside") or kind in ("other", "voltage"):
         return "aside"
     if kind == "time" or (name.has("time") and not kind):
         return "time_s"
@@ -101,7 +112,8 @@ def _role(column: Column) -> str:
         return "approach"
     command, value = name.place("command"), name.place("value")
     if (column.numeric or column.has_digits) and (command is not None or value is not None):
-        return "command" if value is None or (command is not None and command < value) else "value"
+        is_number = value is not None and name.place("number") == value
+        return "command" if value is None or (command is not None and (command < value or is_number)) else "value"
     if not name.has("command", "value", "position") and not kind and counts_rows(column.cells):
         return "index"
     if not column.numeric and not (column.has_digits and name.has("command", "value", "position")):
@@ -268,7 +280,7 @@ def _besides(readings: Sequence[str]) -> str:
 def _pair(known: Mapping[str, Column], command: str, of_role: Mapping[str, list[str]], taken: Mapping[str, str]):
     """The answer that names a command, and the reading where one is left."""
     readings = [name for role in ("value", "position", "") for name in of_role.get(role, ()) if name != command]
-    best = [name for name in of_role.get("value", ()) if name != command] or readings
+    best = _of_device(known, [name for name in of_role.get("value", ()) if name != command], command) or readings
     columns = {"command": command}
     if "value" not in taken and len(best) == 1:
         columns["value"] = best[0]
@@ -338,7 +350,7 @@ def _take_value(
             return
         found = f"no reading but {listed(differences)}, by its name a deviation"
         candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS) for name in differences]
-        raise ask_column(table, found, candidates, AS_STATED, "deviations")
+        raise ask_column(table, found, candidates, "deviations")
     rest = [name for name in (*weak, *others, *of_role.get("u", ())) if name not in taken.values()]
     if rest:
         found = f"no column that is surely the reading; numbers are in {listed(rest)}"
@@ -441,10 +453,8 @@ def _ask_what_is_left(
         if name not in taken.values() and follows(command, known[name]) and not _repeats(command, known[name])
     ]
     if left:
-        found = f"column {escaped(taken['value'])} and also {listed(left)}, which follow the commands alike"
-        raise ask_column(
-            table, found, [choice({"value": name}, known) for name in (taken["value"], *left)], "one reading"
-        )
+        answers = [choice({"value": name}, known) for name in (taken["value"], *left)]
+        raise table.ask("reading-left", answers=answers, value=taken["value"], left=left)
 
 
 def _ask_small(table: ForeignTable, command: Column, value: Column, known: Mapping[str, Column]) -> None:
@@ -469,4 +479,4 @@ def _ask_small(table: ForeignTable, command: Column, value: Column, known: Mappi
             f"readings in column {escaped(name)} that span {span:.3g} {units[0].name} over {np.ptp(c):.6g} of commands"  # type: ignore[union-attr]
         )
         candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS)]
-        raise ask_column(table, found, candidates, AS_STATED, "deviations")
+        raise ask_column(table, found, candidates, "deviations")

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tvsbayes.errors import Candidate, Question, escaped, question, refusal
+from tvsbayes.errors import Question, escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.cells import FieldCells
-from tvsbayes.importing.columns import columns_of
+from tvsbayes.importing.asking import refused
+from tvsbayes.importing.cells import FieldCells, columns_of
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Unit, name_of, parse_unit, plain
 
@@ -52,12 +52,15 @@ def stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:
     text = wishes.units.get(name)
     if text is None:
         return None
+    # Volts of a sensor: "0.5 mm" is what one of the numbers stands for.
+    scaled = re.fullmatch(r"(\d+\.?\d*(?:e-?\d+)?) ?(\D.*)", text)
     unit = parse_unit(text)
+    if unit is None and scaled and float(scaled[1]) and (whole := parse_unit(scaled[2])) is not None:
+        return whole._replace(per_number=float(scaled[1]) * whole.per_number)
     if unit is None and name == "value":
         return Unit(text, "own", 1.0)
     if unit is None:
-        allowed, remedy = "a unit such as mm, um, 1/100 mm, deg, arcsec, turn, s, ms", "name one of them"
-        raise refusal("usage", file=f"--unit {name}={escaped(text)}", found="no unit", allowed=allowed, remedy=remedy)
+        raise refused("no-unit", f"--unit {name}={escaped(text)}")
     return unit
 
 
@@ -79,18 +82,12 @@ def units_of(
             known = columns_of(cells.table)
             own = [column.unknown] if name == "value" else []
             usual = {"time_s": ("s", "ms", "min")}.get(name, ("mm", "um", "deg", "arcsec", "counts"))
-            found = f"unit {escaped(column.unknown)} of column {escaped(column.text)}, which is not known"
             first = {column.text: known[column.text].first}
-            candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}"), first) for text in (*own, *usual)]
-            raise question(
-                file=cells.table.file,
-                line=cells.table.first_line,
-                found=found,
-                allowed="a unit that is known, or one that is stated",
-                candidates=candidates,
-                code="unit",
-            )
+            said = {"unit": column.unknown, "column": column.text, "field": name}
+            raise cells.table.ask("unknown-unit", each=(*own, *usual), first=first, **said)
         units[name] = unit
+    if (unit := units["value"]) is not None and unit.kind == "voltage" and "value" not in wishes.units:
+        raise cells.table.ask("volts", unit=unit.name, column=cells.columns["value"])
     if units["value"] is None and (unit := unit_above(cells.table)) is not None:
         units["value"] = unit
         assumed.append(f"unit: {unit.name}, as a line above the names says; --unit value=mm says another")
@@ -164,20 +161,12 @@ def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit |
     table = cells.table
     if command_unit is None or unit is None:
         name, other = ("command", unit) if command_unit is None else ("value", command_unit)
-        found = f"no unit of column {escaped(cells.columns[name])} beside {other.name} of the other"  # type: ignore[union-attr]
         usual = dict.fromkeys((other.name, *(("mm", "um") if other.kind == "length" else ("deg", "arcsec"))))  # type: ignore[union-attr]
-        candidates = [Candidate(f"it is {text}", ("--unit", f"{name}={text}")) for text in usual]
-        raise question(
-            file=table.file, line=table.first_line, found=found, allowed="two units", candidates=candidates, code="unit"
-        )
+        column = cells.columns[name]
+        raise table.ask("unit-beside", each=usual, column=column, other=other.name, field=name)  # type: ignore[union-attr]
     factor = unit.in_units_of(command_unit)
     if factor is None:
-        found, allowed = (
-            f"deviations in {unit.name} from commands in {command_unit.name}",
-            "deviations in a unit of the commands",
-        )
-        remedy = "add a column of positions, or of commands in the unit of the deviations"
-        raise refusal("unit", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy)
+        raise refused("two-kinds", table.file, line=table.first_line, unit=unit.name, other=command_unit.name)
     return factor
 
 
@@ -209,16 +198,8 @@ def _unit_of_readings(
     }
     # Those in which the readings follow the commands come first.
     near = sorted(usual, key=lambda text: abs(np.log(slope * scales[text])) if text in scales and slope else np.inf)
-    column, table = cells.columns["value"], cells.table
-    found = (
-        f"readings without a unit in column {escaped(column)}, {slope:.4g} for each {command_unit.name} of the commands"
-    )
-    names = (*near[:3], "counts")
-    candidates = [Candidate(f"they are in {text}", ("--unit", f"value={text}")) for text in names]
-    allowed = "a unit of the readings"
-    return question(
-        file=table.file, line=table.first_line, found=found, allowed=allowed, candidates=candidates, code="unit"
-    )
+    said = {"column": cells.columns["value"], "slope": slope, "unit": command_unit.name}
+    return cells.table.ask("unit-of-readings", each=(*near[:3], "counts"), **said)
 
 
 def _are_counts(cells: Sequence[str]) -> bool:
@@ -255,20 +236,10 @@ def _standard_u(
     unit = unit or reading
     factor = 1.0 if unit is None else None if result is None else unit.in_units_of(result)
     if unit is not None and factor is None:
-        of = result.name if result else "an unnamed unit"
-        found = f"u in {unit.name} in column {escaped(name)}, of readings in {of}"
         usual = {"length": ("mm", "um"), "angle": ("deg", "arcsec")}.get(unit.kind, ())
-        names = dict.fromkeys((unit.name, *usual))
-        candidates = [Candidate(f"readings in {text}", ("--unit", f"value={text}")) for text in names]
-        candidates = (candidates if result is None else []) + [Candidate("no column of u", ("--column", "u="))]
-        raise question(
-            file=table.file,
-            line=table.first_line,
-            found=found,
-            allowed="units of one kind",
-            candidates=candidates,
-            code="unit",
-        )
+        names = dict.fromkeys((unit.name, *usual)) if result is None else ()
+        of = result.name if result else "an unnamed unit"
+        raise table.ask("unit-of-u", each=names, unit=unit.name, column=name, of=of)
     if unit is not None and result is not None and factor != 1.0:
         assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")
     coverage = wishes.coverage or name_of(name).coverage

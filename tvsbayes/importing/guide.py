@@ -1,4 +1,4 @@
-"""Guide logs of PHD2 and KStars, and tables of time and periodic error: a mount's RA axis while it tracks a star.
+"""Guide logs of PHD2, KStars and MaxIm, and tables of time and periodic error: a mount's RA axis that tracks a star.
 
 A run lies between "Guiding Begins" and "Guiding Ends". Distances are pixels on the sky, durations ms, times s since the
 beginning of the run. A pulse acts after its frame: the star's uncorrected motion is the raw distance plus the pulses of
@@ -19,10 +19,11 @@ from itertools import pairwise
 from statistics import median
 from typing import Any, NamedTuple
 
-from tvsbayes.errors import Candidate, escaped, question, refusal
+from tvsbayes.errors import Candidate, escaped
 from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.axis import AxisRows
-from tvsbayes.importing.columns import columns_of
+from tvsbayes.importing.cells import DAY_S, columns_of, time_of_day
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import place_of
 
@@ -35,6 +36,8 @@ RATES_AGREE = 0.25
 RATES_EQUAL = 0.05
 """Largest relative difference of rates between which nothing needs to decide."""
 BEGINS, ENDS = "Guiding Begins at ", "Guiding Ends"
+MAXIM = "Track Log Started at UT "
+"""First line of a run of MaxIm DL, whose track log has offsets in px and corrections in s (its help, "Track Log")."""
 NEEDED = ("Time", "RARawDistance", "RADuration", "RADirection")
 TIME_MAX_S, RAW_MAX_PX, PULSE_MAX_MS, PIXEL_MAX_ARCSEC = 1e6, 1e5, 1e6, 1e4
 """Far beyond any night, camera and guider: larger numbers are damage."""
@@ -53,6 +56,7 @@ ASSUMPTIONS = {
     "pixel_arcsec": "scale of the guide camera, arcsec per pixel",
     "drive_arcsec_per_s": "rate of the drive: sidereal",
     "pe_sign": "1 where a positive periodic error is an axis ahead of its drive, else -1",
+    "ra_axis": "1 where X of a guide camera is right ascension, 2 where Y",
 }
 """Values that `--assume` may state, with their meaning."""
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -97,7 +101,7 @@ class GuideRun:
         breaks: indices of `frames` with a new zero: after dithers, new lock positions, settling, pauses.
         counts: numbers of events by name.
         ended: whether the log contains the end of the run.
-        program: that wrote the log, "PHD2" or "KStars".
+        program: that wrote the log, "PHD2", "KStars" or "MaxIm".
     """
 
     number: int
@@ -125,16 +129,21 @@ class GuideRun:
 
 
 def is_guide_log(text: str) -> bool:
-    """Whether a text is a guide log of PHD2 or KStars."""
-    return BEGINS in text or text.startswith(("PHD2 version", "KStars version"))
+    """Whether a text is a guide log of PHD2, KStars or MaxIm."""
+    return BEGINS in text or MAXIM in text or text.startswith(("PHD2 version", "KStars version"))
 
 
-def read_runs(text: str, file: str) -> list[GuideRun]:
-    """The runs of a log, without runs that have no frame.
+def read_runs(text: str, file: str, ra_axis: float | None = None) -> list[GuideRun]:
+    """The runs of a log, without runs that have no frame; of MaxIm those of X, or of Y where `ra_axis` is 2.
 
     Raises:
         InputError: no run, or a table of frames without a required column.
     """
+    if MAXIM in text:
+        lines = text.splitlines()
+        starts = [k for k, line in enumerate(lines) if MAXIM in line]
+        parts = [_maxim_run(a + 1, lines[a:b], ra_axis == 2) for a, b in pairwise([*starts, len(lines)])]
+        return _kept(parts, "MaxIm", file)
     runs: list[GuideRun] = []
     run: GuideRun | None = None
     columns: list[str] | None = None
@@ -162,19 +171,47 @@ def read_runs(text: str, file: str) -> list[GuideRun]:
         elif line.startswith("Frame,"):
             columns = line.split(",")
             if missing := [name for name in NEEDED if name not in columns]:
-                found, remedy = f"no column {', '.join(missing)}", "export the log of the guider unchanged"
-                raise refusal("csv", file=file, line=number, found=found, allowed=", ".join(NEEDED), remedy=remedy)
+                raise refused("frame-columns", file, line=number, names=missing, needed=NEEDED)
         elif columns is None:
             _header(run, line)
         else:
             _frame(run, number, line, columns, settling)
-    runs_kept = [run for run in runs if run.frames]
-    for k, run in enumerate(runs_kept, start=1):
+    return _kept(runs, program, file)
+
+
+def _kept(runs: list[GuideRun], program: str, file: str) -> list[GuideRun]:
+    """Runs with frames, numbered."""
+    runs = [run for run in runs if run.frames]
+    for k, run in enumerate(runs, start=1):
         run.number, run.program = k, program
-    if not runs_kept:
-        found, remedy = "no run with frames", "give a log that holds guiding, not only calibration"
-        raise refusal("empty", file=file, found=found, allowed=f'frames after "{BEGINS.strip()}"', remedy=remedy)
-    return runs_kept
+    if not runs:
+        raise refused("no-guiding", file)
+    return runs
+
+
+def _maxim_run(first: int, lines: Sequence[str], is_y: bool) -> GuideRun:
+    """A run of MaxIm: a positive correction moves the star to larger numbers, so that it acts as a negative pulse."""
+    run = GuideRun(1, first, lines[0].partition(MAXIM)[2].strip(), mount="a mount of MaxIm", ended=True)
+    days_s, before_s, start_s = 0.0, None, None
+    for number, line in enumerate(lines[1:], start=first + 1):
+        cells = [cell.strip() for cell in line.split(",")]
+        if (at_s := time_of_day(cells[0])) is None:
+            continue
+        days_s += DAY_S * (before_s is not None and at_s < before_s - DAY_S / 2)
+        before_s, start_s = at_s, at_s if start_s is None else start_s
+        time_s = at_s + days_s - start_s
+        numbers = [float(cell) if NUMBER.fullmatch(cell) else math.nan for cell in cells[1:7]]
+        offset, correction_s = (numbers[2 + is_y], numbers[4 + is_y]) if len(numbers) == 6 else (math.nan, math.nan)
+        late = time_s < (run.frames[-1].time_s if run.frames else 0.0)
+        if late or not (abs(offset) <= RAW_MAX_PX and 1000 * abs(correction_s) <= PULSE_MAX_MS):
+            (
+                run.dropped_s.append(time_s)
+                if not late and "fade" in line.lower()
+                else run.counts.update(["damaged row"])
+            )
+        else:
+            run.frames.append(GuideFrame(number, time_s, offset, -1000.0 * correction_s, False))
+    return run
 
 
 def _header(run: GuideRun, line: str) -> None:
@@ -267,24 +304,36 @@ def _scale(run: GuideRun, runs: Sequence[GuideRun], stated: Mapping[str, float],
         InputError: a number that the log does not state, with the option that states it.
     """
     known = {**run.header, **stated}
-    for name, words in (("pixel_arcsec", "the pixel scale"), ("declination_deg", "the declination")):
-        if name not in known:
-            found, remedy = f"run {run.number} does not state {words}", f"state it: --assume {name}=NUMBER"
-            raise refusal("missing-value", file=file, line=run.line, found=found, allowed="a number", remedy=remedy)
+    is_maxim = run.program == "MaxIm"
+    needed = {"pixel_arcsec": "the pixel scale", "declination_deg": "the declination"}
+    if is_maxim:
+        needed |= {"pulse_arcsec_per_s": "the rate of a pulse"} if any(f.pulse_ms for f in run.frames) else {}
+        needed |= {"ra_axis": "which of X and Y is right ascension"}
+    if missing := [name for name in needed if name not in known]:
+        numbers = tuple(w for name in missing if name != "ra_axis" for w in ("--assume", f"{name}=NUMBER"))
+        axes = {f"{axis} is right ascension": ("--assume", f"ra_axis={k}") for k, axis in ((1, "X"), (2, "Y"))}
+        ways = axes if "ra_axis" in missing else {"with your numbers": ()}
+        answers = [Candidate(says, (*numbers, *words)) for says, words in ways.items()]
+        said = {"run": run.number, "values": " and ".join(needed[name] for name in missing)}
+        raise asked("missing-value", file, line=run.line, answers=answers, **said)
     pixel, declination = known["pixel_arcsec"], known["declination_deg"]
     if not abs(declination) <= DECLINATION_MAX_DEG:
-        found, allowed = f"a declination of {declination:g} deg", f"at most {DECLINATION_MAX_DEG:g} deg"
-        remedy = "take a run on a star nearer to the equator; or is another one right: --assume declination_deg=NUMBER"
-        raise refusal("range", file=file, line=run.line, found=found, allowed=allowed, remedy=remedy)
+        raise refused("declination", file, line=run.line, declination=declination, most=DECLINATION_MAX_DEG)
     if not 0 < pixel <= PIXEL_MAX_ARCSEC:
-        found, allowed = f"a pixel scale of {pixel:g} arcsec", f"above 0, at most {PIXEL_MAX_ARCSEC:g}"
-        remedy = "state arcsec per pixel: --assume pixel_arcsec=NUMBER"
-        raise refusal("range", file=file, line=run.line, found=found, allowed=allowed, remedy=remedy)
+        raise refused("pixel-scale", file, line=run.line, pixel=pixel, most=PIXEL_MAX_ARCSEC)
     cosine = math.cos(math.radians(declination))
     assumed = [f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg="]
     assumed.append(f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=")
-    if "pulse_arcsec_per_s" in stated:
+    if is_maxim and "pulse_arcsec_per_s" not in stated:
+        pulse = 0.0
+        assumed.append("no corrections: the star's way is the axis' own")
+    elif "pulse_arcsec_per_s" in stated:
         pulse = stated["pulse_arcsec_per_s"]
+        ratios = [abs(1000 * f.raw_px / f.pulse_ms) for f in run.frames if f.pulse_ms and is_maxim]
+        most = median(ratios) * pixel / cosine if ratios else math.inf
+        if pulse > (1 + RATES_AGREE) * most:
+            # A guider corrects at most what it sees.
+            raise asked("large-pulses", file, line=run.line, pulse=pulse, most=most)
         assumed.append(f"pulses turn the axis by {pulse:g} arcsec/s, as stated")
     else:
         pulse, text = _logged_pulse(run, runs, pixel, declination, file)
@@ -324,8 +373,8 @@ def _logged_pulse(
     rates = _hypotheses(run, pixel, declination_deg)
     header, cosine = run.header, math.cos(math.radians(declination_deg))
     if not rates:
-        found, remedy = f"run {run.number} does not state xRate", "state it: --assume pulse_arcsec_per_s=NUMBER"
-        raise refusal("missing-value", file=file, line=run.line, found=found, allowed="a number", remedy=remedy)
+        answers = [Candidate("with your number", ("--assume", "pulse_arcsec_per_s=NUMBER"))]
+        raise asked("missing-value", file, line=run.line, answers=answers, run=run.number, values="xRate")
     stated = {
         "Norm rates": header.get("at_equator"),
         "the mount's guide speed": header.get("guide_speed"),
@@ -344,16 +393,10 @@ def _logged_pulse(
     undecided = not evidence and max(rates.values()) / min(rates.values()) - 1 > RATES_EQUAL
     if against or undecided or pulse > PULSE_MAX * SIDEREAL_ARCSEC_PER_S:
         says = {**rates, **evidence}
-        allowed = f"statements that agree to {RATES_AGREE:.0%}, at most {PULSE_MAX:g} x sidereal"
-        candidates = [
-            Candidate(name, ("--assume", f"pulse_arcsec_per_s={rate:.5g}"))
-            for name, rate in says.items()
-            if rate <= PULSE_MAX * SIDEREAL_ARCSEC_PER_S
-        ]
-        found = f"rates of a pulse of run {run.number}: " + ", ".join(
-            f"{rate:.4g} arcsec/s ({name})" for name, rate in says.items()
-        )
-        raise question(file=file, line=run.line, found=found, allowed=allowed, candidates=candidates, code="pulse-rate")
+        possible = [item for item in says.items() if item[1] <= PULSE_MAX * SIDEREAL_ARCSEC_PER_S]
+        stated_rates = ", ".join(f"{rate:.4g} arcsec/s ({name})" for name, rate in says.items())
+        said = {"run": run.number, "rates": stated_rates, "agree": RATES_AGREE, "most": PULSE_MAX}
+        raise asked("pulse-rates", file, line=run.line, each=possible, **said)
     return pulse, text
 
 
@@ -389,6 +432,12 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
         InputError: a number that neither `stated` nor the log contains, or fewer than three usable frames.
     """
     scale = _scale(run, runs, stated, file)
+    sign, assumed = 1.0, ASSUMED
+    if run.program == "MaxIm":
+        sign = math.copysign(1.0, stated.get("pe_sign", 1.0))
+        which, where = ("Y" if stated.get("ra_axis") == 2 else "X"), "lags" if sign > 0 else "is ahead"
+        assumed = ("a correction acts after its frame: motion = offset - corrections of the frames before",)
+        assumed += (f"sign: where {which} grows the axis {where}; --assume pe_sign={-sign:g} says the other",)
     moves: list[dict[str, Any]] = []
     frames: list[tuple[float, int, float | None, str]] = []
     pulse_sum, needs_move = 0.0, True
@@ -400,13 +449,12 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
                 moves.append(_drive_move(len(moves), time_s, scale.drive_arcsec_per_s))
                 pulse_sum, needs_move = 0.0, False
             motion = raw * scale.pixel_arcsec / scale.cos_declination + pulse_sum
-            value = scale.drive_arcsec_per_s * time_s - motion
+            value = scale.drive_arcsec_per_s * time_s - sign * motion
         frames.append((time_s, len(moves) - 1, value, status))
         pulse_sum += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
     used = sum(value is not None for _, _, value, _ in frames)
     if used < 3:
-        remedy = "name another run with --run"
-        raise refusal("empty", file=file, line=run.line, found=f"{used} frames", allowed="three or more", remedy=remedy)
+        raise refused("few-frames", file, line=run.line, count=used)
     # Frames before the first stretch belong to no move.
     frames += [(time_s, -1, None, "dropped") for time_s in run.dropped_s]
     starts_s = [move["time_s"] for move in moves]
@@ -429,7 +477,7 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
     axis = {**PRIORS, **_search_of([time_s for time_s, *_ in rows])}
     header = {"rate": scale.drive_arcsec_per_s, **_header_of(run, file)}
     notes = (_frames_text(run, used, len(moves)), *_remarks(run))
-    return AxisRows(moves, readings, "arcsec", (*scale.assumed, *ASSUMED), notes, header, axis)
+    return AxisRows(moves, readings, "arcsec", (*scale.assumed, *assumed), notes, header, axis)
 
 
 def _drive_move(number: int, time_s: float, rate: float) -> dict[str, Any]:
@@ -476,11 +524,7 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
     if worm and not errors and len(known) == 3:
         times, _, errors = ([name] for name in known)
     if len(errors) != 1 or len(times) != 1:
-        found = f"{len(times)} columns of times and {len(errors)} of a periodic error"
-        remedy = "give a table with one column of each, as Time (s), PE (arcsec)"
-        raise refusal(
-            "missing-column", file=table.file, line=table.first_line, found=found, allowed="one of each", remedy=remedy
-        )
+        raise refused("periodic-error", table.file, line=table.first_line, times=len(times), errors=len(errors))
     time_unit, error_unit = known[times[0]].name.unit, known[errors[0]].name.unit
     scale_s = time_unit.scale if time_unit and time_unit.kind == "time" else 1.0
     scale = 3600.0 * error_unit.scale * error_unit.per_number if error_unit and error_unit.kind == "angle" else 1.0
@@ -492,8 +536,7 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
         if NUMBER.fullmatch(t) and NUMBER.fullmatch(e)
     ]
     if len(pairs) < 3 or any(b[0] < a[0] for a, b in pairwise(pairs)):
-        found, remedy = f"{len(pairs)} rows of numbers, or times that step back", "give the rows as they were recorded"
-        raise refusal("empty", file=table.file, found=found, allowed="three or more in time order", remedy=remedy)
+        raise refused("few-errors", table.file, count=len(pairs))
     readings = [
         {"reading": k, "move": 0, "value": round(rate * t + sign * e, 4), "u": 0.0, "status": "ok", "time_s": t}
         for k, (t, e) in enumerate(pairs)

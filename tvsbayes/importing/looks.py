@@ -13,11 +13,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from tvsbayes.errors import escaped, refusal
+from tvsbayes.errors import escaped
 from tvsbayes.files.csv_kind import ID_MAX
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.cells import FieldCells, date_time, is_segment, left_out, readable, status_of, time_of_day
-from tvsbayes.importing.columns import Understood, ask_column, check_stated, choice, columns_of
+from tvsbayes.importing.asking import refused
+from tvsbayes.importing.cells import (
+    FieldCells,
+    Understood,
+    ask_column,
+    check_stated,
+    choice,
+    columns_of,
+    date_time,
+    is_segment,
+    left_out,
+    readable,
+    status_of,
+    time_of_day,
+)
 from tvsbayes.importing.counters import AXES, COUNTERS, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
@@ -192,25 +205,17 @@ def look_columns(table: ForeignTable, claims: Claims, moves_listed: bool) -> Non
         listed = " or ".join(map(escaped, texts))
         raise ask_column(table, f"{len(texts)} columns that could be {role} ({listed})", answers)
     ambiguous = [f"{role} ({' or '.join(map(escaped, texts))})" for role, texts in claims.ambiguous.items()]
-    found = f"no column that is surely {', '.join([*missing, *ambiguous])}"
     understood = ", ".join(f"{name} = {escaped(claims.columns[name])}" for name in FIELDS if name in claims.columns)
-    remedy = f"say which: {' '.join(f'--column {name}=NAME' for name in wanted)}"
+    options = " ".join(f"--column {name}=NAME" for name in wanted)
     optional = [name for name in wanted if name not in (*PIXELS, *COUNTERS)]
-    remedy += f"; --column {optional[0]}= where there is none" if optional else ""
+    hint = f"; --column {optional[0]}= where there is none" if optional else ""
     if {*claims.columns}.isdisjoint((*PIXELS, *COUNTERS)):
-        remedy += (
-            "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
-        )
+        hint += "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
     if not understood and not ambiguous:
-        remedy += "; if that line is a title, delete it, so that the first holds the names of the columns"
-    raise refusal(
-        "missing-column",
-        file=table.file,
-        line=table.first_line,
-        found=f"{found}; understood so far: {understood or 'nothing'}",
-        allowed=f"any of {', '.join(map(escaped, table.columns))}",
-        remedy=remedy,
-    )
+        hint += "; if that line is a title, delete it, so that the first holds the names of the columns"
+    said = {"fields": ", ".join([*missing, *ambiguous]), "known": understood or "nothing"}
+    names = ", ".join(map(escaped, table.columns))
+    raise refused("missing-column", table.file, line=table.first_line, names=names, options=options, hint=hint, **said)
 
 
 def _by_distance(claims: Claims, table: ForeignTable, stated: Mapping[str, str]) -> str | None:
@@ -362,9 +367,7 @@ def _listed_moves(cells: FieldCells, known: int) -> list[int]:
     table, count = cells.table, len(cells.table)
     if "move" not in cells:
         if known != count:
-            found = f"{count} looks for {known} moves, and no column of move numbers"
-            allowed, remedy = "a column of move numbers, or a look for every move", "add --column move=NAME"
-            raise refusal("missing-column", file=table.file, found=found, allowed=allowed, remedy=remedy)
+            raise refused("look-moves", table.file, looks=count, moves=known)
         return list(range(count))
     numbers = [number or 0 for number in cells.whole("move", -ID_MAX, ID_MAX)]
     for row, number in enumerate(numbers):

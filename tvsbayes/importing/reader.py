@@ -1,16 +1,291 @@
-"""The table in a file of another program, of any kind that is known."""
+"""The table in a file of another program, of any kind that is known.
+
+Beside texts and workbooks: LabVIEW's .lvm, Renishaw's .rtl, objects of JSON, and "name: value" lines of serial
+monitors, a row on one line or over several.
+"""
 
 from __future__ import annotations
 
+import json
+import re
+from collections import Counter
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
-from tvsbayes.errors import escaped, refusal
-from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.errors import escaped
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX, NUMBER
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.importing import lab_files, serial
-from tvsbayes.importing.table import KINDS, WORKBOOKS, ForeignTable, headed, table_of_rows
+from tvsbayes.importing.asking import refused
+from tvsbayes.importing.table import WORKBOOKS, ForeignTable, Row, Rows, headed, table_of_rows
 from tvsbayes.importing.text import text_of, text_table_rows
 from tvsbayes.importing.workbook import sheet_rows
+
+DEPTH_MAX = 4
+_UNITS = {"LINEAR": ("mm", "mm"), "ANGULAR": ("deg", "arcsec")}
+"""Units of targets and deviations by file type (Renishaw, LaserXL file formats)."""
+
+
+def json_rows(text: str, file: str) -> Rows | None:
+    """Rows of objects of JSON: one on each line, or a list of them; nested names are joined by dots."""
+    if not re.match(r'\s*(\[\s*)?\{\s*"', text) or max(map(text.count, "{[")) > CSV_ROWS_MAX:
+        return None
+    lines = [(n, line.strip().rstrip(",")) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    try:
+        if text.lstrip().startswith("["):
+            lines = [(n, json.dumps(item)) for n, item in enumerate(json.loads(text), start=1)]
+        flat = [(n, _flat(json.loads(line))) for n, line in lines]
+    except (ValueError, TypeError, RecursionError):
+        return None
+    names = list(dict.fromkeys(name for _, cells in flat for name in cells))
+    if len(flat) < 2 or not names:
+        return None
+    rows = [Row(n, [cells.get(name, "") for name in names]) for n, cells in flat]
+    return Rows([Row(rows[0].line, names), *rows], ["objects of JSON"])
+
+
+def _flat(value: object, prefix: str = "", depth: int = 0) -> dict[str, str]:
+    """Numbers, texts and marks of an object by name."""
+    if isinstance(value, dict) and depth < DEPTH_MAX:
+        return {
+            n: c for key, of in value.items() for n, c in _flat(of, f"{prefix}.{key}".strip("."), depth + 1).items()
+        }
+    if not prefix or isinstance(value, list | dict):
+        raise ValueError("no plain object")
+    return {prefix: "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)}
+
+
+def labview_rows(text: str, file: str) -> Rows | None:
+    """Rows below the last header of a LabVIEW measurement file (NI, "LabVIEW Measurement File specification")."""
+    if not text.startswith("LabVIEW Measurement"):
+        return None
+    lines = text.splitlines()
+    header = {key: value for key, _, value in (line.partition("\t") for line in lines[:40])}
+    separator = {"Tab": "\t", "Comma": ","}.get(header.get("Separator", "Tab").strip(), header.get("Separator", "\t"))
+    ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
+    if len(ends) < 2:
+        raise refused("labview", file)
+    rows = []
+    for number, line in enumerate(lines[ends[-1] + 1 :], start=ends[-1] + 2):
+        cells = [cell.strip() for cell in line.split(separator)]
+        if any(cells):
+            rows.append(Row(number, cells))
+    labels = next((line.split(separator) for line in lines[ends[-2] :] if line.startswith("Y_Unit_Label")), [])
+    for k, label in enumerate(labels[1:], start=1):
+        if rows and label.strip() and k < len(rows[0].cells) and "(" not in rows[0].cells[k]:
+            rows[0].cells[k] += f" ({label.strip()})"
+    date = " ".join(header.get(key, "").strip() for key in ("Date", "Time"))
+    return Rows(rows, ["LabVIEW measurement file", *([f"begun {date.strip()}"] if date.strip() else [])])
+
+
+def renishaw_rows(text: str, file: str) -> Rows | None:
+    """Targets and positions of a Renishaw laser file, in the order of its runs."""
+    if not text.startswith("HEADER::") or "DEVIATIONS::" not in text:
+        return None
+    kind = re.search(r"Filetype:\s*(\w+)", text)
+    targets = re.search(r"Targets\s*:\s*((?:[-+.\d eE]+\s*\n)+)", text.replace("\r", ""))
+    units = _UNITS.get(kind[1].upper() if kind else "")
+    if units is None or targets is None:
+        raise refused("renishaw", file, type=kind[1] if kind else "an unnamed type")
+    target = targets[1].split()
+    lines = text.splitlines()
+    begin = next(k for k, line in enumerate(lines) if line.startswith("DEVIATIONS::"))
+    scale = 1.0 if units[0] == units[1] else 1 / 3600
+    rows = [Row(begin + 1, [f"target ({units[0]})", f"measured ({units[0]})", "cycle"])]
+    for number, line in enumerate(lines[begin + 1 :], start=begin + 2):
+        if line.rstrip().endswith("::"):
+            break
+        cells = line.split()
+        if len(cells) != 3 or not all(map(NUMBER.fullmatch, cells)):
+            continue
+        run, point, deviation = cells
+        if not (point.isdigit() and 1 <= int(point) <= len(target)):
+            raise refused("renishaw-target", file, line=number, number=point, most=len(target))
+        at = float(target[int(point) - 1])
+        rows.append(Row(number, [target[int(point) - 1], repr(round(at + scale * float(deviation), 12)), run]))
+    return Rows(rows, ["Renishaw laser file: measured = target + deviation, runs in the order of the file"])
+
+
+PAIRED_SHARE = 0.6
+"""Least share of "name: value" lines in a file of pairs; the others are messages at a program's start."""
+VALUES_MIN = 20
+"""Least number of values of a name by whose decimals one can be seen to be cut."""
+USUAL_SHARE = 0.97
+"""Share of a name's values with one number of decimals, from which a value with fewer was cut."""
+REPEATED_SHARE = 0.1
+"""Largest share of lines equal to the line before, below which such a line was sent twice."""
+DAY_S = 86400.0
+NAMED_MAX = 6
+_PAIR = re.compile(
+    r"(?P<name>[^\W\d][^:=,;|\t]*?)\s*[:=]\s*(?P<value>[+-]?(?:\d+[.,]\d+|\d+\.?|\.\d+)(?:[eE][+-]?\d+)?)"
+    r"(?:\s*(?P<unit>\u00b0|mm|um|\u00b5m|deg|rad|counts|steps|ms|us|s)(?![\w:]))?\s*(?:[,;|\t]\s*|\s+|$)"
+)
+"""One pair of "Step: 200, Angle: 12.5 deg"."""
+_CLOCK = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)\]?\s*(?:->|>)?\s*")
+"""Time of day that a serial monitor puts before a line."""
+
+
+class _Pair(NamedTuple):
+    """A value of a line, with the time of day before the line."""
+
+    line: int
+    name: str
+    value: str
+    clock_s: float | None
+
+
+def paired_rows(text: str, file: str) -> Rows | None:
+    """Rows of a file whose lines are "name: value" pairs; None for any other file.
+
+    The names of a row follow each other in the usual order. A value without its place in that order, after a line that
+    was lost, repeated or cut, is left out and its line is named.
+    """
+    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    pairs_of = {n: found for n, line in lines if (found := _pairs(n, line))}
+    if len(pairs_of) < PAIRED_SHARE * len(lines) or len(pairs_of) < 2:
+        return None
+    if any(len({pair.name for pair in found}) < len(found) for found in pairs_of.values()):
+        return None
+    damaged = _repeated_lines(lines, pairs_of)
+    stream = [pair for n, found in pairs_of.items() if n not in damaged for pair in found]
+    damaged |= (cut := _cut_lines(stream))
+    stream = [pair for pair in stream if pair.line not in cut]
+    counts = Counter(pair.name for pair in stream)
+    usual = [name for name, count in counts.items() if 2 * count > max(counts.values())]
+    rows, orphans = _blocks(stream, usual)
+    if len(usual) < 2 or len(rows) < 2:
+        return None
+    damaged |= orphans
+    names = [*usual, *(name for name in counts if name not in usual)]
+    times = _times([row[usual[0]].clock_s for row in rows])
+    head = ["time (s)"] * (timed := times is not None and "time (s)" not in names) + names
+    body = []
+    for k, row in enumerate(rows):
+        cells = [row[name].value if name in row else "" for name in names]
+        first = min(pair.line for pair in row.values())
+        body.append(Row(first, [f"{times[k]:.6f}", *cells] if timed and times is not None else cells))
+    notes = ['lines of "name: value"']
+    others = [n for n, _ in lines if n not in pairs_of]
+    between = [n for n in others if body[0].line < n]
+    damaged |= set(between)
+    if n := len(others) - len(between):
+        notes.append(f"{n} line{'s' * (n > 1)} before the first row left out")
+    if damaged:
+        named = ", ".join(map(str, sorted(damaged)[:NAMED_MAX])) + " ..." * (len(damaged) > NAMED_MAX)
+        one = len(damaged) == 1
+        notes.append(
+            f"line{'' if one else 's'} {named} left out: lost, repeated or cut beside {'it' if one else 'them'}"
+        )
+    return Rows([Row(body[0].line, head), *body], notes)
+
+
+def _pairs(number: int, line: str) -> list[_Pair]:
+    """The pairs of a line, [] where it holds anything else."""
+    clock = _CLOCK.match(line)
+    content = line[clock.end() if clock else 0 :]
+    found = list(_PAIR.finditer(content))
+    if not found or "".join(match.group() for match in found) != content:
+        return []
+    clock_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) if clock else None
+    return [
+        _Pair(
+            number, m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""), m["value"].replace(",", "."), clock_s
+        )
+        for m in found
+    ]
+
+
+def _repeated_lines(lines: list[tuple[int, str]], pairs_of: dict[int, list[_Pair]]) -> set[int]:
+    """Lines sent twice: equal to the line before, where lines seldom are."""
+    repeated = {n for (_, before), (n, line) in pairwise(lines) if line == before and n in pairs_of}
+    return repeated if len(repeated) <= REPEATED_SHARE * len(lines) else set()
+
+
+def _cut_lines(stream: list[_Pair]) -> set[int]:
+    """Lines with a value of fewer decimals than nearly all others of its name."""
+    decimals = {pair: len(pair.value.partition(".")[2]) for pair in stream}
+    by_name: dict[str, Counter[int]] = {}
+    for pair, places in decimals.items():
+        by_name.setdefault(pair.name, Counter())[places] += 1
+    usual = {name: counts.most_common(1)[0] for name, counts in by_name.items()}
+    return {
+        pair.line
+        for pair, places in decimals.items()
+        if places < usual[pair.name][0]
+        and by_name[pair.name].total() >= VALUES_MIN
+        and usual[pair.name][1] >= USUAL_SHARE * (by_name[pair.name].total() - 1)
+    }
+
+
+def _blocks(stream: list[_Pair], usual: list[str]) -> tuple[list[dict[str, _Pair]], set[int]]:
+    """Rows of the usual names, and the lines of values without a place in one.
+
+    Where several values of the last names follow one of the first, each makes a row with it.
+    """
+    signatures = Counter(tuple(names) for names in _split(stream, usual))
+    signature = signatures.most_common(1)[0][0] if signatures else ()
+    rows: list[dict[str, _Pair]] = []
+    orphans: set[int] = set()
+    block: list[_Pair] = []
+    extras: dict[str, _Pair] = {}
+
+    def end() -> None:
+        names = [pair.name for pair in block]
+        heads = {pair.name: pair for pair in block if signature.count(pair.name) == 1}
+        repeats = [name for name in dict.fromkeys(signature) if signature.count(name) > 1]
+        if not block or names[0] != signature[0]:
+            orphans.update(pair.line for pair in block)
+        elif len(heads) < len(set(signature) - set(repeats)):
+            # A move whose reading was lost is a move.
+            rows.append({**heads, **extras})
+        elif not repeats:
+            rows.append({**heads, **extras})
+        else:
+            values = [[pair for pair in block if pair.name == name] for name in repeats]
+            rows.extend(
+                {**heads, **extras, **dict(zip(repeats, parts, strict=True))} for parts in zip(*values, strict=False)
+            )
+        block.clear()
+        extras.clear()
+
+    for pair in stream:
+        if pair.name not in usual:
+            extras[pair.name] = pair
+            continue
+        if pair.name == (signature[0] if signature else "") and block:
+            end()
+        place = len(block)
+        if place < len(signature) and pair.name == signature[place]:
+            block.append(pair)
+        elif pair.name in signature[place:] and not block:
+            orphans.add(pair.line)
+        else:
+            orphans.add(pair.line)
+    end()
+    return rows, orphans
+
+
+def _split(stream: list[_Pair], usual: list[str]) -> list[list[str]]:
+    """Names of the usual values, from one first name to the next."""
+    blocks: list[list[str]] = []
+    for pair in stream:
+        if pair.name in usual:
+            if pair.name == usual[0] or not blocks:
+                blocks.append([])
+            blocks[-1].append(pair.name)
+    return blocks
+
+
+def _times(clocks_s: list[float | None]) -> list[float] | None:
+    """Seconds since the first row; a step back by more than half a day is midnight."""
+    if any(clock is None for clock in clocks_s):
+        return None
+    times, days = [], 0.0
+    for k, clock_s in enumerate(clocks_s):
+        if k and clock_s < clocks_s[k - 1] - DAY_S / 2:  # type: ignore[operator]
+            days += DAY_S
+        times.append(clock_s + days)  # type: ignore[operator]
+    return [time_s - times[0] for time_s in times]
 
 
 def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
@@ -27,9 +302,8 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
     if data.startswith(WORKBOOKS):
         return table_of_rows(file, *headed(sheet_rows(data, file, sheet)))
     if sheet is not None:
-        found, remedy = "text, which has no sheets", "leave out --sheet"
-        raise refusal("usage", file=file, found=found, allowed=KINDS, remedy=remedy)
+        raise refused("sheet-of-text", file)
     decoded = text_of(data, file)
-    readers = (lab_files.renishaw_rows, lab_files.labview_rows, serial.paired_rows)
+    readers = (renishaw_rows, labview_rows, json_rows, paired_rows)
     rows = next((rows for read in readers if (rows := read(decoded.text, file)) is not None), None)
     return table_of_rows(file, *(rows or text_table_rows(decoded, file)))

@@ -9,10 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
-from tvsbayes.errors import Candidate, escaped, question, refusal
+from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.asking import listed, refused
+from tvsbayes.importing.cells import plain_column
 from tvsbayes.importing.table import ForeignTable, table_of
-from tvsbayes.importing.words import Name, listed, means, name_of, place_of
+from tvsbayes.importing.words import Name, Unit, means, name_of, place_of
 
 FORWARD, ALTERNATE, REPEATS = "forward", "alternate", "repeats"
 ORDERS = (FORWARD, ALTERNATE, REPEATS)
@@ -58,9 +60,11 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     Raises:
         Question: the order of runs that differ, or which column has the commands.
     """
-    runs = _runs(table)
+    written, plain = table, {text: plain_column(text, cells) for text, cells in table.columns.items()}
+    table = replace(table, columns={text: column.cells for text, column in plain.items()})
+    runs = _runs(table, {text: column.unit for text, column in plain.items()})
     if not runs or stated.get("value") or stated.get("approach"):
-        return LongTable(table, stated, [])
+        return LongTable(written, stated, [])
     command = stated.get("command") or _command(table, runs)
     remarks: list[str] = []
     runs = _turned(table, runs, remarks)
@@ -95,16 +99,14 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     unit = next((run.name.unit for run in runs if run.name.unit), None)
     factors = [run.name.unit.in_units_of(unit) if run.name.unit and unit else 1.0 for run in runs]
     if None in factors or (unit and any(run.name.unit is None for run in runs)):
-        found = f"runs in several units, or some without ({listed(names)})"
-        remedy = "give all runs in one unit"
-        raise refusal("csv", file=table.file, line=table.first_line, found=found, allowed="one unit", remedy=remedy)
+        raise refused("run-units", table.file, line=table.first_line, runs=names)
     kind = "deviation" if any(run.name.has("deviation") for run in runs) else "reading"
     bracket = (
         f" ({unit.name})" if unit and unit.per_number == 1.0 else f" ({unit.per_number:g} {unit.name})" if unit else ""
     )
     unknown = next((run.name.unknown for run in runs if run.name.unknown), "")
     reading = f"{kind}{bracket or (f' ({unknown})' if unknown else '')}"
-    columns: dict[str, Sequence[object]] = {command: [table.columns[command][row] for row, _ in rows]}
+    columns: dict[str, Sequence[object]] = {command: [written.columns[command][row] for row, _ in rows]}
     if order != REPEATS or side_of_row:
         columns["direction"] = [
             "forward" if (side_of_row[row] if side_of_row else sides[k]) > 0 else "backward" for row, k in rows
@@ -157,13 +159,13 @@ def _numeric(cells: Sequence[str]) -> bool:
     return bool(filled) and all(map(NUMBER.fullmatch, filled))
 
 
-def _runs(table: ForeignTable) -> list[Run]:
+def _runs(table: ForeignTable, units: Mapping[str, Unit | None]) -> list[Run]:
     """Columns with one run each, in order: those with words of direction, else those alike but for a number."""
     sided: list[Run] = []
     alike: defaultdict[tuple[str, ...], list[Run]] = defaultdict(list)
     for text, cells in table.columns.items():
         name = name_of(text.translate(_ARROWS))
-        name = replace(name, text=text)
+        name = replace(name, text=text, unit=units[text] or name.unit)
         if not _numeric(cells) or (name.has(*_NEVER) and not name.has("run")) or name.has("u", "expanded"):
             continue
         signed = _SIGN.search(text)
@@ -172,7 +174,7 @@ def _runs(table: ForeignTable) -> list[Run]:
         both = rising and falling
         if name.has("several") and not side:
             continue
-        if side and not both and len(name.numbers) < 2:
+        if side and not both and len(name.numbers) < 2 and not name.has("command"):
             sided.append(Run(name, name.numbers[0] if name.numbers else 1, side))
         elif not side and name.numbers:
             skeleton = tuple(word for word in name.words if not word.isdigit())
@@ -190,8 +192,12 @@ def _are_runs(runs: Sequence[Run], table: ForeignTable) -> bool:
     words = [word for word in name.words if not word.isdigit()]
     counted = sorted(run.number for run in runs) in ([*range(1, len(runs) + 1)], [*range(len(runs))])
     rest = [text for text in table.columns if text not in {run.name.text for run in runs}]
-    others = any(name_of(text).has("value") and _numeric(table.columns[text]) for text in rest)
-    if name.has("command") or not counted:
+    read = [text for text in rest if name_of(text).has("value") and not name_of(text).has("command")]
+    others = any(_numeric(table.columns[text]) for text in read)
+    numbers = {run.number for run in runs}
+    # "J1 target" beside "J1 actual": another axis.
+    paired = any(name_of(text).has("command") and numbers & {*name_of(text).numbers} for text in rest)
+    if name.has("command") or not counted or paired:
         return False
     return name.has("run") or not words or (not others and name.has("value", "position", "deviation"))
 
@@ -218,29 +224,11 @@ def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
         if fit:
             rest = fit
             break
-    found = f"runs ({listed(run.name.text for run in runs)}) and no column that is surely their position"
-    allowed = "one column of numbers"
+    texts = [run.name.text for run in runs]
     if not rest:
-        remedy = "add the commanded positions as a column"
-        raise refusal(
-            "missing-column", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy
-        )
-    candidates = [
-        Candidate(
-            f"commands in {escaped(name.text)}",
-            ("--column", f"command={name.text}"),
-            {name.text: table.columns[name.text][:3]},
-        )
-        for name in rest
-    ]
-    raise question(
-        file=table.file,
-        line=table.first_line,
-        found=found,
-        allowed=allowed,
-        candidates=candidates,
-        code="missing-column",
-    )
+        raise refused("no-runs-command", table.file, line=table.first_line, runs=texts)
+    first = {name.text: table.columns[name.text][:3] for name in rest}
+    raise table.ask("runs-command", each=first, first=first, runs=texts)
 
 
 def _are_readings(runs: Sequence[Run]) -> bool:
@@ -266,21 +254,8 @@ def _order(table: ForeignTable, runs: Sequence[Run]) -> str:
     half = len(runs) // 2
     if not is_reading and _agree(values[::2], values[1::2]) and _agree(values[:half], values[half:]):
         return FORWARD
-    found = f"columns {listed(names)} without words of direction"
-    found += "" if is_reading else ", whose readings differ by more than their scatter"
-    candidates = [
-        Candidate("every run with rising commands", ("--runs", FORWARD)),
-        Candidate("the first run rising, the second falling, and so on", ("--runs", ALTERNATE)),
-        Candidate("repeated readings of each stop", ("--runs", REPEATS)),
-    ]
-    raise question(
-        file=table.file,
-        line=table.first_line,
-        found=found,
-        allowed="an order that is known",
-        candidates=candidates,
-        code="runs",
-    )
+    differ = "" if is_reading else ", whose readings differ by more than their scatter"
+    raise table.ask("runs", runs=names, differ=differ)
 
 
 def _agree(some: Sequence[Sequence[float]], others: Sequence[Sequence[float]]) -> bool:

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
+from tvsbayes.errors import Candidate, InputError, escaped
+from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.cells import SUMMER_TIME_S
 from tvsbayes.importing.table import ForeignTable, table_of
 from tvsbayes.importing.words import place_of, words_of
@@ -34,7 +35,6 @@ KLIPPER_TURN = 65536
 """Counts per turn of an angle sensor in Klipper (klippy/extras/angle.py, ANGLE_BITS)."""
 INVALID = 3
 """Severity of a value that is none (EPICS, alarm.h)."""
-PAIRS_ASKED = 6
 _CAMONITOR = re.compile(
     r"(?P<name>(?=\S*[A-Za-z])\S+)\s+(?:\(\S+\)\s*)?(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?)\s+"
     r"(?P<value>\S+)(?:\s+(?P<rest>\S.*))?"
@@ -83,9 +83,7 @@ def epics_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable
     log, read = series[command], series[value]
     inside = (read.times_s >= log.times_s[0] - EQUAL_S) & (read.times_s <= log.times_s[-1] + EQUAL_S)
     if not inside.any():
-        found = f"no value of {escaped(value)} between the first and the last of {escaped(command)}"
-        remedy = "name two series of one time with --column command=NAME --column value=NAME"
-        raise refusal("empty", file=file, found=found, allowed="series that overlap in time", remedy=remedy)
+        raise refused("apart", file, command=command, value=value)
     commands, interpolated = _command_at(log, read.times_s[inside])
     held = log.values[np.searchsorted(log.times_s, read.times_s[inside] + EQUAL_S, side="right") - 1]
     # A command that is logged once a move jumps; between two such rows no axis was halfway.
@@ -146,10 +144,7 @@ def _archived(text: str, file: str) -> tuple[dict[str, Series], list[str]]:
             rows = [(float(row["secs"]) + 1e-9 * float(row.get("nanos", 0)), float(row["val"])) for row in usable]
             series[f"{name} ({unit})" if unit else name] = _series(rows)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        found, remedy = f"a file of another form ({escaped(str(error), 60)})", "retrieve it again as JSON"
-        raise refusal(
-            "kind", file=file, found=found, allowed="JSON of the archiver appliance", remedy=remedy
-        ) from error
+        raise refused("archive", file, error=escaped(str(error), 60)) from error
     series = {name: values for name, values in series.items() if len(values.times_s)}
     return series, [f"EPICS archiver, {len(content)} series, {left_out} values that are invalid or no numbers left out"]
 
@@ -190,9 +185,7 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
     if len(missing) == 1 and len(free) == 1:
         names[missing[0]] = free[0]
     elif missing and len(free) < len(missing):
-        found, allowed = f"series that change: {listed}", "one that is commanded and one that is read"
-        remedy = "log both; or say which: --column command=NAME --column value=NAME"
-        raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
+        raise refused("few-series", file, series=listed)
     elif missing:
         pairs = [
             {**names, "command": c, "value": v}
@@ -206,10 +199,9 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
                 ("--column", f"command={p['command']}", "--column", f"value={p['value']}"),
                 {name: [f"{x:g}" for x in series[name].values[:3]] for name in p.values()},
             )
-            for p in pairs[:PAIRS_ASKED]
+            for p in pairs
         ]
-        found, allowed = f"series that change: {listed}", "one that is commanded and one that is read"
-        raise question(file=file, found=found, allowed=allowed, candidates=candidates, code="missing-column")
+        raise asked("series", file, answers=candidates, series=listed)
     return names["command"], names["value"]
 
 
@@ -294,8 +286,7 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     if (saved := _saved_angles(data)) is not None:
         sensor, numbers = saved
         if len(numbers) < 3:
-            found, remedy = f"a calibration of {len(numbers)} angles", "run ANGLE_CALIBRATE and SAVE_CONFIG"
-            raise refusal("empty", file=file, found=found, allowed="one for every full step", remedy=remedy)
+            raise refused("klipper-table", file, count=len(numbers))
         kind = f"Klipper, ANGLE_CALIBRATE of {escaped(sensor)}: a mean of both directions "
         kind += "for each full step, so that it holds no play"
         angles = [repr(number * 360.0 / KLIPPER_TURN) for number in numbers]
@@ -312,16 +303,13 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
         (angles_s if kind_of == "angle" else queues).append(_checked(params, kind_of, file))
     kinds = {name.partition(":")[0] for name in names}
     if len(names) != 2 or kinds != {"angle", "stepq"}:
-        found, allowed = f"series {', '.join(map(escaped, names)) or 'none'}", "one angle:NAME and one stepq:NAME"
-        remedy = "log one sensor and its stepper with data_logger.py; or name it in a table of your own"
-        raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
+        raise refused("klipper-series", file, series=list(names) or "none")
     rows = np.concatenate(angles_s)
     readings = _series([(float(t), float(v)) for t, v in rows])
     counters = _counters_at(np.concatenate(queues), readings.times_s)
     inside = np.isfinite(counters)
     if not inside.any():
-        remedy = "log both at once, while the stepper moves"
-        raise refusal("empty", file=file, found="no angle after a step", allowed="steps and angles", remedy=remedy)
+        raise refused("klipper-apart", file)
     notes = [f"Klipper, {', '.join(map(escaped, names))}"]
     notes.append(f"{int((~inside).sum())} angles before the first step left out")
     angles_deg = readings.values * 360.0 / KLIPPER_TURN
@@ -336,12 +324,10 @@ def _messages(data: bytes, file: str) -> Iterator[dict[str, Any]]:
         try:
             data = zlib.decompressobj(31).decompress(data, INFLATED_BYTES_MAX)
         except zlib.error as error:
-            found, remedy = "a damaged gzip file", "copy it again, or cut it where it ends"
-            raise refusal("kind", file=file, found=found, allowed="a log of data_logger.py", remedy=remedy) from error
+            raise refused("gzip", file) from error
     for match in re.finditer(rb"[^\x03\n]+", data):
         if match.end() - match.start() > MESSAGE_BYTES_MAX:
-            allowed, remedy = f"messages of at most {MESSAGE_BYTES_MAX} bytes", "log it again with data_logger.py"
-            raise refusal("size", file=file, found="a longer message", allowed=allowed, remedy=remedy)
+            raise refused("klipper-size", file, most=MESSAGE_BYTES_MAX)
         try:
             message = json.loads(match[0])
         except (ValueError, RecursionError):
@@ -368,11 +354,7 @@ def _checked(params: Mapping[str, Any], kind: str, file: str) -> np.ndarray:
             raise ValueError("numbers out of range")
         return rows
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, FloatingPointError) as error:
-        found, remedy = (
-            f"a message of another form ({escaped(str(error), 60)})",
-            "log it with data_logger.py of this Klipper",
-        )
-        raise refusal("kind", file=file, found=found, allowed="its fields", remedy=remedy) from error
+        raise refused("klipper-message", file, error=escaped(str(error), 60)) from error
 
 
 def _queue(params: Mapping[str, Any]) -> np.ndarray:

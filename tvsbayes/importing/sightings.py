@@ -11,14 +11,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from tvsbayes.errors import Candidate, escaped, question
+from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.cells import FieldCells, is_segment, left_out, status_of
-from tvsbayes.importing.columns import Column, Understood, ask_column, check_stated, choice, columns_of, missing_column
+from tvsbayes.importing.asking import listed
+from tvsbayes.importing.cells import (
+    Column,
+    FieldCells,
+    Understood,
+    ask_column,
+    check_stated,
+    choice,
+    columns_of,
+    is_segment,
+    left_out,
+    missing_column,
+    status_of,
+)
 from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, listed, place_of, unit_named
+from tvsbayes.importing.words import Unit, place_of, unit_named
 
 STEP_DEG = 1e-5
 """Size of a counter step: encoders are read in degrees, and 0.04 arcsec is far below telescopes' pointing errors."""
@@ -145,7 +157,7 @@ def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understo
             claims.setdefault(role, []).append(text)
     for angle, counter in zip(ANGLES, COUNTERS, strict=True):
         # "M1 az" beside "azimuth_rad": whole numbers without a unit are the counters.
-        names = claims.get(angle, [])
+        names = [text for text, column in known.items() if field_of(column) == angle and text not in stated.values()]
         whole = [name for name in names if known[name].whole and known[name].name.unit is None]
         if len(names) == 2 and len(whole) == 1 and not ({counter} & (claims.keys() | taken.keys() | stated.keys())):
             claims[counter], claims[angle] = whole, [name for name in names if name not in whole]
@@ -218,8 +230,8 @@ def _units(
         unit = written.get(name) or column.name.unit
         unit = unit if unit is not None and unit.kind == "angle" else None
         if unit is None and column.name.unknown and name not in COUNTERS and stated is None:
-            found = f"unit {escaped(column.name.unknown)} of column {escaped(column.name.text)}, which is not known"
-            raise _ask_angles(cells, column, found)
+            first, said = {column.name.text: column.first}, {"unit": column.name.unknown, "column": column.name.text}
+            raise cells.table.ask("unknown-angles", each=("deg", "rad"), first=first, **said)
         if name in COUNTERS:
             numbers = [float(cell) for cell in cells.text(name) if NUMBER.fullmatch(cell)]
             if unit is None and any(not number.is_integer() for number in numbers):
@@ -231,9 +243,8 @@ def _units(
             possible = _possible_units(cells) if unit is None or name == ANGLES[1] else ["deg"]
             both_unnamed = all(known[cells.columns[angle]].name.unit is None for angle in ANGLES)
             if stated is None and both_unnamed and possible != ["deg"]:
-                raise _ask_angles(
-                    cells, column, f"angles in column {escaped(column.name.text)} without a unit", possible
-                )
+                first = {column.name.text: column.first}
+                raise cells.table.ask("angles", each=possible, first=first, column=column.name.text)
             if unit is None:
                 unit = unit_named("deg")
                 assumed.append(f"angles: no unit in column {escaped(column.name.text)}, so deg; --angles says another")
@@ -256,19 +267,6 @@ def _possible_units(cells: FieldCells) -> list[str]:
     in_deg = 2 * sum(e <= ELEVATION_MAX_DEG for e in elevations) > len(elevations)
     larger = [unit for unit in UNITS_ASKED if max(elevations) * unit_named(unit).scale <= ELEVATION_MAX_DEG]
     return ["rad", "deg"] if in_rad else ["deg"] if in_deg else larger or ["deg"]
-
-
-def _ask_angles(cells: FieldCells, column: Column, found: str, units: Sequence[str] = ("deg", "rad")):
-    first = {column.name.text: column.first}
-    candidates = [Candidate(f"they are in {unit}", ("--angles", unit), first) for unit in units]
-    return question(
-        file=cells.table.file,
-        line=cells.table.first_line,
-        found=found,
-        allowed="angles of a known unit",
-        candidates=candidates,
-        code="unit",
-    )
 
 
 def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) -> list[tuple[int, int]]:

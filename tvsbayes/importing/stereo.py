@@ -4,11 +4,14 @@
 finds the meaning of each number; here numbers become a pair by the names of `stereo.json`, with assumptions in words.
 R and T can follow from several entries: all must agree. Lengths of a pair are mm; Kalibr, ROS and EuRoC write metres,
 others the unit of the squares of their board.
+
+Other lenses are fitted to k1 k2 p1 p2 k3 by linear least squares over a grid of pixels, the camera matrix unchanged.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,10 +24,71 @@ import numpy as np
 from tvsbayes.errors import escaped
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import Keys
-from tvsbayes.importing.stereo_lenses import ERROR_MAX_PX, fitted_to_five, kind_of
 from tvsbayes.importing.stereo_programs import RATIONAL, adapted
 from tvsbayes.importing.stereo_trees import TREE_BYTES_MAX, read_trees
 from tvsbayes.importing.stereo_words import ROTATION_TOLERANCE, Entry, Fields, letters, refused, words
+
+GRID = 25
+"""Number of grid points along each side of the picture."""
+ERROR_MAX_PX = 0.1
+"""Largest accepted error of a fit, equal to that of a centroid."""
+WIDEST_TAN = 4.0
+"""Tangent of the angle off the axis, 76 deg, beyond which five coefficients are not tried."""
+UNDISTORTION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+"""Iterations, and the error of a distorted ray in px."""
+
+
+class FittedLens(NamedTuple):
+    """Five coefficients, their largest and rms error in the picture, px; infinite where the other model has no ray."""
+
+    distortion: np.ndarray
+    error_px: float
+    rms_px: float
+
+
+def kind_of(model: str) -> str | None:
+    """The kind of a lens model by its name: five (also of no name), rational, fisheye or inverse; else None."""
+    name = re.sub(r"[ -]", "_", model.strip().lower()).removeprefix("distortion.")
+    return next((kind for kind, names in words()["lens"].items() if name in names.split()), None if name else "five")
+
+
+def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], kind: str) -> FittedLens:
+    """Fit five coefficients to another model in a picture of this size, px.
+
+    `distortion` holds OpenCV's 8, 12 or 14 coefficients, the 4 of its fisheye model, or the 5 of the inverse one.
+    """
+    pixels: np.ndarray = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 2)
+    target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    rays: np.ndarray = target
+    reprojected = pixels
+    if kind == "inverse":
+        rays = projected(target, np.eye(3), distortion)
+    elif kind == "fisheye":
+        four = distortion.reshape(4, 1)
+        rays = cv2.fisheye.undistortPoints(pixels[:, None], matrix, four).reshape(-1, 2)
+        reprojected = cv2.fisheye.distortPoints(rays[:, None], matrix, four).reshape(-1, 2)
+    else:
+        if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4: undistortPoints takes no criteria in Python
+            points = cv2.undistortPointsIter(pixels[:, None], matrix, distortion, None, None, UNDISTORTION)
+        else:
+            points = cv2.undistortPoints(pixels[:, None], matrix, distortion, criteria=UNDISTORTION)
+        rays = points.reshape(-1, 2)
+        reprojected = projected(rays, matrix, distortion)
+    valid = np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) < WIDEST_TAN)
+    valid[valid] &= np.abs(reprojected[valid] - pixels[valid]).max(axis=1) < ERROR_MAX_PX
+    if not valid.all():
+        return FittedLens(np.zeros(5), np.inf, np.inf)
+    columns = [(projected(rays, np.eye(3), unit) - rays).ravel() for unit in np.eye(5)]
+    five = np.linalg.lstsq(np.stack(columns, axis=1), (target - rays).ravel())[0]
+    errors_px = np.linalg.norm(projected(rays, matrix, five) - pixels, axis=1)
+    return FittedLens(five, float(errors_px.max()), float(np.sqrt(np.mean(errors_px**2))))
+
+
+def projected(rays: np.ndarray, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) of rays (n, 2) by any of OpenCV's pinhole models."""
+    points = np.column_stack([rays, np.ones(len(rays))])
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
+
 
 CAMERAS = ("left", "right")
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -242,9 +306,10 @@ class _Reader:
             raise entry.refuse("coefficients", found=values.size, kind=kind, count=count)
         fitted = fitted_to_five(matrix, values, size, "rational" if kind == "five" else kind)
         lens = {"fisheye": "a fisheye lens", "inverse": "a lens described from pixels to rays"}
-        said = lens.get(kind, f"a lens of {values.size} coefficients")
+        said = lens.get(kind, f"a lens of {values.size} coefficients") + (f" of {self.source}" if self.source else "")
         if not fitted.error_px <= ERROR_MAX_PX:
-            miss = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "an undetermined amount"
+            miss = f"up to {fitted.error_px:.2g} px, {fitted.rms_px:.2g} px rms"
+            miss = miss if math.isfinite(fitted.error_px) else "an undetermined amount"
             convert = words()["programs"]["convert"].get(self.source, "")
             raise entry.refuse("lens", lens=said, miss=miss, most=ERROR_MAX_PX, convert=convert)
         self.notes.append(f"{entry.place}: {said}, fitted to five coefficients within {fitted.error_px:.2g} px")

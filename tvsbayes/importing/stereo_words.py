@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from tvsbayes.errors import InputError, closest, escaped, listed, refusal, shown
+from tvsbayes.errors import InputError, closest, escaped, listed, shown
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.files.documents import Keys
+from tvsbayes.importing import asking
 
 NAMES_LISTED = 12
 LEFT, RIGHT = r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1"
@@ -42,11 +43,11 @@ def fields() -> dict[str, tuple[tuple[int, ...], list[str]]]:
 
 
 def refused(what: str, file: str, keys: Keys | None = None, key: str = "", /, **values: object) -> InputError:
-    """A refusal of `data/words/stereo.toml` in a file, or of a key of a table."""
-    text = {name: text.format(**values) for name, text in words()["says"][what].items()}
-    if keys is not None:
-        return keys.refuse(key, text["code"], text["allowed"], text["remedy"], text["found"])
-    return refusal(text["code"], file=file, found=text["found"], allowed=text["allowed"], remedy=text["remedy"])
+    """A refusal in a file, or of a key of a table."""
+    if keys is None:
+        return asking.refused(f"stereo-{what}", file, **values)
+    text = asking.filled(f"stereo-{what}", values)
+    return keys.refuse(key, text["code"], text["allowed"], text["remedy"], text["found"])
 
 
 class Meaning(NamedTuple):

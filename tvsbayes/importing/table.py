@@ -11,16 +11,19 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.errors import InputError, Question, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.words import means, parse_unit, place_of, words_of
 
 COLUMNS_MAX = 200
 CELL_CHARS_MAX = 1000
 NUMERIC_SHARE = 0.6
 """Least share of numbers in a column of numbers."""
+ACROSS_MIN = 3
+"""Least number of positions across a table, and one."""
 ABOVE_MAX = 50
 """Largest number of lines above the names of columns: serial number, date, operator."""
 KINDS = "a table as text (CSV and its like), XLSX, XLS or ODS"
@@ -58,8 +61,11 @@ class ForeignTable:
     def require_rows(self) -> None:
         """Refuse a table without rows."""
         if not self.lines:
-            found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
-            raise refusal("empty", file=self.file, found=found, allowed="at least one row", remedy=remedy)
+            raise refused("no-rows", self.file)
+
+    def ask(self, what: str, **values: Any) -> Question:
+        """A question about its columns."""
+        return asked(what, self.file, **{"line": self.first_line, **values})
 
     def refuse(self, row: int, column: str, allowed: str, remedy: str) -> InputError:
         """The error of one cell."""
@@ -166,10 +172,14 @@ def _first_data(rows: Sequence[Row]) -> int:
         cells = [row.cells[k] for row in tail if k < len(row.cells) and row.cells[k]]
         if sum(map(is_number, cells)) > NUMERIC_SHARE * max(len(cells), 1) and len(cells) > NUMERIC_SHARE * len(tail):
             numeric.append(k)
-    for first, row in enumerate(rows[: ABOVE_MAX + 1]):
-        cells = [row.cells[k] if k < len(row.cells) else "" for k in numeric]
-        if any(map(is_number, cells)) and all(is_number(c) or not c or means(c, "empty") for c in cells):
-            return first
+    usual = Counter(len(row.cells) for row in tail).most_common(1)[0][0] if tail else 0
+    # "Serial no.; 7" is shorter than the rows.
+    for least in (usual, 0):
+        for first, row in enumerate(rows[: ABOVE_MAX + 1]):
+            cells = [row.cells[k] if k < len(row.cells) else "" for k in numeric]
+            is_data = all(is_number(c) or not c or means(c, "empty") for c in cells)
+            if is_data and any(map(is_number, cells)) and len(row.cells) >= least:
+                return first
     return 0
 
 
@@ -205,13 +215,14 @@ def table_of_rows(
     """
     rows, description = [row for row in rows if any(row.cells)], list(description)
     if not rows:
-        remedy = "name the file, or with --sheet the sheet, that holds the table"
-        raise refusal("empty", file=file, found="no cells", allowed=KINDS, remedy=remedy)
+        raise refused("empty-table", file)
     width = max(len(row.cells) for row in rows)
     if width > COLUMNS_MAX:
-        allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
-        raise refusal("size", file=file, found=f"{width} columns", allowed=allowed, remedy=remedy)
+        raise refused("wide-table", file, count=width, most=COLUMNS_MAX)
     filled = [Row(line, cells + [""] * (width - len(cells))) for line, cells in rows]
+    if _is_across(filled):
+        filled = [Row(filled[0].line, list(cells)) for cells in zip(*(row.cells for row in filled), strict=True)]
+        width, description = len(filled[0].cells), [*description, "positions across: rows and columns exchanged"]
     has_names = names_first(filled)
     names, body, below = (
         _names(filled, width) if has_names else ([f"column {k}" for k in range(1, width + 1)], filled, "")
@@ -219,10 +230,13 @@ def table_of_rows(
     description += [below] * bool(below)
     body, sums = _without_sums(body)
     description += [sums] * bool(sums)
-    repeated = [row for row in body if has_names and row.cells == filled[0].cells]
-    if repeated:
-        body = [row for row in body if row.cells != filled[0].cells]
-        description.append(f"the names again in line {repeated[0].line}{' ...' * (len(repeated) > 1)}, left out")
+    again = [" ".join(" ".join(row.cells).split()) == " ".join(" ".join(filled[0].cells).split()) for row in body]
+    if has_names and any(again):
+        line = body[again.index(True)].line
+        body = [row for row, is_head in zip(body, again, strict=True) if not is_head]
+        description.append(f"the names again in line {line}{' ...' * (sum(again) > 1)}, left out")
+    names, body, titles = _without_titles(names, body, above)
+    description += [titles] * bool(titles)
     cells = [cell for _, row in body for cell in row if not isinstance(cell, Number)]
     commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
     # No notation has both "1.5" and "1,5": such cells are unchanged and refused where a number is needed.
@@ -238,6 +252,16 @@ def table_of_rows(
     )
 
 
+def _is_across(rows: Sequence[Row]) -> bool:
+    """Whether each row is a name and its numbers, the first the commands of all others."""
+    heads, width = [row.cells[0] for row in rows], filled_width(rows[0].cells)
+    if not (len(rows) > 1 and width > ACROSS_MIN and len(set(heads)) == len(heads) and _alpha(heads) and all(heads)):
+        return False
+    rest = [cell for row in rows for cell in row.cells[1:width] if cell]
+    concept = [place_of(words_of(heads[0]), name) is not None for name in ("command", "position")]
+    return any(concept) and all(map(is_number, rest)) and not any(filled_width(row.cells) > width for row in rows)
+
+
 def _without_sums(rows: Sequence[Row]) -> tuple[Sequence[Row], str]:
     """The rows without those that begin with a word of a summary, as "Mean", and a note on these."""
     sums = []
@@ -251,6 +275,48 @@ def _without_sums(rows: Sequence[Row]) -> tuple[Sequence[Row], str]:
         return rows, ""
     named = ", ".join(str(row.line) for row in sums[:4]) + " ..." * (len(sums) > 4)
     return [row for row in rows if row not in sums], f"rows that sum up, left out (line {named})"
+
+
+def _without_titles(
+    names: list[str | None], rows: Sequence[Row], above: Sequence[str]
+) -> tuple[list[str | None], Sequence[Row], str]:
+    """The rows without lines of text between and below them, and a note on these.
+
+    Under titles that all name a direction the rows are runs, and get a column of it.
+    """
+    filled = [[row.cells[k] for row in rows if row.cells[k]] for k in range(len(names))]
+    numeric = [k for k, cells in enumerate(filled) if 2 * sum(map(is_number, cells)) > len(cells)]
+    # "E2" alone, below "E1" beside numbers, is an experiment of a lab book; so is each of a column of such.
+    of_rows = {re.sub(r"\d+", "0", row.cells[0]) for row in rows if sum(map(bool, row.cells)) > 1} - {""}
+    places = {*numeric, *([0] if of_rows else [])}
+    alone = [(row, [k for k, cell in enumerate(row.cells) if cell]) for row in rows if numeric]
+    titles = {
+        row.line: row.cells[at[0]]
+        for row, at in alone
+        if len(at) == 1 and at[0] in places and not is_number(row.cells[at[0]])
+        if at[0] in numeric or re.sub(r"\d+", "0", row.cells[0]) not in of_rows
+    }
+    if not titles or 2 * len(titles) > len(rows):
+        return names, rows, ""
+    side, sides = next((found for line in reversed(above) if (found := side_named(line))), ""), list[str]()
+    for row in rows:
+        side = side_named(titles[row.line]) if row.line in titles else side
+        sides.append(side)
+    body = [(row, of) for row, of in zip(rows, sides, strict=True) if row.line not in titles]
+    are_runs = all(of for _, of in body) and len({of for _, of in body}) > 1
+    named = ", ".join(f'"{escaped(text, 30)}"' for text in list(titles.values())[:3]) + " ..." * (len(titles) > 3)
+    if not are_runs or any(place_of(words_of(name or ""), "approach") is not None for name in names):
+        one = len(titles) == 1
+        return names, [row for row, _ in body], f"line{'s' * (not one)} of text left out ({named})"
+    note = f"runs one below the other, with the directions of their titles ({named})"
+    return [*names, "direction"], [Row(row.line, [*row.cells, of]) for row, of in body], note
+
+
+def side_named(text: str) -> str:
+    """The only direction that a text names, "forward" or "backward", else ""."""
+    words = words_of(text)
+    sides = [side for side in ("forward", "backward") if place_of(words, side) is not None]
+    return sides[0] if len(sides) == 1 else ""
 
 
 def _names(rows: Sequence[Row], width: int) -> tuple[list[str | None], Sequence[Row], str]:

@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from tvsbayes.errors import CONTROL, escaped, refusal
+from tvsbayes.errors import CONTROL, refusal
 from tvsbayes.files.csv_table import CSV_ROWS_MAX
+from tvsbayes.importing.asking import refused
 from tvsbayes.importing.table import (
     ABOVE_MAX,
     COLUMNS_MAX,
@@ -23,7 +24,6 @@ from tvsbayes.importing.table import (
     is_number,
     names_first,
 )
-from tvsbayes.importing.words import place_of, words_of
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """Separators in the order in which they are tried: a decimal comma must not be taken for one."""
@@ -76,13 +76,11 @@ def _text_rows(text: str, file: str) -> tuple[list[Row], str, list[tuple[int, st
     remarks = [(n, line) for n, line in remarks if body and n < body[0][0]]
     if _is_markdown([line for _, line in body]):
         body, declared = _markdown_rows(lines), "|"
-        remarks = [(n, line.strip()) for n, line in lines if "|" not in line]
+        remarks = [(n, line.strip()) for n, line in lines if n < body[0][0] and "|" not in line]
     if len(body) > CSV_ROWS_MAX + 1:
-        allowed, remedy = f"at most {CSV_ROWS_MAX} rows", "split it"
-        raise refusal("size", file=file, found=f"{len(body)} rows", allowed=allowed, remedy=remedy)
+        raise refused("long-table", file, count=len(body), most=CSV_ROWS_MAX)
     if declared == '"':
-        found, allowed = 'the quote " between cells', ", ".join(SEPARATORS.values())
-        raise refusal("csv", file=file, line=1, found=found, allowed=allowed, remedy="correct or remove the line sep=")
+        raise refused("separator", file, line=1)
     separator = declared or _separator([line for _, line in body])
     return _divided(body, separator, file), separator, remarks
 
@@ -95,9 +93,8 @@ def _is_remark(line: str) -> bool:
 def _divided(body: Sequence[tuple[int, str]], separator: str, file: str) -> list[Row]:
     """Cells of the lines."""
     if body and body[0][1].count(separator) > ABOVE_MAX * COLUMNS_MAX:
-        allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
-        found = f"{body[0][1].count(separator) + 1} columns"
-        raise refusal("size", file=file, line=body[0][0], found=found, allowed=allowed, remedy=remedy)
+        count = body[0][1].count(separator) + 1
+        raise refused("wide-table", file, line=body[0][0], count=count, most=COLUMNS_MAX)
     if separator == " ":
         return [Row(number, line.split()) for number, line in body]
     reader = csv.reader((line for _, line in body), delimiter=separator, skipinitialspace=True, strict=True)
@@ -108,9 +105,7 @@ def _divided(body: Sequence[tuple[int, str]], separator: str, file: str) -> list
                 raise csv.Error("a line break inside a cell")
             rows.append(Row(body[len(rows)][0], [cleaned(cell) for cell in row]))
     except csv.Error as error:
-        line, found, remedy = body[len(rows)][0], escaped(str(error), 120), 'close every quote " in its own line'
-        allowed = "one row per line"
-        raise refusal("csv", file=file, line=line, found=found, allowed=allowed, remedy=remedy) from error
+        raise refused("row", file, line=body[len(rows)][0], error=str(error)) from error
     return rows
 
 
@@ -119,23 +114,15 @@ def _is_markdown(lines: Sequence[str]) -> bool:
 
 
 def _markdown_rows(lines: Sequence[tuple[int, str]]) -> list[tuple[int, str]]:
-    """Rows of the Markdown tables of a text; under headings that name directions, with a column of these."""
-    rows, heading, sides = list[tuple[int, str]](), "", list[str]()
+    """Rows of the Markdown tables of a text, and the lines between and below them."""
+    rows = list[tuple[int, str]]()
+    barred = [line.strip() for _, line in lines if "|" in line]
+    outer = [all(line.startswith("|") for line in barred), all(line.endswith("|") for line in barred)]
     for number, line in lines:
-        content = line.strip().strip("|")
-        if "|" not in content:
-            heading = line
-        elif not re.fullmatch(r"[\s|:-]+", content):
-            rows.append((number, content))
-            sides.append(
-                next((side for side in ("forward", "backward") if place_of(words_of(heading), side) is not None), "")
-            )
-    heads = [k for k, (_, content) in enumerate(rows) if content == rows[0][1]]
-    if len(heads) > 1 and all(sides):
-        return [
-            (n, f"{line} | {side if k not in heads else 'direction'}")
-            for k, ((n, line), side) in enumerate(zip(rows, sides, strict=True))
-        ]
+        content = line.strip()[outer[0] :]
+        content = content[:-1] if outer[1] and content.endswith("|") else content
+        if ("|" in content and not re.fullmatch(r"[\s|:-]+", content)) or (rows and "|" not in line):
+            rows.append((number, content.replace('"', "'")))
     return rows
 
 
@@ -146,17 +133,18 @@ def _separator(lines: Sequence[str]) -> str:
     that divides most lines and the names, else commas.
     """
     for sample in (lines[:ROWS_TRIED], lines[-ROWS_TRIED:]):
-        # Separators after the last cell of a row divide nothing.
+        # Separators after the last cell of a row divide nothing, or end an empty cell.
         widths = {s: [len(line.rstrip(s).split(None if s == " " else s)) for line in sample] for s in SEPARATORS}
-        modes = {s: max(Counter(w).items(), key=lambda item: item[1], default=(1, 0)) for s, w in widths.items()}
-        regular = (s for s, (cells, count) in modes.items() if cells > 1 and count >= 0.9 * len(sample))
+        whole = {s: [line.count(s) + 1 for line in sample] for s in "\t;|"}
+        modes = {
+            s: max((*Counter(w).items(), *Counter(whole.get(s, ())).items()), key=lambda item: item[1], default=(1, 0))
+            for s, w in widths.items()
+        }
         # Commas and spaces stand in numbers and titles too: there the first line must be divided alike.
-        frequent = (
-            s
-            for s, (cells, count) in modes.items()
-            if 1 < cells and 2 * count > len(sample) and (s in "\t;|" or cells == widths[s][0])
-        )
-        if separator := next(regular, None) or next(frequent, None):
+        clear = (s for s, (cells, count) in modes.items() if s in whole and cells > 1 and 2 * count > len(sample))
+        regular = (s for s, (cells, count) in modes.items() if cells > 1 and count >= 0.9 * len(sample))
+        frequent = (s for s, (n, count) in modes.items() if n > 1 and 2 * count > len(sample) and n == widths[s][0])
+        if separator := next(clear, None) or next(regular, None) or next(frequent, None):
             return separator
     # In a short table below a heading only names and rows are divided.
     totals = {s: Counter(len(line.split(None if s == " " else s)) for line in lines) for s in SEPARATORS}
@@ -188,13 +176,12 @@ def _refuse_wide(rows: Sequence[Row], separator: str, file: str) -> None:
     for line, cells in filled:
         if (count := filled_width(cells)) <= width:
             continue
-        found = f"{count} cells under the {width} {'name' if width == 1 else 'names'} of line {filled[0].line}"
         remedy = _WIDE.get(
             SEPARATORS.get(separator, ""), "a separator inside a cell? put such cells in quotes; or a name is missing"
         )
         remedy = "put # before lines that stand above the names of the columns" if width == 1 else remedy
-        allowed = "as many cells in a row as there are names"
-        raise refusal("csv", file=file, line=line, found=found, allowed=allowed, remedy=remedy)
+        names = f"{width} {'name' if width == 1 else 'names'}"
+        raise refused("wide-row", file, line=line, count=count, names=names, head=filled[0].line, remedy=remedy)
 
 
 def text_table_rows(decoded: Decoded, file: str) -> Rows:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import tomllib
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import NamedTuple
@@ -164,6 +164,8 @@ def parse_unit(text: str) -> Unit | None:
         "'": "arcmin",
         "\u2032": "arcmin",
         "%": "percent",
+        # Umdrehung; a small one is no unit.
+        "U": "turn",
     }.get(text, text)
     key = " ".join(plain(text).replace("-", " ").replace("_", " ").strip(" .").split())
     if key in units:
@@ -195,7 +197,20 @@ _COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:[.,][0-9]+)?)\b|\b([23])\s*(?:x\s*
 """Coverage factor in the name of a column of expanded uncertainties (GUM, 6.2), or a multiple of sd."""
 COVERAGE_USUAL = 2.0
 _KNOWN = (
-    *("command", "value", "position", "deviation", "u", "expanded", "time", "segment", "approach", "status", "moving"),
+    *(
+        "number",
+        "command",
+        "value",
+        "position",
+        "deviation",
+        "u",
+        "expanded",
+        "time",
+        "segment",
+        "approach",
+        "status",
+        "moving",
+    ),
     *("resting", "temperature", "repeat", "index", "aside", "statistic", "run", "several", "forward", "backward"),
     *("clockwise", "counterclockwise"),
 )
@@ -283,9 +298,8 @@ def _unit_of_words(text: str, words: list[str]) -> tuple[Unit | None, list[str]]
     if (after := re.search(r"(?:\s/\s*|[,:]\s*|\sin\s+)([^,/:]+)$", text)) and (
         unit := parse_unit(after[1])
     ) is not None:
-        rest = words_of(text[: after.start()])
-        if rest:
-            return unit, [*rest, *_of_count(unit, after[1])]
+        if text[: after.start()].strip():
+            return unit, [*words_of(text[: after.start()]), *_of_count(unit, after[1])]
     parted = re.search(r"(?:(?:1/10+|0[.,]0*1) ?[a-z]+|[a-z]+ ?/ ?10+|[a-z]+ (?:of |de )?[a-z]+)$", plain(text))
     if parted and (unit := parse_unit(parted[0])) is not None and unit.per_number != 1.0:
         return unit, words_of(text[: parted.start()])
@@ -322,7 +336,7 @@ def _of_count(unit: Unit, text: str) -> list[str]:
 
 def _may_end(unit: Unit, word: str, before: Sequence[str]) -> bool:
     """Whether a word at the end of a name is its unit, by the words before it."""
-    if unit.kind == "other":
+    if unit.kind in ("other", "voltage"):
         return False
     if _is_direction(word) and unit.kind != "temperature":
         # "Rev 1" is a run, "Measured rev" a number of revolutions.
@@ -336,12 +350,3 @@ def _may_end(unit: Unit, word: str, before: Sequence[str]) -> bool:
 
 def _is_direction(word: str) -> bool:
     return place_of([word], "forward") is not None or place_of([word], "backward") is not None
-
-
-def listed(names: Iterable[str], most: int = 8) -> str:
-    """The first names, quoted safely, and the number of the others."""
-    from tvsbayes.errors import escaped
-
-    names = list(names)
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(escaped(name) for name in names[:most]) + rest

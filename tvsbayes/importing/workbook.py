@@ -6,11 +6,13 @@ import datetime
 import io
 import re
 import zipfile
-from functools import partial
+from collections import Counter
+from collections.abc import Sequence
 
-from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_table import CSV_ROWS_MAX
-from tvsbayes.importing.table import KINDS, Number, Row, Rows, cleaned
+from tvsbayes.importing.asking import asked, refused
+from tvsbayes.importing.table import Number, Row, Rows, cleaned, is_number
 
 UNPACKED_BYTES_MAX = 64 * 2**20
 """Largest sum of the sizes that the parts of a workbook state."""
@@ -20,7 +22,6 @@ CELLS_MAX = 4_000_000
 
 def sheet_rows(data: bytes, file: str, sheet: str | None) -> Rows:
     """Read the rows of one sheet: values, not formulas."""
-    refuse = partial(refusal, file=file)
     kind = "XLS" if data.startswith(b"\xd0") else "XLSX"
     if kind == "XLSX":
         kind = _checked_archive(data, file)
@@ -31,52 +32,54 @@ def sheet_rows(data: bytes, file: str, sheet: str | None) -> Rows:
         # Charts have sheets of their own, without cells.
         names = [s.name for s in book.sheets_metadata if str(s.typ).endswith("WorkSheet")]
         if sheet is not None and sheet not in names:
-            listed = ", ".join(escaped(name) for name in names)
-            raise refuse("sheet", found=f"no sheet {escaped(sheet)}", allowed=listed, remedy="name one of them")
-        rows: list[Row] = []
+            raise refused("no-sheet", file, sheet=sheet, sheets=names)
+        pages: dict[str, list[Row]] = {}
         for name in [sheet] if sheet is not None else names:
             page = book.get_sheet_by_name(name)
             if page.total_height * page.total_width > CELLS_MAX or page.total_height > CSV_ROWS_MAX + 1:
-                allowed, remedy = f"at most {CSV_ROWS_MAX} rows, {CELLS_MAX} cells", "save the table alone in a file"
-                raise refuse("size", found="more", allowed=allowed, remedy=remedy)
+                raise refused("large-sheet", file, rows=CSV_ROWS_MAX, cells=CELLS_MAX)
             cells = page.to_python(skip_empty_area=False)
             rows = [Row(k, [_cell(value) for value in row]) for k, row in enumerate(cells, start=1)]
             if any(any(row.cells) for row in rows):
-                break
+                pages[name] = rows
     except InputError:
         raise
     except BaseException as error:
         # A damaged file can make the library raise any exception, a panic of its core included.
         if isinstance(error, KeyboardInterrupt | SystemExit | MemoryError):
             raise
-        found = f"a damaged workbook ({escaped(str(error), 100)})"
-        raise refuse("kind", found=found, allowed=KINDS, remedy="save it as CSV") from error
-    if not any(any(row.cells) for row in rows):
-        raise refuse(
-            "empty", found="no cells", allowed=KINDS, remedy="name the sheet that holds the table with --sheet"
-        )
-    return Rows(rows, [f"{kind}, sheet {escaped(str(name))}"])
+        raise refused("damaged-book", file, error=f" ({escaped(str(error), 100)})", remedy="save it as CSV") from error
+    if not pages:
+        raise refused("empty-book", file)
+    tables = [name for name, rows in pages.items() if _holds_table(rows)]
+    if len(tables) > 1:
+        raise asked("sheets", file, each=tables, count=len(tables))
+    name = next(iter(tables or pages))
+    return Rows(pages[name], [f"{kind}, sheet {escaped(str(name))}"])
+
+
+def _holds_table(rows: Sequence[Row]) -> bool:
+    """Whether rows hold two columns of numbers."""
+    counts = Counter(k for row in rows for k, cell in enumerate(row.cells) if is_number(cell))
+    return sum(count > 2 for count in counts.values()) > 1
 
 
 def _checked_archive(data: bytes, file: str) -> str:
     """The kind of a zipped workbook, whose sizes and area are checked before anything is unpacked whole."""
-    refuse = partial(refusal, file=file)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             parts = archive.infolist()
             known = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
             large = sum(part.file_size for part in parts) > UNPACKED_BYTES_MAX
             if large or any(part.compress_type not in known for part in parts):
-                allowed = f"at most {UNPACKED_BYTES_MAX // 2**20} MiB when unpacked"
-                raise refuse("size", found="more", allowed=allowed, remedy="save the one sheet that is needed")
+                raise refused("large-book", file, most=UNPACKED_BYTES_MAX // 2**20)
             is_ods = any(part.filename == "content.xml" for part in parts)
             pages = [p for p in parts if re.fullmatch(r"content\.xml|xl/worksheets/[^/]*\.xml", p.filename)]
             area = max((_area(archive.read(page), is_ods) for page in pages), default=0)
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:
-        raise refuse("kind", found="a damaged workbook", allowed=KINDS, remedy="save it again") from error
+        raise refused("damaged-book", file, error="", remedy="save it again") from error
     if area > CELLS_MAX:
-        allowed, remedy = f"at most {CSV_ROWS_MAX} rows, {CELLS_MAX} cells", "save the table alone in a file"
-        raise refuse("size", found="more", allowed=allowed, remedy=remedy)
+        raise refused("large-sheet", file, rows=CSV_ROWS_MAX, cells=CELLS_MAX)
     return "ODS" if is_ods else "XLSX"
 
 
