@@ -231,7 +231,7 @@ def test_a_log_that_numbers_moves_differently_is_reported(numbers, remark):
     [
         (("0.5 0",), "Pan Tilt", "line 2, Pan: .*angles are what the fit finds"),
         (("0 x",), "Pan Tilt", "line 2, Tilt: "),
-        (("0 0 5", "1 0 4"), "Pan Tilt t", "line 3: found times in column t that step back by 1 s"),
+        (("0 0 5", "1 0 4"), "Pan Tilt t", "line 3, t: found times that step back by 1 s"),
         (("0 0 yesterday",), "Pan Tilt t", "2026-01-15T10:00:00"),
         (("0 0 3", "5 0 3"), "Pan Tilt move", "line 3, Pan: .*counters of its move"),
         (("0 0 up",), "Pan Tilt pan_approach", "left, right, unknown"),

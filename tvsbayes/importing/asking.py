@@ -43,7 +43,7 @@ def _shown(value: object) -> object:
 
 
 def refused(
-    what: str, file: str, *, line: int | None = None, column: str | None = None, **values: object
+    what: str, file: str, *, line: int | None = None, column: str | None = None, **values: Any
 ) -> InputError:
     """The refusal of a row."""
     text = filled(what, values)
@@ -60,7 +60,7 @@ def asked(
     answers: Sequence[Candidate] = (),
     each: Iterable[object] = (),
     first: Mapping[str, Sequence[str]] | None = None,
-    **values: object,
+    **values: Any,
 ) -> Question:
     """The question of a row.
 

@@ -175,7 +175,7 @@ class FieldCells:
                 raise self.refuse(row, field, f"a whole number for {field}", remedy)
         return [None if value is None else int(value) for value in values]
 
-    def ask(self, what: str, row: int, field: str, **values: object) -> Question:
+    def ask(self, what: str, row: int, field: str, **values: Any) -> Question:
         """A question about one cell."""
         column = self.columns[field]
         said = {"line": self.table.lines[row], "at": column, "cell": self.table.columns[column][row]}

@@ -42,7 +42,7 @@ def fields() -> dict[str, tuple[tuple[int, ...], list[str]]]:
     return {name: (tuple(of["counts"]), of["names"].split()) for table in tables for name, of in table.items()}
 
 
-def refused(what: str, file: str, keys: Keys | None = None, key: str = "", /, **values: object) -> InputError:
+def refused(what: str, file: str, keys: Keys | None = None, key: str = "", /, **values: Any) -> InputError:
     """A refusal in a file, or of a key of a table."""
     if keys is None:
         return asking.refused(f"stereo-{what}", file, **values)
@@ -91,7 +91,7 @@ class Entry(NamedTuple):
         """Key and file, in words."""
         return f"{escaped(self.path, 80)} of {self.keys.file}"
 
-    def refuse(self, what: str, **values: object) -> InputError:
+    def refuse(self, what: str, **values: Any) -> InputError:
         """The refusal of these numbers."""
         return refused(what, "", self.keys, self.key, **values)
 

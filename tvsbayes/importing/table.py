@@ -224,9 +224,8 @@ def table_of_rows(
         filled = [Row(filled[0].line, list(cells)) for cells in zip(*(row.cells for row in filled), strict=True)]
         width, description = len(filled[0].cells), [*description, "positions across: rows and columns exchanged"]
     has_names = names_first(filled)
-    names, body, below = (
-        _names(filled, width) if has_names else ([f"column {k}" for k in range(1, width + 1)], filled, "")
-    )
+    names: list[str | None] = [f"column {k}" for k in range(1, width + 1)]
+    names, body, below = _names(filled, width) if has_names else (names, filled, "")
     description += [below] * bool(below)
     body, sums = _without_sums(body)
     description += [sums] * bool(sums)
