@@ -172,7 +172,8 @@ def _first_data(rows: Sequence[Row]) -> int:
         cells = [row.cells[k] for row in tail if k < len(row.cells) and row.cells[k]]
         if sum(map(is_number, cells)) > NUMERIC_SHARE * max(len(cells), 1) and len(cells) > NUMERIC_SHARE * len(tail):
             numeric.append(k)
-    usual = Counter(len(row.cells) for row in tail).most_common(1)[0][0] if tail else 0
+    counts = Counter(len(row.cells) for row in tail)
+    usual = min(counts, key=lambda n: (-counts[n], n), default=0)
     # "Serial no.; 7" is shorter than the rows.
     for least in (usual, 0):
         for first, row in enumerate(rows[: ABOVE_MAX + 1]):
