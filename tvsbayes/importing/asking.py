@@ -42,9 +42,7 @@ def _shown(value: object) -> object:
     return escaped(value, 1000) if isinstance(value, str) else value
 
 
-def refused(
-    what: str, file: str, *, line: int | None = None, column: str | None = None, **values: Any
-) -> InputError:
+def refused(what: str, file: str, *, line: int | None = None, column: str | None = None, **values: Any) -> InputError:
     """The refusal of a row."""
     text = filled(what, values)
     texts = {name: text[name] for name in ("found", "allowed", "remedy")}

@@ -314,7 +314,7 @@ def _scale(run: GuideRun, runs: Sequence[GuideRun], stated: Mapping[str, float],
         axes = {f"{axis} is right ascension": ("--assume", f"ra_axis={k}") for k, axis in ((1, "X"), (2, "Y"))}
         ways = axes if "ra_axis" in missing else {"with your numbers": ()}
         answers = [Candidate(says, (*numbers, *words)) for says, words in ways.items()]
-        said = {"run": run.number, "values": " and ".join(needed[name] for name in missing)}
+        said: dict[str, Any] = {"run": run.number, "values": " and ".join(needed[name] for name in missing)}
         raise asked("missing-value", file, line=run.line, answers=answers, **said)
     pixel, declination = known["pixel_arcsec"], known["declination_deg"]
     if not abs(declination) <= DECLINATION_MAX_DEG:
@@ -395,7 +395,7 @@ def _logged_pulse(
         says = {**rates, **evidence}
         possible = [item for item in says.items() if item[1] <= PULSE_MAX * SIDEREAL_ARCSEC_PER_S]
         stated_rates = ", ".join(f"{rate:.4g} arcsec/s ({name})" for name, rate in says.items())
-        said = {"run": run.number, "rates": stated_rates, "agree": RATES_AGREE, "most": PULSE_MAX}
+        said: dict[str, Any] = {"run": run.number, "rates": stated_rates, "agree": RATES_AGREE, "most": PULSE_MAX}
         raise asked("pulse-rates", file, line=run.line, each=possible, **said)
     return pulse, text
 
@@ -432,7 +432,8 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
         InputError: a number that neither `stated` nor the log contains, or fewer than three usable frames.
     """
     scale = _scale(run, runs, stated, file)
-    sign, assumed = 1.0, ASSUMED
+    sign = 1.0
+    assumed: tuple[str, ...] = ASSUMED
     if run.program == "MaxIm":
         sign = math.copysign(1.0, stated.get("pe_sign", 1.0))
         which, where = ("Y" if stated.get("ra_axis") == 2 else "X"), "lags" if sign > 0 else "is ahead"
