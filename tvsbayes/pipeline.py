@@ -62,6 +62,7 @@ WRITING_SECONDS, SUMMARISING_SECONDS = 3.0, 1.5
 RESIDUALS_LISTED = 4096
 """Largest number of stops in `fit.json`, evenly chosen: it limits the file of a long campaign."""
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
+SAMPLING_FIRST = "fitting and sampling first ..."
 _SHOWN_LINES: set[str] = set()
 """Lines that `compile_for` has shown in this process: a command may call it several times."""
 
@@ -140,7 +141,7 @@ def calibrate(
     *,
     model: ModelChoice = AS_STATED,
     sampled: bool = True,
-    tier: Tier = CHAIN,
+    tier: Tier | None = None,
     max_minutes: float = MAX_MINUTES,
     resume: bool = False,
     seed: int = 0,
@@ -156,10 +157,10 @@ def calibrate(
             commands read them from `results` in the campaign's folder.
         model: options beyond the rig's priors.
         sampled: sample the posterior; else only the Laplace approximation is used.
-        tier: one of `TIERS`: "importance" for weighted draws alone, which take seconds, without `posterior.nc` and
-            `chain.npz`; else a chain that must agree with them.
+        tier: None for weighted draws, and a chain only where they are not accepted; "importance" for weighted draws
+            alone; "emcee" for a chain that must agree with them, whatever their answer.
         max_minutes: time for sampling.
-        resume: continue the chain in the folder.
+        resume: continue the chain in the folder, whatever the answer of the weighted draws.
         seed: seed of all random numbers.
         tell: shows lines to the user.
         progress: shows the progress.
@@ -179,34 +180,37 @@ def calibrate(
     held = nullcontext() if directory is None else sole_writer(directory)
     with held, Job(fitting | _later_stages(sampled, tier, directory), progress) as job:
         joint = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
-        posterior = None
+        posterior, walked = None, False
+
+        def chain_begins(early: Posterior) -> None:
+            nonlocal walked
+            walked = True
+            if first is not None:
+                first(summarise(joint, early))
+
         # A fit that must not be used is not sampled.
         if sampled and worth_sampling(joint):
             from tvsbayes.posterior.sampling import sample
 
-            sampling_progress = job.part(SAMPLING)
-            if tier == IMPORTANCE:
-                posterior = sample(joint, tier, seed=seed, progress=sampling_progress)
-            else:
-                posterior = sample(
-                    joint,
-                    tier,
-                    max_minutes=max_minutes,
-                    seed=seed,
-                    checkpoint=None if directory is None else directory / CHAIN_FILE,
-                    resume=resume,
-                    progress=sampling_progress,
-                    first=None if first is None else lambda early: first(summarise(joint, early)),
-                )
-        return _results(joint, posterior, seed, directory, tell, job.begin, with_chain=tier != IMPORTANCE)
+            posterior = sample(
+                joint,
+                tier,
+                max_minutes=max_minutes,
+                seed=seed,
+                checkpoint=None if directory is None or tier == IMPORTANCE else directory / CHAIN_FILE,
+                resume=resume,
+                progress=job.part(SAMPLING),
+                first=chain_begins,
+            )
+        return _results(joint, posterior, seed, directory, tell, job.begin, with_chain=walked)
 
 
-def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, float]:
+def _later_stages(sampled: bool, tier: Tier | None, folder: Path | None) -> dict[str, float]:
     """Stages of `calibrate` after its fit, with expected seconds; 0 for a stage left out."""
     from tvsbayes.posterior.sampling import sampling_stages
 
     sampling = sum(sampling_stages(tier).values()) if sampled else 0.0
-    filing = WRITING_SECONDS if sampled and tier != IMPORTANCE and folder is not None else 0.0
+    filing = WRITING_SECONDS if sampled and folder is not None else 0.0
     return {SAMPLING: sampling, SUMMARISING: SUMMARISING_SECONDS, WRITING: filing}
 
 
@@ -222,7 +226,7 @@ def _results(
 ) -> CampaignResults:
     """Compute summary, calibration and evidence of a fit and its sample; write them where a folder is given.
 
-    With a chain, which keeps `chain.npz`, they include `posterior.nc`; one of another fit is removed.
+    With a sample they include `posterior.nc`; one of another fit is removed. A chain has kept its `chain.npz` there.
     """
     import numpy as np
 
@@ -253,7 +257,7 @@ def _results(
     files = {}
     if folder is not None:
         tree = None
-        if with_chain and posterior is not None and posterior.converged:
+        if posterior is not None and posterior.converged:
             from tvsbayes.posterior.arviz_tree import posterior_bytes
 
             begin(WRITING)
@@ -262,7 +266,7 @@ def _results(
         elif (folder / POSTERIOR_FILE).exists():
             tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
         files = write_results(folder, record, draws, calibration, None if calibration is None else fit.stored, tree)
-        if with_chain and posterior is not None:
+        if with_chain:
             files["chain"] = str(folder / CHAIN_FILE)
     causes = () if fit.converged else misfit_causes(fit.campaign, summary.parameters["pixel_scale"].value)
     return CampaignResults(record, fit, posterior, calibration, draws, unusable(summary, causes), files, causes)
@@ -313,11 +317,13 @@ class StoredOrFitted:
         campaign: from `read_campaign`.
         tell: shows the reason for a new fit.
         progress: shows the progress.
+        tier: how a fit that is reported is sampled, as in `calibrate`.
     """
 
     campaign: Campaign
     tell: Tell = no_output
     progress: Show | None = None
+    tier: Tier | None = CHAIN
 
     @cached_property
     def stored(self) -> FitFiles | Reason:
@@ -382,10 +388,11 @@ class StoredOrFitted:
 
     @cached_property
     def reported(self) -> Reported:
-        """What a report shows, of one fit with the evidence for it; a new fit is stored in the campaign's folder.
+        """What a report shows, of one fit with the evidence for it; a new fit is sampled and stored in the folder.
 
         Raises:
             InputError: the folder cannot be written.
+            NotConverged: a new fit did not converge.
         """
         record, calibration = self.stored_record, self.stored_calibration
         if record is not None and record.evidence is not None and calibration is not None:
@@ -394,9 +401,12 @@ class StoredOrFitted:
             assert isinstance(self.stored, FitFiles)
             return Reported(record, calibration, ratios_of(self.stored.arrays))
         place = None if self.campaign.path is None else output_place(self.campaign.path, "results")
-        with nullcontext() if place is None else sole_writer(place):
-            made = _results(self.fitted, None, 0, place, self.tell)
-        assert made.calibration is not None
+        self.tell(f"{_why_not_stored(self.stored)}: {SAMPLING_FIRST}")
+        compile_for(self.tell)
+        made = calibrate(self.campaign, place, tier=self.tier, tell=self.tell, progress=self.progress)
+        if made.calibration is None:
+            assert made.error is not None
+            raise made.error
         return Reported(made.record, made.calibration, made.draws.effective_deg_per_step)
 
 

@@ -38,6 +38,7 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.posterior.sampling import sample
+from tvsbayes.results.tiers import CHAIN
 from tvsbayes.studies.rows import StudyRows
 from tvsbayes.studies.study import study
 from tvsbayes.studies.study_job import StudyJob
@@ -104,7 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
         shuffled = replace(campaign, spots=tuple(campaign.spots[k] for k in order))
         document["shuffled"] = numbers_of(fit(shuffled, seed=SEED))
         chain = Path(scratch) / "chain.npz"
-        sample(fitted, max_minutes=SAMPLE_MINUTES, seed=SEED, checkpoint=chain)
+        sample(fitted, CHAIN, max_minutes=SAMPLE_MINUTES, seed=SEED, checkpoint=chain)
         with np.load(chain) as file:
             document["steps"] = len(file["w"])
             document["chain"] = exact(file["w"][:STEPS_COMPARED])

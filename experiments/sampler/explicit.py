@@ -35,6 +35,7 @@ from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.laser_path import mirror_angles, trace
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.posterior.sampling import sample
+from tvsbayes.results.tiers import CHAIN
 from tvsbayes.twin.simulated_campaign import simulate
 
 KEPT = ("degrees_per_step", "ratio_contrast", "backlash", "tilt_zero", "stop_sd", "pixel_scale")
@@ -135,7 +136,7 @@ def main() -> None:
     use_compilation_cache()
     campaign = dozen()
     joint = fit(campaign)
-    posterior = sample(joint, seed=0)
+    posterior = sample(joint, CHAIN, seed=0)
     free = np.flatnonzero(joint.free)
     with jax.enable_x64(True):
         density, parts = explicit_density(campaign, joint)

@@ -124,7 +124,7 @@ def test_fit_samples_writes_for_arviz_and_keeps_the_better_answer(ask, grid_fold
     ):
         for name, value in loose.items():
             monkeypatch.setattr(module, name, value)
-    code, document = ask("fit", grid_folder, "--seed", 2)
+    code, document = ask("fit", grid_folder, "--seed", 2, "--chain")
     assert (code, document["estimator"], document["converged"]) == (0, "posterior", True)
     left = document["effective_deg_per_step"]["left"]
     assert left["interval95"][0] < left["value"] < left["interval95"][1]

@@ -72,7 +72,7 @@ def long(fitted, tmp_path_factory):
     file = tmp_path_factory.mktemp("chain") / "long.npz"
     with pytest.MonkeyPatch.context() as patch:
         limits(patch, LONG)
-        result = sample(fitted, seed=SEED, checkpoint=file)
+        result = sample(fitted, CHAIN, seed=SEED, checkpoint=file)
     return result, file
 
 
@@ -85,7 +85,7 @@ def stored(file):
 def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, monkeypatch):
     limits(monkeypatch, SHORT)
     whole_wait, stages = [], []
-    unbroken = sample(fitted, seed=SEED, checkpoint=tmp_path / "unbroken.npz", progress=whole_wait.append)
+    unbroken = sample(fitted, CHAIN, seed=SEED, checkpoint=tmp_path / "unbroken.npz", progress=whole_wait.append)
     assert unbroken.convergence.steps == SHORT
     check_forward(whole_wait)
     assert doings(whole_wait) == [DRAWING, walking(CHAIN)] and len(whole_wait) > SHORT // BLOCK
@@ -98,10 +98,10 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
 
     broken = tmp_path / "broken.npz"
     with pytest.raises(KeyboardInterrupt):
-        sample(fitted, seed=SEED, checkpoint=broken, progress=interrupt)
+        sample(fitted, CHAIN, seed=SEED, checkpoint=broken, progress=interrupt)
     assert len(stored(broken)["w"]) == BLOCK
     only_when_long(monkeypatch)
-    resumed = sample(fitted, seed=SEED, checkpoint=broken, resume=True)
+    resumed = sample(fitted, CHAIN, seed=SEED, checkpoint=broken, resume=True)
     np.testing.assert_array_equal(resumed.z, unbroken.z)
     np.testing.assert_array_equal(resumed.log_density, unbroken.log_density)
     # What importance sampling found is restored, not drawn again, and compared with again.
@@ -117,7 +117,7 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
 @pytest.mark.thorough
 def test_ctrl_c_in_the_middle_of_a_step_is_quiet_and_loses_no_step(fitted, tmp_path, monkeypatch, capfd):
     limits(monkeypatch, SHORT)
-    unbroken = sample(fitted, seed=SEED)
+    unbroken = sample(fitted, CHAIN, seed=SEED)
     whole, calls = Target.__call__, []
 
     def interrupted(target, w):
@@ -130,25 +130,25 @@ def test_ctrl_c_in_the_middle_of_a_step_is_quiet_and_loses_no_step(fitted, tmp_p
     with monkeypatch.context() as patch:
         patch.setattr(Target, "__call__", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            sample(fitted, seed=SEED, checkpoint=broken)
+            sample(fitted, CHAIN, seed=SEED, checkpoint=broken)
     assert 0 < len(stored(broken)["w"]) < SHORT
     printed = capfd.readouterr()
     assert printed.out == printed.err == ""
     only_when_long(monkeypatch)
-    resumed = sample(fitted, seed=SEED, checkpoint=broken, resume=True)
+    resumed = sample(fitted, CHAIN, seed=SEED, checkpoint=broken, resume=True)
     np.testing.assert_array_equal(resumed.z, unbroken.z)
 
 
 def test_resume_refuses_what_is_no_chain(fitted, long, tmp_path):
     file = tmp_path / "chain.npz"
     with pytest.raises(InputError) as caught:
-        sample(fitted, seed=SEED, checkpoint=file, resume=True)
+        sample(fitted, CHAIN, seed=SEED, checkpoint=file, resume=True)
     assert caught.value.code == "no-chain"
     whole = long[1].read_bytes()
     for size in (0, 100, len(whole) // 2, len(whole) - 1):
         file.write_bytes(whole[:size])
         with pytest.raises(InputError) as caught:
-            sample(fitted, seed=SEED, checkpoint=file, resume=True)
+            sample(fitted, CHAIN, seed=SEED, checkpoint=file, resume=True)
         assert caught.value.code == "damaged-chain", size
 
 

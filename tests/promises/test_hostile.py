@@ -248,9 +248,9 @@ def test_a_report_does_not_use_the_fit_of_other_data(good, tmp_path, monkeypatch
     assert StoredOrFitted(data, report_line).reported.record.provenance.inputs == input_hashes(data)
     change(folder / FIT, **{"inputs/spots": "0" * 64})
 
-    def fitted(campaign, why, tell, progress):
+    def fitted(*_, **__):
         raise NotConverged("not-converged", "fitted anew", remedy="-")
 
-    monkeypatch.setattr("tvsbayes.pipeline._converged_fit", fitted)
+    monkeypatch.setattr("tvsbayes.pipeline.calibrate", fitted)
     with pytest.raises(NotConverged, match="fitted anew"):
         _ = StoredOrFitted(data, report_line).reported.record

@@ -9,8 +9,9 @@ import pytest
 from support.axes import FIRST_EDITION, campaign, drawn, random_moves, runs
 
 from tvsbayes.inference import ensemble
+from tvsbayes.inference.chain import run_of
 from tvsbayes.inference.importance import weighted_run
-from tvsbayes.results.tiers import CHAIN, RUNS
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE, RUNS
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_density import AxisDensity
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
@@ -40,13 +41,27 @@ def test_truths_lie_within_the_stated_uncertainty():
 @pytest.mark.thorough
 def test_both_tiers_agree_and_a_seed_gives_the_same():
     axis = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
-    one = fit_axis(axis, seed=1)
+    one = fit_axis(axis, tier=CHAIN, seed=1)
     assert one.tier == "emcee" and one.error is None
     agreement = one.sample.convergence.agreement
     assert agreement is not None and agreement.agrees
     quick, again = (fit_axis(axis, tier="importance", seed=1) for _ in range(2))
     np.testing.assert_array_equal(quick.draws["backlash"], again.draws["backlash"])
     json.dumps(summarise_axis(one).as_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize(("refused", "tier"), [(False, IMPORTANCE), (True, CHAIN)])
+def test_a_chain_runs_where_weighted_draws_are_not_accepted(monkeypatch, refused, tier):
+    """And nowhere else, without being asked for; under these limits it answers in a few steps."""
+    if refused:
+        monkeypatch.setattr("tvsbayes.inference.importance.K_MAX", -9.0)
+        monkeypatch.setattr("tvsbayes.inference.importance.ROUNDS_MAX", 4)
+    chains = []
+    monkeypatch.setattr(
+        "tvsbayes.single_axis.axis_fit.run_of", lambda name: chains.append(name) or run_of(name)
+    )
+    fit = fit_axis(drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign, seed=1)
+    assert (fit.tier, fit.answer) == (tier, "accepted") and chains == [CHAIN] * refused
 
 
 def test_the_seed_is_that_of_the_line_which_is_integrated_out():

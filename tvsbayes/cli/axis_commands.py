@@ -27,6 +27,7 @@ from tvsbayes.single_axis.axis_rows import rows_of
 
 if TYPE_CHECKING:
     from tvsbayes.report.document import Document, Issue
+    from tvsbayes.results.records import Tier
     from tvsbayes.single_axis.axis_record import AxisSummary
 
 FITTING, PLANNING = "fit", "choosing stops"
@@ -82,7 +83,7 @@ def _classic(data: AxisCampaign) -> Part:
 def fit(
     folder: Path,
     *,
-    quick: bool,
+    tier: Tier | None,
     no_sample: bool,
     max_minutes: float,
     details: bool,
@@ -94,7 +95,7 @@ def fit(
     from tvsbayes.report.axis_document import axis_fit_text
 
     place = out or output_place(folder, "results")
-    stored = _kept_fit(read_axis(folder), place, quick, no_sample, max_minutes, seed)
+    stored = _kept_fit(read_axis(folder), place, tier, no_sample, max_minutes, seed)
     text = axis_fit_text(stored.summary, details, list(stored.files.values()))
     if stored.error is None and out is None:
         text += f"\nnext: {command_line('report', folder)}"
@@ -114,7 +115,9 @@ class StoredFit:
         return {**self.summary.as_json(), "seed": seed, "files": self.files}
 
 
-def _kept_fit(data: AxisCampaign, to: Path, quick: bool, no_sample: bool, max_minutes: float, seed: int) -> StoredFit:
+def _kept_fit(
+    data: AxisCampaign, to: Path, tier: Tier | None, no_sample: bool, max_minutes: float, seed: int
+) -> StoredFit:
     """Fit an axis and write the results into a folder; options as in `fit`."""
     from tvsbayes.single_axis.axis_fit import fit_axis
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
@@ -123,7 +126,7 @@ def _kept_fit(data: AxisCampaign, to: Path, quick: bool, no_sample: bool, max_mi
         with waiting() as progress:
             result = fit_axis(
                 data,
-                tier=IMPORTANCE if quick else CHAIN,
+                tier=tier,
                 sampled=not no_sample,
                 max_minutes=max_minutes,
                 seed=seed,
@@ -147,7 +150,8 @@ def _parts(folder: Path, issue: Issue, quick: bool, no_sample: bool, seed: int, 
     check = contents(folder)
     yield Part("check", check, check_text(check))
     yield _classic(data)
-    stored = _kept_fit(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)
+    tier = IMPORTANCE if quick else CHAIN
+    stored = _kept_fit(data, output_place(folder, "results"), tier, no_sample, MAX_MINUTES, seed)
     text = axis_fit_text(stored.summary, written=list(stored.files.values()))
     yield Part("fit", stored.as_json(seed), text, stored.error)
     page = _page(data, folder, issue, pdf)
@@ -207,12 +211,14 @@ def watch(folder: Path, *, looks: Path, append: Path | None, seed: int, as_json:
     finish_watch(result, append, as_json, "stops")
 
 
-def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:
+def report(folder: Path, *, issue: Issue, quick: bool, pdf: bool, out: Path | None, as_json: bool) -> None:
     """Write the page of an axis."""
-    _page(read_axis(folder), folder, issue, pdf, out).finish(as_json)
+    _page(read_axis(folder), folder, issue, pdf, out, IMPORTANCE if quick else CHAIN).finish(as_json)
 
 
-def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None) -> WrittenPage:
+def _page(
+    data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None, tier: Tier = CHAIN
+) -> WrittenPage:
     """Write the page of an axis, and print it with `pdf`."""
     from tvsbayes.report.axis_document import axis_document, curve_commands
     from tvsbayes.single_axis.axis_record import results_for
@@ -220,7 +226,7 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
     def make(job: Job) -> Document:
         commands = rows_of(data).command
         shown = curve_commands(float(commands.min()), float(commands.max()))
-        results = results_for(data, shown, job.part(FITTING), notify=report_line)
+        results = results_for(data, shown, job.part(FITTING), notify=report_line, tier=tier)
         job.begin(DRAWING)
         return axis_document(results, issue)
 

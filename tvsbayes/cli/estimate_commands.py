@@ -78,13 +78,15 @@ def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
 
 def fit(
     campaign: CampaignFolder,
-    quick: Annotated[bool, typer.Option("--quick", help="Importance sampling only: the posterior in seconds.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Weighted draws alone, never a chain.")] = False,
     no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
+    chain: Annotated[
+        bool, typer.Option("--chain", help="Also run a chain of emcee, and say how it agrees with the weighted draws.")
+    ] = False,
     max_minutes: Annotated[
-        float | None,
-        typer.Option("--max-minutes", min=0.01, help="Time for sampling (default 10); unconverged by then: exit 4."),
+        float | None, typer.Option("--max-minutes", min=0.01, help="Time for sampling with a chain (default 10).")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the chain of an earlier run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier chain; implies --chain.")] = False,
     robust: Annotated[bool, typer.Option("--robust", help="Downweight and exclude outlying spots, by name.")] = False,
     per_axis: Annotated[bool, typer.Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
     harmonics: Annotated[bool, typer.Option("--harmonics", help="Free transmission errors of known period.")] = False,
@@ -105,16 +107,21 @@ def fit(
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     if no_sample:
-        given = {"max_minutes": max_minutes, "quick": quick}
+        given = {"max_minutes": max_minutes, "quick": quick, "chain": chain}
         refuse_options("for a sampler, and --no-sample runs none", "give one of them", **given)
     if quick:
         refuse_options(
-            "for a chain, and --quick makes none", "give one of them", max_minutes=max_minutes, resume=resume
+            "for a chain, and --quick makes none",
+            "give one of them",
+            max_minutes=max_minutes,
+            resume=resume,
+            chain=chain,
         )
     minutes = MAX_MINUTES if max_minutes is None else max_minutes
     model = {"robust": robust, "per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
     model["perfect_gears"] = perfect_gears
-    sampling = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes, "resume": resume, "anyway": anyway}
+    tier = IMPORTANCE if quick else CHAIN if chain or resume else None
+    sampling = {"tier": tier, "no_sample": no_sample, "max_minutes": minutes, "resume": resume, "anyway": anyway}
     if serve("fit", campaign, **model, **sampling, details=details, out=out, seed=seed, as_json=as_json):
         return
     from tvsbayes.instrument.campaign import read_campaign
@@ -131,7 +138,7 @@ def fit(
             out or output_place(campaign, "results"),
             model=ModelChoice(**model),
             sampled=not no_sample,
-            tier=IMPORTANCE if quick else CHAIN,
+            tier=tier,
             max_minutes=minutes,
             resume=resume,
             seed=seed,

@@ -39,6 +39,7 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sightings_of
 from tvsbayes.pipeline import FITTING, StoredOrFitted
 from tvsbayes.progress import Job
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.report.document import Document, Issue
@@ -331,14 +332,15 @@ def classic(folder: Path, as_json: bool) -> None:
     finish(model.as_json(), pointing_table(model).text(), as_json)
 
 
-def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:
+def report(folder: Path, issue: Issue, quick: bool, pdf: bool, out: Path | None, as_json: bool) -> None:
     """Write the page of a head; fit first where results are missing."""
     from tvsbayes.estimators.plausibility import check_campaign
     from tvsbayes.report.head_document import head_document
 
     def make(job: Job) -> Document:
         data = read_campaign(folder)
-        record = StoredOrFitted(data, report_line, job.part(FITTING)).reported.record
+        tier = IMPORTANCE if quick else CHAIN
+        record = StoredOrFitted(data, report_line, job.part(FITTING), tier).reported.record
         job.begin(DRAWING)
         return head_document(data, record, issue, check_campaign(data).warnings)
 

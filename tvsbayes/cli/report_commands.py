@@ -58,6 +58,7 @@ Range = Annotated[float, typer.Option("--range-mm", min=1, help="Range at which 
 Pdf = Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")]
 Laboratory = Annotated[str | None, typer.Option("--laboratory", help="Who measured: on the first page.")]
 Customer = Annotated[str | None, typer.Option("--customer", help="For whom: on the first page.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Weighted draws alone, never a chain: seconds.")]
 Schema = Annotated[
     Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
 ]
@@ -65,6 +66,7 @@ Schema = Annotated[
 
 def report(
     campaign: CampaignFolder,
+    quick: Quick = False,
     limit_deg_per_step: LimitRatio = None,
     limit_mm: LimitMm = None,
     range_mm: Range = RANGE_MM,
@@ -107,10 +109,10 @@ def report(
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
     limits["range_mm"] = range_mm if range_mm != RANGE_MM else None
     certificate = {"dcc": dcc, "dcc_schema": dcc_schema}
-    if serve("report", campaign, issue=issue, pdf=pdf, out=out, as_json=as_json, **limits, **certificate):
+    if serve("report", campaign, issue=issue, quick=quick, pdf=pdf, out=out, as_json=as_json, **limits, **certificate):
         return
     data = read_campaign(campaign)
-    content = PageContent(campaign, data, issue, limit_deg_per_step, limit_mm, range_mm)
+    content = PageContent(campaign, data, issue, limit_deg_per_step, limit_mm, range_mm, quick)
     page = content.written(pdf, out)
     missed, lines, result = content.missed, content.lines(page), page.as_json(content.evidence.criteria)
     if dcc or dcc_schema:
@@ -160,7 +162,7 @@ class PageContent:
 
     Attributes:
         campaign, data: folder and content of the campaign.
-        issue, limit_deg_per_step, limit_mm, range_mm: as the options of `report`.
+        issue, limit_deg_per_step, limit_mm, range_mm, quick: as the options of `report`.
         record, evidence: sources of the page.
     """
 
@@ -170,6 +172,7 @@ class PageContent:
     limit_deg_per_step: float | None
     limit_mm: float | None
     range_mm: float
+    quick: bool = False
     record: FitRecord = field(init=False)
     evidence: Evidence = field(init=False)
 
@@ -183,7 +186,8 @@ class PageContent:
         from tvsbayes.report.evidence import gather
         from tvsbayes.report.scanner_document import report_document
 
-        self.record, calibration, ratios = StoredOrFitted(self.data, report_line, job.part(FITTING)).reported
+        tier = IMPORTANCE if self.quick else CHAIN
+        self.record, calibration, ratios = StoredOrFitted(self.data, report_line, job.part(FITTING), tier).reported
         job.begin(GATHERING)
         warnings = campaign_contents(self.campaign, self.data)["warnings"]
         self.evidence = gather(
@@ -231,7 +235,7 @@ class PageContent:
 
 def calibrate(
     campaign: CampaignFolder,
-    quick: Annotated[bool, typer.Option("--quick", help="Importance sampling only: seconds, not minutes.")] = False,
+    quick: Quick = False,
     no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
     limit_deg_per_step: LimitRatio = None,
     limit_mm: LimitMm = None,

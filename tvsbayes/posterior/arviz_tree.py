@@ -35,8 +35,8 @@ from tvsbayes.results.convergence import Convergence
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
-RESAMPLED = 4, 1024
-"""Chains and draws after resampling weighted draws with equal weights."""
+RESAMPLED = 2048
+"""Draws after resampling weighted draws with equal weights."""
 COORDS: dict[str, tuple[str, ...]] = {
     "direction": DIRECTIONS,
     "axis": AXES,
@@ -126,10 +126,13 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
 
     Returns:
         A tree for `az.summary`, `az.loo`, `az.compare` and ArviZ's plots. The unit of the log likelihood is a move.
-        Weighted draws are resampled, since ArviZ has no weights.
+        Weighted draws are resampled to one chain of equal weight; `sample_stats` has the number (`source`) and the
+        weight of the draw that each was, the attributes of the tree the effective draws by quantity.
     """
-    if posterior.tier == IMPORTANCE:
-        posterior = posterior.resampled(*RESAMPLED)
+    weighted = posterior if posterior.tier == IMPORTANCE else None
+    source = None if weighted is None else weighted.equal_places(RESAMPLED)
+    if weighted is not None and source is not None:
+        posterior = weighted.taken(source[None])
     fit = posterior.fit
     shape = posterior.z.shape[:2]
     mechanism = fit.space.mechanism
@@ -142,6 +145,12 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
     stats = {"lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw"))}
     lengths: dict[str, int] = {}
+    effective: dict[str, str] = {}
+    if weighted is not None and source is not None:
+        stats["source"] = xr.DataArray(source[None], coords, ("chain", "draw"))
+        stats["log_weight"] = xr.DataArray(np.log(weighted.weights.ravel()[source])[None], coords, ("chain", "draw"))
+        effective = {"ess_mean": json.dumps(weighted.convergence.ess_bulk)}
+        effective["ess_interval_ends"] = json.dumps(weighted.convergence.ess_tail)
     if isinstance(posterior.convergence, Convergence):
         convergence = posterior.convergence
         stats["acceptance_rate"] = xr.DataArray(convergence.acceptance, {"chain": coords["chain"]}, ("chain",))
@@ -168,6 +177,7 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         "seed": posterior.seed,
         "converged": int(posterior.converged),
         **lengths,
+        **effective,
         "versions": json.dumps({name: version_of(name) for name in ("tvsbayes", CHAIN, "arviz", "jax", "numpy")}),
         "inputs": json.dumps(input_hashes(fit.campaign)),
         "fingerprint": fingerprint(fit),

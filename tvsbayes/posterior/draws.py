@@ -158,15 +158,22 @@ class Posterior(Shown):
 
     def resampled(self, chains: int, draws: int) -> Posterior:
         """Resample to draws of equal weight, in chains; a draw of large weight is repeated."""
-        places = systematic(self.weights.ravel(), chains * draws, 0.5)
+        return self.taken(self.equal_places(chains * draws).reshape(chains, draws))
+
+    def equal_places(self, count: int) -> np.ndarray:
+        """Choose indices of `count` draws of equal weight, in random order; a draw of large weight is repeated."""
         # Without the permutation the repeats of a draw would be in one chain.
-        places = random_stream(self.seed, Stream.ORDER_OF_DRAWS).permutation(places).reshape(chains, draws)
+        order = random_stream(self.seed, Stream.ORDER_OF_DRAWS)
+        return order.permutation(systematic(self.weights.ravel(), count, 0.5))
+
+    def taken(self, places: np.ndarray) -> Posterior:
+        """Return the draws with indices (chain, draw), of equal weight."""
         return replace(
             self,
             z=self.joined_z[places],
             log_density=self.log_density.ravel()[places],
             draws=jax.tree.map(lambda x: x[places], self.joined),
-            weights=np.full((chains, draws), 1 / (chains * draws)),
+            weights=np.full(places.shape, 1 / places.size),
             way=None if self.way is None else self.way.ravel()[places],
         )
 

@@ -223,7 +223,6 @@ def answer_lines(summary: FitSummary) -> list[str]:
     """Why an answer is not accepted, and the remedy; none for an accepted one."""
     if summary.sampling is None or not summary.sampling.missing:
         return []
-    is_quick = summary.sampling.steps is None
     lines = [f"{'rough' if summary.converged else 'not sampled'}: {text}" for text in summary.sampling.missing]
     lines.append(sampling_line(summary.sampling))
     if summary.converged and summary.monte_carlo_error:
@@ -231,7 +230,8 @@ def answer_lines(summary: FitSummary) -> list[str]:
         ends = " and ".join(f"{error:.2f}" for error in worst[1].interval95)
         largest = f"{worst[1].mean:.2f} sd of the mean, {ends} sd of the interval's ends ({worst[0]})"
         lines.append(f"Monte Carlo error, largest: {largest}")
-    return [*lines, f"what helps: {'fit without --quick' if is_quick else 'fit with --resume and more --max-minutes'}"]
+    weighted = summary.sampling.steps is None
+    return [*lines, f"what helps: fit {'without --quick, or ' * weighted}with --resume and more --max-minutes"]
 
 
 def importance_line(importance: Importance) -> str:
@@ -244,7 +244,7 @@ def importance_line(importance: Importance) -> str:
 
 def agreement_line(sampling: Sampling, tier: Tier | None) -> str | None:
     """Whether chain and importance sampling agree; None without a chain."""
-    if sampling.steps is None or sampling.importance is None:
+    if sampling.importance is None or (sampling.steps is None and sampling.agreement is None):
         return None
     if sampling.agreement is None:
         return "importance sampling was not accepted: results are those of the chain"

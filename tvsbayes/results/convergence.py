@@ -154,6 +154,7 @@ class Reweighted:
         importance: their diagnosis.
         ess_bulk, ess_tail: effective draws of the mean and of the worse end of the interval, by quantity name.
         monte_carlo_error: errors of every headline.
+        agreement: of a chain that ran beside them.
     """
 
     tier: ClassVar[Tier] = IMPORTANCE
@@ -161,6 +162,7 @@ class Reweighted:
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
     monte_carlo_error: dict[str, MonteCarloError]
+    agreement: Agreement | None = None
 
     @property
     def answer(self) -> AnswerKind:
@@ -202,6 +204,7 @@ class Reweighted:
             invalid_evaluations=self.importance.invalid_evaluations,
             proposal_pareto_k=self.importance.pareto_k,
             importance=self.importance,
+            agreement=self.agreement,
         )
 
 

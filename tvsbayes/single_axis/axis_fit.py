@@ -256,7 +256,7 @@ def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:
 def fit_axis(
     campaign: AxisCampaign,
     *,
-    tier: Tier = CHAIN,
+    tier: Tier | None = None,
     sampled: bool = True,
     max_minutes: float = 10.0,
     seed: int = 0,
@@ -267,7 +267,8 @@ def fit_axis(
 
     Args:
         campaign: from `read_axis`.
-        tier: one of `TIERS`: "importance" for weighted draws alone, else a chain that must agree with them.
+        tier: None for weighted draws, and a chain only where they are not accepted; "importance" for weighted draws
+            alone; "emcee" for a chain that must agree with them, whatever their answer.
         sampled: sample the posterior; else only the Laplace approximation is used.
         max_minutes: time for the chain.
         seed: seed of all random numbers.
@@ -279,7 +280,12 @@ def fit_axis(
         InputError: too many moves, or angles that wrap.
     """
     model = model_of(campaign, more)
-    stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier != IMPORTANCE), SUMMARISING: 0.5}
+    stages = {
+        MODE: 1.0,
+        WEIGHING: 2.0 * sampled,
+        WALKING: 8.0 * (sampled and tier not in (None, IMPORTANCE)),
+        SUMMARISING: 0.5,
+    }
     with Job(stages, progress) as job:
         job.begin(MODE)
         mode, sample = find_mode(model), None
@@ -288,8 +294,8 @@ def fit_axis(
             run = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX, pilots_max=PILOTS_MAX)
             start_time = time.monotonic()
             sample = run.sample
-            if tier != IMPORTANCE:
-                walk = run_of(tier)
+            if tier not in (None, IMPORTANCE) or (tier is None and sample.convergence.answer != "accepted"):
+                walk = run_of(tier or CHAIN)
                 job.begin(WALKING)
                 sample = better(sample, walk(run, None, None, job.at, start_time).until_converged(60.0 * max_minutes))
         job.begin(SUMMARISING)

@@ -30,6 +30,7 @@ from tvsbayes.results.records import (
     schema_of,
 )
 from tvsbayes.results.store import AGAIN, FitFiles, damaged_draws, fit_id, stored_fit, write_fit
+from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_density import blocks_of, line_factors, line_weights
 from tvsbayes.single_axis.axis_doubts import axis_warnings
@@ -476,10 +477,9 @@ def results_for(
     progress: Show | None = None,
     seed: int = 0,
     notify: Callable[[str], None] = lambda _: None,
+    tier: Tier | None = IMPORTANCE,
 ) -> AxisResults:
     """The results in `results/` if they belong to these data and this model and converged; else those of a new fit.
-
-    The fit is one by weighted draws.
 
     Args:
         campaign: from `read_axis`.
@@ -487,6 +487,7 @@ def results_for(
         progress: shows the progress of the fit.
         seed: seed of that fit.
         notify: reports that a fit runs first.
+        tier: how that fit is sampled, as in `fit_axis`.
 
     Raises:
         InputError: stored results are damaged.
@@ -512,7 +513,7 @@ def results_for(
             return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed), origin.fit_id)
         why = OTHER_MODEL
     notify(f"{why}: {FITTING_FIRST}")
-    fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
+    fit = fit_axis(campaign, tier=tier, seed=seed, more=more, progress=progress)
     if fit.error is not None:
         raise fit.error
     return AxisResults(summarise_axis(fit), fit)
