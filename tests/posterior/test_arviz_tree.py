@@ -1,14 +1,19 @@
-"""Variables of posterior.nc with their dimensions, from draws made by hand."""
+"""Variables of posterior.nc with their dimensions, from draws made by hand; the tree of weighted draws."""
 
 from __future__ import annotations
+
+import json
 
 import numpy as np
 import pytest
 from support.drawn_quantities import drawn_quantities
+from support.small_posterior import SEED, mapped_already, small_fit
 
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import AMPLITUDE_NAMES, INDEX, NAMES
-from tvsbayes.posterior.arviz_tree import COORDS, VARIABLES, _dataset, _variables
+from tvsbayes.posterior.arviz_tree import COORDS, RESAMPLED, VARIABLES, _dataset, _variables, data_tree
+from tvsbayes.posterior.sampling import sample
+from tvsbayes.results.tiers import IMPORTANCE
 
 SHAPE = 2, 3
 """Chains and draws."""
@@ -40,3 +45,22 @@ def test_every_variable_of_several_names_has_a_dimension_with_as_many_labels(dra
         assert labels == len(variable.names), name
     whole = _dataset(_variables(draws, {n for spec in VARIABLES.values() for n in spec.names}, SHAPE, TWO_MIRROR))
     assert set(whole.data_vars) == set(VARIABLES)
+
+
+@pytest.mark.thorough
+def test_weighted_draws_become_one_chain_with_their_weights(monkeypatch):
+    mapped_already(monkeypatch)
+    posterior = sample(small_fit()[0], IMPORTANCE, seed=SEED)
+    tree = data_tree(posterior)
+    stats = tree["sample_stats"]
+    assert dict(stats.sizes) == {"chain": 1, "draw": RESAMPLED}
+    source = stats["source"].values[0]
+    weights = posterior.weights.ravel()
+    np.testing.assert_array_equal(stats["log_weight"].values[0], np.log(weights[source]))
+    # Systematic resampling takes a draw as often as its weight says, rounded down or up.
+    counts = np.bincount(source, minlength=len(weights))
+    assert np.all(np.abs(counts - RESAMPLED * weights) < 1)
+    name = "effective_deg_per_step.left"
+    drawn = tree["posterior"]["effective_deg_per_step"].sel(direction="left").values[0]
+    np.testing.assert_array_equal(drawn, posterior.by_name[name][source])
+    assert json.loads(tree.attrs["ess_mean"])[name] == pytest.approx(posterior.convergence.ess_bulk[name])

@@ -57,9 +57,7 @@ def test_a_chain_runs_where_weighted_draws_are_not_accepted(monkeypatch, refused
         monkeypatch.setattr("tvsbayes.inference.importance.K_MAX", -9.0)
         monkeypatch.setattr("tvsbayes.inference.importance.ROUNDS_MAX", 4)
     chains = []
-    monkeypatch.setattr(
-        "tvsbayes.single_axis.axis_fit.run_of", lambda name: chains.append(name) or run_of(name)
-    )
+    monkeypatch.setattr("tvsbayes.single_axis.axis_fit.run_of", lambda name: chains.append(name) or run_of(name))
     fit = fit_axis(drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign, seed=1)
     assert (fit.tier, fit.answer) == (tier, "accepted") and chains == [CHAIN] * refused
 
