@@ -152,7 +152,13 @@ def sampled(answer: str, missing: tuple[str, ...], steps: int | None = None) -> 
     )
 
 
-@pytest.mark.parametrize(("steps", "helps"), [(None, "fit without --quick"), (900, "--resume and more --max-minutes")])
+@pytest.mark.parametrize(
+    ("steps", "helps"),
+    [
+        (None, "fit without --quick, or with --resume and more --max-minutes"),
+        (900, "fit with --resume and more --max-minutes"),
+    ],
+)
 def test_a_rough_answer_states_its_error_and_remedy(steps, helps):
     """The table stays; what is missing, the worst Monte Carlo error and the way to more stand before it."""
     text = fit_text(sampled("rough", ("known to 0.17 sd, wanted 0.1",), steps))
