@@ -48,7 +48,7 @@ def true_axis(seed: int) -> AxisTruth:
     rng = np.random.default_rng([seed, 101])
     grid = np.linspace(-0.75 * TRAVEL, 0.75 * TRAVEL, 361)
     ratio = 1.0 + 0.002 * float(rng.standard_normal())
-    return draw_axis(grid.tolist(), {"home_sd": HOME}, ratio, TRAVEL, rng)
+    return draw_axis(grid.tolist(), {"home_sd": HOME}, ratio, TRAVEL, rng, unit="mm")
 
 
 def driven(truth: AxisTruth, applied: Correction, factors: tuple[float, float], count: int, rng) -> AxisCampaign:  # type: ignore[no-untyped-def]

@@ -157,7 +157,7 @@ class Loop:
         self.rng = np.random.default_rng([SEED, 1])
         grid = np.linspace(-1.1 * TRAVEL, 1.1 * TRAVEL, 601).tolist()
         stated = {"home_sd": HOME, "backlash": AxisPrior(0.4, 0.0), "stop_sd": AxisPrior(0.004, 0.3)}
-        self.truth = draw_axis(grid, stated, 1.001, TRAVEL, self.rng)
+        self.truth = draw_axis(grid, stated, 1.001, TRAVEL, self.rng, unit="mm")
 
     def campaign(
         self,

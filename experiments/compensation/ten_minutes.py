@@ -49,7 +49,7 @@ class Stage:
     def __init__(self) -> None:
         self.rng = np.random.default_rng([SEED, 1])
         grid = np.linspace(-0.75 * TRAVEL, 0.75 * TRAVEL, 601).tolist()
-        self.truth = draw_axis(grid, TRUE, 1.001, TRAVEL, self.rng)
+        self.truth = draw_axis(grid, TRUE, 1.001, TRAVEL, self.rng, unit="mm")
 
     def log(
         self, moves: tuple[AxisMove, ...], which: list[int], by: Correction | None = None, sign: float = 1.0

@@ -155,3 +155,15 @@ def test_a_table_is_of_one_state_while_the_zero_grows():
         assert promise.causes["creep"] > 0 and promise.causes["temperature"] > 0 and made.kelvin is not None
     # Run-up: the play and the scatter of stops.
     assert 0.006 < made.reversal_command < 0.012
+
+
+def test_creep_and_temperature_are_drawn_together_and_their_sum_is_stated():
+    """Both grow with time: apart they are known to tens of um, their sum to a fraction of one."""
+    fit = fit_axis(growing_screw(), sampled=False)
+    draws, rows, minutes = fit.draws, fit.rows, fit.model.coordinates.values(fit.w)["creep_minutes"]
+    creep = draws["creep"] * -np.expm1(-rows.warm_s[-1] / (60 * minutes))
+    warming = draws["thermal_per_K"] * rows.kelvin[-1]
+    assert creep.std() > 20 * (creep + warming).std() and abs((creep + warming).mean() - 0.005) < 0.001
+    assert np.all(draws["ratio_contrast"] == 0.0)
+    (weak,) = [text for text in summarise_axis(fit).weak_directions if "one thing" in text]
+    assert "a shift with the temperature and a creep of the zero" in weak and "their sum moved the zero by 0.00" in weak

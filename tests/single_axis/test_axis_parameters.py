@@ -37,3 +37,10 @@ def test_sds_of_priors():
     # Sampling errors of 4e5 draws.
     assert prior_sd("half-normal", AxisPrior(0.0, 2.0)) == pytest.approx(np.abs(2 * draws).std(), rel=0.01)
     assert prior_sd("log-normal", AxisPrior(2.0, 0.5)) == pytest.approx((2 * np.exp(0.5 * draws)).std(), rel=0.02)
+
+
+def test_an_axis_in_a_length_has_one_ratio_unless_stated():
+    assert axis_priors({}, 1.0, 0.5, unit="mm")["ratio_contrast"] == AxisPrior(0.0, 0.0)
+    assert axis_priors({}, 1.0, 0.5, unit="arcsec")["ratio_contrast"] == AxisPrior(0.0, 5e-5)
+    stated = {"ratio_contrast": AxisPrior(0.0, 1e-3)}
+    assert axis_priors(stated, 1.0, 0.5, unit="mm")["ratio_contrast"] == AxisPrior(0.0, 1e-3)

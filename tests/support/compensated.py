@@ -33,7 +33,9 @@ TRUE = {
 def true_axis(seed: int = 1, ratio: float = 1.002) -> AxisTruth:
     """Its curves stand every 0.1 mm."""
     grid = np.linspace(-30.0, 30.0, 601).tolist()
-    return draw_axis(grid, {**TRUE, "per_command": AxisPrior(ratio, 0.0)}, ratio, 40.0, np.random.default_rng(seed))
+    return draw_axis(
+        grid, {**TRUE, "per_command": AxisPrior(ratio, 0.0)}, ratio, 40.0, np.random.default_rng(seed), unit="mm"
+    )
 
 
 def driven(truth: AxisTruth, planned: tuple[AxisMove, ...], read: list[int], seed: int, **applied) -> AxisCampaign:

@@ -218,16 +218,16 @@ class AxisFit(Shown):
         """Equal draws (draws,) of every sampled parameter, of the linear ones, and of the line through the stops."""
         rng = random_stream(self.seed, AxisStream.LINEAR_TERMS)
         draws = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
-        linear = self.linear.drawn(headline_functionals(self.model, self.w), rng)
-        return draws | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
-
-    def _shift_draws(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draws of the zero's shifts in time."""
-        names = self.model.shifts
-        if not names:
-            return {}
-        draws = self.linear.drawn(np.array([self.model.shift(name) for name in names]), rng)
-        return dict(zip(names, draws.T, strict=True))
+        # All in one call: their posterior is joint, and a sum may be known far better than its terms.
+        functionals, names = headline_functionals(self.model, self.w), self.model.shifts
+        shifts = np.array([self.model.shift(name) for name in names]).reshape(len(names), self.model.columns)
+        shifts = np.broadcast_to(shifts, (*functionals.shape[:-2], len(names), functionals.shape[-1]))
+        functionals = np.concatenate([functionals, shifts], axis=-2)
+        # In units of their sd: an offset is known to more digits than a contrast has; what is fixed stays exact.
+        sd = self.linear.sd_of(functionals).mean(axis=0)
+        linear = self.linear.drawn(functionals / np.where(sd > 0, sd, 1.0)[:, None], rng) * sd
+        linear[:, sd == 0] = self.linear.mean_of(functionals)[:, sd == 0]
+        return draws | dict(zip((*HEADLINE_DRAWS, *names), linear.T, strict=True))
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -250,7 +250,7 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
 def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:
     """All default priors of an axis."""
     u = float(np.sqrt(fit_line(rows).covariance[1, 1]))
-    return axis_priors({}, rows.travel, rows.line.slope, u)
+    return axis_priors({}, rows.travel, rows.line.slope, u, rows.unit)
 
 
 def fit_axis(

@@ -110,8 +110,11 @@ positions, with the scales integrated out, lie within 1.96 u in 95 % of cases. B
 cent; any reversal determines it well, so a wide prior is harmless. Seeing: errors of readings in motion that last for
 seconds, caused by air, a guider's loop or the reader; its sd is in units of a reading's u."""
 CONTRAST_SHARE = 1e-4
-"""sd of the difference of both directions' ratios over the ratio: gears and screws have one ratio. With a larger sd,
-two ratios would explain the warming of a machine on a long path."""
+"""sd of the difference of both directions' ratios over the ratio, of an axis that is not read in a length: gears have
+one ratio. With a larger sd, two ratios would explain the warming of a machine on a long path."""
+LENGTHS = ("nm", "um", "mm", "cm", "m", "thou", "mil", "inch", "in")
+"""Units of length: of an axis in one of them the difference is 0 unless stated, since a screw, a rack or a belt keeps
+step over its length."""
 SAMPLED = (
     *("backlash", "transmission_error", "transmission_error_length", "play_variation", "drift_per_root_hour"),
     *("stop_sd.forward", "stop_sd.backward", "home_sd", "reading_scale"),
@@ -126,7 +129,7 @@ def kind_of(name: str) -> Kind:
 
 
 def axis_priors(
-    stated: Mapping[str, AxisPrior], travel: float, per_command: float, u_per_command: float = 0.0
+    stated: Mapping[str, AxisPrior], travel: float, per_command: float, u_per_command: float = 0.0, unit: str = ""
 ) -> dict[str, AxisPrior]:
     """Every prior of an axis, defaults filled in.
 
@@ -135,13 +138,14 @@ def axis_priors(
         travel: range of the readings' quantity, > 0: range of commands times |unit per command|.
         per_command: slope of the least-squares line, for centre and u of the default prior.
         u_per_command: its standard error, which widens that prior.
+        unit: unit of the readings.
     """
     priors = {}
     for name, key in AXIS_KEYS.items():
         if name == "per_command":
             default = AxisPrior(per_command, abs(per_command) + 2 * u_per_command)
         elif name == "ratio_contrast":
-            default = AxisPrior(0.0, CONTRAST_SHARE * abs(per_command))
+            default = AxisPrior(0.0, 0.0 if unit in LENGTHS else CONTRAST_SHARE * abs(per_command))
         elif key.share is None:
             default = AxisPrior(key.median, key.u)
         elif key.kind == "log-normal":

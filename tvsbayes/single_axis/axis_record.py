@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -390,8 +391,15 @@ def _weak(fit: AxisFit) -> list[str]:
     return sentences
 
 
-CREEP_SHARE = 0.5
-"""Least correlation with the creep at which the contrast of the directions, or the play, counts as weak."""
+IN_TIME = {
+    "creep": "a creep of the zero",
+    "thermal_per_K": "a shift with the temperature",
+    "ratio_contrast": "the contrast of the directions",
+    "backlash": "the play",
+}
+"""Quantities that a shift of the zero in time may be taken for, in words."""
+CREEP_SHARE, ONE_THING = 0.5, 0.9
+"""Least correlations of two of them at which they count as weak, and at which their sum alone is stated."""
 ORDER_SHARE = 0.9
 """Least correlation of commands and travel at which the positions count as read one after the other."""
 
@@ -407,18 +415,34 @@ def _weak_in_time(fit: AxisFit) -> list[str]:
             "directions are poorly separated: read them again in another order; of gears whose teeth keep step state "
             "`ratio_contrast = { value = 0, u = 0 }` in [axis], of a warm machine `creep` likewise"
         )
-    for shift, remedy in {
+    draws = {name: fit.draws[name] for name in (*fit.model.shifts, "ratio_contrast", "backlash")}
+    draws = {name: values for name, values in draws.items() if values.std() > 0 and name in IN_TIME}
+    remedies = {
         "creep": "alternate the directions, come back to the first stop, wait until it is warm",
         "thermal_per_K": "come back to the first stop at another temperature",
-    }.items():
-        for name, effect in {"backlash": "the play", "ratio_contrast": "the contrast of the directions"}.items():
-            if shift not in fit.model.shifts or not fit.rows.both_sides:
-                continue
-            a, b = fit.draws[shift], fit.draws[name]
-            if a.std() and b.std() and abs(np.corrcoef(a, b)[0, 1]) > CREEP_SHARE:
-                words = "a creep of the zero" if shift == "creep" else "a shift with the temperature"
-                sentences.append(f"{effect} and {words} are poorly separated: {remedy}")
+    }
+    for shift, other in combinations(draws, 2):
+        if shift not in remedies or (other not in remedies and not rows.both_sides):
+            continue
+        together = abs(np.corrcoef(draws[shift], draws[other])[0, 1])
+        if together > CREEP_SHARE:
+            sentence = f"{IN_TIME[other]} and {IN_TIME[shift]} are poorly separated: {remedies[shift]}"
+            sentences.append(sentence + (_sum_in_time(fit) if together > ONE_THING and other != "backlash" else ""))
     return sentences
+
+
+def _sum_in_time(fit: AxisFit) -> str:
+    """State how far creep, temperature and contrast together moved the zero over the readings."""
+    rows, draws, moved = fit.rows, fit.draws, np.zeros(len(fit.w))
+    if "creep" in fit.model.shifts:
+        minutes = fit.model.coordinates.values(fit.w)["creep_minutes"]
+        first, last = (-np.expm1(-rows.warm_s[k] / (60.0 * minutes)) for k in (0, -1))
+        moved = moved + draws["creep"] * (last - first)
+    if "thermal_per_K" in fit.model.shifts and rows.kelvin is not None:
+        moved = moved + draws["thermal_per_K"] * (rows.kelvin[-1] - rows.kelvin[0])
+    moved = moved + 0.5 * draws["ratio_contrast"] * (rows.path[-1] - rows.path[0])
+    size = f"{moved.mean():.3g} (u = {moved.std():.2g}) {fit.campaign.unit}"
+    return f"; they are one thing to these readings: their sum moved the zero by {size}, and a table holds this sum"
 
 
 def uninformed(summary: AxisSummary) -> TvsError | None:
@@ -508,7 +532,9 @@ def results_for(
         origin = read_record(Provenance, document, AGAIN, held=True)
         model = model_of(campaign, more)
         names = model.coordinates.names
-        if summary.parameters.keys() >= {name for name in names if not name.startswith("wave_")}:
+        # The contrast of an axis in a length was free until 0.3.
+        contrast = bool(model.priors["ratio_contrast"].u) == bool(summary.parameters["ratio_contrast"].prior_sd)
+        if contrast and summary.parameters.keys() >= {name for name in names if not name.startswith("wave_")}:
             w = _stored_w(stored.arrays, len(names))
             return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed), origin.fit_id)
         why = OTHER_MODEL

@@ -136,6 +136,7 @@ def draw_axis(
     rng: np.random.Generator,
     periods: WavePeriods | None = None,
     between_s: tuple[float, float] = (0.0, 1.0),
+    unit: str = "",
 ) -> AxisTruth:
     """Draw a true axis for a list of commands.
 
@@ -147,9 +148,10 @@ def draw_axis(
         rng: source of all random numbers.
         periods: stated periods; half of them have a wave, with the scale of `transmission_error`.
         between_s: least and greatest time of the readings, for waves of time.
+        unit: unit of the readings.
     """
     at = np.unique(np.asarray(commands, dtype=float))
-    priors = axis_priors(stated, travel, per_command)
+    priors = axis_priors(stated, travel, per_command, unit=unit)
     names = [
         *(name for name in priors if name not in ("per_command", "ratio_contrast", "stop_sd", *IN_TIME)),
         "stop_sd.forward",
@@ -308,7 +310,14 @@ def simulate_axis(template: AxisCampaign, moves: Sequence[AxisMove] | None = Non
     if not travel > 0:
         raise NothingToEstimate("too-few-positions", "all moves are to one position", remedy="list more positions")
     truth = draw_axis(
-        commands, template.stated, per_command, travel, rng, template.periods, (moves[0].time_s, moves[-1].time_s)
+        commands,
+        template.stated,
+        per_command,
+        travel,
+        rng,
+        template.periods,
+        (moves[0].time_s, moves[-1].time_s),
+        template.unit,
     )
     u = _reading_u(template, travel)
     stops = stops_of(truth, moves, rng, template.powered_on_s, template.absolute)
@@ -334,7 +343,14 @@ def _simulated_drive(template: AxisCampaign, rate: float, seed: int, rng: np.ran
     times = np.array(used) if used else move.time_s + DRIVE_S * np.arange(1, DRIVE_READINGS + 1)
     travel = abs(rate * per_command) * float(np.ptp(times))
     truth = draw_axis(
-        [move.command], template.stated, per_command, travel, rng, template.periods, (float(times[0]), float(times[-1]))
+        [move.command],
+        template.stated,
+        per_command,
+        travel,
+        rng,
+        template.periods,
+        (float(times[0]), float(times[-1])),
+        template.unit,
     )
     u = _reading_u(template, travel)
     truth.parameters["reading_u"] = u
