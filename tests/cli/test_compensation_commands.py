@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import jsonschema
@@ -118,3 +119,25 @@ def test_verify_needs_two_campaigns_of_one_kind_and_results(ask, folder):
 def test_impossible_options_are_refused(ask, folder, options):
     code, document = ask("compensate", folder, *options)
     assert code == 2 and document["error"]["remedy"]
+
+
+def test_a_promise_is_tied_to_its_table(ask, say, folder, tmp_path):
+    """A second table leaves the first in force, one in its place ends it, a file of 0.3.0 is known by its numbers."""
+    first, second = tmp_path / "one.comp", tmp_path / "two.csv"
+    ask("compensate", folder, "--to", "linuxcnc", "-o", first)
+    fresh = drive(folder, tmp_path / "fresh", (1.0, 1.0))
+    code, _, err = say("compensate", folder, "--to", "csv", "-o", second, "--per-command", "1.01")
+    assert code == 0 and "stays" in err
+    # Alone, the readings are held against the last table, which aims at another ratio.
+    code, document = ask("verify", folder, fresh)
+    assert (code, document["verdict"]) == (1, "BROKEN")
+    for remarks in (first.read_text(), "\n".join(line for line in first.read_text().splitlines() if line[0] != "#")):
+        (tmp_path / "table").write_text(remarks)
+        code, document = ask("verify", folder, fresh, "--table", tmp_path / "table")
+        assert (code, document["verdict"]) == (0, "KEPT")
+    (tmp_path / "table").write_text(re.sub("table [0-9a-f]{16}", "table 0123456789abcdef", second.read_text()))
+    code, document = ask("verify", folder, fresh, "--table", tmp_path / "table")
+    assert code == 2
+    assert_error(document, "other-table")
+    code, _, err = say("compensate", folder, "--to", "csv", "-o", second)
+    assert code == 0 and "ends: its file is replaced" in err

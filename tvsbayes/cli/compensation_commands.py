@@ -33,6 +33,7 @@ from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
     from tvsbayes.instrument.mechanisms import Mechanism
+    from tvsbayes.results.compensation_record import Compensation
 
 FITTING, MAKING = "fit", "compensation"
 EXPORTS = {"header": "calibration in C", "json": "calibration"}
@@ -79,7 +80,7 @@ def compensate(
     """
     from tvsbayes.compensation.formats import Wish, checked
     from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
-    from tvsbayes.compensation.verification import compensation_in
+    from tvsbayes.compensation.verification import compensation_in, table_in
     from tvsbayes.report.compensation_text import compensation_text
     from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
     from tvsbayes.results.fit_record import provenance
@@ -113,6 +114,7 @@ def compensate(
     check_output(second, kind="compensation", force=force and second is not None)
     data = read_axis(campaign)
     before = compensation_in(data)
+    replaced = table_in(data, out) if out is not None and out.is_file() else None
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
         compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
@@ -125,11 +127,11 @@ def compensate(
         if second is not None and (yaml_text := file_beside(compensation, data)) is not None:
             write_atomically(second, yaml_text.encode())
             files["yaml"] = str(second)
-        if keep(document, record_path := output_place(campaign, "results") / "compensation.json"):
+        record_path = output_place(campaign, "results") / "compensation.json"
+        held = record_path.read_bytes() if before is not None else b""
+        if keep(document, record_path):
             files["compensation"] = str(record_path)
-            if before is not None and before.digest != compensation.digest:
-                ended = f"the promise of the table made before (--to {before.target}, {before.digest[:12]}) ends"
-                report_line(f"note: {ended}: `verify` tests this one alone")
+            _name_other_promises(compensation, before, replaced, record_path.parent, held)
     text = compensation_text(compensation, list(files.values()))
     if out is None:
         text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(compensation, data)}".rstrip("\n")
@@ -137,6 +139,22 @@ def compensate(
         next_step = compensation.shown_by if compensation.in_motion else command_line("verify", campaign, "FRESH")
         text += f"\nnext: apply it, then {next_step}"
     finish({**document, "files": files}, text, as_json)
+
+
+def _name_other_promises(
+    made: Compensation, before: Compensation | None, replaced: Compensation | None, results: Path, held: bytes
+) -> None:
+    """Say which promise ends, since its file was replaced, and keep that of the table made before, `held`, beside."""
+    from tvsbayes.compensation.verification import kept_name
+
+    if replaced is not None and replaced.digest != made.digest:
+        (results / kept_name(replaced)).unlink(missing_ok=True)
+        table = f"the table made before (--to {replaced.target}, {replaced.table_id})"
+        report_line(f"note: the promise of {table} ends: its file is replaced")
+    if before is not None and before.digest not in (made.digest, getattr(replaced, "digest", "")):
+        write_atomically(results / kept_name(before), held)
+        table = f"the table made before (--to {before.target}, {before.table_id})"
+        report_line(f"note: the promise of {table} stays: `verify --table FILE` tests it, `verify` alone this one")
 
 
 def export_calibration(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
@@ -174,6 +192,9 @@ def verify(
     distance_mm: Annotated[
         float | None, typer.Option("--distance-mm", min=1.0, help="Of a scanner: errors of points there, mm (1000).")
     ] = None,
+    table_file: Annotated[
+        Path | None, typer.Option("--table", help="Of an axis: file of the table in force (the last one made).")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -185,7 +206,7 @@ def verify(
     """
     from tvsbayes.calibration.calibration_file import calibration_json, content_sha256
     from tvsbayes.comparison.verified_looks import accepted_calibration
-    from tvsbayes.compensation.verification import stored_compensation
+    from tvsbayes.compensation.verification import compensation_of_file, stored_compensation
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
@@ -199,14 +220,19 @@ def verify(
     if distance_mm is not None and (mechanism is None or mechanism.sightings):
         message = "--distance-mm is not for an axis, nor for a head that says where it points"
         raise InputError("usage", message, remedy="leave it out")
+    if table_file is not None and mechanism is not None:
+        message = "--table is for an axis; a scanner or head is aimed with its calibration"
+        raise InputError("usage", message, remedy="leave it out")
     known = read_axis(campaign) if mechanism is None else read_campaign(campaign)
-    made = stored_compensation(known) if isinstance(known, AxisCampaign) else None
+    made = None
+    if isinstance(known, AxisCampaign):
+        made = stored_compensation(known) if table_file is None else compensation_of_file(known, table_file)
     with waiting() as progress:
         new, distance = fresh if made is None else read_axis(fresh), distance_mm or 1000.0
         result = verified(known, new, made=made, distance_mm=distance, seed=seed, tell=report_line, progress=progress)
-    if isinstance(known, AxisCampaign):
-        table = stored_compensation(known).digest
-    else:
+    if made is not None:
+        table = made.digest
+    elif not isinstance(known, AxisCampaign):
         table = content_sha256(calibration_json(accepted_calibration(known)))
     document = {"format": VERIFICATION_FORMAT, "inputs": inputs_of(known), "table": table, **result.as_json()}
     keep(document, output_place(campaign, "results") / "verification.json")

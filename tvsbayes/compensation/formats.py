@@ -49,6 +49,7 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
     unit = plainly(made.unit)
     lines = [
         f"compensation by {plainly(origin.text)}, data {origin.data_sha256[:16]}",
+        f"table {made.table_id}: its promise is in results/, for tvsbayes verify --table",
         f"machine: {plainly(made.machine) or 'not named'}; unit {unit}",
         f"for commands from {number(low)} to {number(high)}",
         f"state when this was written: applied to nothing; apply it once, in one place; then {made.shown_by}",
@@ -224,6 +225,18 @@ def _pec(made: Compensation, origin: Origin) -> str:
     lines += ["phase,add"]
     lines += [f"{number(float(p), 6)},{number(float(a), 7)}" for p, a in zip(phase, added, strict=True)]
     return "\n".join([*_commented(made, origin), *lines, ""])
+
+
+_REMARKS = re.compile(r"(?s)<!--.*?-->|/\*.*?\*/|^[ \t]*[#;][^\n]*$", re.MULTILINE)
+_TABLE_ID = re.compile(r"\btable ([0-9a-f]{16}): its promise")
+
+
+def is_table_of(text: str, made: Compensation) -> bool:
+    """Whether a file holds a table: by its id, in one of 0.3.0, which has none, by all that it holds beside remarks."""
+    if named := _TABLE_ID.search(text):
+        return named[1] == made.table_id
+    written = FORMATS[made.target].write(made, Origin("", ""))
+    return bool(text.strip()) and _REMARKS.sub("", text).split() == _REMARKS.sub("", written).split()
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.formats import is_table_of
 from tvsbayes.compensation.promise import bound_of, reading_u, refuse_answer
-from tvsbayes.errors import InputError, NothingToEstimate, refusal
+from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.documents import JSON_BYTES_MAX
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -292,6 +295,39 @@ def compensation_in(campaign: AxisCampaign) -> Compensation | None:
     """
     keys = stored_document(campaign, "compensation.json", (COMPENSATION_FORMAT,), axis_hashes(campaign))
     return None if keys is None else read_record(Compensation, keys, AGAIN)
+
+
+def kept_name(made: Compensation) -> str:
+    """Name in `results/` of a promise whose table stays in force beside a later one."""
+    return f"compensation-{made.table_id}.json"
+
+
+def table_in(campaign: AxisCampaign, path: Path) -> Compensation | None:
+    """Find the compensation of a folder's data whose table a file holds.
+
+    Raises:
+        InputError: the file, or a promise in `results/`, cannot be read.
+    """
+    text, inputs = read_bytes(path, JSON_BYTES_MAX).decode(errors="replace"), axis_hashes(campaign)
+    folder = None if campaign.path is None else campaign.path / "results"
+    for name in [] if folder is None else sorted(each.name for each in folder.glob("compensation*.json")):
+        keys = stored_document(campaign, name, (COMPENSATION_FORMAT,), inputs)
+        if keys is not None and is_table_of(text, made := read_record(Compensation, keys, AGAIN)):
+            return made
+    return None
+
+
+def compensation_of_file(campaign: AxisCampaign, path: Path) -> Compensation:
+    """Read the compensation whose table a file holds.
+
+    Raises:
+        InputError: as `table_in`, or there is none.
+    """
+    made = table_in(campaign, path)
+    if made is None:
+        what, allowed = "no table whose promise is kept", "a table that `compensate -o` made of these data"
+        raise refusal("other-table", file=escaped(str(path), 200), found=what, allowed=allowed, remedy=AGAIN)
+    return made
 
 
 def stored_compensation(campaign: AxisCampaign) -> Compensation:

@@ -140,6 +140,11 @@ class Compensation(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         return hashlib.sha256(json.dumps(self.as_json(), sort_keys=True).encode()).hexdigest()
 
     @property
+    def table_id(self) -> str:
+        """The id in the file, the beginning of `digest`."""
+        return self.digest[:16]
+
+    @property
     def in_motion(self) -> bool:
         """Whether the table is one period of a drive at constant rate, which never reverses."""
         return self.reversal_command == 0 and "period_command" in self.settings
