@@ -83,7 +83,8 @@ def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> tuple
     solved = np.linalg.lstsq(line[~out], error[~out], rcond=None)[0]
     columns = np.array([(row.command, row.forward, row.backward) for row in compensation.table]).T
     expected = np.where(side > 0, *(np.interp(command, columns[0], column) for column in columns[1:]))
-    promised = np.where(side > 0, *(compensation.promise[name].error95 for name in ("forward", "backward")))
+    names = ("forward", "backward")
+    promised = np.where(side > 0, *(compensation.promise[name].error95_with_homing or 0.0 for name in names))
     means = [error[(command == c) & (side == s) & ~out].mean() for c, s in zip(command[out], side[out], strict=True)]
     left, followed = value - expected, value[out] - _followed(results.fit, campaign, at[out])
     simple = (error - error[~out].mean())[out], (error - line @ solved)[out], error[out] - means

@@ -103,8 +103,10 @@ read, `value_mm` is empty. Commands here count in mm, with a nominal ratio of 1.
 """
 TABLE = """## A table, and what it promises
 
-The promise is a prediction of single readings, by side: what 95 % of them do not exceed after the table is applied, and
-what each cause would leave alone. It holds between the commands that were read. Nothing is applied yet.
+The table is of one state, the mean time, travel and temperature of the campaign, for all commands. The promise is a
+prediction of single readings, by side: what 95 % of them do not exceed after the table is applied, in a use as long as
+the campaign's, and what each cause would leave alone. It holds between the commands that were read. Nothing is applied
+yet.
 """
 FILE = """The file says of what it is and what is promised. LinuxCNC takes it by `COMP_FILE = stage.comp` and
 `COMP_FILE_TYPE = 0`; [others](commands.md#compensate) get theirs by `--to`.

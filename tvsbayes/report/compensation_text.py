@@ -74,7 +74,7 @@ def promise_table(result: Compensation) -> TableView:
         rows.append([side.removeprefix("arriving "), *map(two_digits, sizes)])
     shift = ", but for one shift common to all," if result.shift_free else ""
     caption = f"95 % of errors{shift} are at most, {escaped(result.unit)}; each cause alone"
-    return TableView(caption, ["" if result.in_motion else "arriving", "without", "after applying", *causes], rows)
+    return TableView(caption, ["" if result.in_motion else "arriving", "without", "after", *causes], rows)
 
 
 def sizes_table(verification: Verification) -> TableView:

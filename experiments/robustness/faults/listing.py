@@ -302,6 +302,9 @@ FAULTS = (
           "test_homings_shift_the_zeros_as_stated"),
     Fault("a homing sets the absolute zero of an axis", "axis_rows._hours", Argument("zero", "np.arange(len(value))"),
           "test_the_filter_is_the_dense_gaussian"),
+    Fault("a table holds another state at every place", "PredictedAxis.expected",
+          Local("state", "value._replace(warm_hours=np.arange(len(command)) % 5 / 5)"),
+          "test_a_table_is_of_one_state_while_the_zero_grows"),
     Fault("a stated scatter of homings is not used", "RigTable.home_sd_deg", Returns("(0.05, 0.05)"),
           "test_homings_shift_the_zeros_as_stated"),
     # Compensation.
