@@ -36,7 +36,7 @@ def good():
 EDIT = st.tuples(st.sampled_from(sorted(EDITS)), st.integers(0, 639), st.integers(0, 479), st.integers(1, 10))
 
 
-@few(25)
+@few(12)
 @given(st.lists(st.tuples(st.integers(0, 3), EDIT), min_size=1, max_size=4), st.integers(0, 3), st.integers(-1, 10**5))
 def test_damaged_pictures_are_views_or_refused(tmp_path_factory, good, edits, file, byte):
     """Up to four edits of four pictures, then a byte of a file; views have corners where the board has them."""
@@ -64,7 +64,7 @@ SIZES = (*["9x8"] * 9, "9 x 8", "60x60", "61x4", "1x1")
 NUMBERS = st.sampled_from((0.0, -1.0, 1e-300, 1e308, float("nan"), float("inf"), 40.0, 28.0))
 
 
-@few(200)
+@few(80)
 @given(st.sampled_from((*WORDS, *SIZES)), st.sampled_from((*WORDS, *["5X5_100"] * 9)), NUMBERS, NUMBERS)
 def test_descriptions_of_boards_are_taken_or_refused(squares, dictionary, pitch_mm, marker_mm):
     try:

@@ -38,7 +38,7 @@ def test_classic_document_has_the_documented_keys(ask):
     assert set(document) == {"directions", "experiments", "skipped"}
     keys = {
         *("n", "mean_deg_per_step", "sd_deg_per_step", "u_type_a_deg_per_step", "interval95_type_a"),
-        *("u_gum_deg_per_step", "interval95_gum", "u_stereo_deg_per_step", "effective_dof"),
+        *("u_gum_deg_per_step", "interval95_gum", "u_stereo_deg_per_step", "effective_dof", "outlier"),
     }
     assert list(document["directions"]) == list(DIRECTIONS)
     for result in document["directions"].values():

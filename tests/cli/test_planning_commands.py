@@ -71,5 +71,18 @@ def test_study_states_the_assurance_of_the_users_target(ask, tmp_path):
     assert document["campaigns"] == 8 and (tmp_path / "rows.jsonl").read_bytes().count(b"\n") == 8
     code, _ = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows)
     assert code == 0
+    assert ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows)[1]["target"]["limit"] == 2e-4
+    # A plan that states its target is judged by it.
+    plan = tmp_path / "plan.csv"
+    names, first, *others = (MOUNTED / "grid.csv").read_text().splitlines()
+    for made_for, expected in (("u(left) <= 3e-4 deg/step", 3e-4), ("u(left) <= 3 mm", None)):
+        rest = [f"{line}," for line in others]
+        plan.write_text("\n".join([f"{names},made_for", f"{first},{made_for}", *rest]) + "\n")
+        code, document = ask("study", MOUNTED / "rig.toml", plan, "--n", 2)
+        if expected is None:
+            assert code == 2 and (document["error"]["column"], document["error"]["file"]) == ("made_for", "plan.csv")
+        else:
+            assert code == 0 and document["target"]["limit"] == expected
+            assert ask("study", MOUNTED / "rig.toml", plan, *rows, *target)[1]["target"]["limit"] == 1e-3
     code, document = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", "--engine", "cloud")
     assert code == 2 and document["error"]["column"] == "--engine"

@@ -176,6 +176,26 @@ def test_statistics_of_known_ratios():
     assert [result.directions[name] for name in ("right", "up", "down")] == [None, None, None]
 
 
+SCATTER_DEG = (0.05, -0.04, 0.01, -0.02, 0.03, -0.05, 0.02, 0.0, -0.01, 0.04)
+
+
+def test_the_experiment_that_makes_the_sd_is_named_with_its_approach():
+    """The first of a homing has no play to lose, the others return and reverse: it stands out, and why is known."""
+    angles = [12.0 + 0.9, *(12.0 + d for d in SCATTER_DEG)]
+    left = classic(make_campaign([("pan", 200, 10.0, 10.0 + d) for d in angles])).directions["left"]
+    assert left.outlier.experiment == 0 and left.outlier.play_alone == "cleared" and left.outlier.p < 1e-4
+    rest = np.array(angles[1:]) / 200
+    assert left.outlier.sd_without_deg_per_step == pytest.approx(np.std(rest, ddof=1), abs=ROUNDING_DEG)
+    assert left.outlier.mean_without_deg_per_step == pytest.approx(np.mean(rest), abs=ROUNDING_DEG)
+    # Another one, reversed as most are: named, without a reason.
+    moved = [*angles[1:6], angles[0], *angles[6:]]
+    left = classic(make_campaign([("pan", 200, 10.0, 10.0 + d) for d in moved])).directions["left"]
+    assert left.outlier.experiment == 5 and left.outlier.play_alone is None
+    # An ordinary scatter has none.
+    even = classic(make_campaign([("pan", 200, 10.0, 22.0 + d) for d in SCATTER_DEG])).directions["left"]
+    assert even.outlier is None
+
+
 def test_one_experiment_has_a_mean_and_no_sd():
     """With n = 1, what needs two experiments is null, never NaN."""
     document = classic(make_campaign([("tilt", 100, 0.0, 7.0)], calibration_covariance())).as_json()

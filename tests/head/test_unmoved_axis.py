@@ -98,7 +98,7 @@ def test_plans_leave_the_unmoved_axis_where_it_is(ask, fitted, tmp_path, purpose
     assert len({step.pan_steps for step in steps if step.action == "move"}) >= 2
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_every_command_answers(ask, fitted, tmp_path):
     write_campaign(head(seed=9), tmp_path / "fresh")
     assert ask("report", fitted)[0] == 0

@@ -43,7 +43,7 @@ def imported(path, folder):
     return refused
 
 
-@few(200)
+@few(80)
 @given(damaged(FILES))
 def test_damaged_files_are_read_or_refused(tmp_path_factory, case):
     _, data = case
@@ -69,7 +69,7 @@ MAXIM = {name: float(number) for name, _, number in (text.partition("=") for tex
 """Short logs of guiders: most edits fall into their headers."""
 
 
-@few(400)
+@few(120)
 @given(damaged({name: text.encode() for name, text in GUIDES.items()}))
 def test_damaged_guide_logs_are_read_or_refused(tmp_path_factory, case):
     """What is written can be read."""

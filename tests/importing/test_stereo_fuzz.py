@@ -34,7 +34,7 @@ def refused_or_read(paths: list[Path]) -> bool:
     return False
 
 
-@few(120)
+@few(60)
 @given(damaged({name: (FOREIGN / name).read_bytes() for name in SAMPLES}))
 def test_damaged_files_are_read_or_refused(tmp_path_factory, case):
     name, data = case

@@ -94,7 +94,7 @@ def test_absurd_numbers_are_refused_by_their_line(old, new):
     assert refused.value.line == line and refused.value.remedy
 
 
-@few(120)
+@few(60)
 @given(damaged({"unit.urdf": UNIT}))
 def test_damaged_files_are_heads_or_refused(case):
     """A head is written back as the same head."""

@@ -29,6 +29,19 @@ def test_plan_round_trip(tmp_path):
     assert read_plan(tmp_path / "plan.csv") == PLAN  # home counters default to 0
 
 
+def test_a_plan_states_its_target_in_the_first_row(tmp_path):
+    """Plans without a target have no such column; it stands behind those by which readers know a plan."""
+    path, text = tmp_path / "plan.csv", "u(left) <= 1e-4 deg/step"
+    stated = (dataclasses.replace(PLAN[0], made_for=text), *PLAN[1:])
+    write_plan(stated, path)
+    assert read_plan(path) == stated and path.read_text().splitlines()[0].endswith("point,made_for")
+    require_own(path, "plan")
+    with pytest.raises(InputError, match=r"made_for.*first row only"):
+        write_plan((PLAN[0], dataclasses.replace(PLAN[1], made_for=text), *PLAN[2:]), path)
+    write_plan(PLAN, path)
+    assert "made_for" not in path.read_text()
+
+
 def test_a_plan_is_known_by_its_columns_and_lines_are_counted_with_remarks(tmp_path):
     path = tmp_path / "plan.csv"
     write_plan(PLAN, path)

@@ -9,7 +9,7 @@ import pytest
 from support.coarse_planning import ROUNDING, with_priors
 
 from tvsbayes.instrument.parameters import INDEX, Prior
-from tvsbayes.planning.drawn_rigs import draw_instruments, instruments_in
+from tvsbayes.planning.drawn_rigs import BUILD_NAMES, alike, draw_instruments, instruments_in
 from tvsbayes.planning.expectation import prior_knowledge
 from tvsbayes.twin.true_rig import draw_truth
 
@@ -47,3 +47,15 @@ def test_after_data_instruments_are_drawn_from_the_posterior(knowledge):
     z = draw_instruments(known, 400, seed=3).z
     assert np.abs(z.mean(axis=0) - 0.5).max() < 5 * 0.5 / 20
     assert z.std() == pytest.approx(0.5, rel=4 / np.sqrt(2 * z.size))
+
+
+def test_the_next_of_a_build_has_its_play_and_scatter_and_gears_of_its_own(mounted_rig, knowledge):
+    """Of another that is known to a hundredth of each prior, half of it off; all else as drawn without it."""
+    known = replace(knowledge, after_data=True, z=knowledge.z + 0.5, precision=1e4 * knowledge.precision)
+    like, plain = draw_instruments(alike(knowledge, known), 30, seed=3), draw_instruments(knowledge, 30, seed=3)
+    build = [INDEX[name] for name in BUILD_NAMES if np.asarray(knowledge.space.u)[INDEX[name]] > 0]
+    assert np.abs(like.z[:, build] - 0.5).max() < 5 * 0.01
+    assert plain.z[:, build].std() > 0.5
+    ratio = INDEX["degrees_per_step.pan"]
+    assert like.z[:, ratio].std() > 0.5 and abs(like.z[:, ratio].mean()) < 5 / np.sqrt(30)
+    assert np.array_equal(alike(knowledge, known).precision, knowledge.precision)

@@ -16,7 +16,6 @@ from tvsbayes.report import figures
 from tvsbayes.report.drawing import WIDTH_IN
 from tvsbayes.report.figures import (
     direction_scatter,
-    direction_scatters,
     intervals,
     points_3d,
     ratio_curves,
@@ -107,12 +106,11 @@ def test_no_text_of_the_ratios_is_cut_or_covers_points(evidence):
     places = (0.0, 5.0, 9.0)
     along = {a: tuple(CurvePoint(x, x, **dict.fromkeys(pair, at)) for x in places) for a, pair in SENSES.items()}
     curves = ratio_curves(Curves(along, {}))
-    for figure in (direction_scatters(classic(evidence.campaign), evidence.fit.summary), curves):
+    for figure in (direction_scatter(classic(evidence.campaign), "left"), curves):
         # The layout is found by drawing.
         FigureCanvasAgg(figure).draw()
         assert [axes for axes in figure.axes if axes.get_legend()] == []
         texts = [text for axes in figure.axes for text in (axes.xaxis.label, axes.title) if text.get_text()]
-        texts += [text for text in (figure._supxlabel,) if text is not None]
         for box in (text.get_window_extent() for text in texts):
             assert 0 <= box.x0 and box.x1 <= figure.bbox.x1
     (legend,) = curves.legends

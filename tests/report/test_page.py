@@ -20,6 +20,7 @@ from support.reported_twin import PLANNED, Nodes, evidence_of, first_words, repo
 from support.small_results import estimate
 
 from tvsbayes.errors import InputError
+from tvsbayes.estimators.four_point import Outlier
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
@@ -117,6 +118,21 @@ def test_numbers_of_the_page_are_those_of_the_libraries(page, evidence):
     (missed,) = (c for c in evidence.criteria if c.verdict == "not met")
     chance = chance_text(missed.probability)
     assert f"Not met: {missed.quantity} within 1 mm (probability {chance})" in text
+
+
+def test_the_papers_table_and_figures_are_on_the_page(page, evidence, no_pictures):
+    """Table 1 (n, mean, sd, type A), Figures 11 to 16 one by one, and the experiment that makes an sd."""
+    text = words(page)
+    for direction, result in evidence.classic.directions.items():
+        spread = f"{result.sd_deg_per_step:.6f} {result.u_type_a_deg_per_step:.6f}"
+        assert f"{direction} {result.n} {result.mean_deg_per_step:.6f} {spread}" in text
+    assert [text.count(f"Figure {number}") for number in range(11, 17)] == [1] * 6
+    left = evidence.classic.directions["left"]
+    outlier = Outlier(1, 0.0644, 1e-6, 0.0602, 1.8e-4, "cleared")
+    directions = evidence.classic.directions | {"left": structs.replace(left, outlier=outlier)}
+    made = words(report_html(replace(evidence, classic=structs.replace(evidence.classic, directions=directions))))
+    assert "Experiment 1 (left) with 0.064400 deg/step makes the sd" in made and "they lost no play" in made
+    assert "makes the sd" not in text
 
 
 def test_the_first_page_has_results_and_customer(page, evidence, no_pictures):

@@ -19,6 +19,7 @@ from tvsbayes.statistics.intervals import (
     Validation,
     coverage_factor,
     effective_dof,
+    grubbs_p,
     numerical_tolerance,
     symmetric_interval,
     validate,
@@ -418,3 +419,20 @@ def test_digits_held_are_the_most_whose_tolerance_holds_the_deviation():
         verdict = judge(0.5 * x + shift, 0.5 * x, 0.0, 0.5)
         ends[shift] = int(verdict.digits_held(np.array([0.5]))[0])
     assert ends == {0.0: 2, 0.0049: 2, 0.0051: 1, 0.049: 1, 0.051: 0}
+
+
+@pytest.mark.parametrize(("n", "critical"), [(5, 1.764), (10, 2.482), (24, 3.112)])
+def test_grubbs_p_at_the_published_critical_values(n, critical):
+    """ISO 5725-2, table 5, one outlying value at 1 %: digits of the table are 2e-4 of p."""
+    rest = np.linspace(-1.0, 1.0, n - 1)
+
+    def values(far):
+        return np.append(rest, far)
+
+    def excess(far):
+        all_values = values(far)
+        return np.max(np.abs(all_values - all_values.mean())) / np.std(all_values, ddof=1) - critical
+
+    assert grubbs_p(values(optimize.brentq(excess, 1.0, 1e3))) == pytest.approx(0.01, abs=2e-4)
+    assert grubbs_p(np.ones(4)) == grubbs_p(np.array([1.0, 2.0])) == 1.0
+    assert grubbs_p(np.array([1.0, 1.0, 1.0, 2.0])) < 1e-6, "equal but for one"

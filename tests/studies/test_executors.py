@@ -15,7 +15,7 @@ import pytest
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.studies.executors import SINGLE_THREADED, made_rows
+from tvsbayes.studies.executors import LOOKED_AFTER_S, SINGLE_THREADED, made_rows
 
 
 class KilledWorker(Exception):
@@ -31,10 +31,14 @@ class Pool:
 
     def __init__(self, lost: BaseException):
         self.lost, self.threads, self.ended = lost, "", False
+        self.workers: dict[str, object] = {}
 
     def submit(self, function, job, index):
         self.threads = os.environ["NPROC"]
         future: Future = Future()
+        if index == 7:
+            # Its worker has died, and no other takes it.
+            return future
         if index == 5:
             future.set_result({"index": index})
         else:
@@ -65,7 +69,17 @@ def pool_of(engine: str, lost: BaseException, monkeypatch) -> Pool:
         def submit(self, *order, **options):
             return pool.submit(*order)
 
-    members = {"Client": Client, "LocalCluster": nullcontext, "KilledWorker": KilledWorker, "as_completed": iter}
+        def scheduler_info(self):
+            return {"workers": pool.workers}
+
+    def wait(pending, *, timeout, return_when):
+        assert timeout == LOOKED_AFTER_S and return_when == "FIRST_COMPLETED"
+        done = {future for future in pending if future.done()}
+        if not done:
+            raise TimeoutError
+        return SimpleNamespace(done=done)
+
+    members = {"Client": Client, "LocalCluster": nullcontext, "KilledWorker": KilledWorker, "wait": wait}
     monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(**members))
     monkeypatch.setitem(sys.modules, "distributed.comm", SimpleNamespace(CommClosedError=CommClosedError))
     return pool
@@ -95,6 +109,17 @@ def test_dead_workers_are_reported_with_a_remedy(job, monkeypatch, engine, lost,
         list(made_rows(job, [5, 3], engine, 1, "tcp://scheduler:8786"))
     assert error.value.code == "worker-died" and "run the same command again" in error.value.remedy
     assert pool.ended and {name: os.environ.get(name) for name in SINGLE_THREADED} == before
+
+
+def test_a_cluster_without_workers_is_said(job, monkeypatch):
+    """Dask itself would wait forever; rows made before are given out."""
+    pool = pool_of("dask", KilledWorker("none"), monkeypatch)
+    monkeypatch.setattr("tvsbayes.studies.executors.NO_WORKER_S", 0.0)
+    rows = made_rows(job, [5, 7], "dask", 1, "tcp://scheduler:8786")
+    assert next(rows) == {"index": 5}
+    with pytest.raises(TvsError, match=r"had no worker.*finished rows are kept"):
+        next(rows)
+    assert pool.ended
 
 
 @pytest.mark.parametrize("engine", ["processes", "dask"])

@@ -52,6 +52,17 @@ def test_the_progress_callback_may_end_a_study_and_loses_no_row(job, quick, tmp_
     assert whole == study(job, 9, StudyRows(tmp_path / "other.jsonl"))
 
 
+def test_a_study_that_does_not_fit_the_time_says_how_many_ran(job, quick, tmp_path):
+    """At least one row each time; the same command goes on, and ends as the whole study."""
+    short = study(job, 9, StudyRows(tmp_path / "rows.jsonl"), max_minutes=0.0)
+    assert (short.campaigns, short.asked, quick) == (1, 9, [0])
+    assert "1 of 9 simulated campaigns" in study_text(short) and "the same command goes on" in study_text(short)
+    study(job, 9, StudyRows(tmp_path / "rows.jsonl"), max_minutes=0.0)
+    whole = study(job, 9, StudyRows(tmp_path / "rows.jsonl"), max_minutes=60.0)
+    assert quick == list(range(9)) and whole == study(job, 9, StudyRows(tmp_path / "other.jsonl"))
+    assert "stopped" not in study_text(whole)
+
+
 def test_counts_of_a_perfect_estimator_are_within_bounds_and_of_a_boastful_one_outside(job):
     rows = [invented(job, i) for i in range(400)]
     result = study_result(job, rows)

@@ -32,6 +32,7 @@ def small_searches():
             patch.setattr(f"tvsbayes.planning.candidates.{name}", value)
         patch.setattr("tvsbayes.planning.candidates.VISIBILITY_DRAWS", 8)
         patch.setattr("tvsbayes.planning.forecast.CLASSIC_DRAWS", 5)
+        patch.setattr("tvsbayes.planning.planner.BASELINE_DRAWS", 3)
         patch.setitem(planner.plan.__kwdefaults__, "largest", 8)
         yield
 

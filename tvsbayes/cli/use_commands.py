@@ -35,7 +35,7 @@ from tvsbayes.cli.compensation_commands import EXPORTS, export_calibration, plan
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
-from tvsbayes.errors import InputError, escaped
+from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import output_place
 from tvsbayes.instrument.axes import AXES, sides_of
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
@@ -258,6 +258,9 @@ def plan(
         Path | None, typer.Argument(metavar="RIG", help="Rig file; none with an axis folder; CAMPAIGN with --watch.")
     ] = None,
     given: Annotated[Path | None, typer.Option("--given", help="Existing campaign: plan what to measure next.")] = None,
+    like: Annotated[
+        Path | None, typer.Option("--like", help="Campaign of a rig of the same build: plan for the next one.")
+    ] = None,
     target: TargetText = None,
     minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the plan here (plan.csv).")] = None,
@@ -288,6 +291,7 @@ def plan(
     finite(minutes=minutes, confirm=confirm)
     # Further options of a plan for a target.
     extra: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}
+    extra["like"] = like
     onward = {"next": count, "confirm": confirm}
     if verify:
         refused: dict[str, object] = {"target": target, "minutes": minutes, "watch": watch, **extra, **onward}
@@ -308,7 +312,12 @@ def plan(
     from tvsbayes.instrument.plan import write_plan
     from tvsbayes.instrument.rig import read_rig
 
-    instrument, data = read_rig(rig), None if given is None else read_campaign(given)
+    if given is not None:
+        refuse_options("for a rig without data, not for --given", "leave one of them out", like=like)
+    instrument, data = read_rig(rig), None if (known := given or like) is None else read_campaign(known)
+    if data is not None and data.rig.mechanism != instrument.table.mechanism:
+        message = f"{escaped(str(known), 200)} is the campaign of another mechanism than {escaped(str(rig), 200)}"
+        raise InputError("usage", message, remedy="name a campaign of the same mechanism")
     from tvsbayes.planning.planner import plan as find_plan
     from tvsbayes.planning.search import CRITERIA
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
@@ -318,7 +327,7 @@ def plan(
     parsed_target = parse_target(target or DEFAULT_TARGET)
     if count is not None:
         refuse_options("for whole plans, not for --next", "leave it out", **extra, minutes=minutes, out=out)
-        _next_looks(instrument, data, parsed_target, count, confirm, as_json)
+        _next_looks(instrument, data if given else None, parsed_target, count, confirm, as_json)
         return
     refuse_options("for --next", "add --next, or leave it out", confirm=confirm)
     if criterion not in CRITERIA:
@@ -330,7 +339,8 @@ def plan(
         result = find_plan(
             instrument,
             parsed_target,
-            given=fitted,
+            given=fitted if given else None,
+            like=None if given else fitted,
             minutes=minutes,
             criterion=criterion,
             aperture=aperture,
@@ -345,6 +355,9 @@ def plan(
         text += f"\nwritten: {escaped(str(out), 200)}"
     elif out is not None:
         text += f"\nnothing written to {escaped(str(out), 200)}: there is nothing more to measure"
+    if like is not None:
+        document["like"] = str(like)
+        text = f"instruments like that of {escaped(str(like), 200)}: its play, scatter, drift and place\n{text}"
     if data is not None and given is not None:
         # The report reads the next looks from this file.
         keep(plan_document(document, input_hashes(data)), output_place(given, "results") / "plan.json")
@@ -392,6 +405,9 @@ def study(
         str, typer.Option("--estimator", help="importance (the posterior), or laplace, in half the time.")
     ] = "importance",
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0.01, help="Stop after so long; the same command goes on.")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -399,6 +415,7 @@ def study(
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
+    finite(max_minutes=max_minutes)
     if engine == "serial":
         refuse_options(
             "for engines with workers", "add --engine processes or dask", workers=workers, scheduler=scheduler
@@ -410,7 +427,6 @@ def study(
     check_order(rig, plan_file)
     instrument = read_rig(rig)
     steps = read_plan(plan_file, instrument.table.mechanism)
-    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
     from tvsbayes.statistics.chances import ASSURED
     from tvsbayes.studies.executors import require_engine
@@ -423,21 +439,40 @@ def study(
         allowed = " and ".join(ESTIMATORS)
         raise InputError("usage", f"--estimator {escaped(estimator)}: allowed are {allowed}", remedy="choose one")
     compile_for(report_line)
-    job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture, estimator)
+    job = StudyJob(instrument, steps, _target_of_study(target, steps[0].made_for, plan_file), seed, aperture, estimator)
     stored = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
     if damaged := stored.damaged(job.key):
         lines = ", ".join(map(str, damaged))
         report_line(f"warning: {escaped(str(stored.path), 200)}: not as study wrote it, made again: line {lines}")
     missing = n - sum(index < n for index in stored.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(stored.path), 200)}")
-    with waiting("every campaign that is done is kept; the same command goes on from there") as progress:
-        result = run_study(
-            job, n, stored, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
-        )
+    where = {"engine": engine, "workers": workers or WORKERS, "address": scheduler}
+    try:
+        with waiting() as progress:
+            result = run_study(job, n, stored, **where, max_minutes=max_minutes, progress=progress)
+    except (KeyboardInterrupt, InputError):
+        ran = sum(index < n for index in stored.of(job.key))
+        report_line(f"{ran} of {n} campaigns ran and are kept; the same command goes on from there")
+        raise
     document = {**result.as_json(), "rows": str(stored.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:
         raise Ended(TARGET_MISSED)
+
+
+def _target_of_study(target: str | None, made_for: str, plan_file: Path) -> Target:
+    """The stated target, that which the plan was made for, or the default."""
+    from tvsbayes.planning.target import DEFAULT_TARGET, TARGET_FORMS, parse_target
+
+    if target is not None or not made_for:
+        return parse_target(target or DEFAULT_TARGET)
+    report_line(f"target, from {escaped(plan_file.name, 200)}: {escaped(made_for, 200)}")
+    try:
+        return parse_target(made_for)
+    except InputError as error:
+        file, remedy = escaped(plan_file.name, 200), "state another with --target, or empty the cell"
+        found = {"found": escaped(made_for, 120), "allowed": TARGET_FORMS}
+        raise refusal("target", file=file, column="made_for", **found, remedy=remedy) from error
 
 
 def _limits(path: Path) -> dict[str, tuple[float, float]]:

@@ -23,11 +23,14 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign, Look, Move, ordered_spots, pixels_of
 from tvsbayes.instrument.experiments import experiments_of, name_of, rank
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
+from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.records import Record
-from tvsbayes.statistics.intervals import coverage_factor, effective_dof
+from tvsbayes.statistics.intervals import coverage_factor, effective_dof, grubbs_p
 
 PROBE_PX = 0.01
 """Step of the ratios' derivatives: far above rounding (1e-9 px), far below curvature (10 px)."""
+OUTLIER_LEVEL = 0.01
+"""Level of the test for an experiment that makes the sd (an outlier of ISO 5725-2, 7.3.4)."""
 STEP_HALVINGS = 40
 """Largest number of halvings of a difference quotient's step, until both ends lie in the lens model: 1e-13 sd."""
 
@@ -97,6 +100,21 @@ class Selection:
         return np.where(self.axis == "tilt", tilt, pan)
 
 
+class Outlier(Record, frozen=True):
+    """The experiment that makes a direction's sd, `p` by Grubbs' test, and the others' results without it.
+
+    `play_alone` is how its first beam was approached, where all others were approached otherwise: "cleared" (by a
+    move in the direction of its steps, which then lose no play), "reversed", "unknown"; None where others were so too.
+    """
+
+    experiment: int
+    deg_per_step: float
+    p: float
+    mean_without_deg_per_step: float
+    sd_without_deg_per_step: float
+    play_alone: str | None
+
+
 class DirectionResult(Record, frozen=True):
     """Mean of one direction's experiments, deg/step, with type A and GUM uncertainty.
 
@@ -114,6 +132,7 @@ class DirectionResult(Record, frozen=True):
     interval95_gum: tuple[float, float] | None
     u_stereo_deg_per_step: float
     effective_dof: float | None
+    outlier: Outlier | None = None
 
 
 class ClassicResult(Shown, Record, frozen=True):
@@ -346,7 +365,35 @@ def _direction(campaign: Campaign, selection: Selection, rows: np.ndarray, ratio
         interval95_gum=_interval(average, gum, dof),
         u_stereo_deg_per_step=type_b,
         effective_dof=dof if math.isfinite(dof) else None,
+        outlier=_outlier(campaign, selection, rows, ratios),
     )
+
+
+def _outlier(campaign: Campaign, selection: Selection, rows: np.ndarray, ratios: np.ndarray) -> Outlier | None:
+    far = int(np.argmax(np.abs(ratios - np.mean(ratios))))
+    p = grubbs_p(ratios)
+    if p >= OUTLIER_LEVEL:
+        return None
+    others = np.delete(ratios, far)
+    play = _play_before(campaign, selection, rows)
+    return Outlier(
+        experiment=int(selection.experiments[rows[far]]),
+        deg_per_step=float(ratios[far]),
+        p=p,
+        mean_without_deg_per_step=float(np.mean(others)),
+        sd_without_deg_per_step=float(np.std(others, ddof=1)),
+        play_alone=play[far] if play.count(play[far]) == 1 else None,
+    )
+
+
+def _play_before(campaign: Campaign, selection: Selection, rows: np.ndarray) -> list[str]:
+    """How the moved axis approached the first beam of each experiment, as against its steps."""
+    rests = {axis: rests_of(campaign.moves, axis) for axis in AXES}
+    row_of = {move.move: row for row, move in enumerate(campaign.moves)}
+    names = {1: "cleared", -1: "reversed", 0: "unknown"}
+    looks = [campaign.spots[selection.spot_rows[row][1]] for row in rows]
+    signs = [rests[selection.axis[row]][row_of[look.move]].sign for row, look in zip(rows, looks, strict=True)]
+    return [names[int(sign * np.sign(selection.steps[row]))] for row, sign in zip(rows, signs, strict=True)]
 
 
 def _interval(mean: float, u: float, dof: float) -> tuple[float, float]:

@@ -46,6 +46,9 @@ class PlanStep:
     target: Annotated[str, Column("name of a sheet of the rig file, or empty")] = ""
     experiment: Annotated[int | None, Column("of the four-point method: number, and 1 to 4; both or neither")] = None
     point: Annotated[int | None, Column("", 1, 4)] = None
+    made_for: Annotated[
+        str, Column("optional, in the first row: the target of the plan; `study` judges by it", group="made_for")
+    ] = ""
 
     def counters(self, start: tuple[int, int]) -> tuple[int, int]:
         """Counters (pan, tilt) after this step, for axes at `start` before it."""
@@ -77,6 +80,8 @@ def _check_actions(table: Table, values: Values, unplaced: bool) -> None:
         if action not in (_PLAN_ACTIONS if row else ("home",)):
             allowed = "home, place, move or look" if row else "home, the first action"
             raise table.refuse(row, "action", "action", allowed, "begin with home; one action per row")
+        if row and values["made_for"][row]:
+            raise table.refuse(row, "made_for", "action", "a target in the first row only", "empty the cell")
         filled, empty = _PLAN_ACTIONS[action]
         for column in (*filled, *empty):
             if bool(table.columns[column][row]) != (column in filled):

@@ -61,6 +61,8 @@ def judged_z(
         Shape (n, p).
     """
     z, u = instruments.z.copy(), np.asarray(knowledge.space.u)
+    # A fit of the next instrument of a build has the priors of the rig file, wherever the plan expects it.
+    centre = knowledge.z if knowledge.after_data else np.zeros(PARAMETERS)
     times_seen = seen.seen * np.bincount(picks, minlength=len(side))
     looks = np.maximum(times_seen.sum(axis=1), 1)
     rig_columns = np.ones(knowledge.size, dtype=bool)
@@ -73,7 +75,7 @@ def judged_z(
     def estimate(column: int, information: np.ndarray, normal: np.ndarray) -> None:
         information = information * u[column] ** 2 * residual_share
         prior_precision = precision[column]
-        mean = prior_precision * knowledge.z[column] + information * z[:, column] + np.sqrt(information) * normal
+        mean = prior_precision * centre[column] + information * z[:, column] + np.sqrt(information) * normal
         # ln s = u z: the root of E s^2 lies u^2 times the variance of z above the median.
         z[:, column] = (mean + u[column]) / (prior_precision + information)
 

@@ -1,4 +1,4 @@
-"""Possible instruments: drawn from `[truth]` of the rig file, or from the posterior of a campaign."""
+"""Possible instruments: drawn from `[truth]` of the rig file, the posterior of a campaign, or like that of another."""
 
 from __future__ import annotations
 
@@ -7,12 +7,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.instrument.stereo_pair import stereo_parameters
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge
 from tvsbayes.statistics.streams import Stream, random_stream
-from tvsbayes.twin.true_rig import Truth, draw_truth
+from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
+
+BUILD_NAMES = names_of(
+    *("backlash_deg", "stop_sd_deg", "look_scatter_deg", "pixel_scale", "transmission_error_deg"),
+    *("transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg"),
+    *("extrinsics.rotation_rad", "extrinsics.translation_mm"),
+)
+"""What a rig shares with another of its build: play, scatter, sizes of gear errors and drift, and where it stands."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,8 @@ def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments
 
 def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
     """Draw coordinates of possible instruments, shape (count, p)."""
+    if knowledge.like is not None:
+        return _drawn_alike(knowledge, knowledge.like, count, generator).z
     root = np.linalg.cholesky(knowledge.covariance[:PARAMETERS, :PARAMETERS])
     return knowledge.z + generator.standard_normal((count, PARAMETERS)) @ root.T
 
@@ -69,8 +79,35 @@ def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -
 def draw_instruments(knowledge: Knowledge, count: int, seed: int) -> Instruments:
     """Draw instruments from `[truth]` of the rig file (the design prior), or from the posterior of a campaign."""
     generator = random_stream(seed, Stream.INSTRUMENTS)
+    if knowledge.like is not None:
+        return _drawn_alike(knowledge, knowledge.like, count, generator)
     if knowledge.after_data:
         z = draws_of(knowledge, count, generator)
         value = np.asarray(knowledge.space.value)
         return Instruments.at(z, np.broadcast_to(value, (count, len(value))), knowledge.space)
     return instruments_in(knowledge, [draw_truth(knowledge.rig, generator) for _ in range(count)])
+
+
+def alike(knowledge: Knowledge, like: Knowledge) -> Knowledge:
+    """Plan for the next instrument of a build: `BUILD_NAMES` as another's campaign found them, the priors unchanged.
+
+    Args:
+        knowledge: the priors of the next one.
+        like: the other one after its campaign.
+    """
+    found = np.asarray(physical_at(like.z, like.space).value)
+    centre = np.array(physical_at(knowledge.z, knowledge.space).value)
+    build = [INDEX[name] for name in BUILD_NAMES]
+    centre[build] = found[build]
+    return replace(knowledge, z=coordinates_of(knowledge.space, centre), like=like)
+
+
+def _drawn_alike(knowledge: Knowledge, like: Knowledge, count: int, generator: np.random.Generator) -> Instruments:
+    """Draw instruments whose build is drawn from the other's posterior, and the rest from `[truth]`."""
+    names = set(knowledge.rig.table.mechanism.rig_names).intersection(BUILD_NAMES)
+    truths = []
+    for z in draws_of(like, count, generator):
+        found, truth = physical_at(z, like.space).value, draw_truth(knowledge.rig, generator)
+        build = {name: float(found[INDEX[name]]) for name in names}
+        truths.append(replace(truth, parameters=with_derived({**truth.parameters, **build})))
+    return instruments_in(knowledge, truths)

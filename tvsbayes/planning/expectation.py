@@ -76,6 +76,7 @@ class Knowledge:
         gears: counters with coordinates for repeated errors of the gears, see `with_gears`.
         warm_minutes: time since power-on of looks that continue a campaign.
         made: lowest and highest counter by axis that a campaign made; None without one.
+        like: knowledge of an instrument of the same build, see `alike`.
         errors_of_fit: estimate of errors by a fit at its own places.
     """
 
@@ -88,6 +89,7 @@ class Knowledge:
     errors_of_fit: FittedErrors | None = None
     warm_minutes: float = 0.0
     made: Mapping[str, tuple[int, int]] | None = None
+    like: Knowledge | None = None
 
     @property
     def size(self) -> int:

@@ -196,6 +196,8 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
     if not limit.reachable:
         reason = f"no number of looks meets the target: the floor is {limit.floor:.3g} {target.unit}"
         return Advice(after_data, reason if after_data else f"{reason}; measure if that suffices", rule)
+    if not after_data:
+        return Advice(False, f"nothing is measured yet; {value} by the priors", rule)
     if best < least_gain:
         return Advice(True, f"the best next four looks lower {value} by only {best:.2g} {target.unit} a minute", rule)
     return Advice(False, f"{value} now; the best next four looks lower it by {best:.2g} {target.unit} a minute", rule)

@@ -6,11 +6,12 @@ Values in the target's unit, minutes by the rig's `[costs]`; an experiment is fo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from msgspec import structs
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NotConverged
@@ -21,9 +22,9 @@ from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
-from tvsbayes.planning.assurance import Assurance, Family
+from tvsbayes.planning.assurance import Assurance, Family, instrument_gears
 from tvsbayes.planning.candidates import candidates
-from tvsbayes.planning.drawn_rigs import draw_instruments
+from tvsbayes.planning.drawn_rigs import Instruments, alike, draw_instruments
 from tvsbayes.planning.expectation import (
     Expectation,
     Knowledge,
@@ -42,7 +43,7 @@ from tvsbayes.planning.forecast import (
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, Looks, covariance_of, looks_wait
 from tvsbayes.planning.plan_check import JUDGING, judge, judging_seconds
-from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family, refine, smallest_design
+from tvsbayes.planning.search import LADDER, DesignProblem, Refined, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.plan_record import Advice, Batch
@@ -69,13 +70,16 @@ class CurveRow(Record, frozen=True):
 
 
 class Baseline(Record, frozen=True):
-    """A known protocol, or the planned one, evaluated in the same way at the most probable instrument."""
+    """A known protocol, or the planned one: medians over drawn instruments of looks in view and of the target.
+
+    `joint` is None where most instruments see no look.
+    """
 
     name: str
     spots: int
     seen: int
     minutes: float
-    joint: float
+    joint: float | None
 
 
 class PlanResult(Shown, Record, frozen=True, kw_only=True, rename={"limit": "limited_by", "shares": "variance_shares"}):
@@ -83,14 +87,16 @@ class PlanResult(Shown, Record, frozen=True, kw_only=True, rename={"limit": "lim
 
     Attributes:
         target: target of the plan.
-        experiments, looks, minutes: its size.
-        expected: the target's value after it at the most probable instrument; `now`: before it.
+        experiments, looks, minutes: its size; an experiment is four looks.
+        now: the target's value before it, at the most probable instrument.
+        expected: its median after it over drawn instruments, as in the row of the curve and the first of `baselines`;
+            None where most instruments see no look.
         assurance, assurance_se: probability that its fit reports the target as met, and its Monte Carlo error; None
             where the target is met already.
         curve: results by number of experiments.
         n80, n95: experiments for which the assurance is 80 % and 95 %, None if none.
         baselines: the plan and other protocols.
-        next: possible next experiments, best first.
+        next: possible next experiments, best first; none before any data.
         stop: the stopping rule applied now.
         classic: the four-point method's own number of experiments, None for quantities that it does not estimate.
         met: the target is met already, or the plan meets it with an assurance of 80 %.
@@ -106,7 +112,7 @@ class PlanResult(Shown, Record, frozen=True, kw_only=True, rename={"limit": "lim
     looks: int
     minutes: float
     now: float
-    expected: float
+    expected: float | None
     assurance: float | None
     assurance_se: float | None
     curve: tuple[CurveRow, ...]
@@ -135,9 +141,15 @@ class PlanResult(Shown, Record, frozen=True, kw_only=True, rename={"limit": "lim
 
 
 PLAN_DRAWS = 200
+BASELINE_DRAWS = 20
+"""Drawn instruments at which other protocols are evaluated, move by move."""
+IN_VIEW = 0.9
+"""Share of the looks of a plan that half of the drawn instruments see at least, without a note."""
 
 
-def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None) -> list[Baseline]:
+def _baselines(
+    knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None, instruments: Instruments
+) -> list[Baseline]:
     """Evaluate the paper's protocol, its mixture of step counts and starts, and the grid, on this rig's sheets."""
     sheets = knowledge.sheets
     plans: dict[str, tuple[PlanStep, ...]] = {}
@@ -145,19 +157,33 @@ def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: n
         pair = sheets[0], sheets[1]
         plans = {"paper": paper_protocol(targets=pair), "mixed": mixed_protocol(targets=pair)}
     plans["grid"] = grid_protocol(targets=sheets[:3])
-    return [
-        baseline_of(name, information_of(steps, knowledge, aperture=aperture), knowledge, target, pose_rad)
-        for name, steps in plans.items()
+    places = [
+        replace(knowledge, z=z, space=instruments.space_of(row), gears=instrument_gears(knowledge, physical))
+        for row, (z, physical) in enumerate(
+            zip(instruments.z[:BASELINE_DRAWS], instruments.physical[:BASELINE_DRAWS], strict=True)
+        )
     ]
+    found = []
+    for name, steps in plans.items():
+        each = [baseline_of(name, information_of(steps, at, aperture=aperture), at, target, pose_rad) for at in places]
+        seen, joint = (float(np.median([getattr(one, key) for one in each])) for key in ("seen", "joint"))
+        found.append(structs.replace(each[0], seen=int(seen), joint=joint if math.isfinite(joint) else None))
+    return found
 
 
 def baseline_of(
     name: str, information: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
 ) -> Baseline:
-    """Evaluate a plan at the most probable instrument; ratios are at `pose_rad`, by default the plan's, as in a fit."""
+    """Evaluate a plan at one instrument; ratios are at `pose_rad`, by default the plan's, as in a fit.
+
+    The target is infinite where no beam of the instrument reaches the target's point.
+    """
     pose = information.pose_rad if pose_rad is None else pose_rad
-    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
-    value = at.value(covariance_of(knowledge.precision + information.fisher), target.factor)
+    try:
+        at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
+        value = at.value(covariance_of(knowledge.precision + information.fisher), target.factor)
+    except InputError:
+        value = math.inf
     in_view = int(information.expectation.seen.sum())
     return Baseline(name, len(information.look_moves), in_view, information.minutes, value)
 
@@ -167,6 +193,7 @@ def plan(
     target: Target,
     *,
     given: JointFit | None = None,
+    like: JointFit | None = None,
     minutes: float | None = None,
     criterion: str = "c",
     aperture: bool = False,
@@ -181,6 +208,7 @@ def plan(
         rig: sheets, limits, costs; its priors where there is no campaign.
         target: target of the plan.
         given: a fit of earlier data.
+        like: a fit of another instrument of the same build, whose play, scatter and place the next one is drawn with.
         minutes: the plan must not take longer.
         criterion: criterion of the search: "c" the target, "D" or "A" ratios and backlashes together.
         aperture: looks also read the aperture.
@@ -194,28 +222,31 @@ def plan(
 
     Raises:
         InputError: no sheet to look at, nothing in view, a point out of reach, too few minutes for one experiment.
-        NotConverged: `given` did not converge.
+        NotConverged: `given` or `like` did not converge.
     """
-    if given is not None and not given.converged:
-        raise NotConverged.of(given.problems, "see `tvsbayes fit`")
+    for known in (given, like):
+        if known is not None and not known.converged:
+            raise NotConverged.of(known.problems, "see `tvsbayes fit`")
     knowledge = prior_knowledge(rig) if given is None else knowledge_of(given, rig)
+    if like is not None:
+        knowledge = alike(knowledge, knowledge_of(like, rig))
     campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
     scope = Scope(criterion, aperture, largest, minutes)
     return plan_from(knowledge, target, campaign, pose, scope=scope, draws=draws, seed=seed, progress=progress)
 
 
 def _curve(
-    assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], sizes: Sequence[int]
+    assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], size: _Size, plan: Refined
 ) -> tuple[CurveRow, ...]:
-    """Compute results of up to n experiments, for each size.
+    """Compute results of up to n experiments, for each size; that of the plan has the plan's own looks.
 
     Noise scales estimated from few stops make values vary from size to size. A row states the best of all sizes up to
     its own, so that more experiments never appear worse. The best of several estimates has an optimistic bias.
     """
     target, draws = assurance.target, len(assurance.instruments)
     rows, best_value, best_share = [], math.inf, 0.0
-    for n in sorted(set(sizes)):
-        reported = assurance.values([n])[n]
+    for n in size.sizes:
+        reported = plan.reported if n == size.experiments else assurance.values([n])[n]
         best_value = min(best_value, float(np.median(reported)))
         best_share = max(best_share, float(np.mean(reported <= target.limit)))
         classic_value = value_of_classic(forecast, target, n)
@@ -281,17 +312,15 @@ def _durations(family: Family, scope: Scope) -> dict[int, float]:
 
 @dataclass(frozen=True)
 class _Size:
-    """Number of experiments: the curve, and the smallest numbers with an assurance of 80 % and 95 %."""
+    """Number of experiments, the sizes of the curve, and the smallest with an assurance of 80 % and 95 %."""
 
-    curve: tuple[CurveRow, ...]
+    sizes: tuple[int, ...]
     n80: int | None
     n95: int | None
     experiments: int
 
 
-def _size(
-    assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], advance: Advance
-) -> _Size:
+def _size(assurance: Assurance, durations: Mapping[int, float], advance: Advance) -> _Size:
     largest = max(durations)
     sizes = sorted({n for n in LADDER if n <= largest} | {largest})
     assurance.values(sizes, advance)
@@ -300,8 +329,8 @@ def _size(
         return smallest_design(lambda n: assurance.met_share(n) >= level, sizes)
 
     n80, n95 = map(smallest, ASSURED)
-    curve = _curve(assurance, forecast, durations, [*sizes, *(n for n in (n80, n95) if n)])
-    return _Size(curve, n80, n95, n95 or n80 or largest)
+    shown = sorted({*sizes, *(n for n in (n80, n95) if n)})
+    return _Size(tuple(shown), n80, n95, n95 or n80 or largest)
 
 
 LOOKING, CHOOSING = "looking from every place", "choosing looks"
@@ -354,41 +383,49 @@ def _plan_in_stages(
     job.begin(COUNTING)
     assurance = Assurance(family, target, draw_instruments(knowledge, draws, seed), seed)
     forecast = classic_forecast(knowledge, assurance.instruments)
-    size = _size(assurance, forecast, durations, job.at)
+    size = _size(assurance, durations, job.at)
     job.begin(EXCHANGING)
     refined = refine(family, problem, size.experiments, scope, assurance, job.at)
     job.begin(JUDGING)
     steps = refined.family.arranged(size.experiments).steps
     judgement = judge(steps, knowledge, aperture=scope.aperture)
-    planned = baseline_of("planned", judgement.information, knowledge, target, pose_rad)
-    share = float(np.mean(refined.reported <= target.limit))
+    curve = _curve(assurance, forecast, durations, size, refined)
+    row = next(row for row in curve if row.experiments == size.experiments)
+    looks = refined.family.looks(size.experiments)
+    in_view = LookArrays(looks, knowledge, scope.aperture).in_images(assurance.instruments.z).sum(axis=1)
+    planned = Baseline("planned", len(looks), int(np.median(in_view)), judgement.information.minutes, row.joint)
     largest_information = problem.information(family.picks, family.arranged(family.largest))
     limit = limit_of(knowledge, largest_information, problem.at_centre, target)
     pixel_information = _pixel_part(judgement.information.expectation)
-    batches = next_experiments(problem)
+    batches = next_experiments(problem) if knowledge.after_data else ()
     met_already = knowledge.after_data and problem.now <= target.limit
-    notes = few_looks(refined.family.looks(size.experiments), target)
+    notes = few_looks(looks, target)
+    if planned.seen < IN_VIEW * len(looks):
+        notes.append(
+            f"half of the drawn instruments see at most {planned.seen} of the {len(looks)} looks: state in [rig.prior] "
+            "and [truth] more closely where the positioner stands (extrinsics), or plan --like a campaign of that build"
+        )
     notes += [judgement.inseparable_text(axis) for axis in AXES if inseparable(judgement.exchange(axis))]
     return PlanResult(
         target=target,
-        steps=() if met_already else steps,
+        steps=() if met_already else (replace(steps[0], made_for=target.text), *steps[1:]),
         experiments=0 if met_already else size.experiments,
         looks=0 if met_already else len(refined.family.picks),
         minutes=0.0 if met_already else judgement.information.minutes,
         now=problem.now,
-        expected=problem.now if met_already else planned.joint,
-        assurance=None if met_already else share,
-        assurance_se=None if met_already else share_error(share, draws),
-        curve=size.curve,
+        expected=problem.now if met_already else row.joint,
+        assurance=None if met_already else row.assurance,
+        assurance_se=None if met_already else row.assurance_se,
+        curve=curve,
         n80=size.n80,
         n95=size.n95,
         limit=limit,
         shares=split_of(knowledge, judgement.information.fisher, pixel_information, problem.at_centre),
-        baselines=(planned, *_baselines(knowledge, target, scope.aperture, pose_rad)),
+        baselines=(planned, *_baselines(knowledge, target, scope.aperture, pose_rad, assurance.instruments)),
         next=batches,
         stop=stop_now(problem.now, target, limit, batches, knowledge.after_data),
         classic=classic_answer(target, forecast, campaign),
-        met=met_already or share >= ASSURED[0],
+        met=met_already or row.assurance >= ASSURED[0],
         notes=(*problem.candidates.notes, *([] if met_already else notes)),
         draws=draws,
         seed=seed,

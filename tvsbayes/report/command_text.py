@@ -131,30 +131,33 @@ def plan_text(result: PlanResult) -> str:
     """A plan as text."""
     unit = result.target.unit
     lines = [f"target: {result.target.text}; now {result.now:.3g} {unit}", ""]
-    lines.append("looks  minutes     classic       joint  chance of success")
+    lines.append("experiments  looks  minutes     classic       joint  chance of success")
     for p in _curve_shown(result):
         classic_value, joint = ("-" if value is None else f"{value:.3g}" for value in (p.classic, p.joint))
         lines.append(
-            f"{LOOKS_PER_EXPERIMENT * p.experiments:5d}  {p.minutes:7.1f}  {classic_value:>10}  {joint:>10}  "
-            f"{100 * p.assurance:6.0f} +- {100 * p.assurance_se:.1f} %"
+            f"{p.experiments:11d}  {LOOKS_PER_EXPERIMENT * p.experiments:5d}  {p.minutes:7.1f}  "
+            f"{classic_value:>10}  {joint:>10}  {100 * p.assurance:6.0f} +- {100 * p.assurance_se:.1f} %"
         )
     symbol = result.target.text.partition("(")[0]
-    lines.append(f"{symbol} in {unit}, medians over {result.draws} drawn instruments;")
+    lines.append(f"{symbol} in {unit}, medians over {result.draws} drawn instruments; an experiment is four looks;")
     lines.append("chance of success (assurance): that the fit of such a campaign reports the target as met")
-    lines.append("a row takes the first looks of the longest plan: few may leave a direction without a stop")
-    looks_max = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
+    lines.append("a row but the plan's takes the first looks of the longest: few may leave a direction without a stop")
+    largest = result.curve[-1].experiments
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
-        count = f"not reached with up to {looks_max} looks" if n is None else f"{LOOKS_PER_EXPERIMENT * n} looks"
+        count = f"not reached with up to {_size_text(largest)}" if n is None else _size_text(n)
         lines.append(f"for a chance of {100 * level:.0f} %: {count}")
     if result.assurance is None or result.assurance_se is None:
         lines.append("the target is met already: nothing is left to do")
     else:
         lines.append(
-            f"the plan: {result.looks} looks in {result.minutes:.1f} minutes; chance of success "
+            f"the plan: {_size_text(result.experiments)} in {result.minutes:.1f} minutes; chance of success "
             f"{100 * result.assurance:.0f} +- {100 * result.assurance_se:.1f} %"
         )
     lines += ["", f"{'plan':10}  spots  in view  minutes  expected {unit}"]
-    lines += [f"{b.name:10}  {b.spots:5d}  {b.seen:7d}  {b.minutes:7.1f}  {b.joint:.3g}" for b in result.baselines]
+    lines += [
+        f"{b.name:10}  {b.spots:5d}  {b.seen:7d}  {b.minutes:7.1f}  {'-' if b.joint is None else f'{b.joint:.3g}'}"
+        for b in result.baselines
+    ]
     shares = ", ".join(f"{name} {100 * s:.0f} %" for name, s in list(result.shares.items())[:5])
     lines += ["", f"after the plan the variance consists of: {shares}"]
     verdict = "lies below the target" if result.limit.reachable else "NO NUMBER OF LOOKS MEETS THE TARGET"
@@ -174,8 +177,12 @@ def plan_text(result: PlanResult) -> str:
     if result.next:
         lines.append("next four looks, best first:")
         lines += [f"  {b.gain_per_minute:.2g} {unit} a minute ({b.minutes:.1f} min): {b.text}" for b in result.next[:3]]
-    lines.append(f"{'STOP' if result.stop.now else 'go on'}: {result.stop.reason}; {result.stop.rule}")
+        lines.append(f"{'STOP' if result.stop.now else 'go on'}: {result.stop.reason}; {result.stop.rule}")
     return "\n".join(lines)
+
+
+def _size_text(experiments: int) -> str:
+    return f"{experiments} experiment{'s' * (experiments != 1)} ({LOOKS_PER_EXPERIMENT * experiments} looks)"
 
 
 def _curve_shown(result: PlanResult) -> list[CurveRow]:
@@ -440,7 +447,8 @@ def study_text(result: StudyResult) -> str:
         numbers = [f"{h.sd:.3g}", f"{h.rms_z:.2f}", f"{h.rms_predicted:.2f}", *shares, f"{h.power:.2f}"]
         rows.append([name, *numbers, "within" if h.within else "OUTSIDE"])
     columns = ["quantity", "median sd", "RMS z", "predicted", *(f"{100 * x:g} %" for x in LEVELS), "power", ""]
-    title = f"{result.campaigns} simulated campaigns, {n} fits converged ({made_by(result.estimator)}); "
+    ran = f"{result.campaigns}" if result.campaigns == result.asked else f"{result.campaigns} of {result.asked}"
+    title = f"{ran} simulated campaigns, {n} fits converged ({made_by(result.estimator)}); "
     lines: list[Part] = [TableView(f"{title}{result.seconds:.1f} s each", columns, rows)]
     a, b = result.assurance_interval95
     share = f"{100 * result.assurance:.1f} % of fits ({100 * a:.1f} to {100 * b:.1f} %)"
@@ -453,5 +461,7 @@ def study_text(result: StudyResult) -> str:
     )
     if result.reported is not None:
         lines.append("reported: {:.3g}, {:.3g}, {:.3g}".format(*result.reported) + f" {t.unit} (5, 50, 95 % of fits)")
+    if result.campaigns < result.asked:
+        lines.append(f"stopped: {ran} campaigns ran and are kept; the same command goes on from there")
     lines += [f"failed: {p}" for p in result.problems[:5]]
     return terminal(*lines)

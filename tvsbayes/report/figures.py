@@ -30,7 +30,6 @@ from tvsbayes.report.drawing import (
     SEQUENTIAL,
     SKY,
     SMALLEST_SHARE,
-    STYLE,
     colour_map,
     drawing,
     legend,
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
     from tvsbayes.results.estimates import Cause, Curves, Estimate, FitSummary, StopResidual
 
 __all__ = [
-    *("causes", "correlations", "coverage", "direction_scatter", "direction_scatters", "error_maps", "gap_terms"),
+    *("causes", "correlations", "coverage", "direction_scatter", "error_maps", "gap_terms"),
     *("intervals", "points_3d", "ratio_curves", "residuals", "setup", "shares", "trajectories"),
 ]
 
@@ -150,43 +149,30 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
     summary = result.directions[direction]
     if summary is None:
         raise ValueError(f"no complete experiment moves {direction}")
-    with drawing(3.2) as figure:
-        axes = figure.add_subplot()
-        _scatter(axes, result, direction, joint)
-        axes.set(xlabel=EXPERIMENT)
-        legend(figure, 3)
-    return figure
-
-
-def direction_scatters(result: ClassicResult, joint: FitSummary | None = None) -> Figure:
-    """Draw `direction_scatter` of all four directions in one figure."""
-    with drawing(5.2) as figure:
-        panels = figure.subplots(2, 2).ravel()
-        for axes, direction in zip(panels, DIRECTIONS, strict=True):
-            if result.directions[direction] is None:
-                axes.set(title=f"{direction}: no experiment")
-                continue
-            _scatter(axes, result, direction, None if joint is None else joint.effective[direction])
-        # One label for all: there is no room below each panel.
-        figure.supxlabel(EXPERIMENT, fontsize=STYLE["font.size"])
-    return figure
-
-
-def _scatter(axes: Axes, result: ClassicResult, direction: str, joint: Estimate | None) -> None:
-    """Draw one direction's experiments into a panel."""
-    summary = result.directions[direction]
-    assert summary is not None
     experiments = [e for e in result.experiments if e.direction == direction]
     mean, sd = summary.mean_deg_per_step, summary.sd_deg_per_step
-    if sd is not None:
-        for k, grey in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
-            axes.axhspan(mean - k * sd, mean + k * sd, color=grey, label=f"{k} sigma", zorder=0)
-    axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
-    if joint is not None:
-        label = f"joint {joint.value:.6f}, 2 u"
-        axes.errorbar(len(experiments) + 1.5, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
-    axes.plot(range(1, len(experiments) + 1), [e.deg_per_step for e in experiments], "^", color=BLACK, markersize=4)
-    axes.set(ylabel="deg/step", title=f"{direction}, n = {summary.n}")
+    with drawing(3.4) as figure:
+        axes = figure.add_subplot()
+        if sd is not None:
+            for k, grey in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
+                axes.axhspan(mean - k * sd, mean + k * sd, color=grey, label=f"{k} sigma", zorder=0)
+        axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
+        if joint is not None:
+            label = f"joint {joint.value:.6f}, 2 u"
+            last = len(experiments) + 1.5
+            axes.errorbar(last, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
+        axes.plot(range(1, len(experiments) + 1), [e.deg_per_step for e in experiments], "^", color=BLACK, markersize=4)
+        if (one := summary.outlier) is not None:
+            place = 1 + [e.experiment for e in experiments].index(one.experiment)
+            # Inwards, where there is room.
+            side = "left" if place <= len(experiments) / 2 else "right"
+            offset = (6 if side == "left" else -6, 0)
+            text, at = f"experiment {one.experiment}", (place, one.deg_per_step)
+            axes.annotate(text, at, offset, textcoords="offset points", ha=side, va="center")
+        scatter = "" if sd is None else f", sd {sd:.6f}, u of the mean {summary.u_type_a_deg_per_step:.6f}"
+        axes.set(xlabel=EXPERIMENT, ylabel="deg/step", title=f"{direction}, n = {summary.n}{scatter}")
+        legend(figure, 3)
+    return figure
 
 
 def setup(

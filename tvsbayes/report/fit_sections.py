@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.display import concise
+from tvsbayes.estimators.four_point import ClassicResult, Experiment
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, Axis
 from tvsbayes.instrument.experiments import name_of
 from tvsbayes.metrology.traceability import header_table, stated_text
@@ -22,10 +23,12 @@ from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
 from tvsbayes.report.position_figures import gear_errors
 from tvsbayes.report.result_tables import (
     ESTIMATE_COLUMNS,
+    classic_table,
     estimate_row,
     gap_table,
     gears_table,
     hold_out_table,
+    outlier_lines,
     range_text,
     waves_table,
 )
@@ -54,8 +57,9 @@ HEADER_SHOWN = ("method", "notes")
 
 def fit_sections(e: Evidence) -> list[Section]:
     """The sections in the order of the page."""
-    parts = (results_section, setup_section, gear_section, identifiability_section, residuals_section)
-    return [part(e) for part in (*parts, validation_section) if part is not gear_section or e.gears]
+    parts = (results_section, classic_section, setup_section, gear_section, identifiability_section, residuals_section)
+    sections = (part(e) for part in (*parts, validation_section) if part is not gear_section or e.gears)
+    return [section for section in sections if section is not None]
 
 
 def setup_section(e: Evidence) -> Section:
@@ -99,14 +103,14 @@ def setup_section(e: Evidence) -> Section:
 
 
 def results_section(e: Evidence) -> Section:
-    """Gap between both estimators, their experiments, and every parameter."""
+    """Gap between both estimators, and every parameter."""
     text = [
         "value(u): the digits in brackets are the standard uncertainty in units of the last place, or with their "
         "decimal point the uncertainty itself."
     ]
     if e.classic is None:
         text.append("Classic: not applicable, the campaign has no complete four-point experiment.")
-    tables, views = [_parameters(e)], [*_one_experiment(e), *_scatters(e)]
+    tables, views = [_parameters(e)], list[FigureView]()
     if e.shown.gap:
         tables.insert(0, gap_table(e.shown.gap))
         view = FigureView(
@@ -126,34 +130,43 @@ def results_section(e: Evidence) -> Section:
     return Section("Results in full", text, tables=tables, figures=views, opened=True)
 
 
-def _one_experiment(e: Evidence) -> list[FigureView]:
-    """The first complete experiment as in the paper: its beams and its points."""
+def classic_section(e: Evidence) -> Section | None:
+    """The paper's Table 1 and Figures 11 to 16; None without a complete experiment."""
     if e.classic is None or not e.classic.experiments:
-        return []
-    first = e.classic.experiments[0]
-    name = name_of(first.direction, first.experiment)
-    beams = FigureView(
-        figures.trajectories(e.campaign, first.experiment, first.direction),
-        f"Beams of experiment {name} before and after its steps, with the angle of each",
-        f"Experiment {name}: the beam before and after, in the plane of its angle.",
-    )
-    return [beams]
-
-
-def _scatters(e: Evidence) -> list[FigureView]:
-    """The experiments of all directions in one figure."""
-    if e.classic is None:
-        return []
-    results = {d: r for d, r in e.classic.directions.items() if r is not None}
-    means = ", ".join(f"{d} {r.mean_deg_per_step:.6f} deg/step of {r.n}" for d, r in results.items())
-    figure = figures.direction_scatters(e.classic, e.fit.summary)
-    return [
+        return None
+    shown = _middle(e.classic)
+    name = name_of(shown.direction, shown.experiment)
+    views = [
         FigureView(
-            figure,
-            f"Experiments by direction with their means: {means}",
-            "Experiments of the classic method, with the mean and bands of 1, 2 and 3 sigma; blue: joint.",
-        )
+            figures.points_3d(e.campaign, shown.experiment, shown.direction),
+            f"Points 1 to 4 of experiment {name} in space, joined in their order",
+            f"Experiment {name}, the median of its direction: its points in frame S (Figure 11 of the paper).",
+        ),
+        FigureView(
+            figures.trajectories(e.campaign, shown.experiment, shown.direction),
+            f"Beams of experiment {name} before and after its steps, with the angle of each",
+            f"Experiment {name}: the beam before and after, in the plane of its angle (Figure 12).",
+        ),
     ]
+    for number, direction in enumerate(DIRECTIONS, 13):
+        if (result := e.classic.directions[direction]) is None:
+            continue
+        views.append(
+            FigureView(
+                figures.direction_scatter(e.classic, direction, e.fit.summary.effective[direction]),
+                f"Ratios of {result.n} experiments moving {direction} about their mean; values in the table",
+                f"{direction}: experiments in order, mean and bands of 1, 2 and 3 sd; blue: joint (Figure {number}).",
+            )
+        )
+    lines = outlier_lines(e.classic)
+    return Section("The classic four-point method", [], lines, [classic_table(e.classic)], views)
+
+
+def _middle(result: ClassicResult) -> Experiment:
+    """The experiment whose ratio is the median of the first direction that has any."""
+    direction = next(name for name in DIRECTIONS if result.directions[name] is not None)
+    ordered = sorted((e for e in result.experiments if e.direction == direction), key=lambda e: e.deg_per_step)
+    return ordered[(len(ordered) - 1) // 2]
 
 
 def _parameters(e: Evidence) -> TableView:

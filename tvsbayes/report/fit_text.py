@@ -20,6 +20,7 @@ from tvsbayes.report.result_tables import (
     details_table,
     gears_table,
     headline_table,
+    outlier_lines,
     range_text,
     waves_table,
 )
@@ -35,9 +36,9 @@ PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 
 def classic_text(result: ClassicResult) -> str:
-    """The classic estimator's table, and the experiments that it left out."""
+    """The classic estimator's table, experiments that make an sd, and those that it left out."""
     skipped = [f"experiment {s.name} skipped: {s.reason}" for s in result.skipped]
-    return terminal(classic_table(result), *skipped)
+    return terminal(classic_table(result), *outlier_lines(result), *skipped)
 
 
 def fit_text(

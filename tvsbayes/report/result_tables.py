@@ -12,6 +12,7 @@ import numpy as np
 from tvsbayes.display import concise
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.experiments import name_of
 from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.parameter_words import share_in_words
@@ -47,6 +48,28 @@ def classic_table(result: ClassicResult) -> TableView:
         rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
     columns = ["direction", "n", "mean deg/step", "sd", "u type A", "95 % interval (GUM)"]
     return TableView("classic four-point estimator", columns, rows)
+
+
+PLAY_ALONE = {
+    "cleared": "Its first beam alone was approached in the direction of its steps: they lost no play.",
+    "reversed": "Its first beam alone was approached against the direction of its steps: they lost the play.",
+    "unknown": "How its first beam alone was approached is not known: its steps may have lost no play.",
+}
+
+
+def outlier_lines(result: ClassicResult) -> list[str]:
+    """Every experiment that makes the sd of its direction, and what the sd is without it."""
+    lines = []
+    for direction, r in result.directions.items():
+        if r is None or r.sd_deg_per_step is None or (one := r.outlier) is None:
+            continue
+        lines.append(
+            f"Experiment {name_of(direction, one.experiment)} with {one.deg_per_step:.6f} deg/step makes the sd: "
+            f"{r.sd_deg_per_step:.6f}, without it {one.sd_without_deg_per_step:.6f} and mean "
+            f"{one.mean_without_deg_per_step:.6f} (Grubbs' test, p {one.p:.1g})."
+        )
+        lines += [PLAY_ALONE[one.play_alone]] if one.play_alone else []
+    return lines
 
 
 ESTIMATE_COLUMNS = ("quantity", "value(u)", "95 % interval", "set by")

@@ -44,6 +44,23 @@ def effective_dof(u: float, contributions: Sequence[float], dof: Sequence[float]
     return float(u**4 / total) if total > 0 else math.inf
 
 
+def grubbs_p(values: np.ndarray) -> float:
+    """Compute the p value of the value farthest from the mean (n,), two-sided, Bonferroni's bound (Grubbs 1950, 1969).
+
+    1 for fewer than three values and for equal ones.
+    """
+    from scipy.special import stdtr
+
+    n = len(values)
+    if n < 3 or not (sd := float(np.std(values, ddof=1))):
+        return 1.0
+    g_squared = float(np.max(np.abs(values - np.mean(values))) / sd) ** 2
+    # The largest g there is, of values that are equal but for one, leaves no scatter: t is infinite.
+    rest = (n - 1) ** 2 - n * g_squared
+    t = math.sqrt(n * (n - 2) * g_squared / rest) if rest > 0 else math.inf
+    return min(1.0, 2 * n * float(stdtr(n - 2, -t)))
+
+
 BLOCKS = 10
 """Blocks of draws whose scatter gives the Monte Carlo error of an interval's end."""
 BELIEVED = 4.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent import futures
 from contextlib import contextmanager, nullcontext
@@ -93,17 +94,39 @@ def _by_processes(job: StudyJob, indices: Sequence[int], workers: int, address: 
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+LOOKED_AFTER_S, NO_WORKER_S = 10.0, 300.0
+"""Time between two looks at the workers of a cluster, and for how long it may have none."""
+
+
 def _by_dask(job: StudyJob, indices: Sequence[int], workers: int, address: str | None) -> Iterator[StudyRow]:
-    """Compute rows on a Dask cluster; another worker repeats the rows of one that dies."""
-    from distributed import Client, KilledWorker, LocalCluster, as_completed
+    """Compute rows on a Dask cluster; another worker repeats the rows of one that dies.
+
+    Dask gives a row up (`KilledWorker`) after more deaths of its workers than `scheduler.allowed-failures`, 3. It would
+    wait forever where no worker is left: none is started without a nanny, nor by that of a local cluster once a worker
+    died between the end of its row and its fetching (distributed 2026.8).
+    """
+    from distributed import Client, KilledWorker, LocalCluster, wait
     from distributed.comm import CommClosedError
 
     local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
     try:
         with LocalCluster(**local) if address is None else nullcontext(address) as place, Client(place) as client:
             # Not `Client.get_executor`: it waits forever for a row that is fetched while the scheduler dies.
-            for future in as_completed([client.submit(_in_worker, job, i, pure=False, retries=3) for i in indices]):
-                yield future.result()
+            pending = {client.submit(_in_worker, job, i, pure=False, retries=3) for i in indices}
+            seen_s = time.monotonic()
+            while pending:
+                try:
+                    for future in wait(pending, timeout=LOOKED_AFTER_S, return_when="FIRST_COMPLETED").done:
+                        row = future.result(timeout=LOOKED_AFTER_S)
+                        pending.discard(future)
+                        seen_s = time.monotonic()
+                        yield row
+                except TimeoutError:
+                    if client.scheduler_info()["workers"]:
+                        seen_s = time.monotonic()
+                    elif time.monotonic() - seen_s >= NO_WORKER_S:
+                        words = f"the Dask cluster has had no worker for {NO_WORKER_S / 60:g} minutes"
+                        raise _worker_died(words) from None
     except KilledWorker as error:
         raise _worker_died("every Dask worker that took a certain row died (out of memory, or killed)") from error
     except (futures.CancelledError, CommClosedError) as error:

@@ -7,6 +7,7 @@ Headlines in deg/step, deg and mm.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from contextlib import closing
 
@@ -57,7 +58,7 @@ class StudyResult(Shown, Record, frozen=True, kw_only=True):
     Attributes:
         design: hash of the design.
         estimator: estimator of the rows, "importance" or "laplace".
-        campaigns, converged: number of simulated campaigns, and of converged fits.
+        asked, campaigns, converged: number of campaigns asked for, of those that ran, and of converged fits.
         assurance, assurance_interval95: share of ALL campaigns whose fit reports the target as met (Clopper-Pearson).
         reported: 5, 50 and 95 % quantiles of the reported value.
         seconds: median time of a row.
@@ -68,6 +69,7 @@ class StudyResult(Shown, Record, frozen=True, kw_only=True):
 
     design: str
     estimator: str
+    asked: int
     campaigns: int
     converged: int
     assurance: float
@@ -89,8 +91,8 @@ class StudyResult(Shown, Record, frozen=True, kw_only=True):
         return View(title, columns, rows)
 
 
-def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
-    """Evaluate the rows of a study.
+def study_result(job: StudyJob, rows: Sequence[StudyRow], asked: int | None = None) -> StudyResult:
+    """Evaluate the rows of a study, all that were asked for by default.
 
     Raises:
         NotConverged: not one fit ended well.
@@ -133,6 +135,7 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
     return StudyResult(
         design=job.key,
         estimator=job.estimator,
+        asked=len(rows) if asked is None else asked,
         campaigns=len(rows),
         converged=n,
         headlines=headlines,
@@ -154,9 +157,10 @@ def study(
     engine: str = "serial",
     workers: int = 2,
     address: str | None = None,
+    max_minutes: float | None = None,
     progress: Show | None = None,
 ) -> StudyResult:
-    """Compute the missing rows among 0 ... count - 1 of a study, and evaluate all.
+    """Compute the missing rows among 0 ... count - 1 of a study, and evaluate those that there are.
 
     Args:
         job: what is studied.
@@ -165,6 +169,7 @@ def study(
         engine: where rows are computed; the numbers are the same on each.
         workers: number of processes.
         address: address of a Dask scheduler.
+        max_minutes: no row is begun after so long; at least one is made.
         progress: called with the share that is done after every row.
 
     Raises:
@@ -174,6 +179,7 @@ def study(
     require_engine(engine)
     done = rows.of(job.key)
     missing = [index for index in range(count) if index not in done]
+    end_s = math.inf if max_minutes is None else time.monotonic() + 60 * max_minutes
     with Job({CAMPAIGNS: 1.0}, progress) as work:
         if missing:
             work.at(0.0, f"{count - len(missing)} of {count}")
@@ -181,5 +187,7 @@ def study(
                 for made, row in enumerate(running, 1):
                     rows.append(row)
                     work.at(made / len(missing), f"{count - len(missing) + made} of {count}")
+                    if time.monotonic() >= end_s:
+                        break
         every = rows.of(job.key)
-        return study_result(job, [every[index] for index in range(count)])
+        return study_result(job, [every[index] for index in range(count) if index in every], count)
