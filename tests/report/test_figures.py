@@ -49,6 +49,11 @@ def test_the_papers_figures_for_any_campaign(evidence):
         trajectories(replace(campaign, spots=spots), number)
     drawn = trajectories(replace(campaign, spots=spots), number, same.direction).axes[0]
     assert drawn.get_title().startswith(f"experiment {number} ({same.direction})")
+    # A joint estimate far away leaves the scatter its room.
+    mean, sd = result.directions["left"].mean_deg_per_step, result.directions["left"].sd_deg_per_step
+    far = direction_scatter(result, "left", estimate(mean + 30 * sd, sd)).axes[0]
+    assert far.get_ylim()[1] < mean + 5 * sd
+    assert any(label.endswith("above") for label in far.get_legend_handles_labels()[1])
     with pytest.raises(ValueError, match="allowed: left, right, up, down"):
         direction_scatter(result, "Left")
 

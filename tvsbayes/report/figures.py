@@ -52,6 +52,8 @@ __all__ = [
 ]
 
 EXPERIMENT = "experiment of this direction"
+FAR_SD = 8.0
+"""Distance of the joint estimate from the experiments' mean, in their sd, at which it would press them into a line."""
 
 
 def __dir__() -> list[str]:
@@ -158,9 +160,12 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
                 axes.axhspan(mean - k * sd, mean + k * sd, color=grey, label=f"{k} sigma", zorder=0)
         axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
         if joint is not None:
-            label = f"joint {joint.value:.6f}, 2 u"
+            label, away = f"joint {joint.value:.6f}, 2 u", joint.value - mean
             last = len(experiments) + 1.5
-            axes.errorbar(last, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
+            if sd is None or abs(away) <= FAR_SD * sd:
+                axes.errorbar(last, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
+            else:
+                axes.plot([], [], "o", color=BLUE, label=f"{label}, {'above' if away > 0 else 'below'}")
         axes.plot(range(1, len(experiments) + 1), [e.deg_per_step for e in experiments], "^", color=BLACK, markersize=4)
         if (one := summary.outlier) is not None:
             place = 1 + [e.experiment for e in experiments].index(one.experiment)
