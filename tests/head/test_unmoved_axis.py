@@ -88,7 +88,7 @@ def fitted(tmp_path_factory):
     return folder
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("purpose", [["--verify"], ["--watch", "--minutes", 1]])
 def test_plans_leave_the_unmoved_axis_where_it_is(ask, fitted, tmp_path, purpose):
     code, _ = ask("plan", fitted, *purpose, "-o", tmp_path / "looks.csv")
@@ -111,7 +111,7 @@ def test_every_command_answers(ask, fitted, tmp_path):
     assert code == 3 and {c["what"]: c["power"] for c in document["changes"]}["ratio: tilt"] < 0.1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_looks_of_the_campaign_confirm_nothing(ask, fitted, tmp_path):
     """Neither the folder itself nor a part of it under another name."""
     write_campaign(replace(head(), spots=head().spots[4:]), tmp_path / "part")
