@@ -446,10 +446,10 @@ def study(
         report_line(f"warning: {escaped(str(stored.path), 200)}: not as study wrote it, made again: line {lines}")
     missing = n - sum(index < n for index in stored.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(stored.path), 200)}")
-    where = {"engine": engine, "workers": workers or WORKERS, "address": scheduler}
+    study_of = partial(run_study, job, n, stored, engine=engine, workers=workers or WORKERS, address=scheduler)
     try:
         with waiting() as progress:
-            result = run_study(job, n, stored, **where, max_minutes=max_minutes, progress=progress)
+            result = study_of(max_minutes=max_minutes, progress=progress)
     except (KeyboardInterrupt, InputError):
         ran = sum(index < n for index in stored.of(job.key))
         report_line(f"{ran} of {n} campaigns ran and are kept; the same command goes on from there")
@@ -470,9 +470,10 @@ def _target_of_study(target: str | None, made_for: str, plan_file: Path) -> Targ
     try:
         return parse_target(made_for)
     except InputError as error:
-        file, remedy = escaped(plan_file.name, 200), "state another with --target, or empty the cell"
-        found = {"found": escaped(made_for, 120), "allowed": TARGET_FORMS}
-        raise refusal("target", file=file, column="made_for", **found, remedy=remedy) from error
+        file, found = escaped(plan_file.name, 200), escaped(made_for, 120)
+        remedy = "state another with --target, or empty the cell"
+        refused = refusal("target", file=file, column="made_for", found=found, allowed=TARGET_FORMS, remedy=remedy)
+        raise refused from error
 
 
 def _limits(path: Path) -> dict[str, tuple[float, float]]:
