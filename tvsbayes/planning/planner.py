@@ -42,7 +42,7 @@ from tvsbayes.planning.forecast import (
 )
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, Looks, covariance_of, looks_wait
-from tvsbayes.planning.plan_check import JUDGING, judge, judging_seconds
+from tvsbayes.planning.plan_check import JUDGING, Judgement, judge, judging_seconds
 from tvsbayes.planning.search import LADDER, DesignProblem, Refined, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.progress import Advance, Job, Show
@@ -399,13 +399,7 @@ def _plan_in_stages(
     pixel_information = _pixel_part(judgement.information.expectation)
     batches = next_experiments(problem) if knowledge.after_data else ()
     met_already = knowledge.after_data and problem.now <= target.limit
-    notes = few_looks(looks, target)
-    if planned.seen < IN_VIEW * len(looks):
-        notes.append(
-            f"half of the drawn instruments see at most {planned.seen} of the {len(looks)} looks: state in [rig.prior] "
-            "and [truth] more closely where the positioner stands (extrinsics), or plan --like a campaign of that build"
-        )
-    notes += [judgement.inseparable_text(axis) for axis in AXES if inseparable(judgement.exchange(axis))]
+    notes = _notes(planned, looks, target, judgement)
     return PlanResult(
         target=target,
         steps=() if met_already else (replace(steps[0], made_for=target.text), *steps[1:]),
@@ -431,6 +425,18 @@ def _plan_in_stages(
         seed=seed,
         criterion=scope.criterion,
     )
+
+
+def _notes(planned: Baseline, looks: Looks, target: Target, judgement: Judgement) -> list[str]:
+    """Write notes on what a plan leaves open."""
+    notes = few_looks(looks, target)
+    if planned.seen < IN_VIEW * len(looks):
+        notes.append(
+            f"half of the drawn instruments see at most {planned.seen} of the {len(looks)} looks: state in [rig.prior] "
+            "and [truth] more closely where the positioner stands (extrinsics), or plan --like a campaign of that build"
+        )
+    notes += [judgement.inseparable_text(axis) for axis in AXES if inseparable(judgement.exchange(axis))]
+    return notes
 
 
 def _pixel_part(expectation: Expectation) -> np.ndarray:
