@@ -114,6 +114,10 @@ AXIS_TEXTS = {
     "one unknown word of direction": TABLE.replace(";-\n", ";x\n").replace(";+\n", ";x\n"),
     "a good row without a reading": "steps,mm,ok\n0,0,yes\n10,,yes\n20,2,yes\n10,1.1,yes\n0,0.1,yes\n",
     "turns by U": "Nennwinkel gon,Auf 1 [U],Ab 1 [U]\n0,0,0.002\n100,0.25,0.252\n200,0.5,0.502\n",
+    "small deviations with their unit in the cells": "Target;Forward [1/1000 in];Reverse [1/1000 in]\n"
+    + "".join(f"{2 * k}.0 inch;{3 * k % 7}.81;{3 * k % 7 + 1}.77\n" for k in range(6)),
+    "units in all cells below words": "Nominal,Ist,Notiz\n"
+    + "".join(f"{2 * k} mm,{2 * k}.01 mm,{'ok' * (k % 2)}\n" for k in range(6)),
     "two joints": "J1 target (deg),J1 actual (deg),J2 target (deg),J2 actual (deg)\n"
     + lines("{c},{v:.4f},{c},{v:.3f}\n"),
     "empty remarks at the ends": "Teórica [mm];Medida [mm];Notas\n"

@@ -385,8 +385,8 @@ def _set_aside(
 
 def difference(column: Column, command: Column, value: Column) -> str:
     """The formula by which a column is the reading less the command in every row, to its digits; "" where it is not."""
-    to_reading = factor_between(command.name.unit, value.name.unit)
-    to_column = factor_between(value.name.unit, column.name.unit)
+    to_reading = factor_between(command.unit, value.unit)
+    to_column = factor_between(value.unit, column.unit)
     if to_reading is None or to_column is None:
         return ""
     gap = (value.values - to_reading * command.values) * to_column
@@ -454,6 +454,8 @@ def _ask_what_is_left(
     ]
     if left:
         answers = [choice({"value": name}, known) for name in (taken["value"], *left)]
+        # The column left over may be what was commanded.
+        answers += [choice({"command": name, "value": taken["value"]}, known) for name in left]
         raise table.ask("reading-left", answers=answers, value=taken["value"], left=left)
 
 
@@ -463,8 +465,8 @@ def _ask_small(table: ForeignTable, command: Column, value: Column, known: Mappi
     Raises:
         Question: they are.
     """
-    units = command.name.unit, value.name.unit
-    factor = value.name.unit and command.name.unit and value.name.unit.in_units_of(command.name.unit)
+    units = command.unit, value.unit
+    factor = value.unit and command.unit and value.unit.in_units_of(command.unit)
     rows = np.isfinite(command.values) & np.isfinite(value.values)
     if not factor or units[0].kind not in ("length", "angle") or rows.sum() < 4:  # type: ignore[union-attr]
         return

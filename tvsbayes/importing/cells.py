@@ -403,6 +403,11 @@ class Column:
         return np.array([float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells])
 
     @cached_property
+    def unit(self) -> Unit | None:
+        """The unit in its cells, else in its name."""
+        return plain_column(self.name.text, self.cells).unit or self.name.unit
+
+    @cached_property
     def numeric(self) -> bool:
         """Whether it holds numbers, of which some differ."""
         finite = self.values[np.isfinite(self.values)]

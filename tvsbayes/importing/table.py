@@ -32,6 +32,7 @@ WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?")
 _GROUPED_POINT = re.compile(r"[+-]?[0-9]{1,3}(?:,[0-9]{3})+\.[0-9]+")
 _GROUPED_COMMA = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+,[0-9]+")
+_WITH_UNIT = re.compile(r"([+-]?[0-9][0-9.,]{0,20}) ?([^\W\d]{1,6}|\u00b0)")
 _THIN = re.compile("(?<=[0-9])[\u00a0\u2007\u2009\u202f](?=[0-9])")
 
 
@@ -105,6 +106,12 @@ def is_number(cell: str) -> bool:
     return any(form.fullmatch(cell) for form in (NUMBER, _COMMA, _GROUPED_POINT, _GROUPED_COMMA))
 
 
+def is_value(cell: str) -> bool:
+    """Whether a cell is a number, or one with its unit."""
+    match = None if is_number(cell) else _WITH_UNIT.fullmatch(cell)
+    return (match is not None and parse_unit(match[2]) is not None and is_number(match[1])) or is_number(cell)
+
+
 def cleaned(cell: str) -> str:
     """A cell without marks that spreadsheets put into numbers: a long minus, thin spaces between thousands."""
     return _THIN.sub("", cell.strip().replace("\u2212", "-")) if not cell.isascii() else cell.strip()
@@ -170,7 +177,7 @@ def _first_data(rows: Sequence[Row]) -> int:
     numeric = []
     for k in range(width):
         cells = [row.cells[k] for row in tail if k < len(row.cells) and row.cells[k]]
-        if sum(map(is_number, cells)) > NUMERIC_SHARE * max(len(cells), 1) and len(cells) > NUMERIC_SHARE * len(tail):
+        if sum(map(is_value, cells)) > NUMERIC_SHARE * max(len(cells), 1) and len(cells) > NUMERIC_SHARE * len(tail):
             numeric.append(k)
     counts = Counter(len(row.cells) for row in tail)
     usual = min(counts, key=lambda n: (-counts[n], n), default=0)
@@ -178,8 +185,8 @@ def _first_data(rows: Sequence[Row]) -> int:
     for least in (usual, 0):
         for first, row in enumerate(rows[: ABOVE_MAX + 1]):
             cells = [row.cells[k] if k < len(row.cells) else "" for k in numeric]
-            is_data = all(is_number(c) or not c or means(c, "empty") for c in cells)
-            if is_data and any(map(is_number, cells)) and len(row.cells) >= least:
+            is_data = all(is_value(c) or not c or means(c, "empty") for c in cells)
+            if is_data and any(map(is_value, cells)) and len(row.cells) >= least:
                 return first
     return 0
 
@@ -187,10 +194,10 @@ def _first_data(rows: Sequence[Row]) -> int:
 def _may_be_names(cells: Sequence[str], data: Sequence[str]) -> bool:
     """Whether a row can hold the names of the columns: texts, for half of the numbers of the data or more."""
     filled = [cell for cell in cells if cell]
-    numbers = sum(map(is_number, data))
+    numbers = sum(map(is_value, data))
     # A whole number can be the name of a run.
-    decimals = any(is_number(cell) and not cell.lstrip("+-").isdigit() for cell in filled)
-    return 2 * len(filled) >= max(4, numbers) and not decimals and not is_number(filled[0])
+    decimals = any(is_value(cell) and not cell.lstrip("+-").isdigit() for cell in filled)
+    return 2 * len(filled) >= max(4, numbers) and not decimals and not is_value(filled[0])
 
 
 def _all_units(cells: Sequence[str]) -> bool:

@@ -135,13 +135,13 @@ def _separator(lines: Sequence[str]) -> str:
     for sample in (lines[:ROWS_TRIED], lines[-ROWS_TRIED:]):
         # Separators after the last cell of a row divide nothing, or end an empty cell.
         widths = {s: [len(line.rstrip(s).split(None if s == " " else s)) for line in sample] for s in SEPARATORS}
-        whole = {s: [line.count(s) + 1 for line in sample] for s in "\t;|"}
+        whole = {s: [line.count(s) + 1 for line in sample] for s in "\t;|,"}
         modes = {
             s: max((*Counter(w).items(), *Counter(whole.get(s, ())).items()), key=lambda item: item[1], default=(1, 0))
             for s, w in widths.items()
         }
         # Commas and spaces stand in numbers and titles too: there the first line must be divided alike.
-        clear = (s for s, (cells, count) in modes.items() if s in whole and cells > 1 and 2 * count > len(sample))
+        clear = (s for s, (cells, count) in modes.items() if s in "\t;|" and cells > 1 and 2 * count > len(sample))
         regular = (s for s, (cells, count) in modes.items() if cells > 1 and count >= 0.9 * len(sample))
         frequent = (s for s, (n, count) in modes.items() if n > 1 and 2 * count > len(sample) and n == widths[s][0])
         if separator := next(clear, None) or next(regular, None) or next(frequent, None):

@@ -10,7 +10,7 @@ import tomllib
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import NamedTuple
 
 from tvsbayes.files.disk import shipped_data
@@ -151,6 +151,7 @@ _PART = re.compile(
 )
 
 
+@lru_cache(maxsize=4096)
 def parse_unit(text: str) -> Unit | None:
     """The unit that a whole text states, as in brackets: "mm", "1/100 mm", "Hundertstel mm", "mm/100"."""
     units, parts = _units()
