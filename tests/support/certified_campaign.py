@@ -12,8 +12,8 @@ from support.known_calibration import known_calibration
 from support.small_campaign import small_campaign
 
 from tvsbayes.instrument.campaign import Campaign, input_hashes
-from tvsbayes.metrology.dcc import dcc_bytes
 from tvsbayes.metrology.positioning_table import positioning
+from tvsbayes.metrology.scanner_certificate import dcc_bytes
 from tvsbayes.results.fit_record import FitEvidence, FitRecord, read_fit
 
 KEPT = Path(__file__).parents[1] / "data"

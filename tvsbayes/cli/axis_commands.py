@@ -5,18 +5,21 @@ The modules of the commands contain their options; `cli/instruments` calls these
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import command_line, finish, finish_kept, keep, report_line, write_new
+from tvsbayes.cli.app import TARGET_MISSED, Ended, command_line, finish, finish_kept, keep, report_line, write_new
 from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.cli.report_options import Certification, parties_of, tolerance_of
 from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
 from tvsbayes.cli.watched import WATCHING, finish_watch
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import output_place, read_bytes, write_atomically
+from tvsbayes.metrology.conformity import CONFORMS, Criterion, Tolerance
 from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
 from tvsbayes.results.records import plain
@@ -26,9 +29,10 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, axis_t
 from tvsbayes.single_axis.axis_rows import rows_of
 
 if TYPE_CHECKING:
+    from tvsbayes.metrology.dcc import Embedded
     from tvsbayes.report.document import Document, Issue
     from tvsbayes.results.records import Tier
-    from tvsbayes.single_axis.axis_record import AxisSummary
+    from tvsbayes.single_axis.axis_record import AxisResults, AxisSummary
 
 FITTING, PLANNING = "fit", "choosing stops"
 
@@ -154,7 +158,7 @@ def _parts(folder: Path, issue: Issue, quick: bool, no_sample: bool, seed: int, 
     stored = _kept_fit(data, output_place(folder, "results"), tier, no_sample, MAX_MINUTES, seed)
     text = axis_fit_text(stored.summary, written=list(stored.files.values()))
     yield Part("fit", stored.as_json(seed), text, stored.error)
-    page = _page(data, folder, issue, pdf)
+    page = _page(data, folder, issue, pdf).page
     page.report_removed()
     yield page.part()
 
@@ -211,26 +215,85 @@ def watch(folder: Path, *, looks: Path, append: Path | None, seed: int, as_json:
     finish_watch(result, append, as_json, "stops")
 
 
-def report(folder: Path, *, issue: Issue, quick: bool, pdf: bool, out: Path | None, as_json: bool) -> None:
-    """Write the page of an axis."""
-    _page(read_axis(folder), folder, issue, pdf, out, IMPORTANCE if quick else CHAIN).finish(as_json)
+def report(
+    folder: Path,
+    *,
+    issue: Issue,
+    quick: bool,
+    pdf: bool,
+    out: Path | None,
+    as_json: bool,
+    tolerance: str | None = None,
+    of: str | None = None,
+    rule: str | None = None,
+    guard: float | None = None,
+    dcc: bool = False,
+    dcc_schema: Path | None = None,
+    certification: Certification | None = None,
+) -> None:
+    """Write the page of an axis, and its certificate."""
+    from tvsbayes.report.axis_document import figures_by_name
+    from tvsbayes.report.criteria import criterion_text
+
+    data = read_axis(folder)
+    wish = tolerance_of(tolerance, of, rule, guard, figures_by_name(data.unit))
+    made = _page(data, folder, issue, pdf, out, IMPORTANCE if quick else CHAIN, wish)
+    page, lines, result, missed = made.page, [*map(criterion_text, made.criteria)], {}, False
+    if certification is not None and (dcc or dcc_schema):
+        done = certification.written(page, out, partial(made.certificate, certification.countries))
+        lines, result, missed = [*lines, *done.lines], done.result, done.missed
+    page.report_removed(certificates=True)
+    lines += [f"report {page.number}", f"written: {', '.join(page.files.values())}"]
+    finish(page.as_json(made.criteria) | result, "\n".join(lines), as_json)
+    if missed or any(c.verdict != CONFORMS for c in made.criteria):
+        raise Ended(TARGET_MISSED)
+
+
+@dataclass
+class AxisPage:
+    """The page of an axis once it is written, with what it shows."""
+
+    page: WrittenPage
+    results: AxisResults
+    issue: Issue
+    criteria: tuple[Criterion, ...]
+
+    def certificate(self, countries: Mapping[str, str], report: Embedded, signed: bool) -> bytes:
+        """DCC-schema XML with the page inside, issued on its day (UTC)."""
+        from tvsbayes.single_axis.axis_certificate import axis_certificate
+
+        parties, issued = parties_of(self.issue, countries), self.issue.day
+        return axis_certificate(
+            self.results, issued=issued, parties=parties, report=report, criteria=self.criteria, signed=signed
+        )
 
 
 def _page(
-    data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None, tier: Tier = CHAIN
-) -> WrittenPage:
+    data: AxisCampaign,
+    folder: Path,
+    issue: Issue,
+    pdf: bool,
+    out: Path | None = None,
+    tier: Tier = CHAIN,
+    wish: Tolerance | None = None,
+) -> AxisPage:
     """Write the page of an axis, and print it with `pdf`."""
-    from tvsbayes.report.axis_document import axis_document, curve_commands
+    from tvsbayes.report.axis_document import axis_document, criteria_of, curve_commands
     from tvsbayes.single_axis.axis_record import results_for
+
+    shown: dict[str, Any] = {}
 
     def make(job: Job) -> Document:
         commands = rows_of(data).command
-        shown = curve_commands(float(commands.min()), float(commands.max()))
-        results = results_for(data, shown, job.part(FITTING), notify=report_line, tier=tier)
+        curve = curve_commands(float(commands.min()), float(commands.max()))
+        results = results_for(data, curve, job.part(FITTING), notify=report_line, tier=tier)
+        criteria = criteria_of(results.summary, wish)
+        shown.update(results=results, criteria=criteria)
         job.begin(DRAWING)
-        return axis_document(results, issue)
+        return axis_document(results, issue, criteria)
 
-    return written_page(folder, out, pdf, {FITTING: 3.0, DRAWING: 1.5}, make)
+    page = written_page(folder, out, pdf, {FITTING: 3.0, DRAWING: 1.5}, make)
+    return AxisPage(page, issue=issue, **shown)
 
 
 def plan(

@@ -234,6 +234,9 @@ def _run_of(runs: Sequence[GuideRun], file: Path, options: FileOptions) -> tuple
 def _axis_lines(rows: AxisRows) -> list[str]:
     """Entries of campaign.toml that the file gives, as lines."""
     lines = [f"campaign.toml: {toml_line(name, value)}" for name, value in rows.axis.items()]
+    if rows.header.keys() == {"created"}:
+        lines.append(f"campaign.toml: {toml_line('created', rows.header['created'])}")
+    lines += [f"campaign.toml: [reference] {toml_line(name, value)}" for name, value in rows.reference.items()]
     if "rate" in rows.header and not {"period_between", "periods"} & rows.axis.keys():
         lines.append("too short a run to look for a period; state `periods` in campaign.toml where one is known")
     return lines
@@ -284,11 +287,14 @@ def _header(rows: AxisRows) -> bytes:
     text = axis_templates()["campaign.toml"].decode()
     text = text.replace(f'\nunit = "{UNIT}"', f"\n{toml_line('unit', unit)}")
     if rows.header:
-        text = text.replace(
-            '\nname = "my axis"\n', "\n" + "\n".join(toml_line(k, v) for k, v in rows.header.items()) + "\n"
-        )
+        name = '\nname = "my axis"\n'
+        entries = "\n".join(toml_line(k, v) for k, v in rows.header.items())
+        text = text.replace(name, f"\n{entries}\n" if "name" in rows.header else f"{name}{entries}\n")
     if rows.axis:
         text = text.replace(
             "\n[axis]\n", "\n[axis]\n" + "\n".join(toml_line(k, v) for k, v in rows.axis.items()) + "\n"
         )
+    if rows.reference:
+        entries = "\n".join(toml_line(k, v) for k, v in rows.reference.items())
+        text = text.replace("\n# [reference]\n", f"\n[reference]\n{entries}\n")
     return text.encode()

@@ -5,8 +5,9 @@ Reads options, calls the library, prints a table or JSON; heavy imports are insi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,9 +32,11 @@ from tvsbayes.cli.campaign_commands import campaign_contents
 from tvsbayes.cli.estimate_commands import OVERRIDE_HINT
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_progress
+from tvsbayes.cli.report_options import certification_of, parties_of, tolerance_of
 from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.files.disk import output_place
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
 from tvsbayes.progress import Job
@@ -41,13 +44,15 @@ from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.metrology.conformity import Tolerance
+    from tvsbayes.metrology.dcc import Embedded
     from tvsbayes.report.document import Document, Issue
     from tvsbayes.report.evidence import Evidence
     from tvsbayes.results.fit_record import FitRecord
 
-DCC_MESSAGES = 20
-"""Largest number of messages of a schema validator to show."""
 RANGE_MM = 1e3
+LIMITED = {**{direction: (direction, "deg/step") for direction in DIRECTIONS}, "xyz": ("xyz", "mm")}
+"""Name and unit of what a tolerance of a scanner may limit."""
 GATHERING = "gathering evidence"
 
 LimitRatio = Annotated[
@@ -81,6 +86,24 @@ def report(
         str | None, typer.Option("--customer-country", help="Two letters of the customer's country, for --dcc.")
     ] = None,
     dcc_schema: Schema = None,
+    sign: Annotated[Path | None, typer.Option("--sign", help="Private key, PEM: sign the certificate (--dcc).")] = None,
+    certificate: Annotated[
+        Path | None, typer.Option("--certificate", help="Certificate of that key, PEM, for --sign.")
+    ] = None,
+    tolerance: Annotated[
+        str | None,
+        typer.Option("--tolerance", help="Largest value allowed, such as 15um: conformity."),
+    ] = None,
+    of: Annotated[
+        str | None,
+        typer.Option("--of", help="Axis: A, E, R, B, M, 'A forward' ...; else left, right, up, down, xyz."),
+    ] = None,
+    rule: Annotated[
+        str | None, typer.Option("--rule", help="Decision rule: guarded (default), simple or probability.")
+    ] = None,
+    guard: Annotated[
+        float | None, typer.Option("--guard", min=0, help="Guard band in standard uncertainties (2; one-sided 1.65).")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="HTML file (default CAMPAIGN/results/report.html).")
     ] = None,
@@ -90,7 +113,7 @@ def report(
     """The calibration report as one HTML page. Verdict and results first, then the evidence."""
     from tvsbayes.instrument.campaign import read_campaign
 
-    finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
+    finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm, guard=guard)
     check_output(out, kind="report", force=force)
     if out is not None and out.suffix.lower() == ".pdf":
         message, remedy = "-o names the HTML page, and its PDF lies beside it", "write -o NAME.html --pdf"
@@ -102,34 +125,23 @@ def report(
         beside["certificate"] = certificate_place(out, out) if dcc or dcc_schema else None
         for kind, place in beside.items():
             check_output(place, kind=kind, force=force and place is not None)
-    if not (dcc or dcc_schema):
-        refuse_options("for a certificate", "add --dcc", country=country, customer_country=customer_country)
     issue = _issue(laboratory, customer)
-    countries = _countries(country, customer_country)
-    limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
-    limits["range_mm"] = range_mm if range_mm != RANGE_MM else None
-    certificate = {"dcc": dcc, "dcc_schema": dcc_schema}
-    if serve("report", campaign, issue=issue, quick=quick, pdf=pdf, out=out, as_json=as_json, **limits, **certificate):
+    certification = certification_of(dcc, dcc_schema, _countries(country, customer_country), sign, certificate)
+    limits: dict[str, object] = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
+    limits |= {"range_mm": range_mm if range_mm != RANGE_MM else None, "dcc": dcc, "dcc_schema": dcc_schema}
+    judged = {"tolerance": tolerance, "of": of, "rule": rule, "guard": guard}
+    asked = {"certification": certification if certification.wanted else None}
+    limits |= {"quick": quick, "pdf": pdf, "out": out, "as_json": as_json}
+    if serve("report", campaign, issue=issue, **limits, **judged, **asked):
         return
+    wish = tolerance_of(tolerance, of, rule, guard, LIMITED)
     data = read_campaign(campaign)
-    content = PageContent(campaign, data, issue, limit_deg_per_step, limit_mm, range_mm, quick)
+    content = PageContent(campaign, data, issue, limit_deg_per_step, limit_mm, range_mm, quick, wish)
     page = content.written(pdf, out)
     missed, lines, result = content.missed, content.lines(page), page.as_json(content.evidence.criteria)
-    if dcc or dcc_schema:
-        from tvsbayes.report.page import certificate_place
-
-        certificate_xml = content.certificate(page, countries)
-        path = certificate_place(page.path, out)
-        write_atomically(path, certificate_xml)
-        page.files["dcc"] = str(path)
-        if dcc_schema:
-            from tvsbayes.metrology.dcc import check_dcc
-
-            check = check_dcc(certificate_xml, dcc_schema)
-            verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[check.valid]
-            lines += [f"DCC by {check.tool} against {dcc_schema}: {verdict}", *check.messages[:DCC_MESSAGES]]
-            result["dcc_schema"] = asdict(check)
-            missed |= not check.valid
+    if certification.wanted:
+        done = certification.written(page, out, partial(content.certificate, certification.countries))
+        missed, lines, result = missed or done.missed, [*lines, *done.lines], result | done.result
     page.report_removed(certificates=True)
     finish(result, "\n".join([*lines, f"written: {', '.join(page.files.values())}"]), as_json)
     if missed:
@@ -163,6 +175,7 @@ class PageContent:
     Attributes:
         campaign, data: folder and content of the campaign.
         issue, limit_deg_per_step, limit_mm, range_mm, quick: as the options of `report`.
+        tolerance: with its decision rule; None where none is stated.
         record, evidence: sources of the page.
     """
 
@@ -173,6 +186,7 @@ class PageContent:
     limit_mm: float | None
     range_mm: float
     quick: bool = False
+    tolerance: Tolerance | None = None
     record: FitRecord = field(init=False)
     evidence: Evidence = field(init=False)
 
@@ -198,6 +212,7 @@ class PageContent:
             ratios_deg_per_step=ratios,
             limit_deg_per_step=self.limit_deg_per_step,
             limit_mm=self.limit_mm,
+            tolerance=self.tolerance,
             doubts=warnings,
         )
         job.begin(DRAWING)
@@ -206,31 +221,27 @@ class PageContent:
     @property
     def missed(self) -> bool:
         """Whether a limit that the user gave is not met."""
-        from tvsbayes.report.evidence import MET
+        from tvsbayes.report.evidence import SATISFIED
 
-        return any(c.verdict != MET for c in self.evidence.criteria)
+        return any(c.verdict not in SATISFIED for c in self.evidence.criteria)
 
     def lines(self, page: WrittenPage) -> list[str]:
         """Verdicts on the limits and the page's number, for a terminal."""
+        from tvsbayes.report.criteria import criterion_text
         from tvsbayes.report.fit_text import validation_lines
-        from tvsbayes.report.tables import chance_text
 
-        lines = [
-            f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (probability {chance_text(c.probability)})"
-            for c in self.evidence.criteria
-        ]
+        lines = [criterion_text(c) for c in self.evidence.criteria]
         validation = self.record.summary.validation
         failed = validation is not None and not validation.passed
         tests = validation_lines(validation)[:1] if validation is not None and failed else []
         return [*tests, *lines, f"report {page.number}"]
 
-    def certificate(self, page: WrittenPage, countries: dict[str, str]) -> bytes:
+    def certificate(self, countries: Mapping[str, str], report: Embedded, signed: bool) -> bytes:
         """DCC-schema XML with the page inside, issued on its day (UTC)."""
-        from tvsbayes.metrology.dcc import Embedded, Parties, dcc_bytes
+        from tvsbayes.metrology.scanner_certificate import dcc_bytes
 
-        stated = {name: text for name in ("laboratory", "customer") if (text := getattr(self.issue, name))}
-        parties, report = Parties(**stated, **countries), Embedded(page.number, page.html)
-        return dcc_bytes(self.data, self.record, issued=self.issue.day, parties=parties, report=report)
+        parties, issued = parties_of(self.issue, countries), self.issue.day
+        return dcc_bytes(self.data, self.record, issued=issued, parties=parties, report=report, signed=signed)
 
 
 def calibrate(

@@ -14,8 +14,8 @@ from tvsbayes.files.disk import output_place, require_writable
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
+    from tvsbayes.metrology.conformity import Criterion
     from tvsbayes.report.document import Document
-    from tvsbayes.report.evidence import Criterion
 
 DRAWING, PRINTING = "drawing the page", "printing to PDF"
 

@@ -303,7 +303,7 @@ def _promise(tried: _Tried, shift: bool, zero_free: bool) -> dict[str, SidePromi
 
 def reading_u(campaign: AxisCampaign) -> float:
     """Return the median u of the campaign's readings."""
-    return float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
+    return float(np.median([r.u for r in campaign.noisy if r.status == "ok"]))
 
 
 def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress: Show | None = None) -> Compensation:

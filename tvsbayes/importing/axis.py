@@ -20,11 +20,12 @@ from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import asked
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
-from tvsbayes.importing.axis_units import Wishes, in_one_unit, shown_units, stated_unit, units_of
+from tvsbayes.importing.axis_units import Wishes, in_one_unit, is_expanded, shown_units, stated_unit, units_of
 from tvsbayes.importing.cells import (
     FieldCells,
     Understood,
     columns_of,
+    first_date,
     homings_of,
     left_out,
     seconds_of,
@@ -112,6 +113,10 @@ SCALES = ("length", "angle")
 """Kinds of units in which commands are target positions."""
 STATED_SHARE = 0.6
 """Least mean sign of the steps at which a single word stands for their direction."""
+EXPANDED_IS_COMMON = (
+    "u: an expanded uncertainty is one error that all readings share, as a certificate's is, not noise of each; "
+    "campaign.toml says otherwise without u_is"
+)
 STATUS_SHARE = 0.5
 """Share of rows that a status of 0 and 1 may leave out without a question."""
 
@@ -128,6 +133,7 @@ class AxisRows:
         notes: remarks on rows used and left out.
         header: entries of `campaign.toml` outside `[axis]`.
         axis: entries of `[axis]`.
+        reference: entries of `[reference]`.
         lines: the columns as understood, for people.
         document: the same for programs.
     """
@@ -139,6 +145,7 @@ class AxisRows:
     notes: tuple[str, ...] = ()
     header: Mapping[str, Any] = field(default_factory=dict)
     axis: Mapping[str, Any] = field(default_factory=dict)
+    reference: Mapping[str, Any] = field(default_factory=dict)
     lines: tuple[str, ...] = ()
     document: Mapping[str, Any] = field(default_factory=dict)
 
@@ -197,7 +204,17 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     lines, document = table_lines(table, shown, FIELDS, shown_units(units, unit, cells)), table_document(table, shown)
     of_commands = units["command"]
     axis = {} if of_commands is None or of_commands.kind not in SCALES else {"command_unit": of_commands.text}
-    return AxisRows(stops.moves, readings, unit, tuple(assumed), axis=axis, lines=tuple(lines), document=document)
+    reference = {"u_is": "common"} if is_expanded(cells, wishes) else {}
+    if reference:
+        assumed.append(EXPANDED_IS_COMMON)
+    created = first_date(cells)
+    return AxisRows(
+        *(stops.moves, readings, unit, tuple(assumed), (), {} if created is None else {"created": created}),
+        axis=axis,
+        reference=reference,
+        lines=tuple(lines),
+        document=document,
+    )
 
 
 # --- rows that count -------------------------------------------------------------------------------------------------

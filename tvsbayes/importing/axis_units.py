@@ -243,10 +243,15 @@ def _standard_u(
     if unit is not None and result is not None and factor != 1.0:
         assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")
     coverage = wishes.coverage or name_of(name).coverage
-    if coverage is not None and coverage != 1.0:
+    if is_expanded(cells, wishes):
         how = f"over {coverage:g}; --assume coverage=NUMBER says another"
         assumed.append(f"u: column {escaped(name)} is an expanded uncertainty, {how}")
     return [rounded(u * (factor or 1.0) / (coverage or 1.0)) for u in stated]
+
+
+def is_expanded(cells: FieldCells, wishes: Wishes) -> bool:
+    """Whether the column of u holds expanded uncertainties."""
+    return "u" in cells and (wishes.coverage or name_of(cells.columns["u"]).coverage) not in (None, 1.0)
 
 
 def shown_units(units: Mapping[str, Unit | None], unit: str | None, cells: FieldCells) -> dict[str, str]:

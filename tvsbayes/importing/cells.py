@@ -300,6 +300,14 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
     return _in_order(cells, seconds, is_local, assumed)
 
 
+def first_date(cells: FieldCells) -> datetime.datetime | None:
+    """When the first row was written, where its time has a date; with a zone where the cell has one."""
+    first = cells.text("time_s")[0] if "time_s" in cells else ""
+    at = None if NUMBER.fullmatch(first) or time_of_day(first) is not None else date_time(first)
+    has_zone = re.search(r"(?:Z|[+-]\d\d:?\d\d)$", first.strip()) is not None
+    return at if at is None or has_zone else at.replace(tzinfo=None)
+
+
 def _written_times(cells: FieldCells, texts: Sequence[str]) -> tuple[list[float], bool]:
     """Seconds since the first row of dates or times of day; whether a clock with summer time may have written them."""
     seconds: list[float] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Mapping
 from pathlib import Path
 
 from tvsbayes.errors import InputError
@@ -12,7 +13,8 @@ from tvsbayes.instrument.conditions import check_power
 from tvsbayes.instrument.mechanisms import WORDS
 
 _TEXT_CHARS = {
-    **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
+    **dict.fromkeys(("name", "operator", "instrument", "serial", "method"), 200),
+    **dict.fromkeys(("board_certificate", "reference_certificate"), 200),
     **dict.fromkeys(("pan_joint", "tilt_joint"), 200),
     "notes": 4000,
 }
@@ -21,8 +23,10 @@ _QUANTITIES = {
     "humidity_percent": (0.0, 100.0, 100.0),
     "pitch_mm": (1e-3, 1e4, 1e3),
 }
+ENVIRONMENT = ("temperature_degC", "humidity_percent")
+"""Keys of `[environment]` of every instrument."""
 _HEADER_TABLES = {
-    "environment": ("temperature_degC", "humidity_percent"),
+    "environment": ENVIRONMENT,
     "traceability": ("board_certificate", "pitch_mm", "stereo_calibrated"),
     "urdf": ("pan_joint", "tilt_joint", "steps_per_turn"),
 }
@@ -55,14 +59,20 @@ def parse_header(keys: Keys) -> dict[str, object]:
     keys.word("format", ("tvsbayes-campaign/1",))
     keys.only(_HEADER_KEYS)
     plain_keys = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
-    header = {key: _header_value(keys, key) for key in plain_keys}
-    for name, allowed in _HEADER_TABLES.items():
+    header = {key: _header_value(keys, key) for key in plain_keys} | header_tables(keys, _HEADER_TABLES)
+    check_power(keys, header)
+    return header
+
+
+def header_tables(keys: Keys, tables: Mapping[str, tuple[str, ...]]) -> dict[str, dict[str, object]]:
+    """The tables of a header by name, checked; empty ones are left out, other keys refused."""
+    found = {}
+    for name, allowed in tables.items():
         table = keys.table(name)
         table.only(allowed)
         if table.values:
-            header[name] = {key: _header_value(table, key) for key in table.values}
-    check_power(keys, header)
-    return header
+            found[name] = {key: _header_value(table, key) for key in table.values}
+    return found
 
 
 def mechanism_key(folder: Path) -> str:

@@ -77,10 +77,10 @@ def kelvin(moves: Sequence[TimedMove]) -> np.ndarray:
     return np.zeros(len(moves)) if temperatures is None else temperatures
 
 
-def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) -> np.ndarray | None:
-    """Temperatures at times (n,) minus that of the first move, linear in time between those recorded.
+def degC_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) -> np.ndarray | None:
+    """Temperatures at times (n,), linear in time between those recorded; None where none was.
 
-    Constant before the first and after the last recorded one; None where fewer than two were recorded.
+    Constant before the first and after the last recorded one.
 
     Args:
         moves: moves with their temperatures.
@@ -89,11 +89,15 @@ def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) 
     """
     readings = [(recorded_at, move.temperature_degC) for recorded_at, move in zip(clock, moves, strict=True)]
     known = [(recorded_at, degC) for recorded_at, degC in readings if degC is not None]
-    if len(known) < 2:
+    return np.interp(times, *np.array(known, dtype=float).T) if known else None
+
+
+def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) -> np.ndarray | None:
+    """Temperatures as in `degC_at` minus that of the first move; None where fewer than two were recorded."""
+    if sum(move.temperature_degC is not None for move in moves) < 2:
         return None
-    recorded_at, degC = np.array(known, dtype=float).T
-    temperatures: np.ndarray = np.interp(times, recorded_at, degC)
-    return temperatures - float(np.interp(clock[0], recorded_at, degC))
+    degC, first = degC_at(moves, times, clock), degC_at(moves, clock[:1], clock)
+    return None if degC is None or first is None else degC - first
 
 
 def interpolated(moves: Sequence[TimedMove]) -> int:

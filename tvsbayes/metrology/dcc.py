@@ -1,8 +1,8 @@
-"""The calibration certificate as DCC XML (schema 3.3.0 of PTB): unsigned, not accredited, as the campaign declares.
+"""The calibration certificate of any instrument as DCC XML (schema 3.3.0 of PTB): not accredited, as the user declares.
 
-`data/export/certificate.xml` is its template. Ratios in degrees per step, backlash in degrees, lengths in mm;
-uncertainties to two digits (GUM 7.2.6). Every text is escaped. A certificate is validated against a local schema that
-its reader names, without network.
+`data/export/certificate.xml` is its template, filled with the `Content` that an instrument gives. Uncertainties to two
+digits (GUM 7.2.6). Every text is escaped. A certificate is validated against a local schema that its reader names,
+without network.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 from xml.sax.saxutils import escape
@@ -26,22 +26,9 @@ from markupsafe import Markup
 
 from tvsbayes.errors import InputError, NotConverged, escaped
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.axes import AXES, SIDES
-from tvsbayes.instrument.campaign import Campaign, input_hashes
 from tvsbayes.metrology.budget_tables import PROBABILITY
-from tvsbayes.metrology.traceability import (
-    NOT_STATED,
-    Performance,
-    header_table,
-    performed,
-    plain_text,
-    stated_value,
-    traceability,
-)
-from tvsbayes.results.estimates import Estimate
-from tvsbayes.results.fit_record import FitRecord
-from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning
-from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.metrology.traceability import NOT_STATED, Performance, Traceability, plain_text, stated_in
+from tvsbayes.results.fit_record import Provenance
 
 COUNTRY_NOT_STATED = "ZZ"
 """User-assigned code of ISO 3166-1: valid for the schema, reported by PTB's Schematron."""
@@ -54,14 +41,6 @@ COVERAGE = (
     "An expanded uncertainty is half the 95 % interval, its coverage factor that half over the standard uncertainty: "
     "1.96 where the posterior is normal, a little more or less where it is not."
 )
-METHOD = (
-    "Joint Bayesian estimate of gear ratios, backlash, mirror geometry and camera pose from the pixels of laser spots "
-    "seen by a calibrated stereo pair at several depths; angles are inferred through cameras and model, no angle "
-    "standard measured them. Effective degrees of the beam per motor step hold at the stated pose of the mirrors. "
-    "U is half the 95 % interval, k = U/u."
-)
-DEG_PER_STEP, DEG, MM = r"\degree\per\one", r"\degree", r"\milli\metre"
-"""Units in the notation of D-SI, which has no unit of a count: steps are `\\one`."""
 CONDITIONS = {
     "basic_temperature": ("temperature_degC", "temperature", r"\degreecelsius"),
     "basic_humidityRelative": ("humidity_percent", "relative humidity", r"\percent"),
@@ -92,6 +71,9 @@ class Parties:
     customer_country: str = COUNTRY_NOT_STATED
 
 
+NO_PARTIES = Parties()
+
+
 @dataclass(frozen=True)
 class Embedded:
     """The HTML report that a certificate carries, and the number on its first page."""
@@ -106,7 +88,7 @@ class Embedded:
 
 
 @dataclass(frozen=True)
-class _Statement:
+class Statement:
     """A declaration with its name; `traceable` if it states whether the results are."""
 
     name: str
@@ -115,7 +97,7 @@ class _Statement:
 
 
 @dataclass(frozen=True)
-class _Real:
+class Real:
     """An `si:real` of D-SI 2.2.1, with the entries of its uncertainty in the element `kind`; "" for none."""
 
     value: str
@@ -125,19 +107,19 @@ class _Real:
 
 
 @dataclass(frozen=True)
-class _Quantity:
+class Quantity:
     """A named value; None where there is none."""
 
     name: str
-    real: _Real | None
+    real: Real | None
 
 
 @dataclass(frozen=True)
-class _Result:
+class Result:
     """A result: its quantities, and a description where it needs one."""
 
     name: str
-    quantities: Sequence[_Quantity]
+    quantities: Sequence[Quantity]
     description: str = ""
 
 
@@ -147,13 +129,13 @@ def dcc_real(
     u: float | None,
     interval95: tuple[float, float] | None = None,
     distribution: str = "normal",
-) -> _Real:
+) -> Real:
     """Build a number with no, a standard or an expanded uncertainty or an interval, to two digits of uncertainty."""
     numbers = [value, *(() if u is None else (u,)), *(interval95 or ())]
     if not all(map(math.isfinite, numbers)):
         raise ValueError(f"a certificate needs finite numbers, not {numbers}")
     if not u:
-        return _Real(repr(float(value)), unit)
+        return Real(repr(float(value)), unit)
     low, high = interval95 or (value, value)
     expanded, middle = 0.5 * (high - low), 0.5 * (high + low)
     k = expanded / u
@@ -164,87 +146,93 @@ def dcc_real(
     text, standard = f"{value:.{places}f}", f"{u:.{places}f}"
     covered = {"coverageProbability": f"{PROBABILITY:.2f}", "distribution": distribution}
     if interval95 is None:
-        return _Real(text, unit, "standardMU", {"valueStandardMU": standard, "distribution": distribution})
+        return Real(text, unit, "standardMU", {"valueStandardMU": standard, "distribution": distribution})
     if symmetric:
         half = {"valueExpandedMU": f"{expanded:.{places}f}", "coverageFactor": f"{k:.2f}"}
-        return _Real(text, unit, "expandedMU", {**half, **covered})
+        return Real(text, unit, "expandedMU", {**half, **covered})
     ends = {"intervalMin": f"{low:.{places}f}", "intervalMax": f"{high:.{places}f}"}
-    return _Real(text, unit, "coverageIntervalMU", {"valueStandardMU": standard, **ends, **covered})
+    return Real(text, unit, "coverageIntervalMU", {"valueStandardMU": standard, **ends, **covered})
 
 
-def _statements(campaign: Campaign, fit: FitRecord, when: Performance, parties: Parties) -> Iterator[_Statement]:
-    yield _Statement("accreditation", NOT_ACCREDITED)
-    trace = traceability(campaign)
-    yield _Statement("traceability", trace.statement, trace.declared)
-    yield _Statement("scope", ITEM_ONLY)
-    validation = fit.summary.validation
-    if validation is not None and not validation.passed:
-        text = f"VALIDATION FAILED: {validation.cause}. Uncertainties are stated as fitted; multiply every one of "
-        yield _Statement("validation", f"{text}them by {validation.inflation:.2f}.")
-    if campaign.header.get("synthetic"):
-        yield _Statement("synthetic data", "The campaign was simulated: no instrument was measured.")
-    if not when.recorded:
-        yield _Statement("dates", "The campaign does not record its date; the date of issue stands for it.")
+@dataclass(frozen=True)
+class Equipment:
+    """A thing that measured; `certificate` None where it has none of its own."""
+
+    identifier: str
+    name: str
+    description: str
+    certificate: str | None = None
+    quantities: Sequence[Quantity] = ()
+    normal: bool = False
+
+
+@dataclass(frozen=True)
+class Content:
+    """What an instrument certifies.
+
+    Attributes:
+        title: name of the campaign.
+        header: keys of `campaign.toml` outside the instrument's.
+        item: name of the measured object where the header has no `instrument`.
+        measured: name of the result.
+        scope: under which conditions it holds.
+        method: name, description.
+        references: norms and papers of the method, by their element.
+        equipment: what measured.
+        results: results.
+        statements: declarations besides those that every certificate has.
+        performance: when it was measured.
+        traceability: of the length standard.
+        provenance: how the results were made.
+    """
+
+    title: str
+    header: Mapping[str, object]
+    item: str
+    measured: str
+    scope: str
+    method: tuple[str, str]
+    references: Sequence[tuple[str, str]]
+    equipment: Sequence[Equipment]
+    results: Sequence[Result]
+    statements: Sequence[Statement]
+    performance: Performance
+    traceability: Traceability
+    provenance: Provenance
+
+
+def common_statements(content: Content, parties: Parties) -> list[Statement]:
+    """Declarations of every certificate."""
+    statements = [
+        Statement("accreditation", NOT_ACCREDITED),
+        Statement("traceability", content.traceability.statement, content.traceability.declared),
+        Statement("scope", ITEM_ONLY),
+        *content.statements,
+    ]
+    if content.header.get("synthetic"):
+        statements.append(Statement("synthetic data", "The campaign was simulated: no instrument was measured."))
+    if not content.performance.recorded:
+        text = "The campaign does not record its date; the date of issue stands for it."
+        statements.append(Statement("dates", text))
     for name, country in (("country", parties.country), ("country of the customer", parties.customer_country)):
         if country == COUNTRY_NOT_STATED:
-            yield _Statement(name, f"The {name} was not stated; {COUNTRY_NOT_STATED} stands for it.")
+            text = f"The {name} was not stated; {COUNTRY_NOT_STATED} stands for it."
+            statements.append(Statement(name, text))
+    return statements
 
 
-def _cameras(campaign: Campaign) -> str:
-    """Describe the camera pair in words."""
-    declared, stereo = header_table(campaign, "traceability"), campaign.stereo_pair
-    text = f"2 x {stereo.image_width} x {stereo.image_height} px, calibration residual {stereo.rms_px:.3g} px rms"
-    if stereo.assumed:
-        text += "; covariance of the calibration assumed, not estimated"
-    if "stereo_calibrated" in declared:
-        text += f"; calibrated {declared['stereo_calibrated']}"
-    return text
+def check_certifiable(parties: Parties, *, own: bool, converged: bool) -> None:
+    """Refuse inputs that allow no certificate.
 
+    Args:
+        parties: issuer and customer.
+        own: whether the results belong to the data.
+        converged: whether their fit has converged.
 
-def _stated(campaign: Campaign, table: str, key: str, unit: str) -> _Real | None:
-    """Return a quantity of a table of `campaign.toml`; None where it is not stated."""
-    stated = stated_value(campaign, table, key)
-    return None if stated is None else dcc_real(unit, stated.value, stated.u)
-
-
-def _results(fit: FitRecord) -> Iterator[_Result]:
-    """List ratios, backlash, and the predicted ISO 230-2-style figures."""
-    summary = fit.summary
-    shape = "normal" if summary.estimator == "laplace" else "sampled posterior"
-
-    def quantity(name: str, estimate: Estimate | None, unit: str) -> _Quantity:
-        if estimate is None:
-            return _Quantity(name, None)
-        return _Quantity(name, dcc_real(unit, estimate.value, estimate.sd, estimate.interval95, shape))
-
-    ratios = [
-        quantity(f"effective degrees per step, {direction}", entry, DEG_PER_STEP)
-        for direction, entry in summary.effective.items()
-    ]
-    yield _Result("effective degrees of beam per motor step", ratios)
-    plays = []
-    for axis in AXES:
-        moved = any(summary.effective[d] is not None for d in SIDES[axis])
-        play = summary.parameters[f"backlash_deg.{axis}"] if moved else None
-        plays.append(quantity(f"backlash of the {axis} axis", play, DEG))
-    yield _Result("backlash", plays)
-    for table in () if fit.evidence is None else fit.evidence.positioning:
-        if table.predicted is not None:
-            title = f"ISO 230-2-style figures of the {table.axis} axis, posterior predictive"
-            yield _Result(title, list(_figures(table)), "; ".join(table.notes))
-
-
-def _figures(table: AxisPositioning) -> Iterator[_Quantity]:
-    for name, (symbol, term) in FIGURES.items():
-        figure = (table.predicted or {})[name]
-        low, high = figure.interval95
-        # Medians and intervals of a simulation: u is the half width over 1.96.
-        u = (high - low) / (2 * NORMAL_95)
-        yield _Quantity(f"{symbol}, {term}", dcc_real(DEG, figure.median, u, figure.interval95, "simulated tests"))
-
-
-def _check_certifiable(campaign: Campaign, fit: FitRecord, parties: Parties) -> None:
-    """Refuse inputs that allow no certificate; errors as in `dcc_bytes`."""
+    Raises:
+        InputError: a country is not a code, or the results belong to other data or priors.
+        NotConverged: the fit of the results has not converged.
+    """
     where = "in which the campaign was measured", "of the customer"
     for country, place in zip((parties.country, parties.customer_country), where, strict=True):
         if not re.fullmatch("[A-Z]{2}", country):
@@ -257,71 +245,61 @@ def _check_certifiable(campaign: Campaign, fit: FitRecord, parties: Parties) -> 
                 remedy=f"write the two letters of the country {place}: MX for Mexico",
             )
     again = "run `tvsbayes fit` on the campaign again"
-    if fit.provenance.inputs != input_hashes(campaign):
+    if not own:
         message = "results/fit.json belongs to other data or priors than the campaign"
         raise InputError("stale-results", message, file="fit.json", remedy=again)
-    if not fit.summary.converged:
+    if not converged:
         raise NotConverged("not-converged", "no certificate of a fit that has not converged", remedy=again)
 
 
-def dcc_bytes(
-    campaign: Campaign,
-    fit: FitRecord,
+def certificate_xml(
+    content: Content,
+    identifier: str,
     *,
     issued: datetime.date,
-    identifier: str | None = None,
-    parties: Parties = Parties(),
-    report: Embedded | None = None,
+    parties: Parties,
+    report: Embedded | None,
+    signed: bool = False,
 ) -> bytes:
-    """Write DCC-schema XML of a fit: unsigned, not accredited, traceable only as far as the campaign declares.
+    """Write DCC-schema XML: not accredited, traceable only as far as the campaign declares.
 
     Args:
-        campaign: the fitted campaign; names are used as given, as text.
-        fit: content of its `results/fit.json`.
+        content: what is certified; names are used as given, as text.
+        identifier: unique identifier.
         issued: date of issue; the same inputs and date give the same bytes.
-        identifier: unique identifier; None makes one from results, name, date, parties and report.
         parties: laboratory, customer, countries.
         report: the HTML report to embed; its number is part of the core data.
+        signed: whether a signature will be added.
 
     Returns:
         UTF-8 XML, DCC 3.3.0.
-
-    Raises:
-        InputError: a country is not a code, or the results belong to other data or priors.
-        NotConverged: the fit of the results has not converged.
     """
-    _check_certifiable(campaign, fit, parties)
-    summary, made, when = fit.summary, fit.provenance, performed(campaign, issued)
-    besides = [campaign.title, *astuple(parties), None if report is None else report.number]
+    made = content.provenance
     # PTB's Schematron requires a letter and up to four numbers; the whole version is in the description.
     release = _RELEASE.match(made.shown_versions["tvsbayes"])
     listed = ", ".join(f"{name} {version}" for name, version in made.shown_versions.items())
-    pose = summary.reference_pose_deg
-    kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
-    where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    named = campaign.header.get("method")
     return _rendered(
-        campaign=campaign,
-        header=campaign.header,
+        content=content,
         parties=parties,
         report=report,
         issued=issued,
-        identifier=identifier or fit.certificate_id(issued, besides),
-        performance=when,
+        identifier=identifier,
         release=f"v{release.group() if release else '0'}",
         software=f"{listed}; seed {made.seed}; command: {made.command}",
-        statements=_statements(campaign, fit, when, parties),
-        scope=f"Effective ratios hold {where}. Values and intervals from {kind}. {COVERAGE}",
-        method=METHOD + (f" Method as named by the user: {named}" if named else ""),
-        cameras=_cameras(campaign),
-        board_certificate=header_table(campaign, "traceability").get("board_certificate", NOT_STATED),
-        pitch=_stated(campaign, "traceability", "pitch_mm", MM),
+        statements=common_statements(content, parties),
+        signed=signed,
+        used=" ".join(("method", "software", *(each.identifier for each in content.equipment))),
         conditions={
-            refers: _Quantity(name, _stated(campaign, "environment", key, unit))
+            refers: Quantity(name, stated(content.header, "environment", key, unit))
             for refers, (key, name, unit) in CONDITIONS.items()
         },
-        results=_results(fit),
     )
+
+
+def stated(header: Mapping[str, object], table: str, key: str, unit: str) -> Real | None:
+    """A quantity of a table of `campaign.toml`; None where it is not stated."""
+    found = stated_in(header, table, key)
+    return None if found is None else dcc_real(unit, found.value, found.u)
 
 
 def _text(value: object) -> Markup:

@@ -6,12 +6,26 @@ Lengths in mm, temperatures in degC, relative humidity in %, each with its stand
 from __future__ import annotations
 
 import datetime
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from tvsbayes.files.documents import StatedValue
-from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.conditions import TimedMove
 
 NOT_STATED = "not stated"
+
+
+class Measured(Protocol):
+    """A campaign of any kind."""
+
+    @property
+    def header(self) -> Mapping[str, object]:
+        """Keys of `campaign.toml` outside the instrument's."""
+
+    @property
+    def moves(self) -> Sequence[TimedMove]:
+        """Moves in time order."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +50,7 @@ class Performance:
     recorded: bool
 
 
-def performed(campaign: Campaign, issued: datetime.date) -> Performance:
+def performed(campaign: Measured, issued: datetime.date) -> Performance:
     """Return when the campaign was measured; the date of issue where it does not state it."""
     created = campaign.header.get("created")
     if not isinstance(created, datetime.date):
@@ -51,23 +65,29 @@ def performed(campaign: Campaign, issued: datetime.date) -> Performance:
         return Performance(created.date(), created.date(), True)
 
 
-def header_table(campaign: Campaign, name: str) -> dict[str, object]:
+def header_table(campaign: Measured, name: str) -> dict[str, object]:
     """Return `[environment]` or `[traceability]` of `campaign.toml`; empty where it is missing."""
     table = campaign.header.get(name)
     return table if isinstance(table, dict) else {}
 
 
-def stated_value(campaign: Campaign, name: str, key: str) -> StatedValue | None:
-    """Return a quantity of such a table."""
-    entry = header_table(campaign, name).get(key)
+def stated_in(header: Mapping[str, object], name: str, key: str) -> StatedValue | None:
+    """Return a quantity of such a table of a header."""
+    table = header.get(name)
+    entry = table.get(key) if isinstance(table, dict) else None
     return StatedValue(entry["value"], entry["u"]) if isinstance(entry, dict) else None
+
+
+def stated_value(campaign: Measured, name: str, key: str) -> StatedValue | None:
+    """Return a quantity of such a table."""
+    return stated_in(campaign.header, name, key)
 
 
 UNITS = {"degC": "degC", "percent": "%", "mm": "mm"}
 """Units by the suffix of a key."""
 
 
-def stated_text(campaign: Campaign, name: str, key: str) -> tuple[str, str]:
+def stated_text(campaign: Measured, name: str, key: str) -> tuple[str, str]:
     """Return an entry of such a table for readers: its name, without the unit of a quantity, and its text."""
     stated = stated_value(campaign, name, key)
     if stated is None:
@@ -81,13 +101,18 @@ def plain_text(value: object) -> str:
     return " ".join(str(value).split()) or NOT_STATED
 
 
-def traceability(campaign: Campaign) -> Traceability:
+def traceability(campaign: Measured) -> Traceability:
     """Return the campaign's statement on its length standard, not checked; simulated data are never traceable."""
     certificate = plain_text(header_table(campaign, "traceability").get("board_certificate", ""))
+    return length_traceability(campaign, certificate, "the board", "the calibration board")
+
+
+def length_traceability(campaign: Measured, certificate: str, named: str, standard: str) -> Traceability:
+    """Return the statement on a length standard by its certificate, `NOT_STATED` for none."""
     if campaign.header.get("synthetic"):
         return Traceability("Simulated data: not traceable.", False)
     if certificate == NOT_STATED:
-        text = "Not traceable: the campaign names no certificate of the length standard (the calibration board)."
+        text = f"Not traceable: the campaign names no certificate of the length standard ({standard})."
         return Traceability(text, False)
-    text = f"As declared by the user and not verified here: length from the board with certificate {certificate}."
+    text = f"As declared by the user and not verified here: length from {named} with certificate {certificate}."
     return Traceability(text, True)

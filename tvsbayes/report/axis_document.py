@@ -14,10 +14,14 @@ import numpy as np
 from tvsbayes.compensation.periodic_error import LIKELY as TABLE_LIKELY
 from tvsbayes.compensation.verification import compensation_in
 from tvsbayes.display import concise
-from tvsbayes.errors import escaped, typed
+from tvsbayes.errors import NothingToEstimate, escaped, typed
 from tvsbayes.instrument.campaign import title_of
+from tvsbayes.metrology.conformity import Criterion, Tolerance
+from tvsbayes.metrology.traceability import performed
 from tvsbayes.report.advice import ROUGH, UNSAMPLED
+from tvsbayes.report.budget_views import budget_view
 from tvsbayes.report.compensation_text import compensation_section
+from tvsbayes.report.criteria import COLOUR, criteria_table, criterion_text
 from tvsbayes.report.document import (
     Document,
     FigureView,
@@ -42,8 +46,9 @@ from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import axis_hashes
+from tvsbayes.single_axis.axis_certificate import axis_traceability
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_iso230 import target_runs
+from tvsbayes.single_axis.axis_iso230 import AXIS_SYMBOLS, target_runs
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
 from tvsbayes.single_axis.axis_record import (
@@ -76,6 +81,10 @@ HELPS = {
 """Alternatives by target where further stops hardly help."""
 CONFLICT_TEXT = "the numbers hold only if the readings, not the priors, are wrong"
 """Part of the verdict where the readings contradict priors."""
+BUDGETS = (
+    "Shares are of the variance. An error that all readings of the reference share is never rescaled by their scatter. "
+    "The u of a figure of ISO 230-2 is that of its measurement; what the axis does not repeat is in the figure.",
+)
 METHOD = (
     "Readings = offset + unit per command x command, play taken up on the side of arrival, an error and a play "
     "that repeat by position (Matern processes), waves where periods are asked for, a zero that creeps and drifts, "
@@ -404,6 +413,11 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
         Section("What the readings do not determine", items=summary.weak_directions or ["No remarks."]),
         Section("Classic", [line]),
         *([] if is_drive(summary) else [iso230_section(results)]),
+        *(
+            [Section("Uncertainty budgets", BUDGETS, tables=[*map(budget_view, summary.budgets)])]
+            if summary.budgets
+            else []
+        ),
         Section("Method", METHOD),
     ]
 
@@ -434,13 +448,43 @@ def _steps(summary: AxisSummary, folder: str) -> list[str]:
     return ["Log a longer run: of N periods, noise leaves about period / (2 N) times noise over amplitude."]
 
 
-def axis_document(results: AxisResults, issue: Issue) -> Document:
+def figures_by_name(unit: str) -> dict[str, tuple[str, str]]:
+    """Name and unit of the figures that a tolerance may limit, by their letters in small letters."""
+    return {symbol.lower(): (name, unit) for name, symbol in AXIS_SYMBOLS.items()}
+
+
+def criteria_of(summary: AxisSummary, tolerance: Tolerance | None) -> tuple[Criterion, ...]:
+    """The tolerance judged; none where none is stated.
+
+    Raises:
+        NothingToEstimate: the readings do not give the figure.
+        InputError: the rule needs an uncertainty that is not known.
+    """
+    if tolerance is None:
+        return ()
+    classic, symbol = summary.classic, AXIS_SYMBOLS[tolerance.of]
+    value, u = ((figures or {}).get(tolerance.of) for figures in (classic.iso230, classic.iso230_u))
+    if value is None:
+        why = classic.iso230_basis if classic.iso230 is None else "the runs do not give it"
+        remedy = "read every position at least twice from both sides, and state command_unit in [axis]"
+        raise NothingToEstimate("no-figure", f"--of {symbol}: {why}", remedy=remedy)
+    # Rounding of the derivatives is no uncertainty.
+    known = u if u is not None and u > 1e-9 * abs(value) else None
+    return (tolerance.judged(symbol, summary.unit, value, known),)
+
+
+def axis_document(results: AxisResults, issue: Issue, criteria: Sequence[Criterion] = ()) -> Document:
     """The report of an axis with its number; `results.fit` must include `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
     origin = provenance(axis_hashes(fit.campaign), fit.seed)
     content = json.dumps([summary.as_json(), origin.inputs], sort_keys=True)
     header = fit.campaign.header
-    verdict = sentence(axis_verdict(summary)) + " No limit was stated." * summary.explained
+    verdict = sentence(axis_verdict(summary))
+    if criteria:
+        verdict = f"{'. '.join(map(criterion_text, criteria))}. {verdict}"
+    elif summary.explained:
+        verdict += " No limit was stated."
+    colour = "cannot-tell" if summary.explained else "not-met"
     figures = [*_error_figures(fit), *_wave_figures(fit)]
     folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
     return numbered(
@@ -448,12 +492,13 @@ def axis_document(results: AxisResults, issue: Issue) -> Document:
             results=digest_number(content.encode()),
             name=title_of(header, fit.campaign.path),
             about=about_table(header, str(header.get("created") or ""), issue),
-            verdict=Verdict(verdict, "cannot-tell" if summary.explained else "not-met"),
+            verdict=Verdict(verdict, COLOUR[criteria[0].verdict] if criteria else colour),
             numbers=[] if is_drive(summary) else [_play_number(summary)],
             answer=period_table(summary) or ratio_table(summary),
             picture=figures[0] if figures else None,
             steps=_steps(summary, folder),
-            traceable="The readings are taken as stated.",
+            criteria=criteria_table(criteria),
+            traceable=axis_traceability(fit.campaign, performed(fit.campaign, issue.day)).statement,
             warnings=[
                 *summary.problems,
                 *_lines("Doubt", [doubt.text for doubt in summary.doubts]),

@@ -15,9 +15,11 @@ from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.coordinates.error_map import ErrorMap, SimpleError, error_map, simple_error
 from tvsbayes.coordinates.simple_calibration import simple_calibrations
+from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import ClassicResult, classic_of
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_APPROACH, Axis
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.metrology.conformity import CONFORMING_PROBABILITY, CONFORMS, Criterion, Tolerance
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
 from tvsbayes.report.spot_pictures import SpotCrop, spot_crops
 from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, stored_hold_out
@@ -28,33 +30,27 @@ from tvsbayes.results.plan_record import PlanRecord, stored_plan
 from tvsbayes.statistics.intervals import band95
 
 MET, NOT_MET = "met", "not met"
-MET_PROBABILITY = 0.95
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """Whether an error stays within a limit.
-
-    Attributes:
-        quantity: quantity whose error is limited.
-        limit: largest error allowed, in `unit`.
-        unit: unit of the limit.
-        probability: probability that the error is within the limit.
-        verdict: "met" for a probability of at least 0.95, "not met" up to 0.05, else "cannot tell".
-    """
-
-    quantity: str
-    limit: float
-    unit: str
-    probability: float
-    verdict: str
+SATISFIED = (MET, CONFORMS)
+"""Verdicts that let `report` end with exit code 0."""
+POINT = "xyz"
+"""Name of a point's error in 3D for a tolerance."""
 
 
 def criterion(quantity: str, errors: np.ndarray, limit: float, unit: str) -> Criterion:
-    """Compare draws of an error (n,) with a limit (decision rule agreed in advance, ISO/IEC 17025 7.8.6)."""
+    """Compare draws of an error (n,) with a limit (decision rule agreed in advance, ISO/IEC 17025 7.8.6).
+
+    It is "met" for a probability of at least 0.95, "not met" up to 0.05, else "cannot tell".
+    """
     probability = float(np.mean(np.abs(errors) <= limit))
-    verdict = MET if probability >= MET_PROBABILITY else NOT_MET if probability <= 1 - MET_PROBABILITY else CANNOT_TELL
-    return Criterion(quantity, limit, unit, probability, verdict)
+    verdict = (
+        MET
+        if probability >= CONFORMING_PROBABILITY
+        else NOT_MET
+        if probability <= 1 - CONFORMING_PROBABILITY
+        else CANNOT_TELL
+    )
+    risk = {MET: 1 - probability, NOT_MET: probability}.get(verdict)
+    return Criterion(quantity, limit, unit, probability, verdict, risk=risk)
 
 
 MAP_CELLS = 5
@@ -153,6 +149,7 @@ def gather(
     ratios_deg_per_step: np.ndarray | None = None,
     limit_deg_per_step: float | None = None,
     limit_mm: float | None = None,
+    tolerance: Tolerance | None = None,
     doubts: Sequence[str] = (),
 ) -> Evidence:
     """Compute all data of a report.
@@ -165,6 +162,7 @@ def gather(
         ratios_deg_per_step: draws of the effective ratios by direction, shape (draws, 4), for their limit.
         limit_deg_per_step: largest error allowed of every effective ratio.
         limit_mm: largest 3D error allowed at that range, with pan and tilt in the middle of the counters seen.
+        tolerance: limit with its decision rule, of the error of a direction's ratio, deg/step, or of `POINT`, mm.
         doubts: warnings of `check`.
     """
     classic_result = classic_of(campaign)
@@ -178,6 +176,9 @@ def gather(
     if limit_mm is not None:
         errors = _inflation(fit) * distances["joint"]
         criteria.append(criterion(f"3D point at {range_mm:g} mm", errors, limit_mm, "mm"))
+    if tolerance is not None:
+        errors_mm = _inflation(fit) * distances["joint"]
+        criteria.append(_judged(tolerance, fit, ratios_deg_per_step, errors_mm, range_mm))
     pan, tilt = (float(value) for value in calibration.range_steps.mean(axis=1))
     ray = calibration.ray(pan, tilt, HOME_APPROACH)
     point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
@@ -219,6 +220,24 @@ def _maps(campaign: Campaign, result: ClassicResult | None, calibration: Calibra
 def _inflation(fit: FitRecord) -> float:
     """Factor on uncertainties of limits after a failed validation."""
     return 1.0 if fit.summary.validation is None else fit.summary.validation.inflation
+
+
+def _judged(
+    tolerance: Tolerance, fit: FitRecord, ratios_deg_per_step: np.ndarray | None, errors_mm: np.ndarray, range_mm: float
+) -> Criterion:
+    """A stated tolerance of one direction, or of a point.
+
+    Raises:
+        NothingToEstimate: the direction was never moved.
+    """
+    if tolerance.of == POINT:
+        return tolerance.judged_error(f"3D point at {range_mm:g} mm", "mm", errors_mm)
+    estimate = fit.summary.effective.get(tolerance.of)
+    if estimate is None or ratios_deg_per_step is None:
+        message = f"--of {tolerance.of}: the axis was never moved in this direction"
+        raise NothingToEstimate("no-motion", message, remedy="name a direction that has looks")
+    errors = _inflation(fit) * (ratios_deg_per_step[:, DIRECTIONS.index(tolerance.of)] - estimate.value)
+    return tolerance.judged_error(f"ratio {tolerance.of}", "deg/step", errors)
 
 
 def _ratio_criteria(ratios_deg_per_step: np.ndarray, fit: FitRecord, limit: float) -> list[Criterion]:

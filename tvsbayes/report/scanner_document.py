@@ -17,20 +17,21 @@ from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.estimators.plausibility import misfit_causes
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.metrology.conformity import Criterion
 from tvsbayes.metrology.traceability import performed, traceability
 from tvsbayes.report import figures
 from tvsbayes.report.advice import LAPLACE_SHORT, assumed_stereo, next_steps, verdict_line
 from tvsbayes.report.compensation_text import verified_section
+from tvsbayes.report.criteria import COLOUR, WORST_FIRST, criteria_table
 from tvsbayes.report.document import Document, FigureView, Issue, Number, Verdict, about_table, sentence
 from tvsbayes.report.drawing import ESTIMATOR_STYLE
-from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
+from tvsbayes.report.evidence import SATISFIED, Evidence
 from tvsbayes.report.fit_sections import fit_sections
 from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.page import numbered
 from tvsbayes.report.parameter_words import cause_in_words, sentence_in_words
 from tvsbayes.report.tables import TableView, chance_text, interval_text, two_digits
 from tvsbayes.report.uncertainty_sections import uncertainty_sections
-from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
 NO_CLASSIC = "not estimated"
@@ -89,36 +90,22 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
         usable = verdict_line(summary).removeprefix("verdict: ") + "; see the warnings of check" * bool(doubts)
         return Verdict(f"{sentence(usable)} No limit was stated", "cannot-tell")
     judgements = []
-    for verdict in (NOT_MET, CANNOT_TELL, MET):
+    for verdict in WORST_FIRST:
         criteria_of_verdict = [c for c in criteria if c.verdict == verdict]
         limits = dict.fromkeys((c.limit, c.unit) for c in criteria_of_verdict)
         for limit, unit in limits:
             same_limit = [c for c in criteria_of_verdict if (c.limit, c.unit) == (limit, unit)]
-            chances = [c.probability for c in same_limit]
-            bound = "" if len(same_limit) == 1 else "at most " if verdict == NOT_MET else "at least "
-            worst = chance_text(max(chances) if verdict == NOT_MET else min(chances), bound)
+            chances = [c.probability or 0.0 for c in same_limit]
+            misses = COLOUR[verdict] == "not-met"
+            bound = "" if len(same_limit) == 1 else "at most " if misses else "at least "
+            worst = chance_text(max(chances) if misses else min(chances), bound)
             names = ", ".join(c.quantity for c in same_limit)
             judgements.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
     text, (worst, _) = "; ".join(sentence for _, sentence in judgements), judgements[0]
     prefix = ""
     if failed and validation is not None:
         prefix = "With that factor: " if validation.widens else "As fitted: "
-    return Verdict(failed + prefix + text[0].upper() + text[1:], worst.replace(" ", "-"))
-
-
-def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
-    """Every limit with its verdict and the rule; None where no limit was stated."""
-    if not criteria:
-        return None
-    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", _chance(c), c.verdict] for c in criteria]
-    caption = "Decision rule: met if P(|error| <= limit) >= 0.95, not met if <= 0.05, else cannot tell"
-    return TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
-
-
-def _chance(c: Criterion) -> str:
-    """The probability; where the verdict is open, also the number in a hundred beyond the limit."""
-    text = chance_text(c.probability)
-    return text if c.verdict != CANNOT_TELL else f"{text}: {100 - round(100 * c.probability)} of 100 are off by more"
+    return Verdict(failed + prefix + text[0].upper() + text[1:], COLOUR[worst])
 
 
 def measured_days(campaign: Campaign, issue: Issue) -> str:
@@ -260,7 +247,7 @@ def _steps(e: Evidence) -> list[str]:
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
         steps.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
-    unmet = next((c for c in e.criteria if c.verdict != MET), None)
+    unmet = next((c for c in e.criteria if c.verdict not in SATISFIED), None)
     if unmet is not None and e.planned is None and summary.explained:
         limit = f"{unmet.limit:g} {unmet.unit}"
         goal = f"U95(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"

@@ -30,10 +30,12 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
-from tvsbayes.instrument.campaign_header import header_values
+from tvsbayes.instrument.campaign_header import ENVIRONMENT, header_tables, header_values
 from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
+from tvsbayes.single_axis.reference import TABLE as REFERENCE
+from tvsbayes.single_axis.reference import Reference, parse_reference
 from tvsbayes.single_axis.waves import WavePeriods
 
 FORMAT = "tvsbayes-axis/1"
@@ -51,6 +53,11 @@ TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1
 """One turn in each unit of angle."""
 _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
 """Log-normal parameters by which the model divides: the density is undefined where they are fixed at 0."""
+HEADER_TABLES = {
+    "environment": ENVIRONMENT,
+    "traceability": ("reference_certificate", "reference_calibrated"),
+}
+"""Keys of the tables of the header."""
 PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that define waves."""
 LIMITS, COMMAND_UNIT = "limits", "command_unit"
@@ -156,6 +163,7 @@ class AxisCampaign(Shown):
         path: the folder; None where it was never written.
         absolute: whether the encoder keeps its zero over a homing.
         command_unit: unit of the commands; None where `[axis]` does not state it.
+        reference: what `[reference]` states.
     """
 
     unit: str
@@ -168,6 +176,12 @@ class AxisCampaign(Shown):
     absolute: bool = False
     limits: tuple[float, float] | None = None
     command_unit: str | None = None
+    reference: Reference = field(default_factory=Reference)
+
+    @property
+    def noisy(self) -> tuple[Reading, ...]:
+        """Readings with the u of their own noise: 0, unknown, where the stated one is common to all."""
+        return tuple(replace(r, u=0.0) for r in self.readings) if self.reference.common else self.readings
 
     @property
     def priors(self) -> dict[str, AxisPrior]:
@@ -250,7 +264,21 @@ def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[
 
 
 def _parse_header(keys: Keys) -> dict[str, object]:
-    keys.only(("format", "unit", *_TEXTS, "created", "powered_on", "rate", "synthetic", "seed", "axis"))
+    keys.only(
+        (
+            "format",
+            "unit",
+            *_TEXTS,
+            "created",
+            "powered_on",
+            "rate",
+            "synthetic",
+            "seed",
+            "axis",
+            REFERENCE,
+            *HEADER_TABLES,
+        )
+    )
     header: dict[str, object] = {}
     for key in keys.values:
         if key in _TEXTS:
@@ -269,7 +297,7 @@ def _parse_header(keys: Keys) -> dict[str, object]:
                 raise keys.refuse(key, "date", allowed, "write it without quotes")
             header[key] = keys.values[key]
     check_power(keys, header)
-    return header
+    return header | header_tables(keys, HEADER_TABLES)
 
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
@@ -354,8 +382,10 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     moves = parse_axis_moves(files["moves.csv"])
     readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
     command_unit = axis.text_value(COMMAND_UNIT, UNIT_CHARS_MAX) if COMMAND_UNIT in axis else None
-    limits = _parse_limits(axis)
-    return AxisCampaign(unit, moves, readings, stated, header, periods, path, absolute, limits, command_unit)
+    limits, reference = _parse_limits(axis), parse_reference(keys.table(REFERENCE), moves)
+    return AxisCampaign(
+        *(unit, moves, readings, stated, header, periods, path, absolute, limits, command_unit, reference)
+    )
 
 
 def unit_of_folder(folder: Path) -> str | None:
@@ -413,7 +443,9 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
     # No estimate depends on them: they are no part of the hash of the inputs.
     besides = [] if campaign.limits is None else [toml_line(LIMITS, list(campaign.limits))]
     besides += [] if campaign.command_unit is None else [toml_line(COMMAND_UNIT, campaign.command_unit)]
-    return ("\n".join([*lines, "[axis]", *besides, *_axis_table_lines(campaign)]) + "\n").encode()
+    reference = campaign.reference.lines()
+    lines += ["[axis]", *besides, *_axis_table_lines(campaign), *([f"[{REFERENCE}]"] if reference else []), *reference]
+    return ("\n".join(lines) + "\n").encode()
 
 
 def axis_bytes(campaign: AxisCampaign) -> dict[str, bytes]:
@@ -441,7 +473,8 @@ def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
     """SHA-256 of the inputs of an estimate, by "moves", "readings" and "axis", over values in canonical text."""
     readings = sorted(campaign.readings, key=lambda reading: reading.reading)
     timing = [toml_line(key, campaign.header[key]) for key in ("rate", "powered_on") if key in campaign.header]
-    axis = "\n".join([campaign.unit, *timing, *_axis_table_lines(campaign)])
+    reference = campaign.reference.lines(estimate=True)
+    axis = "\n".join([campaign.unit, *timing, *_axis_table_lines(campaign), *reference])
     contents = {
         "moves": axis_moves_bytes(campaign.moves),
         "readings": readings_bytes(readings),

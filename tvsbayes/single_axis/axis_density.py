@@ -49,6 +49,13 @@ def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
     return functionals
 
 
+def mean_play(model: AxisModel) -> np.ndarray:
+    """Functional (columns,) of the mean of the play over the positions read."""
+    functional = model.line_terms(backlash=1.0)
+    functional[model.layout["play"]] = model.places.weights(model.rows.positions).mean(axis=0)
+    return functional
+
+
 def line_functionals(model: AxisModel) -> np.ndarray:
     """Functionals of all but the last of `HEADLINE_DRAWS`; the same for all draws."""
     return np.array([model.line_terms(**factors) for factors in line_factors(model).values()])

@@ -5,7 +5,6 @@ Deviations in the folder's unit; forward is the standard's "up".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -106,10 +105,49 @@ def target_runs(rows: AxisRows) -> TargetRuns:
 
 def iso_targets(runs: PositionRuns) -> tuple[IsoTarget, ...]:
     """The table by position."""
-    values = iso230(runs.forward, runs.backward)
-    names = ("mean_up", "sd_up", "mean_down", "sd_down", "reversal_at")
-    counts: Sequence[np.ndarray] = [np.isfinite(side).sum(axis=1) for side in (runs.forward, runs.backward)]
+    at = iso230(runs.forward, runs.backward)
+    up, down = (np.isfinite(side).sum(axis=1) for side in (runs.forward, runs.backward))
     return tuple(
-        IsoTarget(float(position), *(_number(values[name][k]) for name in names), *(int(side[k]) for side in counts))
+        IsoTarget(
+            position=float(position),
+            mean_forward=_number(at["mean_up"][k]),
+            s_forward=_number(at["sd_up"][k]),
+            mean_backward=_number(at["mean_down"][k]),
+            s_backward=_number(at["sd_down"][k]),
+            reversal=_number(at["reversal_at"][k]),
+            runs_forward=int(up[k]),
+            runs_backward=int(down[k]),
+        )
         for k, position in enumerate(runs.position)
     )
+
+
+STEP = 1e-4
+"""Step of derivatives of figures, in standard uncertainties: far below the distance of two positions' deviations."""
+
+
+class FigureParts(NamedTuple):
+    """Contributions to a figure: of each cause of the reference, signed, and of the readings' own noise together."""
+
+    reference: np.ndarray
+    noise: float
+
+    @property
+    def u(self) -> float | None:
+        """Standard uncertainty; None where there is no figure."""
+        return _number(np.sqrt(np.sum(self.reference**2) + self.noise**2))
+
+
+def figure_parts(runs: PositionRuns, rows: AxisRows) -> dict[str, FigureParts]:
+    """First-order uncertainty of every figure of these runs (GUM 5.1.2): of how they were read, not of the axis."""
+    u = np.sqrt(rows.variance)
+    noisy = np.flatnonzero(u > 0)
+    errors = np.concatenate([rows.reference.T, u[noisy, None] * np.eye(len(u))[noisy]]) if len(u) else np.zeros((0, 0))
+    moved = np.stack([sign * STEP * errors for sign in (1.0, -1.0)])
+    sides = [side + moved[..., np.maximum(table, 0)] for side, table in zip(runs[1:3], runs.rows, strict=True)]
+    figures = iso230(*sides)
+    parts, causes = {}, len(rows.reference_causes)
+    for name in SYMBOLS:
+        by_error = (figures[name][0] - figures[name][1]) / (2 * STEP)
+        parts[of_sides(name)] = FigureParts(by_error[:causes], float(np.sqrt(np.sum(by_error[causes:] ** 2))))
+    return parts

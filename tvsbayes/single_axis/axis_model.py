@@ -1,10 +1,11 @@
 """The density of an axis' readings: linear quantities are integrated out exactly, for many draws of the scales at once.
 
 A reading = offset + unit per command x command + contrast + position in the play x (backlash + its variation) / 2
-+ error by position + waves + creep + thermal shift + drift + stop error + noise (formulation 8.1). A Kalman filter of
-two states (drift, held stop error) over the rows whitens the columns of all other terms; its cost is linear in the
-rows. For a drive at constant rate time and position are equivalent: no error by position, and seeing in place of stop
-errors. NumPy.
++ error by position + waves + creep + thermal shift + drift + stop error + errors that the reference's readings share
++ noise (formulation 8.1). A position is the reading less the reference's errors, which functionals leave out. A Kalman
+filter of two states (drift, held stop error) over the rows whitens the columns of all other terms; its cost is linear
+in the rows. For a drive at constant rate time and position are equivalent: no error by position, and seeing in place of
+stop errors. NumPy.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from tvsbayes.single_axis.axis_parameters import AxisCoordinates, AxisPrior
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_are_long, play_places, reversal_of
 from tvsbayes.single_axis.filter_of_rows import Whitened, averaged_variance, whitened
+from tvsbayes.single_axis.linear_posterior import LinearPosterior
 from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
 from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
@@ -36,38 +38,6 @@ OFFSET, SLOPE, CONTRAST, BACKLASH = 0, 1, 2, 3
 """Indices of the first columns, the terms of the line and the backlash."""
 LINE_TERMS = 4
 """Their number."""
-
-
-@dataclass(frozen=True)
-class LinearPosterior:
-    """Posterior of the linear quantities given the scales: normal, by column of the model.
-
-    Attributes:
-        mean: shape (n, columns).
-        covariance: shape (n, columns, columns).
-    """
-
-    mean: np.ndarray
-    covariance: np.ndarray
-
-    def mean_of(self, functionals: np.ndarray) -> np.ndarray:
-        """Means (n, t) of functionals (t, columns), or of (n, t, columns), one for each draw."""
-        return np.einsum("ni,nti->nt", self.mean, functionals) if functionals.ndim == 3 else self.mean @ functionals.T
-
-    def sd_of(self, functionals: np.ndarray) -> np.ndarray:
-        """Standard deviations (n, t) of functionals as in `mean_of`."""
-        if functionals.ndim == 3:
-            variance = np.einsum("nti,nti->nt", functionals @ self.covariance, functionals)
-        else:
-            variance = np.einsum("ti,nij,tj->nt", functionals, self.covariance, functionals, optimize=True)
-        return np.sqrt(np.maximum(variance, 0.0))
-
-    def drawn(self, functionals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw functionals (t, columns) or (n, t, columns) once for each of the n, shape (n, t)."""
-        covariance = functionals @ self.covariance @ np.swapaxes(functionals, -1, -2)
-        values, vectors = np.linalg.eigh(covariance)
-        normal = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0.0))
-        return self.mean_of(functionals) + np.einsum("nij,nj->ni", vectors, normal)
 
 
 @dataclass(frozen=True)
@@ -203,7 +173,7 @@ class AxisModel:
         places = len(self.places.command)
         sizes = {"line": LINE_TERMS, "homed": len(self.homed), "unknown": len(self.unknown_segments)}
         sizes |= {"shifts": len(self.shifts), "waves": COLUMNS * len(self.coordinates.waves)}
-        sizes |= {"error": places, "play": places}
+        sizes |= {"reference": len(self.rows.reference_causes), "error": places, "play": places}
         ends = np.cumsum(list(sizes.values())).tolist()
         return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
@@ -294,6 +264,7 @@ class AxisModel:
             columns[..., self.shift_columns[name]] = column
         for k, wave in enumerate(waves):
             columns[..., self.of_wave(k)] = wave
+        columns[..., self.layout["reference"]] = rows.reference
         columns[..., self.layout["error"]] = self._weights
         columns[..., self.layout["play"]] = 0.5 * play.share[:, :, None] * self._weights
         if extra is not None:
@@ -363,6 +334,8 @@ class AxisModel:
             sd[:, column] = self.priors[name].u
         for k, scale in enumerate(scales):
             sd[:, self.of_wave(k)] = np.outer(scale, SHARES)
+        # Never rescaled: the readings share the error, so that their scatter says nothing about it.
+        sd[:, self.layout["reference"]] = 1.0
         factor = sd[:, None] * np.eye(self.columns)
         distance = abs(self.rows.line.slope) * (self.places.command[:, None] - self.places.command)
         length = values["transmission_error_length"][:, None, None]

@@ -18,6 +18,7 @@ from tvsbayes.progress import Show
 from tvsbayes.results.convergence import Convergence, MonteCarloError
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import Provenance, Sha256, provenance
+from tvsbayes.results.metrology_tables import BudgetTable
 from tvsbayes.results.records import (
     AnswerKind,
     Count,
@@ -32,8 +33,16 @@ from tvsbayes.results.records import (
 )
 from tvsbayes.results.store import AGAIN, FitFiles, damaged_draws, fit_id, stored_fit, write_fit
 from tvsbayes.results.tiers import IMPORTANCE
+from tvsbayes.single_axis.axis_budget import axis_budgets
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
-from tvsbayes.single_axis.axis_density import blocks_of, line_factors, line_weights
+from tvsbayes.single_axis.axis_density import (
+    HEADLINE_DRAWS,
+    blocks_of,
+    headline_functionals,
+    line_factors,
+    line_weights,
+    mean_play,
+)
 from tvsbayes.single_axis.axis_doubts import axis_warnings
 from tvsbayes.single_axis.axis_fit import AxisFit, conflict_text, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_PARTS, kind_of, prior_sd
@@ -95,6 +104,8 @@ class AxisSummary(Shown, Record, frozen=True):
         effective_backlash: mean of the play over the positions read; `backlash` is the mean of all positions, read or
             not; None where no play was read.
         doubts: results that physics excludes or that rest on the priors.
+        budgets: GUM budgets of `effective_per_command` (mean of both directions), `effective_backlash`, and of E and A
+            of ISO 230-2 where their u is known.
     """
 
     unit: str
@@ -122,6 +133,7 @@ class AxisSummary(Shown, Record, frozen=True):
     periods_in: PeriodClock = "unit"
     effective_backlash: Estimate | None = None
     doubts: tuple[AxisDoubt, ...] = ()
+    budgets: tuple[BudgetTable, ...] = ()
 
     @property
     def explained(self) -> bool:
@@ -156,10 +168,16 @@ def axis_fit_schema() -> dict[str, Any]:
     return schema_of(AxisSummary, Provenance, format={"const": AXIS_FIT_FORMAT}, inputs=AxisInputs)
 
 
-def _estimate(draws: np.ndarray, prior: float | None, diagnosis: Mapping[str, float | None]) -> Estimate:
-    sd = float(draws.std())
+def _estimate(
+    draws: np.ndarray,
+    prior: float | None,
+    diagnosis: Mapping[str, float | None],
+    moments: tuple[float, float] | None = None,
+) -> Estimate:
+    """An estimate by draws (n,); `moments`, value and sd, where they are known without the draws' own scatter."""
+    value, sd = moments or (float(draws.mean()), float(draws.std()))
     contraction = None if not prior else float(max(1 - (sd / prior) ** 2, -1.0))
-    return Estimate(float(draws.mean()), sd, interval95(draws), prior, contraction, **diagnosis)
+    return Estimate(value, sd, interval95(draws), prior, contraction, **diagnosis)
 
 
 def _diagnoses(fit: AxisFit) -> dict[str, dict[str, float | None]]:
@@ -189,15 +207,28 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
     """The complete summary of a fit."""
     draws, sds, diagnoses = fit.draws, _prior_sds(fit), _diagnoses(fit)
 
-    def estimate(name: str, values: np.ndarray | None = None) -> Estimate:
-        diagnosis = diagnoses.get(name, diagnoses[""])
-        return _estimate(draws[name] if values is None else values, sds.get(name), diagnosis)
+    functionals = headline_functionals(fit.model, fit.w)
+    lines = dict(
+        zip(HEADLINE_DRAWS, zip(*map(np.ndarray.tolist, fit.linear.moments(functionals)), strict=True), strict=True)
+    )
 
-    effective, contrast = draws["effective_per_command"], draws["ratio_contrast"]
+    def estimate(name: str) -> Estimate:
+        return _estimate(draws[name], sds.get(name), diagnoses.get(name, diagnoses[""]), lines.get(name))
+
+    def effective(half: float) -> Estimate:
+        """Slope of the line through the positions, with this share of the contrast."""
+        drawn = draws["effective_per_command"] + half * draws["ratio_contrast"]
+        slope, contrast = (
+            functionals[..., HEADLINE_DRAWS.index(n), :] for n in ("effective_per_command", "ratio_contrast")
+        )
+        (value,), (sd,) = (m.tolist() for m in fit.linear.moments((slope + half * contrast)[..., None, :]))
+        return _estimate(drawn, None, diagnoses[""], (value, sd))
+
     sampled = [name for name in fit.free if not name.startswith("wave_")]
     linear = [name for name, quantity in AXIS_QUANTITIES.items() if quantity.line and not quantity.parts]
     names = [*sampled, *fit.model.shifts, *linear]
     samples = wave_samples(fit)
+    classic, play = classic_axis(fit.rows), _effective_backlash(fit, diagnoses[""])
     summary = AxisSummary(
         unit=fit.campaign.unit,
         estimator=fit.estimator,
@@ -207,13 +238,11 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         converged=fit.error is None and (fit.sample is None or fit.answer != "laplace"),
         problems=fit.missing,
         per_command={side: estimate(f"per_command.{side}") for side in CONTRAST_PARTS},
-        effective_per_command={
-            side: _estimate(effective + half * contrast, None, diagnoses[""]) for side, half in CONTRAST_PARTS.items()
-        },
+        effective_per_command={side: effective(half) for side, half in CONTRAST_PARTS.items()},
         range_command=(float(fit.rows.command.min()), float(fit.rows.command.max())),
         parameters={name: estimate(name) for name in dict.fromkeys(names)} | _prior_backlash(fit),
         deviations=_deviations(fit),
-        classic=classic_axis(fit.rows),
+        classic=classic,
         moves=len(fit.rows.move),
         readings=int(fit.rows.count.sum()),
         positions=len(fit.rows.positions),
@@ -228,7 +257,8 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         periods=tuple(period_estimate(sample) for sample in samples if sample.wave.clock != "encoder"),
         encoder_periods=tuple(period_estimate(sample) for sample in samples if sample.wave.clock == "encoder"),
         periods_in="seconds" if fit.campaign.periods.in_seconds else "unit",
-        effective_backlash=_effective_backlash(fit, diagnoses[""]),
+        effective_backlash=play,
+        budgets=axis_budgets(fit, effective(0.0), play, classic) if fit.error is None else (),
     )
     return structs.replace(summary, doubts=doubts_of(facts_of(summary, without_processes(fit))))
 
@@ -254,10 +284,10 @@ def _effective_backlash(fit: AxisFit, diagnosis: Mapping[str, float | None]) -> 
     rows, model = fit.rows, fit.model
     if rows.in_motion or not rows.both_sides:
         return None
-    functional = model.line_terms(backlash=1.0)
-    functional[model.layout["play"]] = model.places.weights(rows.positions).mean(axis=0)
-    drawn = fit.linear.drawn(functional[None], random_stream(fit.seed, AxisStream.EFFECTIVE_BACKLASH))
-    return _estimate(drawn[:, 0], None, diagnosis)
+    functional = mean_play(model)[None]
+    drawn = fit.linear.drawn(functional, random_stream(fit.seed, AxisStream.EFFECTIVE_BACKLASH))
+    (value,), (sd,) = (moment.tolist() for moment in fit.linear.moments(functional))
+    return _estimate(drawn[:, 0], None, diagnosis, (value, sd))
 
 
 def _prior_backlash(fit: AxisFit) -> dict[str, Estimate]:
@@ -527,7 +557,7 @@ def results_for(
         if "answer" not in document.values and summary.estimator == "posterior":
             # 0.2.0 had accepted samples only.
             summary = structs.replace(summary, answer="accepted")
-        # Depends on no draw; files of 0.3.0 hold other figures by the same names.
+        # Depends on no draw, but on `command_unit`; files of 0.3.0 hold other figures by the same names.
         summary = structs.replace(summary, classic=classic_axis(rows_of(campaign)))
         origin = read_record(Provenance, document, AGAIN, held=True)
         model = model_of(campaign, more)

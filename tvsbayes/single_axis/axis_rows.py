@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ import numpy as np
 from tvsbayes.errors import InputError, NothingToEstimate, listed
 from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.reference import corrected, loadings
 from tvsbayes.statistics.intervals import WithSd
 from tvsbayes.statistics.wrapped import turn_jumps
 
@@ -80,6 +81,8 @@ class AxisRows:
         rate: commands per second of a drive at constant rate; None for stops.
         reading_u: u of a typical reading, unit; 0 where no u is known.
         command_unit: unit of the commands, as the folder states it; None where it does not.
+        reference: errors of the rows per standard normal number of each cause of the reference, (rows, causes).
+        reference_causes: names of these causes.
     """
 
     unit: str
@@ -104,6 +107,8 @@ class AxisRows:
     rate: float | None
     reading_u: float
     command_unit: str | None = None
+    reference: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    reference_causes: tuple[str, ...] = ()
 
     @property
     def in_motion(self) -> bool:
@@ -143,7 +148,9 @@ class AxisRows:
             hours[k] = time_h[row] - time_h[previous] if same else time_h[row] - time_h[first] + self.hours[first]
             redrawn[k] = not same or bool(self.redrawn[previous + 1 : row + 1].any())
         arrays = ("move", "command", "side", "segment", "zero", "path", "value", "variance", "within", "count")
-        columns = {name: getattr(self, name)[rows_kept] for name in (*arrays, "time_s", "warm_s", "width_s")}
+        columns = {
+            name: getattr(self, name)[rows_kept] for name in (*arrays, "time_s", "warm_s", "width_s", "reference")
+        }
         columns["kelvin"] = None if self.kelvin is None else self.kelvin[rows_kept]
         return replace(self, hours=hours, redrawn=redrawn, **columns)
 
@@ -220,6 +227,19 @@ def _check_motion(slope: float, command: np.ndarray, value: np.ndarray, remedy: 
         raise NothingToEstimate("no-motion", found, file="readings.csv", remedy=remedy)
 
 
+def _used(campaign: AxisCampaign) -> list[Reading]:
+    """Readings that count, less the stated expansion of the reference, with the u of their own noise."""
+    used = [r for r in campaign.noisy if r.status == "ok" and r.value is not None]
+    return corrected(campaign.reference, campaign.moves, used)
+
+
+def _with_reference(rows: AxisRows, campaign: AxisCampaign) -> AxisRows:
+    """The rows with the errors that their readings share."""
+    used = [r for r in campaign.readings if r.status == "ok" and r.value is not None]
+    known = loadings(campaign.reference, campaign.moves, used, rows.move, rows.time_s, rows.value)
+    return replace(rows, reference=known.columns, reference_causes=known.names)
+
+
 def rows_of(campaign: AxisCampaign) -> AxisRows:
     """The rows of a campaign.
 
@@ -228,8 +248,8 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         InputError: too many moves, or angles that wrap.
     """
     if campaign.rate is not None:
-        return rows_in_motion(campaign, campaign.rate)
-    used = [r for r in campaign.readings if r.status == "ok" and r.value is not None]
+        return _with_reference(rows_in_motion(campaign, campaign.rate), campaign)
+    used = _used(campaign)
     means = _means(used)
     moves = np.array(sorted(means), dtype=int)
     legs = legs_of(campaign.moves)
@@ -269,7 +289,10 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         hours=_hours(times_s / HOUR_S, zero, moves),
         path=_path(legs)[moves],
         redrawn=_redrawn(legs, moves) | (read["variance"] == 0),
-        **read,
+        value=value,
+        variance=read["variance"],
+        within=read["within"],
+        count=read["count"],
         line=Line(float(level - slope * command.mean()), float(slope)),
         time_s=times_s[moves],
         warm_s=times_s[moves] - warm_from(campaign),
@@ -279,7 +302,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         reading_u=float(np.median(stated_u)) if stated_u else 0.0,
         command_unit=campaign.command_unit,
     )
-    return rows if legs_are_long(rows) else _line_with_play(rows)
+    return _with_reference(rows if legs_are_long(rows) else _line_with_play(rows), campaign)
 
 
 ROWS_IN_MOTION, PER_PERIOD, READINGS_IN_MOTION = 2000, 5.0, 100_000
@@ -298,7 +321,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
         NothingToEstimate, InputError: as `rows_of`.
     """
     used = sorted(
-        (r for r in campaign.readings if r.status == "ok" and r.value is not None and r.time_s is not None),
+        (r for r in _used(campaign) if r.time_s is not None),
         key=lambda r: (r.move, r.time_s or 0.0),
     )
     if len(used) > READINGS_IN_MOTION:

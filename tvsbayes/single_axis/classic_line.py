@@ -10,7 +10,7 @@ from msgspec import field
 from tvsbayes.display import Shown, View
 from tvsbayes.results.metrology_tables import IsoTarget
 from tvsbayes.results.records import Record
-from tvsbayes.single_axis.axis_iso230 import AXIS_SYMBOLS, iso_targets, runs_about_line, target_runs
+from tvsbayes.single_axis.axis_iso230 import AXIS_SYMBOLS, figure_parts, iso_targets, runs_about_line, target_runs
 from tvsbayes.single_axis.axis_rows import AxisRows, line_design
 
 
@@ -20,7 +20,8 @@ class ClassicAxis(Shown, Record, frozen=True):
     Attributes:
         per_command: slope of the line.
         backlash: reversal; None where stops were reached from one side only.
-        u_per_command, u_backlash: standard errors; None where no degree of freedom is left.
+        u_per_command, u_backlash: standard uncertainties, the reference's included; None where no degree of freedom is
+            left.
         residual_sd: scatter of the rows about the line; None likewise.
         iso230: figures by name, actual less target; null where commands are no targets. R and A are null with fewer
             than two runs a side, figures of a side, or of both, where it was not read.
@@ -29,6 +30,7 @@ class ClassicAxis(Shown, Record, frozen=True):
         iso230_targets: the positions of `iso230`.
         iso230_basis: how targets are known, or why there are no figures.
         symbols: letters of the standard by the names of the figures.
+        iso230_u: standard uncertainty of each figure of `iso230` by reference and readings; 0 where neither states one.
     """
 
     per_command: float
@@ -42,6 +44,7 @@ class ClassicAxis(Shown, Record, frozen=True):
     iso230_targets: tuple[IsoTarget, ...] = ()
     iso230_basis: str = ""
     symbols: dict[str, str] = field(default_factory=dict)
+    iso230_u: dict[str, float | None] | None = None
 
     def shown(self) -> View:
         """Show slope, backlash, scatter and ISO 230-2 figures."""
@@ -86,10 +89,19 @@ def fit_line(rows: AxisRows, included: np.ndarray | None = None) -> LineFit:
     return LineFit(solution, covariance, scatter, freedom)
 
 
+def reference_errors(rows: AxisRows) -> np.ndarray:
+    """Errors of the line's solution by each cause of the reference, (3, causes); 0 for undetermined values."""
+    errors = np.zeros((3, len(rows.reference_causes)))
+    determined = np.array([True, np.ptp(rows.command) > 0, np.ptp(rows.side) > 0])
+    errors[determined] = np.linalg.lstsq(line_design(rows)[:, determined], rows.reference, rcond=None)[0]
+    return errors
+
+
 def classic_axis(rows: AxisRows) -> ClassicAxis:
     """Compute the least-squares line with a reversal, and the ISO 230-2 figures."""
     line = fit_line(rows)
-    u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0)).tolist() if line.freedom else [None] * 3
+    variance = np.diag(line.covariance) + np.sum(reference_errors(rows) ** 2, axis=1)
+    u = np.sqrt(np.maximum(variance, 0.0)).tolist() if line.freedom else [None] * 3
     has_backlash = rows.both_sides
     (targets, basis), about_line = target_runs(rows), runs_about_line(rows)
     return ClassicAxis(
@@ -104,4 +116,5 @@ def classic_axis(rows: AxisRows) -> ClassicAxis:
         iso230_targets=() if targets is None else iso_targets(targets),
         iso230_basis=basis,
         symbols=AXIS_SYMBOLS,
+        iso230_u=None if targets is None else {name: parts.u for name, parts in figure_parts(targets, rows).items()},
     )

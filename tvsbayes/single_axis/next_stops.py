@@ -127,7 +127,7 @@ def _with_stop(campaign: AxisCampaign, rows: AxisRows, stop: AxisStop, seconds: 
         moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
     line, play = rows.line, reversal_of(rows).value
     value = line.offset + line.slope * stop.command - 0.5 * float(np.sign(line.slope)) * SIDES[stop.direction] * play
-    u = float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
+    u = float(np.median([r.u for r in campaign.noisy if r.status == "ok"]))
     number = max(r.reading for r in campaign.readings) + 1
     reading = Reading(number, len(moves) - 1, value, u)
     return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading))

@@ -156,9 +156,11 @@ class PredictedAxis:
             # Somewhere in the range that was read.
             unknown = float(np.ptp(self.fit.rows.kelvin)) ** 2 / 12
         hours = _since_homing(rows)
-        repeated = self._readings(rows.command, play, State(hours, rows.path, rows.warm_s / HOUR_S, kelvin))
+        shared, own = self._shared_errors(campaign, rows)
+        state = State(hours, rows.path, rows.warm_s / HOUR_S, kelvin)
+        repeated = self._readings(rows.command, play, state, shared)
         scatter = self._scattered(rows.zero, hours, np.cumsum(rows.redrawn), rows.side, rows.variance)
-        covariance = repeated.covariance + sum(scatter.values())
+        covariance = repeated.covariance + sum(scatter.values()) + own @ own.T
         if "thermal_per_K" in self.fit.model.shifts:
             column = self.fit.model.shift_columns["thermal_per_K"]
             second = self._linear.mean[:, column] ** 2 + self._linear.covariance[:, column, column]
@@ -188,8 +190,29 @@ class PredictedAxis:
             factors["thermal_per_K"] = np.atleast_2d(np.asarray(state.kelvin, dtype=float))
         return factors
 
-    def _readings(self, command: np.ndarray, play: PlayPlaces, state: State) -> PredictedReadings:
-        """Predict the repeatable part at places of the play, with the processes at the commands."""
+    def _shared_errors(self, campaign: AxisCampaign, rows: AxisRows) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of rows of another campaign that its readings share, by cause.
+
+        Those of the fit's own reference (rows, its causes), where both name the same certificate, and others.
+        """
+        causes = self.fit.rows.reference_causes
+        shared = np.zeros((len(rows.command), len(causes)))
+        others = []
+        same = campaign.reference.certificate == self.fit.campaign.reference.certificate
+        for cause, column in zip(rows.reference_causes, rows.reference.T, strict=True):
+            if same and cause in causes:
+                shared[:, causes.index(cause)] = column
+            else:
+                others.append(column)
+        return shared, np.column_stack(others) if others else np.zeros((len(rows.command), 1))
+
+    def _readings(
+        self, command: np.ndarray, play: PlayPlaces, state: State, reference: np.ndarray | float = 0.0
+    ) -> PredictedReadings:
+        """Predict the repeatable part at places of the play, with the processes at the commands.
+
+        It is that of positions; with errors `reference` (r, causes) of the reference that of its readings.
+        """
         known = self.fit.model
         model = AxisModel.of(known.rows, known.priors, command, known.coordinates.waves)
         in_time = self._in_time(state)
@@ -207,6 +230,7 @@ class PredictedAxis:
             functionals[..., model.shift_columns[name]] = factor
         for k, wave_factors in enumerate(waves):
             functionals[..., model.of_wave(k)] = wave_factors
+        functionals[..., model.layout["reference"]] = reference
         weights = model.places.weights(command)
         functionals[..., model.layout["error"]] = weights
         functionals[..., model.layout["play"]] = 0.5 * play.share[..., None] * weights

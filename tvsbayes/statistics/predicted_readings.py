@@ -12,7 +12,8 @@ predicted_stops` for an axis); who uses it knows no instrument. The contract:
 - `shifts` is what a change of state adds, by cause, in `expected` as well; `scatter` is what does not repeat, by cause.
   A single reading is `expected` at its state plus all of `scatter`.
 - All have the same draws in the same order: sums of their means and covariances are by draw, `pooled` after the sum.
-- The uncertainty of a reference that is common to all readings is added to the covariance by its owner.
+- The uncertainty of a reference that is common to all readings is in the covariance of `expected`, which is of
+  positions, not of what that reference would read.
 """
 
 from __future__ import annotations
