@@ -11,7 +11,7 @@ from tvsbayes.cli.main import COMMANDS
 from tvsbayes.instrument.campaign_header import mechanism_key
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 
-HANDED_ON = {"out", "issue", "moves", "alone", "certification"}
+HANDED_ON = {"out", "issue", "moves", "alone", "certification", "tier"}
 """What a command makes of its options before it hands them on."""
 
 
