@@ -176,7 +176,7 @@ def calibrate(
     from tvsbayes.estimators.joint_fit import fit_stages
 
     directory = None if folder is None else Path(folder)
-    fitting = {FITTING: sum(fit_stages(model.robust, campaign.moves).values())}
+    fitting = {FITTING: sum(fit_stages(model.robust, campaign.moves, campaign.rig).values())}
     held = nullcontext() if directory is None else sole_writer(directory)
     with held, Job(fitting | _later_stages(sampled, tier, directory), progress) as job:
         joint = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))

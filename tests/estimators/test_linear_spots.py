@@ -201,8 +201,8 @@ def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen)
     # As many as a fit evaluates at once: that is compiled.
     z = jnp.asarray(dozen.z + 0.1 * rng.standard_normal((BATCH, dozen.z.size)))
     # Errors at places are given: what others say of them would be lost with a move.
-    none = jnp.zeros_like(dozen.arrays.gears.places.valid)
-    dozen = replace(dozen, arrays=eqx.tree_at(lambda a: a.gears.places.valid, dozen.arrays, none))
+    none = jnp.zeros_like(dozen.arrays.gears.valid)
+    dozen = replace(dozen, arrays=eqx.tree_at(lambda a: a.gears.valid, dozen.arrays, none))
     spots = dozen.arrays.spots
     count = int(np.sum(np.asarray(spots.valid)))
     index = np.asarray(spots.move_index)[:count]

@@ -159,7 +159,7 @@ def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varyin
     # Covariances by prior sds; of a scale of zero the floor of 1e-12 rad is left.
     np.testing.assert_allclose(moved.T @ moved / np.outer(scale, scale), left / np.outer(scale, scale), atol=1e-6)
     gears = varying.arrays.gears
-    assert not np.asarray(gears.error_share)[:, ~valid].any() and not np.asarray(gears.play_share)[:, ~valid].any()
+    assert gears.columns == 2 * valid.sum() and not np.asarray(gears.share)[:, gears.columns :].any()
 
 
 def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying, point):

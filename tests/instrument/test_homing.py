@@ -9,6 +9,7 @@ from support.written_rows import move_row
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.homing import ANYWHERE, every_way, has_play, homed, prior_chance, unrecorded, ways
 from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.rig import RigTable
 
 
 def moves(*first: tuple[str, str]) -> tuple[Move, ...]:
@@ -21,9 +22,17 @@ def moves(*first: tuple[str, str]) -> tuple[Move, ...]:
 
 
 def test_an_axis_is_unrecorded_only_if_every_homing_is():
-    assert unrecorded(moves(("unknown", "up"), ("unknown", "up"))) == ("pan",)
-    assert unrecorded(moves(("unknown", "unknown"), ("left", "unknown"))) == ("tilt",)
-    assert unrecorded(moves(("left", "up"))) == ()
+    assert unrecorded(moves(("unknown", "up"), ("unknown", "up")), RigTable()) == ("pan",)
+    assert unrecorded(moves(("unknown", "unknown"), ("left", "unknown")), RigTable()) == ("tilt",)
+    assert unrecorded(moves(("left", "up")), RigTable()) == ()
+
+
+def test_no_way_of_homing_is_weighed_of_an_absolute_encoder_or_without_play():
+    unknown, none = moves(("unknown", "unknown")), Prior(0.0, 0.0, "half-normal")
+    assert unrecorded(unknown, RigTable()) == ("pan", "tilt")
+    assert unrecorded(unknown, RigTable(absolute=("pan",))) == ("tilt",)
+    tight = dict.fromkeys(("backlash_deg.tilt", "play_variation_deg.tilt"), none)
+    assert unrecorded(unknown, RigTable(tight)) == ("pan",)
 
 
 @pytest.mark.parametrize("axis", ["pan", "tilt"])

@@ -171,10 +171,11 @@ def drawn_gears(
     steps, seen_of = np.asarray(fit.arrays.gears.places.steps), seen_places(fit)
     table = _table(physical, {axis: steps[seen_of[axis]] for axis in AXES})
     # The derivative of the table by the places at the fit's scales, these in units in which they are N(0, 1) a priori.
-    mode, root = np.asarray(fit.mode.physical), np.asarray(fit.linearised.place_root) * DEGREES
+    mode = np.asarray(fit.mode.physical)
+    root = fit.arrays.gears.at_places(np.asarray(fit.linearised.place_root).T * DEGREES).T
     generator = random_stream(seed, Stream.GEAR_TABLES)
     expected, left_open = np.zeros((count, table.size)), np.zeros((count, table.size))
-    by_places = np.zeros((table.size, errors))
+    by_places = np.zeros((table.size, root.shape[1]))
     for kind, axis in product((ERROR_AT, PLAY_AT), AXES):
         part, at = table.parts[f"{kind}.{axis}"], seen_of[axis] + (0 if kind == ERROR_AT else errors // 2)
         known, new = steps[seen_of[axis]], np.array(table.steps[AXES.index(axis)])

@@ -91,9 +91,9 @@ def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
     eliminated in every step: they precede the coordinates in N, and their rows of L are dropped. `also` is the campaign
     linearised there, as NumPy arrays, without padding.
     """
-    places, filled = len(arrays.gears.places.steps), arrays.gears.errors_filled
+    errors = arrays.gears.share.shape[1]
     point = space.known_point(np.where(fixed.held, fixed.value, z))
-    before = Belief(np.zeros((STATES, 1 + z.size + 2 * places)), np.zeros((STATES, STATES)))
+    before = Belief(np.zeros((STATES, 1 + z.size + errors)), np.zeros((STATES, STATES)))
     parts = []
     for first in range(0, int(arrays.count), PART):
         parts.append(linear_part(point, space, arrays, fixed.inflation, np.int32(first), before))
@@ -101,7 +101,7 @@ def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
     gram = np.sum([np.asarray(part.gram) for part in parts], axis=0)
     lin = Linearised.joined(parts, point, space, arrays)
     mixed = linalg.block_diag(lin.place_root, np.diag(np.where(fixed.held, 0.0, 1.0)))
-    coordinates = np.concatenate([1 + z.size + filled, np.arange(1, 1 + z.size)])
+    coordinates = np.concatenate([1 + z.size + np.arange(arrays.gears.columns), np.arange(1, 1 + z.size)])
     prior = np.concatenate([np.zeros(len(lin.place_root)), np.where(fixed.held, z - fixed.value, z)])
     root = np.linalg.cholesky(mixed.T @ gram[np.ix_(coordinates, coordinates)] @ mixed + np.eye(prior.size))
     slope = mixed.T @ gram[coordinates, 0] + prior

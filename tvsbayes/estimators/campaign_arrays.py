@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots, pixels_of
 from tvsbayes.instrument.conditions import kelvin, powered_on_s, warm_minutes
-from tvsbayes.instrument.places import PLACES_MAX, SeenPlaces, gears_vary, seen_places
+from tvsbayes.instrument.places import PLACES_MAX, SeenPlaces, gears_vary, seen_places, vary_by_position
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.sightings import sighted_deg, sightings_of, tangent_frames
 from tvsbayes.instrument.stereo_pair import triangulate
@@ -27,9 +27,9 @@ from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 
-PLACES_TOGETHER = 6
-"""Places of both axes whose columns pass the filter together. Columns determine the cost of a density; the paper's
-protocol has six counters."""
+COLUMNS_TOGETHER, PLACES_TOGETHER = 12, 6
+"""Columns of errors that pass the filter together, and their places. Columns determine the cost of a density; the
+paper's protocol has six counters."""
 SMALLEST_BUCKET = 4096
 """Spots and moves are padded to this size or the next power of two above it: smaller campaigns share compiled
 functions, and their cost follows their own rows."""
@@ -70,49 +70,72 @@ class SpotArrays(eqx.Module):
 
 
 class GearArrays(eqx.Module):
-    """Places of both axes at which looks found the gears, and the effect of the errors there on each spot.
+    """Errors of the gears that may differ from place to place, a column each, and their effect on each spot.
 
-    A spot's axis angle contains the transmission error of a place times `error_share` and its play times `play_share`:
-    minus half the play where the axis came from the right or from below, else plus half.
+    All errors at the places are their transmission errors, then their plays; only those that the priors leave open have
+    a column: transmission errors of pan, of tilt, plays of pan, of tilt. A spot's axis angle contains an error times
+    `share`: for a play minus its half where the axis came from the right or from below, else plus its half.
+
+    Attributes:
+        places: counters of both axes at which looks found the gears.
+        share: effect of each column on the angle of its axis.
+        error: number of each column among all errors at the places.
+        on_tilt: axis of each column; valid: padding is last, and not valid.
     """
 
     places: Places
-    error_share: Float[Array | np.ndarray, "spots places"]
-    play_share: Float[Array | np.ndarray, "spots places"]
-
-    def some(self, start: Int[Array, ""] | int, count: int) -> GearArrays:
-        """Return `count` places from `start` on."""
-
-        def part(array):
-            return jax.lax.dynamic_slice_in_dim(array, start, count, axis=-1)
-
-        return jax.tree.map(part, self)
+    share: Float[Array | np.ndarray, "spots columns"]
+    error: Int[Array | np.ndarray, " columns"]
+    on_tilt: Bool[Array | np.ndarray, " columns"]
+    valid: Bool[Array | np.ndarray, " columns"]
 
     @property
     def together(self) -> int:
-        """Return the number of places in a group: `PLACES_TOGETHER`, or a divisor of the padded number."""
-        return math.gcd(len(self.places.steps), PLACES_TOGETHER)
+        """Return the number of columns in a group: `COLUMNS_TOGETHER`, or a divisor of the padded number."""
+        return math.gcd(self.share.shape[1], COLUMNS_TOGETHER)
 
     @property
     def groups(self) -> int:
-        """Return the number of groups of places, padding included."""
-        return len(self.places.steps) // max(self.together, 1)
+        """Return the number of groups of columns, padding included."""
+        return self.share.shape[1] // max(self.together, 1)
+
+    @property
+    def columns(self) -> int:
+        """Return the number of columns without padding; NumPy only."""
+        return int(np.asarray(self.valid).sum())
 
     @property
     def filled(self) -> int:
-        """Return the number of places in all groups that are not only padding; NumPy only."""
-        together = max(self.together, 1)
-        return together * -(-int(np.asarray(self.places.valid).sum()) // together)
+        """Return the number of places, rounded up to a multiple of `PLACES_TOGETHER`; NumPy only."""
+        return PLACES_TOGETHER * -(-int(np.asarray(self.places.valid).sum()) // PLACES_TOGETHER)
 
     @property
-    def errors_filled(self) -> np.ndarray:
-        """Return the indices of the errors (transmission errors, then plays) at the filled places."""
-        return np.add.outer([0, len(self.places.steps)], np.arange(self.filled)).ravel()
+    def place(self) -> np.ndarray:
+        """Return the place of each column; NumPy only."""
+        return np.asarray(self.error)[: self.columns] % max(len(self.places.steps), 1)
+
+    @property
+    def of_play(self) -> np.ndarray:
+        """Mark the columns that are plays; NumPy only."""
+        return np.asarray(self.error)[: self.columns] >= len(self.places.steps)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Return the number of each column among all errors at the filled places; NumPy only."""
+        return self.place + self.filled * self.of_play
+
+    def at_places(self, errors: np.ndarray) -> np.ndarray:
+        """Return errors of the columns (..., c) as errors at all filled places (..., 2 filled); others are zero."""
+        every = np.zeros((*errors.shape[:-1], 2 * self.filled))
+        every[..., self.rows] = errors
+        return every
 
     def without_padding(self) -> GearArrays:
-        """Return NumPy arrays of the `filled` places."""
-        count = self.filled
-        return jax.tree.map(lambda array: np.asarray(array)[..., :count], self)
+        """Return NumPy arrays of the `filled` places and of the columns."""
+        places = jax.tree.map(lambda array: np.asarray(array)[: self.filled], self.places)
+        share = np.asarray(self.share)[:, : self.columns]
+        kept = (np.asarray(array)[: self.columns] for array in (self.on_tilt, self.valid))
+        return GearArrays(places, share, self.rows, *kept)
 
 
 class CampaignArrays(eqx.Module):
@@ -147,7 +170,7 @@ class CampaignArrays(eqx.Module):
         def part(array):
             return jax.lax.dynamic_slice_in_dim(array, start, count)
 
-        gears = GearArrays(self.gears.places, part(self.gears.error_share), part(self.gears.play_share))
+        gears = eqx.tree_at(lambda gears: gears.share, self.gears, part(self.gears.share))
         return CampaignArrays(self.moves, jax.tree.map(part, self.spots), gears, self.azimuth_convention, self.count)
 
 
@@ -197,20 +220,32 @@ def place_arrays(places: SeenPlaces) -> Places:
 
 def no_gears(size: int) -> GearArrays:
     """Return the arrays of gears without errors by position, for this padded number of spots."""
-    none = padded(np.zeros((0, 0)), size)
-    return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))]), none, none)
+    none = placed(np.zeros(0, dtype=bool))
+    places = Places(placed(np.zeros(0)), none, none)
+    return GearArrays(places, padded(np.zeros((0, 0)), size), placed(np.zeros(0, dtype=np.int32)), none, none)
 
 
-def gear_arrays(given: SeenPlaces, size: int) -> GearArrays:
-    """Pad the places of looks.
+def gear_arrays(given: SeenPlaces, table: RigTable, size: int) -> GearArrays:
+    """Pad the places of looks, and make columns of the errors that the priors leave open.
 
     Args:
         given: from `seen_places`.
+        table: priors of the gears.
         size: padded number of spots.
     """
-    places = place_arrays(given)
-    wider = (0, 0), (0, len(places.steps) - len(given.steps))
-    return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (given.error_share, given.play_share)))
+    places, varied = place_arrays(given), vary_by_position(table)
+    most, axis = 2 * len(places.steps), given.on_tilt.astype(int)
+    kept = [np.flatnonzero(of_kind[axis]) for of_kind in varied]
+    error = np.concatenate([kept[0], len(places.steps) + kept[1]]).astype(np.int32)
+    on_tilt = given.on_tilt[np.concatenate(kept)]
+    share = np.concatenate([given.error_share[:, kept[0]], given.play_share[:, kept[1]]], axis=1)
+    return GearArrays(
+        places,
+        padded(np.pad(share, ((0, 0), (0, most - share.shape[1]))), size),
+        padded(error, most, 0, np.int32),
+        padded(on_tilt, most, False, bool),
+        padded(np.ones(len(error)), most, False, bool),
+    )
 
 
 def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> CampaignArrays:
@@ -238,7 +273,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     priors = campaign.rig if table is None else table
     new = redraws(campaign.moves, looks, absolute=campaign.rig.absolute)
     places = seen_places(campaign.moves, looks, priors)
-    gears = gear_arrays(places if gears_vary(priors) else places.none, size)
+    gears = gear_arrays(places if gears_vary(priors) else places.none, priors, size)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
     finite = np.isfinite(points_mm).all(axis=1)
     points_mm[~finite] = NOWHERE_MM

@@ -26,7 +26,7 @@ from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, held_by, search_stages
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
-from tvsbayes.instrument.homing import Sides, has_play, homed, prior_chance, unrecorded
+from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES
 from tvsbayes.instrument.places import line_share, seen_places
@@ -55,9 +55,9 @@ HOMING_SECONDS = 1.5
 """Seconds of the fit under one homing hypothesis."""
 
 
-def fit_stages(robust: bool, moves: Sequence[Move]) -> dict[str, float]:
+def fit_stages(robust: bool, moves: Sequence[Move], table: RigTable) -> dict[str, float]:
     """Return the stages of a fit with their seconds."""
-    ways = most_fits(unrecorded(moves))
+    ways = most_fits(unrecorded(moves, table))
     return search_stages(robust) | LAST_SECONDS | ({HOMING: HOMING_SECONDS * ways} if ways else {})
 
 
@@ -97,7 +97,7 @@ class JointFit(Shown):
         seen_line: counters of the spots, over which the headlines are slopes.
         free: parameters that are estimated, shape (p,).
         draws_z: Laplace draws, shape (draws, p), with mean and covariance exactly those of the approximation.
-        draws_places: errors at places of these draws in units of `linearised.place_root`, shape (draws, e).
+        draws_places: errors of the gears of these draws in units of `linearised.place_root`, shape (draws, e).
         draws: headlines and parameters of the draws.
         prior_draws: the same under the priors, at the same pose.
         mode: headlines and parameters at the mode (fields without leading axis).
@@ -255,7 +255,7 @@ def fit(
     with (
         jax.enable_x64(True),
         ThreadPoolExecutor(1) as executor,
-        Job(fit_stages(model.robust, campaign.moves), progress) as job,
+        Job(fit_stages(model.robust, campaign.moves, table), progress) as job,
     ):
         problem = Problem(campaign, table, used)
         if not problem.free.any():
@@ -274,8 +274,7 @@ def fit(
             mode = problem.mode(z)
             job.begin(DIAGNOSING)
             result = fit_at(campaign, problem, mode, seed)
-            # Without play the side from which an axis came makes no difference.
-            axes = tuple(axis for axis in unrecorded(campaign.moves) if has_play(table.priors, axis))
+            axes = unrecorded(campaign.moves, table)
             if not axes or not result.converged:
                 return result
             job.begin(HOMING)
@@ -436,16 +435,18 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     pose = np.asarray(lin.mirror_angles_rad[used].mean(axis=0))
     line, joint = _seen_line(campaign, problem, pose), with_places(mode.z, mode.covariance, information)
     draws_z, draws_places = np.split(_drawn(joint, problem.free, seed), [len(NAMES)], axis=1)
+    gears = problem.arrays.gears
 
     def with_mode(z: np.ndarray, errors_rad: np.ndarray) -> Derived:
         """Compute derived quantities at the mode, then of draws."""
-        centre_rad = np.asarray(lin.place_root) @ information.place_mean
+        centre_rad = gears.at_places(np.asarray(lin.place_root) @ information.place_mean)
         z, errors = np.concatenate([mode.z[None], z]), np.concatenate([centre_rad[None], errors_rad])
         return jax.tree.map(np.asarray, derived_quantities(z, errors, problem.space, line))
 
-    at_mode_and_draws = with_mode(draws_z, draws_places @ np.asarray(lin.place_root).T)
+    at_mode_and_draws = with_mode(draws_z, gears.at_places(draws_places @ np.asarray(lin.place_root).T))
     if prior_draws is None:
-        prior = Gaussian(np.zeros(len(joint.mean)), np.eye(len(joint.mean)))
+        size = len(NAMES) + 2 * gears.filled
+        prior = Gaussian(np.zeros(size), np.eye(size))
         prior_z, normal = np.split(_drawn(prior, problem.free, seed + 1), [len(NAMES)], axis=1)
         prior_rad = np.asarray(prior_errors_at_places(prior_z, normal, problem.space, problem.arrays))
         prior_draws = jax.tree.map(lambda x: x[1:], with_mode(prior_z, prior_rad))

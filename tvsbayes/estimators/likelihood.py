@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
+from tvsbayes.estimators.campaign_arrays import COLUMNS_TOGETHER, CampaignArrays, GearArrays, SpotArrays
 from tvsbayes.estimators.kalman_filter import (
     STATES,
     Belief,
@@ -33,7 +33,7 @@ from tvsbayes.estimators.looks import WINDOW, Looks, looks_at, spot_angles
 from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToStates, noise_scales, spot_residuals
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.gear_processes import BlockRoot, place_blocks
+from tvsbayes.model.gear_processes import BlockRoot, column_blocks
 from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, no_moves
 from tvsbayes.model.parameter_space import RATIO_COLUMNS, Model, ParameterSpace
 
@@ -63,9 +63,8 @@ def scatter_variances(scatter_rad: Float[Array, "2"], spots: SpotArrays) -> Floa
 def place_columns(
     slope: Float[Array | np.ndarray, "spots components 2"], gears: GearArrays
 ) -> Float[Array, "spots components errors"]:
-    """Compute d(predicted)/d(transmission errors, then plays, at the places), rad^-1."""
-    by_place = jnp.where(gears.places.on_tilt, slope[..., 1:], slope[..., :1])
-    return jnp.concatenate([by_place * gears.error_share[:, None], by_place * gears.play_share[:, None]], axis=2)
+    """Compute d(predicted)/d(errors of the gears' columns), rad^-1."""
+    return jnp.where(gears.on_tilt, slope[..., 1:], slope[..., :1]) * gears.share[:, None]
 
 
 class LookTerms(eqx.Module):
@@ -132,8 +131,7 @@ def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | No
 class Sums(eqx.Module):
     """Sums over spots for the normal equations of the errors at places; many points have a leading axis.
 
-    Places are in groups of `PLACES_TOGETHER`, each with a column for every transmission error, then for every play.
-    `log_density` is that of the spots with all those errors zero. `along` holds the products of the standardised
+    Columns of errors are in groups of `COLUMNS_TOGETHER`. `log_density` is that of the spots with all those errors zero. `along` holds the products of the standardised
     columns and residuals, `gram` those of the columns of two groups, for the pairs (0, 0), (1, 0), (1, 1), (2, 0)
     ......
     """
@@ -144,7 +142,7 @@ class Sums(eqx.Module):
 
 
 def pairs_of(groups: Any) -> Any:
-    """Count the pairs of groups of places, each with itself and with those before it."""
+    """Count the pairs of groups of columns, each with itself and with those before it."""
     return groups * (groups + 1) // 2
 
 
@@ -176,12 +174,12 @@ def blocks_filled(arrays: CampaignArrays) -> Int[Array, ""]:
 def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
     """Run the filter over all spots; the result does not depend on the block size.
 
-    Moves are computed up to the last spot, and columns of groups with a place only.
+    Moves are computed up to the last spot, and groups with a column of an error only.
     """
-    size, together = block_size(arrays.spots), arrays.gears.together
+    size, columns = block_size(arrays.spots), arrays.gears.together
     gears, zero = model.transmission, model.tilt_zero_rad
-    most, columns = arrays.gears.groups, 2 * together
-    groups = -(-jnp.sum(arrays.gears.places.valid) // max(together, 1))
+    most = arrays.gears.groups
+    groups = -(-jnp.sum(arrays.gears.valid) // max(columns, 1))
     one, two = (jnp.asarray(each) for each in np.tril_indices(most))
 
     def through(number, so_far):
@@ -189,8 +187,9 @@ def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
         part = arrays.of_spots(start, size)
         at_looks = angles_at(gears, zero, arrays.moves, part.spots.move_index, so_far.stretch)
         given = filter_input(model, part, at_looks.angles)
+        by_error = place_columns(given.slope, part.gears)
         # The first group is filtered with the residuals: its columns need no loop of their own.
-        both = [given.rows.residual[..., None], place_columns(given.slope, part.gears.some(0, together))]
+        both = [given.rows.residual[..., None], by_error[..., :columns]]
         rows = eqx.tree_at(lambda r: r.residual, given.rows, jnp.concatenate(both, axis=2))
         after = filtered(rows, so_far.belief)
         standardised, leading = after.standardised[..., 0], after.standardised[..., 1:].reshape(-1, columns)
@@ -200,7 +199,7 @@ def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
 
         def of_group(group, of_places):
             means, block, along = of_places
-            own = place_columns(given.slope, part.gears.some(group * together, together))
+            own = jax.lax.dynamic_slice_in_dim(by_error, group * columns, columns, axis=2)
             passed_on = columns_filtered(own, given.rows, after.gains, means[group])
             flat = passed_on.standardised.reshape(-1, columns)
             return means.at[group].set(passed_on.mean), block.at[group].set(flat), along.at[group].add(along_with(flat))
@@ -230,7 +229,7 @@ def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
 
 @dataclass(frozen=True)
 class RepeatedErrors:
-    """Conditional distribution of errors at places given all looks: divided by `root`, N(mean, (factor factor')^-1).
+    """Conditional distribution of the errors of columns given all looks: divided by `root`, N(mean, (factor factor')^-1).
 
     A priori they are N(0, 1). `explained` is the mean times the transposed factor. Many points with leading axes.
     """
@@ -241,21 +240,20 @@ class RepeatedErrors:
 
     @classmethod
     def of(cls, sums: Sums, root: BlockRoot) -> RepeatedErrors:
-        """Solve the normal equations of the errors at places.
+        """Solve the normal equations of the errors.
 
         Args:
-            sums: sums of all groups, or of the first of them.
-            root: factor of the prior covariance of their errors, rad.
+            sums: sums of all groups, or of the first of them; columns after those of the errors are padding.
+            root: factor of the prior covariance of the errors, rad.
         """
         groups = sums.along.shape[-2]
         one, two = np.indices((groups, groups))
         given = sums.gram[..., pairs_of(np.maximum(one, two)) + np.minimum(one, two), :, :]
         whole = np.where((one < two)[:, :, None, None], given.swapaxes(-2, -1), given)
-        size, half = root.size, sums.along.shape[-1] // 2
-        batch = sums.along.shape[:-2]
-        along = np.einsum("...gkp->...kgp", sums.along.reshape(*batch, groups, 2, half)).reshape(*batch, size)
-        whole = np.einsum("...ghkplq->...kgplhq", whole.reshape(*batch, groups, groups, 2, half, 2, half))
-        precision = np.eye(size) + root.congruent(whole.reshape(*batch, size, size))
+        batch, size = sums.along.shape[:-2], groups * sums.along.shape[-1]
+        along = sums.along.reshape(*batch, size)[..., : root.size]
+        whole = np.swapaxes(whole, -3, -2).reshape(*batch, size, size)[..., : root.size, : root.size]
+        precision = np.eye(root.size) + root.congruent(whole)
         slope = root.transposed_times(along[..., None])[..., 0]
         # The last row of its factor is the slope divided by the factor; its last pivot is not used, but positive.
         corner = 1 + np.sum(slope**2, axis=-1)[..., None, None]
@@ -276,17 +274,17 @@ class RepeatedErrors:
 
 
 def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> BlockRoot:
-    """Compute the factors of the covariance of transmission errors, then plays, at the places, for n points.
+    """Compute the factors of the covariance of the errors of the gears' columns, for n points.
 
     Args:
         values: all parameters in the units of their names, shape (n, p).
         space: priors.
-        gears: as NumPy arrays.
+        gears: without padding.
     """
-    places, ratio = gears.places, np.radians(values[:, RATIO_COLUMNS])
-    angle_rad = places.steps * np.where(places.on_tilt, ratio[:, 1:], ratio[:, :1])
+    ratio = np.radians(values[:, RATIO_COLUMNS])
+    angle_rad = gears.places.steps[gears.place] * ratio[:, gears.on_tilt.astype(int)]
     scales = scales_at(values, np.asarray(space.harmonic_period_deg))
-    return place_blocks(scales, np.asarray(angle_rad), np.asarray(places.on_tilt), np.asarray(places.valid))
+    return column_blocks(scales, angle_rad, gears.on_tilt, gears.of_play)
 
 
 def prior_errors_at_places(
@@ -303,7 +301,7 @@ def prior_errors_at_places(
     gears = arrays.gears.without_padding()
 
     def drawn(z: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        return roots_at(space.values(z), space, gears).times(normal)
+        return gears.at_places(roots_at(space.values(z), space, gears).times(normal[:, gears.rows]))
 
     return in_batches(drawn, z, normal)
 
@@ -339,12 +337,12 @@ def evaluate(
         arrays: the campaign.
     """
     gears = arrays.gears.without_padding()
-    pairs = pairs_of(gears.groups)
+    groups = -(-gears.columns // COLUMNS_TOGETHER)
 
     def sums(values: np.ndarray) -> Sums:
         result = _sums(values, space, arrays)
         along, gram = np.asarray(result.along), np.asarray(result.gram)
-        return Sums(np.asarray(result.log_density), along[:, : gears.groups], gram[:, :pairs])
+        return Sums(np.asarray(result.log_density), along[:, :groups], gram[:, : pairs_of(groups)])
 
     def added(values: np.ndarray, sums: Sums, normal: np.ndarray) -> Evaluation:
         try:
@@ -354,14 +352,15 @@ def evaluate(
                 return Evaluation(np.full(1, np.nan), np.zeros(normal.shape))
             rows = [slice(k, k + 1) for k in range(len(values))]
             return _joined([added(values[k], jax.tree.map(lambda x, k=k: x[k], sums), normal[k]) for k in rows])
-        return Evaluation(np.asarray(sums.log_density) + errors.log_density(), errors.drawn_rad(normal))
+        drawn_rad = gears.at_places(errors.drawn_rad(normal[:, gears.rows]))
+        return Evaluation(np.asarray(sums.log_density) + errors.log_density(), drawn_rad)
 
     def block(z: np.ndarray, normal: np.ndarray) -> Evaluation:
         values = space.values(z)
         parts = in_batches(sums, values)
         finite = np.isfinite(parts.log_density) & np.isfinite(values).all(axis=1)
         log_density, errors_rad = np.where(finite, parts.log_density, np.nan), np.zeros(normal.shape)
-        if gears.groups and finite.any():
+        if groups and finite.any():
             whole = added(values[finite], jax.tree.map(lambda x: x[finite], parts), normal[finite])
             log_density[finite], errors_rad[finite] = whole.log_density, whole.place_errors_rad
         return Evaluation(log_density - 0.5 * np.sum(z**2, axis=1), errors_rad)

@@ -31,7 +31,7 @@ class LinearLooks(eqx.Module):
     """Spots linearised at a point; the first axis of all arrays is over spots.
 
     Residuals, slopes and derived arrays are in units of the noise of a look, its scatter included. `place_columns` is
-    d(predicted)/d(errors at places, rad).
+    d(predicted)/d(errors of the gears' columns, rad).
     """
 
     residual: Float[Array | np.ndarray, "spots 4"]
@@ -50,7 +50,7 @@ class LinearLooks(eqx.Module):
 class Linearised(LinearLooks):
     """A campaign linearised at coordinates `z`, without padding.
 
-    `place_root` is the factor of the prior covariance of the errors at places, rad.
+    `place_root` is the factor of the prior covariance of the errors of the gears' columns, rad.
     """
 
     z: Float[Array | np.ndarray, " parameters"]
@@ -60,13 +60,13 @@ class Linearised(LinearLooks):
     def joined(
         cls, parts: Sequence[LinearLooks], point: Point, space: ParameterSpace, arrays: CampaignArrays
     ) -> Linearised:
-        """Concatenate parts, at the filled places, as NumPy arrays."""
+        """Concatenate parts, without padding of columns, as NumPy arrays."""
         count, gears = int(arrays.count), arrays.gears.without_padding()
         given = {
             field.name: np.concatenate([np.asarray(getattr(part, field.name)) for part in parts])[:count]
             for field in fields(LinearLooks)
         }
-        given["place_columns"] = given["place_columns"][..., arrays.gears.errors_filled]
+        given["place_columns"] = given["place_columns"][..., : gears.columns]
         blocks = roots_at(np.asarray(point.values)[None], space, gears).blocks
         root = linalg.block_diag(*(block[0] for block in blocks))
         return cls(**given, z=np.asarray(point.z), place_root=root)

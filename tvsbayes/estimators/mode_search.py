@@ -14,8 +14,8 @@ from jaxtyping import Bool
 from scipy import optimize, special
 
 from tvsbayes.estimators.annealed_stage import Fixed, linear_part, linearised_at, stage
-from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.likelihood import evaluate, no_draw
+from tvsbayes.estimators.campaign_arrays import GearArrays, campaign_arrays
+from tvsbayes.estimators.likelihood import evaluate, no_draw, roots_at
 from tvsbayes.estimators.linear_spots import (
     Linearised,
     StopInformation,
@@ -27,8 +27,6 @@ from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.conditions import unseen_shifts
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.gear_processes import Places, place_root
 from tvsbayes.model.parameter_space import RATIO_COLUMNS, ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
 from tvsbayes.statistics.least_squares import Mode, Objective, neighbouring_mode, newton_mode
@@ -68,32 +66,28 @@ class LogVolume:
 
     Attributes:
         space: priors.
-        products: products of the columns of coordinates, then errors at places (rad), by the inverse covariance of all
-            other terms, shape (p + e, p + e).
-        angle_rad: k n of the places.
-        places: places of the campaign, as NumPy arrays.
+        products: products of the columns of coordinates, then errors of the gears (rad), by the inverse covariance of
+            all other terms, shape (p + e, p + e).
+        gears: columns of the campaign, without padding.
+        ratio: mean ratios.
     """
 
     space: ParameterSpace
     products: np.ndarray
-    angle_rad: np.ndarray
-    places: Places
+    gears: GearArrays
+    ratio: np.ndarray
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """Evaluate at points (n, p), of which the scales are used, shape (n,)."""
         free, rest = slice(len(NAMES)), slice(len(NAMES), None)
         if not self.products[rest].size:
             return np.zeros(len(z))
-        root = place_root(
-            scales_at(self.space.values(z), np.asarray(self.space.harmonic_period_deg)),
-            self.angle_rad,
-            np.asarray(self.places.on_tilt),
-            np.asarray(self.places.valid),
-        )
-        back = np.swapaxes(root, 1, 2)
-        inner = np.eye(root.shape[1]) + back @ self.products[rest, rest] @ root
-        load = self.products[free, rest] @ root
-        information = self.products[free, free] - load @ np.linalg.solve(inner, np.swapaxes(load, 1, 2))
+        values = self.space.values(z)
+        values[:, RATIO_COLUMNS] = self.ratio
+        root = roots_at(values, self.space, self.gears)
+        inner = np.eye(root.size) + root.congruent(self.products[rest, rest])
+        load = root.transposed_times(self.products[rest, free])
+        information = self.products[free, free] - np.swapaxes(load, 1, 2) @ np.linalg.solve(inner, load)
         return -0.5 * np.linalg.slogdet(np.eye(len(NAMES)) + information)[1]
 
 
@@ -196,15 +190,13 @@ class Problem:
 
     def log_volume(self, z: np.ndarray) -> LogVolume:
         """Return the volume of geometry and cameras by scales of repeating errors, linearised at z."""
-        places = self.arrays.gears.without_padding().places
-        steps = np.asarray(places.steps)
-        if not len(steps):
-            return LogVolume(self.space, np.zeros((len(NAMES), len(NAMES))), steps, places)
+        gears, ratio = self.arrays.gears.without_padding(), physical_at(z, self.space).value[RATIO_COLUMNS]
+        if not gears.columns:
+            return LogVolume(self.space, np.zeros((len(NAMES), len(NAMES))), gears, ratio)
         lin = self.linearised(z)
         linear = linear_spots(lin, self.arrays, lin.by_coordinates(self.held))
         information = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
-        ratio = np.radians(physical_at(z, self.space).value[RATIO_COLUMNS])
-        return LogVolume(self.space, information.fisher, steps * ratio[places.on_tilt.astype(int)], places)
+        return LogVolume(self.space, information.fisher, gears, ratio)
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
         """Alternate geometry and noise scales until the noise settles (formulation 4.2)."""

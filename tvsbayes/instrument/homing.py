@@ -1,7 +1,7 @@
 """Unrecorded homing sides as a few hypotheses that the data can distinguish (formulation 3.1).
 
 Homing ends always at one side, always at the other, or anywhere each time; each axis whose first rows all say `unknown`
-has one such hypothesis ("way"). A single unknown among recorded homings stays "anywhere".
+has one such hypothesis ("way"), unless it has no play or an absolute encoder. A single unknown among recorded homings stays "anywhere".
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign, Move
 from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.rig import RigTable
 
 ANYWHERE = "anywhere"
 ONE_SIDED_CHANCE = 0.45
@@ -24,15 +25,19 @@ type Sides = Mapping[str, str]
 """Way of homing by axis: one of its two sides, or `ANYWHERE`."""
 
 
-def unrecorded(moves: Sequence[Move]) -> tuple[str, ...]:
-    """Axes without any recorded homing side."""
-    return tuple(axis for axis in AXES if {getattr(m, f"{axis}_approach") for m in moves} <= {"", "unknown"})
-
-
 def has_play(priors: Mapping[str, Prior], axis: str) -> bool:
     """Whether an axis may have play, by its priors."""
     names = f"backlash_deg.{axis}", f"play_variation_deg.{axis}"
     return any(priors[name].u > 0 or priors[name].value > 0 for name in names)
+
+
+def unrecorded(moves: Sequence[Move], rig: RigTable) -> tuple[str, ...]:
+    """Axes with play without any recorded homing side.
+
+    An absolute encoder is not homed: an unknown side at the first row of a segment is any, until the axis reverses.
+    """
+    driven = (axis for axis in AXES if axis not in rig.absolute and has_play(rig.priors, axis))
+    return tuple(axis for axis in driven if {getattr(m, f"{axis}_approach") for m in moves} <= {"", "unknown"})
 
 
 def ways(axis: str) -> dict[str, float]:

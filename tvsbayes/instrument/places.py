@@ -30,10 +30,17 @@ FEW_COUNTERS = 3
 """With this number of observed counters or fewer, transmission error and ratio of an axis are hardly separable."""
 
 
+def vary_by_position(table: RigTable) -> np.ndarray:
+    """Whether transmission error, then play, may differ from place to place, of (pan, tilt), shape (2, 2)."""
+    kinds = (("transmission_error_deg", "harmonic_amplitude_deg"), ("play_variation_deg",))
+    names = [[[n for n in names_of(*kind) if n.split(".")[1] == axis] for axis in AXES] for kind in kinds]
+    priors = table.priors
+    return np.array([[any(priors[n].u > 0 or priors[n].value > 0 for n in own) for own in kind] for kind in names])
+
+
 def gears_vary(table: RigTable) -> bool:
-    """Whether transmission error or play may differ from place to place."""
-    names = names_of("transmission_error_deg", "play_variation_deg", "harmonic_amplitude_deg")
-    return any(table.priors[name].u > 0 or table.priors[name].value > 0 for name in names)
+    """Whether transmission error or play of an axis may differ from place to place."""
+    return bool(vary_by_position(table).any())
 
 
 @dataclass(frozen=True)

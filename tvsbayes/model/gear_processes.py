@@ -110,46 +110,54 @@ def _joined(parts: list[np.ndarray], axis: int) -> np.ndarray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=axis)
 
 
-def _roots(
+def _distances(angle_rad: np.ndarray) -> np.ndarray:
+    return angle_rad[..., :, None] - angle_rad[..., None, :]
+
+
+def _error_root(
     scales: GearScales, rows: Callable[[Any], np.ndarray], angle_rad: np.ndarray, together: np.ndarray | bool
-) -> BlockRoot:
-    """Compute factors of transmission errors and plays, a block each; `rows` spreads an axis' number over places."""
-    size, distance = angle_rad.shape[-1], angle_rad[..., :, None] - angle_rad[..., None, :]
+) -> np.ndarray:
+    """Compute a factor of the covariance of transmission errors; `rows` spreads an axis' number over its places."""
+    size, distance = angle_rad.shape[-1], _distances(angle_rad)
     amplitudes, periods = (
         [rows(x[..., k]) for k in range(PERIODS_MAX)] for x in (scales.amplitude_rad, scales.period_rad)
     )
     waves = [pair for pair in zip(amplitudes, periods, strict=True) if np.any(pair[0])]
-    error, near = rows(scales.error_rad), matern52(distance, rows(scales.length_rad))
-    covariance = with_waves(error**2 * near, distance, waves)
+    error = rows(scales.error_rad)
+    covariance = with_waves(error**2 * matern52(distance, rows(scales.length_rad)), distance, waves)
     floor = JITTER * sum((amplitude**2 for amplitude, _ in waves), error**2) + FLOOR_RAD2
-    error_root = np.linalg.cholesky(np.where(together, covariance, error**2 * np.eye(size)) + floor * np.eye(size))
-    # The play scales the factor, not the covariance, which may be zero.
-    near = np.where(together, near, np.eye(size))
-    play_root = rows(scales.play_rad) * np.linalg.cholesky(near + JITTER * np.eye(size))
-    return BlockRoot((error_root, play_root))
+    return np.linalg.cholesky(np.where(together, covariance, error**2 * np.eye(size)) + floor * np.eye(size))
 
 
-def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray, valid: np.ndarray) -> BlockRoot:
-    """Compute `place_root` in independent blocks: places of pan, then of tilt, then padding.
+def _play_root(
+    scales: GearScales, rows: Callable[[Any], np.ndarray], angle_rad: np.ndarray, together: np.ndarray | bool
+) -> np.ndarray:
+    """Compute a factor of the covariance of plays. Their sd scales the factor, not the covariance, which may be zero."""
+    near = matern52(_distances(angle_rad), rows(scales.length_rad))
+    near = np.where(together, near, np.eye(angle_rad.shape[-1]))
+    return rows(scales.play_rad) * np.linalg.cholesky(near + JITTER * np.eye(angle_rad.shape[-1]))
+
+
+def column_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray, of_play: np.ndarray) -> BlockRoot:
+    """Compute the factor of the covariance of some errors in independent blocks: one for each axis and process.
 
     Args:
         scales: scales of the processes, fields with any leading axes.
-        angle_rad: k n of the places, shape (..., places).
-        on_tilt: as in `Places`.
-        valid: as in `Places`.
+        angle_rad: k n of the errors' places, shape (..., c).
+        on_tilt: axis of each error, shape (c,).
+        of_play: whether it is a play, shape (c,): transmission errors of pan, of tilt, plays of pan, of tilt.
     """
-    kinds = np.where(valid, on_tilt, 2)
+    kinds = 2 * of_play.astype(int) + on_tilt
     if np.any(np.diff(kinds) < 0):
-        raise ValueError("places are those of pan, then of tilt, then padding")
+        raise ValueError("errors are those of pan, then of tilt, then plays of pan and of tilt")
 
-    def roots(kind: int) -> BlockRoot:
+    def root(kind: int) -> np.ndarray:
         def rows(of_axis: Any) -> np.ndarray:
             return of_axis[..., kind % 2, None, None]
 
-        return _roots(scales, rows, angle_rad[..., kinds == kind], kind < 2)
+        return (_error_root, _play_root)[kind // 2](scales, rows, angle_rad[..., kinds == kind], True)
 
-    by_kind = [roots(kind).blocks for kind in np.unique(kinds).tolist()]
-    blocks = tuple(root for of_kinds in zip(*by_kind, strict=True) for root in of_kinds)
+    blocks = tuple(root(kind) for kind in np.unique(kinds).tolist())
     return BlockRoot(blocks or (np.zeros((*scales.error_rad.shape[:-1], 0, 0)),))
 
 
@@ -172,6 +180,6 @@ def place_root(
     def rows(of_axis: Any) -> np.ndarray:
         return np.where(on_tilt, of_axis[..., 1:], of_axis[..., :1])[..., None]
 
-    error_root, play_root = _roots(scales, rows, angle_rad, together).blocks
+    error_root, play_root = (of(scales, rows, angle_rad, together) for of in (_error_root, _play_root))
     nothing = np.zeros_like(error_root)
     return np.block([[error_root, nothing], [nothing, play_root]])

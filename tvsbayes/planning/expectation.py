@@ -159,9 +159,12 @@ def fitted_errors(result: JointFit, covariance: np.ndarray) -> FittedErrors | No
     if not len(result.information.place_mean):
         return None
     joint = with_places(result.z, covariance, result.information)
-    valid = result.arrays.gears.without_padding().places.valid
-    rows = np.concatenate([np.ones(PARAMETERS, dtype=bool), valid, valid])
-    return FittedErrors(fit_places(result), joint.covariance[np.ix_(rows, rows)])
+    gears, count = result.arrays.gears.without_padding(), int(np.sum(result.arrays.gears.places.valid))
+    # Errors that the priors fix keep their unit variance, as coordinates do.
+    covariance = np.eye(PARAMETERS + 2 * count)
+    rows = np.concatenate([np.arange(PARAMETERS), PARAMETERS + gears.place + count * gears.of_play])
+    covariance[np.ix_(rows, rows)] = joint.covariance
+    return FittedErrors(fit_places(result), covariance)
 
 
 def fit_places(result: JointFit) -> GearPlaces:

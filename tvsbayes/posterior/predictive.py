@@ -208,11 +208,8 @@ def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarra
 def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarray:
     """Compute the change of spots' angles (pan, tilt) by repeating errors (draws, e), shape (draws, spots, 2)."""
     gears = arrays.gears.without_padding()
-    count, spots = len(gears.places.steps), int(arrays.count)
-    axes = []
-    for of_axis in (~gears.places.on_tilt, gears.places.on_tilt):
-        error = place_errors_rad[:, :count][:, of_axis] @ gears.error_share[:spots, of_axis].T
-        axes.append(error + place_errors_rad[:, count:][:, of_axis] @ gears.play_share[:spots, of_axis].T)
+    errors_rad, share = place_errors_rad[:, gears.rows], gears.share[: int(arrays.count)]
+    axes = [errors_rad[:, of] @ share[:, of].T for of in (~gears.on_tilt, gears.on_tilt)]
     return np.stack(axes, axis=2)
 
 

@@ -24,7 +24,7 @@ from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.gear_processes import BlockRoot, place_blocks
+from tvsbayes.model.gear_processes import BlockRoot, column_blocks
 from tvsbayes.model.parameter_space import (
     DRIFT_COLUMNS,
     FARTHEST_SD,
@@ -154,8 +154,8 @@ class Transport:
         residuals: residuals of the model, for centring.
         bend: change of the slopes of the narrow coordinates with all others, `turn` = 1 + bend' y, shape (g, narrow,
             narrow).
-        place_angle_rad, place_on_tilt: places, as arguments of `gear_processes.place_blocks`; their transmission errors
-            and plays are the first of the e errors, followed by the terms of the drifts.
+        angle_rad, on_tilt, of_play: arguments of `gear_processes.column_blocks` for the first of the e errors, which
+            are followed by the terms of the drifts.
         drift_axis: 1 at the axis (pan, tilt) whose drift is the sd of each of those terms, shape (terms, 2).
         period_deg: periods of the gears' errors, shape (2, 3).
     """
@@ -171,8 +171,9 @@ class Transport:
     linear: LinearCampaign
     residuals: Residuals
     bend: np.ndarray
-    place_angle_rad: np.ndarray
-    place_on_tilt: np.ndarray
+    angle_rad: np.ndarray
+    on_tilt: np.ndarray
+    of_play: np.ndarray
     drift_axis: np.ndarray
     period_deg: np.ndarray
 
@@ -260,8 +261,7 @@ class Transport:
         """Compute factors of the covariance of errors at places, then of drift terms, at ln of noise scales (n, q)."""
         values = np.zeros((len(log_scale), len(NAMES)))
         values[:, GEAR_SCALES] = self.physical[GEAR_SCALES] * np.exp(log_scale @ self.noise_of(*GEAR_SCALES).T)
-        scales, valid = scales_at(values, self.period_deg), np.ones(len(self.place_on_tilt), dtype=bool)
-        errors = place_blocks(scales, self.place_angle_rad, self.place_on_tilt, valid)
+        errors = column_blocks(scales_at(values, self.period_deg), self.angle_rad, self.on_tilt, self.of_play)
         drift = np.radians(self.physical[DRIFT_COLUMNS]) * np.exp(log_scale @ self.noise_of(*DRIFT_COLUMNS).T)
         terms = (drift @ self.drift_axis.T)[..., None] * np.eye(len(self.drift_axis))
         return BlockRoot((*errors.blocks, terms))
@@ -542,9 +542,8 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     stops, looks = stop_states(fit, linear), look_noise(fit)
     drifts = walks(fit, stops)
     by_noise = STOP_COLUMNS.reshape(4, 1) == noise
-    places = fit.arrays.gears.without_padding().places
-    present = np.flatnonzero(places.valid)
-    columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, 2 * len(places.steps))
+    gears = fit.arrays.gears.without_padding()
+    columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, gears.columns)
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
     ratio = np.radians(physical[RATIO_COLUMNS])
     spots = len(linear.residual)
@@ -571,17 +570,16 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
             by_noise=stops.variance @ by_noise,
             # Stop errors whose sd is not estimated keep their variance.
             constant=stops.constant + stops.variance @ ~by_noise.any(axis=1),
-            places=np.column_stack(
-                [columns[:, np.concatenate([present, len(places.steps) + present])], drifts.columns]
-            ),
+            places=np.column_stack([columns, drifts.columns]),
             prior=(wide.T * precision) @ wide,
             looks=looks,
-            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(present) + len(drifts.axis), looks),
+            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, gears.columns + len(drifts.axis), looks),
         ),
         residuals=misfit,
         bend=np.zeros((len(others), 0, 0)),
-        place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[present],
-        place_on_tilt=np.asarray(places.on_tilt)[present],
+        angle_rad=gears.places.steps[gears.place] * ratio[gears.on_tilt.astype(int)],
+        on_tilt=gears.on_tilt,
+        of_play=gears.of_play,
         drift_axis=drifts.axis,
         period_deg=np.asarray(fit.space.harmonic_period_deg),
     )

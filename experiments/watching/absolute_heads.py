@@ -1,0 +1,136 @@
+"""Heads with absolute encoders: are they answered, is the promise kept the next night, is a moved zero seen?
+
+    python -m experiments.watching.absolute_heads run --n 10 --cores 0     # 10 heads of each kind, resumable
+    python -m experiments.watching.absolute_heads table > experiments/watching/absolute_heads.md
+
+Head i of a kind is drawn with seed i by NumPy alone, nothing of the package in it: geometry, errors by position of its
+encoders (`output`) or gears (`motor`, with play that varies), scatter of stops, a zero that walks. 40 to 100 stars are
+found, each at its own angles, on a night of one power-up or of two; the approach of the first move is recorded or not.
+The next night is another campaign of 40 stars. Tables go through `import --sightings --encoders`. CPU is in imports:
+the CPU time of `import jax, optimistix, scipy.stats` in a process of its own, measured beside every head.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from experiments.common.command_line import study
+from experiments.common.rows import commit, commits_of
+
+KINDS = tuple((encoder, sides) for encoder in ("output", "motor") for sides in ("recorded", "unrecorded"))
+SEED, NEXT_STARS = 7311, 40
+U_DEG = 0.0005
+MOVED_U = 10.0
+PAN_DEG, TILT_DEG = (-120.0, 120.0), (15.0, 75.0)
+IMPORTS = "import jax, optimistix, scipy.stats"
+
+
+def matern52(distance: np.ndarray, length: float) -> np.ndarray:
+    """Correlation of a twice differentiable process."""
+    scaled = np.sqrt(5.0) * np.abs(distance) / length
+    return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
+
+
+def process(rng: np.random.Generator, at: np.ndarray, sd: float, length: float) -> np.ndarray:
+    """A drawn process at angles (n,), deg."""
+    near = matern52(at[:, None] - at, length) + 1e-9 * np.eye(len(at))
+    return sd * np.linalg.cholesky(near) @ rng.standard_normal(len(at))
+
+
+@dataclass(frozen=True)
+class Night:
+    """Stars of a night: encoder angles, true directions, deg; hours; sides of approach of the first move."""
+
+    encoder_deg: np.ndarray
+    seen_deg: np.ndarray
+    hours: np.ndarray
+    begins: tuple[int, ...]
+    sides: tuple[str, str] | None
+
+    def table(self, shift_deg: float = 0.0) -> str:
+        """As a table of sightings; `shift_deg` moves the zero of the elevation."""
+        rows = ["segment,time_s,encoder azimuth (deg),encoder elevation (deg),azimuth_deg,elevation_deg,u_deg"]
+        rows[0] += ",pan_approach,tilt_approach" if self.sides else ""
+        for k, (encoder, seen) in enumerate(zip(self.encoder_deg, self.seen_deg, strict=True)):
+            segment = sum(k >= begin for begin in self.begins) - 1
+            cells = [f"{segment}", f"{3600 * self.hours[k]:.1f}", *(f"{x:.5f}" for x in encoder)]
+            cells += [f"{seen[0]:.6f}", f"{seen[1] + shift_deg:.6f}", f"{U_DEG}"]
+            if self.sides:
+                cells += list(self.sides) if k in self.begins else ["", ""]
+            rows.append(",".join(cells))
+        return "\n".join(rows) + "\n"
+
+
+def turn(axis: int, angle_deg: np.ndarray) -> np.ndarray:
+    """Rotation matrices (n, 3, 3) about a coordinate axis."""
+    angle = np.radians(np.atleast_1d(angle_deg))
+    one, other = [k for k in range(3) if k != axis]
+    sign = -1.0 if axis == 1 else 1.0
+    matrix = np.tile(np.eye(3), (len(angle), 1, 1))
+    matrix[:, one, one] = matrix[:, other, other] = np.cos(angle)
+    matrix[:, one, other], matrix[:, other, one] = -sign * np.sin(angle), sign * np.sin(angle)
+    return matrix
+
+
+def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, Night, int]:
+    """Both nights of a head, and the number of stars of the first."""
+    encoder, recorded = kind
+    rng = np.random.default_rng([SEED, KINDS.index(kind), seed])
+    first, of_motor = int(rng.integers(40, 101)), encoder == "motor"
+    count = first + NEXT_STARS
+    night = np.arange(count) >= first
+    encoder_deg = np.stack([rng.uniform(*PAN_DEG, count), rng.uniform(*TILT_DEG, count)], axis=1)
+    hours = np.cumsum(rng.uniform(0.02, 0.04, count)) + np.where(night, 24.0 - 0.03 * first, 0.0)
+    ratio = 1 + (0.005 if of_motor else 1e-3) * rng.standard_normal(2)
+    half = np.abs(rng.standard_normal(2)) * (0.15 if of_motor else 0.0)
+    begins = (0, first // 2) if rng.uniform() < 0.5 else (0,)
+    output, sides = np.empty((count, 2)), rng.choice([-1, 1], 2)
+    for axis in range(2):
+        q = ratio[axis] * encoder_deg[:, axis]
+        sd, length = 0.02 * abs(rng.standard_normal()), 8.0 * np.exp(0.5 * rng.standard_normal())
+        error = process(rng, encoder_deg[:, axis], sd, length)
+        varied = process(rng, encoder_deg[:, axis], 0.1 * half[axis], length)
+        at = 0.0
+        for k in range(count):
+            play = max(half[axis] + varied[k] / 2, 0.0)
+            # A shaft that somebody turned by hand comes from either side.
+            side = sides[axis] if k in begins or k == first else None
+            at = q[k] - play * side if side else float(np.clip(at, q[k] - play, q[k] + play))
+            output[k, axis] = at
+        stops = np.exp(0.5 * rng.standard_normal()) * 0.002 * rng.standard_normal(count)
+        walk = 0.002 * abs(rng.standard_normal()) * np.cumsum(np.sqrt(np.diff(hours, prepend=0)) * rng.standard_normal(count))
+        output[:, axis] += error + stops + walk
+    zero, lean = rng.normal(0, 0.3, 2), rng.normal(0, 0.1, 2)
+    square, beam = rng.normal(0, 0.1, 2)
+    pointing = turn(0, lean[0]) @ turn(1, lean[1]) @ turn(2, output[:, 0] + zero[0])
+    pointing = pointing @ turn(0, square) @ turn(1, -(output[:, 1] + zero[1])) @ turn(2, beam)
+    x, y, z = pointing[:, :, 0].T
+    seen = np.degrees(np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1))
+    off = U_DEG * rng.standard_normal((count, 2))
+    seen += off / np.stack([np.cos(np.radians(seen[:, 1])), np.ones(count)], axis=1)
+    words = (("right", "left")[int(sides[0] > 0)], ("down", "up")[int(sides[1] > 0)])
+    named = words if recorded == "recorded" else None
+    parts = (slice(None, first), begins), (slice(first, None), (0,))
+    both = [Night(encoder_deg[p], seen[p], hours[p] - hours[p][0], b, named) for p, b in parts]
+    return both[0], both[1], first
+
+
+def cpu_s(command: list[str], cwd: Path) -> tuple[float, subprocess.CompletedProcess]:
+    """CPU seconds of a command, and what it left."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done
+
+
+if __name__ == "__main__":
+    pass
