@@ -28,7 +28,7 @@ def without_padding(arrays: CampaignArrays, moves: int) -> CampaignArrays:
 
 
 def root_at_places(model: Model, gears: GearArrays) -> jax.Array:
-    """Lower triangular factor of the covariance of transmission errors, then plays, as `gear_processes.place_root`."""
+    """Lower triangular factor of the covariance of the errors of the gears' columns, as `likelihood.roots_at`."""
     places, scales = gears.places, model.gears
     if not len(places.steps):
         return jnp.zeros((0, 0))
@@ -45,9 +45,8 @@ def root_at_places(model: Model, gears: GearArrays) -> jax.Array:
     error_root = jnp.linalg.cholesky(jnp.where(together, covariance, jnp.diag(variance)) + jnp.diag(floor))
     # The play scales the factor, not the covariance: its derivative then exists at zero play too.
     one = jnp.eye(len(axis))
-    return block_diag(
-        error_root, scales.play_rad[axis, None] * jnp.linalg.cholesky(jnp.where(together, near, one) + JITTER * one)
-    )
+    play_root = scales.play_rad[axis, None] * jnp.linalg.cholesky(jnp.where(together, near, one) + JITTER * one)
+    return block_diag(error_root, play_root)[gears.error][:, gears.error]
 
 
 class Innovations(eqx.Module):

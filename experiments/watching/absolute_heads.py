@@ -12,6 +12,8 @@ the CPU time of `import jax, optimistix, scipy.stats` in a process of its own, m
 
 from __future__ import annotations
 
+import datetime
+import json
 import os
 import resource
 import subprocess
@@ -22,12 +24,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import binom
 
 from experiments.common.command_line import study
-from experiments.common.rows import commit, commits_of
+from experiments.common.rows import ROOT, commit, commits_of
+from tvsbayes.errors import TvsError
+from tvsbayes.studies.executors import SINGLE_THREADED
 
 KINDS = tuple((encoder, sides) for encoder in ("output", "motor") for sides in ("recorded", "unrecorded"))
 SEED, NEXT_STARS = 7311, 40
+FIRST_NIGHT = datetime.datetime(2026, 3, 1, 20, 0)
+NIGHTS_APART = datetime.timedelta(hours=24)
 U_DEG = 0.0005
 MOVED_U = 10.0
 PAN_DEG, TILT_DEG = (-120.0, 120.0), (15.0, 75.0)
@@ -107,7 +114,8 @@ def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, Night, int]:
             at = q[k] - play * side if side else float(np.clip(at, q[k] - play, q[k] + play))
             output[k, axis] = at
         stops = np.exp(0.5 * rng.standard_normal()) * 0.002 * rng.standard_normal(count)
-        walk = 0.002 * abs(rng.standard_normal()) * np.cumsum(np.sqrt(np.diff(hours, prepend=0)) * rng.standard_normal(count))
+        steps = np.sqrt(np.diff(hours, prepend=0.0)) * rng.standard_normal(count)
+        walk = 0.002 * abs(rng.standard_normal()) * np.cumsum(steps)
         output[:, axis] += error + stops + walk
     zero, lean = rng.normal(0, 0.3, 2), rng.normal(0, 0.1, 2)
     square, beam = rng.normal(0, 0.1, 2)
@@ -124,13 +132,125 @@ def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, Night, int]:
     return both[0], both[1], first
 
 
-def cpu_s(command: list[str], cwd: Path) -> tuple[float, subprocess.CompletedProcess]:
-    """CPU seconds of a command, and what it left."""
+def tvsbayes(cwd: Path, *words: str) -> tuple[float, subprocess.CompletedProcess]:
+    """CPU seconds of a command of the package, and what it left."""
+    return cpu_s(cwd, "-m", "tvsbayes", *words)
+
+
+def cpu_s(cwd: Path, *words: str) -> tuple[float, subprocess.CompletedProcess]:
+    """CPU seconds of Python with these arguments, and what it left."""
+    environment = {**os.environ, **SINGLE_THREADED, "PYTHONPATH": str(ROOT)}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    command = [sys.executable, *words]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, env=environment)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done
 
 
+def imported(cwd: Path, name: str, table: str, encoder: str, start: datetime.datetime) -> None:
+    """Make a campaign of a night's table, dated."""
+    (cwd / f"{name}.csv").write_text(table)
+    words = ("import", f"{name}.csv", "--sightings", "--to", name, "--encoders", encoder, "--yes")
+    _, done = tvsbayes(cwd, *words)
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    campaign = cwd / name / "campaign.toml"
+    first, *others = campaign.read_text().splitlines()
+    campaign.write_text("\n".join([first, f"created = {start.isoformat()}", *others, ""]))
+
+
+def one_head(task: tuple[str, str, int]) -> dict[str, object]:
+    """One head: fitted by the command, then its next night, and the same with a zero that moved."""
+    encoder, recorded, seed = task
+    first, later, stars = drawn_nights((encoder, recorded), seed)
+    row: dict[str, object] = {"encoder": encoder, "sides": recorded, "seed": seed, "stars": stars, "commit": commit()}
+    with tempfile.TemporaryDirectory() as folder:
+        cwd = Path(folder)
+        imported(cwd, "night", first.table(), encoder, FIRST_NIGHT)
+        imported(cwd, "next", later.table(), encoder, FIRST_NIGHT + NIGHTS_APART)
+        imports, _ = cpu_s(cwd, "-c", IMPORTS)
+        taken, done = tvsbayes(cwd, "fit", "night", "--quick", "--json")
+        row |= {"imports": taken / imports, "import_s": imports, "answer": "none"}
+        if done.returncode:
+            return row | {"problem": done.stderr[-300:]}
+        fitted = json.loads(done.stdout)
+        zero = fitted["parameters"]["elevation_zero_deg"]["sd"]
+        row |= {"answer": fitted["answer"], "u_zero_deg": zero}
+        imported(cwd, "moved", later.table(MOVED_U * zero), encoder, FIRST_NIGHT + NIGHTS_APART)
+        return row | _next_night(cwd)
+
+
+def _next_night(cwd: Path) -> dict[str, object]:
+    """Promise and errors of the next night, verdicts on it and on the moved zero."""
+    from tvsbayes.comparison.verified_looks import SeenAngles, accepted_calibration, verify_looks
+    from tvsbayes.comparison.watched_looks import WatchedLooks, watch
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.model.compilation_cache import use_compilation_cache
+    from tvsbayes.pipeline import StoredOrFitted
+    from tvsbayes.progress import Job
+
+    use_compilation_cache()
+    campaign, later, moved = (read_campaign(cwd / name) for name in ("night", "next", "moved"))
+    with Job({"fit": 1.0}, None) as job:
+        known = StoredOrFitted(campaign, str, job.part("fit")).fit
+    result: dict[str, object] = {}
+    for name, looks in (("next", later), ("moved", moved)):
+        seen = watch(known, looks)
+        result |= {f"{name}_verdict": seen.verdict, f"{name}_p": seen.p, f"{name}_what": [m.what for m in seen.moved]}
+    try:
+        calibration = accepted_calibration(campaign)
+    except TvsError as error:
+        return result | {"problem": error.message}
+    promised = verify_looks(known, calibration, later)
+    sides = np.zeros((len(later.spots), 2))
+    errors = np.abs(SeenAngles.of(known, WatchedLooks(known, later), sides, 0).value)
+    inside = float(np.mean(errors <= promised.promised95))
+    verdict = {"verify": promised.verdict, "promised95_deg": promised.promised95, "inside": inside}
+    return result | verdict | {"error95_deg": float(np.quantile(errors, 0.95))}
+
+
+TEXT = """# Heads with absolute encoders
+
+Made by `python -m experiments.watching.absolute_heads`. Heads drawn by NumPy alone: encoders on the axes (`output`) or
+before the gears (`motor`), 40 to 100 stars, each at angles of its own, sides of approach recorded or not. `fit --quick`
+on the first night; the next night, a day later, is 40 stars. CPU in imports of JAX, optimistix and scipy.stats."""
+
+
+def table(rows: list[dict]) -> None:
+    """Answers and cost by kind, then promises and alarms."""
+    print(TEXT)
+    print("\n| encoders | sides | heads | accepted | rough | other | median imports | largest |")
+    print("|---|---|---|---|---|---|---|---|")
+    for kind in (*KINDS, None):
+        own = [row for row in rows if kind in (None, (row["encoder"], row["sides"]))]
+        if not own:
+            continue
+        count = Counter(row["answer"] for row in own)
+        imports = [row["imports"] for row in own]
+        others = len(own) - count["accepted"] - count["rough"]
+        name = "**all** | " if kind is None else " | ".join(kind)
+        print(f"| {name} | {len(own)} | {count['accepted']} | {count['rough']} | {others}", end=" | ")
+        print(f"{np.median(imports):.0f} | {max(imports):.0f} |")
+    kept = [row for row in rows if "inside" in row]
+    seen = [row for row in rows if "next_verdict" in row]
+    if kept:
+        ratio = np.array([row["promised95_deg"] / row["error95_deg"] for row in kept])
+        inside = 100 * np.mean([row["inside"] for row in kept])
+        print(
+            f"\nPromise of the next night, {len(kept)} heads: {inside:.1f} % of errors within it; promise over", end=" "
+        )
+        print(
+            f"the actual 95 % of a head's errors {np.median(ratio):.2f} (median), {ratio.max():.2f} (largest)", end="; "
+        )
+        print(f"BROKEN {sum(row['verify'] == 'BROKEN' for row in kept)}.")
+    if seen:
+        alarms = sum(row["next_verdict"] == "MOVED" for row in seen)
+        most = binom.isf(0.001, len(seen), 0.01)
+        found = sum(row["moved_verdict"] == "MOVED" for row in seen)
+        print(f"\n`watch`, {len(seen)} heads: {alarms} false alarms (at 1 % at most {most:.0f} in 99.9 %); an", end=" ")
+        print(f"elevation zero moved by {MOVED_U:g} u is MOVED in {found}.")
+    print(f"\nCommit {commits_of(rows)}.")
+
+
 if __name__ == "__main__":
-    pass
+    study(__file__, __doc__, one_head, ("encoder", "sides", "seed"), KINDS, table, 10)

@@ -75,7 +75,7 @@ def fitted(steps: dict[str, list[float]], scales: dict[str, float], ratios: dict
     root = place_root(shape, angle, on_tilt, valid)
     places = SimpleNamespace(steps=counters, on_tilt=on_tilt, valid=valid)
     fit = SimpleNamespace(
-        arrays=SimpleNamespace(gears=SimpleNamespace(places=places)),
+        arrays=SimpleNamespace(gears=SimpleNamespace(places=places, at_places=lambda errors: errors)),
         linearised=SimpleNamespace(place_root=root),
         mode=SimpleNamespace(physical=mode),
         campaign=SimpleNamespace(rig=SimpleNamespace(harmonic_period_deg={})),

@@ -5,7 +5,7 @@ A dozen spots, linearised; the dense side is written from formulation 3.1 (`supp
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -197,3 +197,20 @@ def test_scales_of_zero_are_perfect_gears(varying, dozen, evaluate):
         perfect = evaluate(z, space, arrays).log_likelihood
     # What is left is the floor of 1e-12 rad under every place: with slopes of 1e4 per rad 1e-16 of a variance.
     assert at_zero.log_likelihood == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)
+
+
+def test_errors_that_the_priors_fix_have_no_column(varying, evaluate):
+    """Pan with the same play everywhere, tilt without a transmission error: the density is that of scales of 0."""
+    fixed = ("play_variation_deg.pan", "transmission_error_deg.tilt", *names_of("harmonic_amplitude_deg"))
+    table = varying_gears(varying.campaign.rig, periods=False)
+    exact = {name: replace(table.priors[name], value=0.0, u=0.0) for name in fixed}
+    table = replace(table, priors={**table.priors, **exact})
+    with jax.enable_x64(True):
+        arrays = jax.tree.map(jnp.asarray, campaign_arrays(varying.campaign, table))
+        z = coordinates_with(varying.space, varying.z, {**SCALES["rough"], **dict.fromkeys(fixed, 0.0)})
+        some, every = (evaluate(z, varying.space, each).log_likelihood for each in (arrays, varying.arrays))
+    pan = int(np.sum(arrays.gears.places.valid & ~arrays.gears.places.on_tilt))
+    tilt = int(np.sum(arrays.gears.places.valid & arrays.gears.places.on_tilt))
+    assert arrays.gears.columns == pan + tilt < varying.arrays.gears.columns == 2 * (pan + tilt)
+    # What is left is the floor of 1e-12 rad under every place.
+    assert some == pytest.approx(every, abs=1e-9 * LOG_UNIT, rel=1e-12)

@@ -8,6 +8,7 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.head.pointing_table import campaign_of, read_stars
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.twin.head_physics import head_beam
@@ -67,6 +68,17 @@ def test_terms_of_a_table_with_wraps(tmp_path):
     for name, value, error in zip(model.names, model.value, model.standard_error, strict=True):
         assert abs(value - TERMS.get(name, model.known.get(name, 0.0))) < 1e-5 + 5 * error, name
     assert model.rms_deg < 1e-5
+
+
+def test_encoders_that_are_absolute_are_stated(tmp_path):
+    """On the axes without play; before the gears with it."""
+    path = tmp_path / "night.dat"
+    path.write_text("".join(table(5)))
+    stars = read_stars(path).stars
+    rigs = {kind: campaign_of(stars, "night", encoders=kind).rig for kind in (None, "incremental", "motor", "output")}
+    assert [rig.absolute for rig in rigs.values()] == [(), (), AXES, AXES]
+    plays = [rig.priors["backlash_deg.tilt"].u for rig in rigs.values()]
+    assert plays[0] == plays[1] == plays[2] > 0 == plays[3]
 
 
 def test_azimuth_of_a_long_night_stays_within_its_turns(tmp_path):

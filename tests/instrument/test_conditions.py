@@ -15,6 +15,7 @@ from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.conditions import (
     interpolated,
     kelvin,
+    pause_s,
     powered_on_s,
     temperature_doubts,
     unseen_shifts,
@@ -111,3 +112,11 @@ def test_shifts_determined_by_the_moves():
     assert unseen_shifts(both, RIG_PRIORS) == ()
     assert unseen_shifts(both, still) == ("creep_minutes",)
     assert CREEP_NAMES == (*names_of("creep_deg"), "creep_minutes")
+
+
+def test_the_pause_between_two_campaigns_is_by_their_dates():
+    one, naive = datetime.datetime(2026, 3, 1, 20, 0, tzinfo=datetime.UTC), datetime.datetime(2026, 3, 2, 20, 0)
+    later = {"created": one + datetime.timedelta(days=1)}
+    assert pause_s({"created": one}, later, 3600.0) == 82800.0
+    assert pause_s(later, {"created": one}, 3600.0) == pause_s({}, later, 0.0) == 0.0
+    assert pause_s({"created": one}, {"created": naive}, 0.0) == 0.0

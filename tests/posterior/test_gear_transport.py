@@ -86,7 +86,7 @@ def fitted(dozen) -> SimpleNamespace:
 @pytest.fixture(scope="module")
 def path(fitted) -> Transport:
     chart = transport(fitted)
-    assert chart.noise > 10 and chart.narrow and chart.linear.places.shape[1] == 2 * len(chart.place_on_tilt) > 0
+    assert chart.noise > 10 and chart.narrow and chart.linear.places.shape[1] == len(chart.on_tilt) > 0
     return chart
 
 

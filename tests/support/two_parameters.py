@@ -65,8 +65,9 @@ def route() -> Transport:
         linear=linear_campaign(np.ones(1), np.zeros((1, 1)), 1),
         residuals=lambda z: np.zeros((len(z), ROWS)),
         bend=np.zeros((1, 0, 0)),
-        place_angle_rad=np.zeros(0),
-        place_on_tilt=np.zeros(0, bool),
+        angle_rad=np.zeros(0),
+        on_tilt=np.zeros(0, bool),
+        of_play=np.zeros(0, bool),
         drift_axis=np.zeros((0, 2)),
         period_deg=np.zeros((2, PERIODS_MAX)),
     )

@@ -63,6 +63,13 @@ def head_templates(sightings: bool) -> dict[str, bytes]:
     return {name: re.sub(rb"(?m)^#%s " % kind, b"", data) for name, data in files.items()}
 
 
+INCREMENTAL = (
+    "encoders: incremental, with a new zero at each homing; --encoders output (absolute, on the axis itself) or motor "
+    "(absolute, before the gears) says another"
+)
+"""What an import says where --encoders is not given."""
+
+
 def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_per_turn: float | None) -> Import:
     """Import the nominal geometry of two joints into a new campaign of a head, or into one made by `new`."""
     data = read_bytes(file, URDF_BYTES_MAX)
@@ -210,8 +217,7 @@ def _absolute(
         allowed, remedy = "angles of encoders, which have a unit or decimals", "leave --encoders out"
         raise refusal("usage", file=file, found="counters", allowed=allowed, remedy=remedy)
     if encoders and kind is None:
-        other = "--encoders output (absolute, on the axis itself) or motor (absolute, before the gears) says another"
-        assumed.append(f"encoders: incremental, with a new zero at each homing; {other}")
+        assumed.append(INCREMENTAL)
     axes = tuple(axis for axis in AXES if axis in encoders) if kind in ("output", "motor") else ()
     for axis in axes if kind == "output" else ():
         priors |= {f"backlash_deg.{axis}": Prior(0.0, 0.0), f"play_variation_deg.{axis}": Prior(0.0, 0.0)}

@@ -33,7 +33,7 @@ ANGLE_UNITS = ("deg", "rad", "mrad", "gon", "arcmin", "arcsec")
 KINDS_OF: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("column", "sheet"), (AXIS, SIGHTINGS, LOOKS)),
     **{"pixels_from": (COPY, LOOKS), "angles": (SIGHTINGS, LOOKS), "sd_px": (LOOKS,)},
-    **{"axis": (AXIS,), "sightings": (SIGHTINGS,), "kind": (POINTING, AXIS), "encoders": (AXIS, SIGHTINGS)},
+    **{"axis": (AXIS,), "sightings": (SIGHTINGS,), "kind": (POINTING, AXIS), "encoders": (POINTING, AXIS, SIGHTINGS)},
     **dict.fromkeys(("run", "runs", "unit", "deviations", "counts_per_turn"), (AXIS,)),
     "assume": (AXIS, SIGHTINGS),
     **dict.fromkeys(("relative", "flip", "shift_moves"), (COPY, SIGHTINGS, LOOKS)),
@@ -161,7 +161,7 @@ def import_(
 
         task = import_urdf(o.file, o.to, {"pan": o.pan_joint, "tilt": o.tilt_joint}, o.steps_per_turn)
     elif kind_of_file == POINTING:
-        task = _pointing_table(o.file, o.to)
+        task = _pointing_table(o.file, o.to, o.encoders)
     elif kind_of_file == AXIS:
         from tvsbayes.cli.axis_import import KINDS, FileOptions, import_readings
         from tvsbayes.importing.guide import ASSUMPTIONS
@@ -246,14 +246,15 @@ def _why_refused(kind_of_file: str, option: str) -> Reason:
     return Reason("for spots in pictures, and these are sightings", remedy)
 
 
-def _pointing_table(file: Path, to: Path) -> Import:
+def _pointing_table(file: Path, to: Path, encoders: str | None) -> Import:
     """Import a pointing table of a telescope as a campaign of sightings."""
+    from tvsbayes.cli.head_commands import INCREMENTAL
     from tvsbayes.head.pointing_table import U_ARCSEC, campaign_of, read_stars
     from tvsbayes.importing.sightings import STEP_DEG
     from tvsbayes.instrument.campaign import write_campaign
 
     table = read_stars(file)
-    campaign = campaign_of(table.stars, file.stem)
+    campaign = campaign_of(table.stars, file.stem, encoders=encoders)
     moves, sightings = len(campaign.moves), len(campaign.spots)
     assumed = [
         f"counters are the encoders' degrees in steps of {STEP_DEG:g} deg, whose scale is known to 1e-6",
@@ -261,6 +262,8 @@ def _pointing_table(file: Path, to: Path) -> Import:
         f"a star's place is known to {U_ARCSEC:g} arcsec; refraction is as the table has it",
         "no transmission error and no play of more than arcseconds: state another scale in [rig.prior]",
     ]
+    if encoders is None:
+        assumed.append(INCREMENTAL)
     if table.left_out:
         assumed.append(f"{table.left_out} blocks without RAA:, TAA: or LST: are no pointings")
     lines = [f"gives: {moves} moves, {sightings} sightings", *(f"assumed: {text}" for text in assumed)]

@@ -21,6 +21,7 @@ from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.conditions import pause_s
 from tvsbayes.instrument.copies import refuse_same_looks
 from tvsbayes.instrument.homing import homed
 from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
@@ -63,10 +64,16 @@ SIGHTED_CHANGES = (
 
 
 def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
-    """Join two sessions to one campaign; the second begins with a homing of its own."""
+    """Join two sessions to one campaign; the second begins with a homing of its own.
+
+    The zero of an absolute encoder walks on between them.
+    """
     moves, spots, last = len(campaign.moves), max(spot.spot for spot in campaign.spots) + 1, campaign.moves[-1]
+    begins_s = last.time_s
+    if campaign.rig.absolute:
+        begins_s += pause_s(campaign.header, looks.header, last.time_s)
     later = tuple(
-        replace(m, move=m.move + moves, segment=m.segment + last.segment + 1, time_s=m.time_s + last.time_s)
+        replace(m, move=m.move + moves, segment=m.segment + last.segment + 1, time_s=m.time_s + begins_s)
         for m in looks.moves
     )
     second = tuple(s.renumbered(s.spot + spots, s.move + moves) for s in looks.spots)

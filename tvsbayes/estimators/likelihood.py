@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.linalg import lapack
 
 from tvsbayes.estimators.campaign_arrays import COLUMNS_TOGETHER, CampaignArrays, GearArrays, SpotArrays
 from tvsbayes.estimators.kalman_filter import (
@@ -131,9 +132,9 @@ def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | No
 class Sums(eqx.Module):
     """Sums over spots for the normal equations of the errors at places; many points have a leading axis.
 
-    Columns of errors are in groups of `COLUMNS_TOGETHER`. `log_density` is that of the spots with all those errors zero. `along` holds the products of the standardised
-    columns and residuals, `gram` those of the columns of two groups, for the pairs (0, 0), (1, 0), (1, 1), (2, 0)
-    ......
+    Columns of errors are in groups of `COLUMNS_TOGETHER`. `log_density` is that of the spots with all errors zero.
+    `along` holds the products of the standardised columns and residuals, `gram` those of the columns of two groups, for
+    the pairs (0, 0), (1, 0), (1, 1), (2, 0) ...
     """
 
     log_density: Float[Array | np.ndarray, "*batch"]
@@ -229,9 +230,10 @@ def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
 
 @dataclass(frozen=True)
 class RepeatedErrors:
-    """Conditional distribution of the errors of columns given all looks: divided by `root`, N(mean, (factor factor')^-1).
+    """Conditional distribution of the errors of columns given all looks.
 
-    A priori they are N(0, 1). `explained` is the mean times the transposed factor. Many points with leading axes.
+    Divided by `root` they are N(mean, (factor factor')^-1), and N(0, 1) a priori. `explained` is the mean times the
+    transposed factor. Many points with leading axes.
     """
 
     root: BlockRoot
@@ -251,7 +253,7 @@ class RepeatedErrors:
         given = sums.gram[..., pairs_of(np.maximum(one, two)) + np.minimum(one, two), :, :]
         whole = np.where((one < two)[:, :, None, None], given.swapaxes(-2, -1), given)
         batch, size = sums.along.shape[:-2], groups * sums.along.shape[-1]
-        along = sums.along.reshape(*batch, size)[..., : root.size]
+        along = np.asarray(sums.along).reshape(*batch, size)[..., : root.size]
         whole = np.swapaxes(whole, -3, -2).reshape(*batch, size, size)[..., : root.size, : root.size]
         precision = np.eye(root.size) + root.congruent(whole)
         slope = root.transposed_times(along[..., None])[..., 0]
@@ -269,8 +271,9 @@ class RepeatedErrors:
 
     def drawn_rad(self, normal: np.ndarray) -> np.ndarray:
         """Draw the errors from standard normal numbers; zeros give their mean."""
-        right = (self.explained + normal)[..., None]
-        return self.root.times(np.linalg.solve(self.factor.swapaxes(-2, -1), right)[..., 0])
+        # By back substitution: NumPy's solver would factorise again.
+        pairs = zip(self.factor, self.explained + normal, strict=True)
+        return self.root.times(np.reshape([lapack.dtrtrs(factor.T, each)[0] for factor, each in pairs], normal.shape))
 
 
 def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> BlockRoot:
@@ -281,10 +284,9 @@ def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> Bl
         space: priors.
         gears: without padding.
     """
-    ratio = np.radians(values[:, RATIO_COLUMNS])
-    angle_rad = gears.places.steps[gears.place] * ratio[:, gears.on_tilt.astype(int)]
-    scales = scales_at(values, np.asarray(space.harmonic_period_deg))
-    return column_blocks(scales, angle_rad, gears.on_tilt, gears.of_play)
+    ratio, on_tilt = np.radians(values[:, RATIO_COLUMNS]), np.asarray(gears.on_tilt)
+    angle_rad = np.asarray(gears.places.steps)[gears.place] * ratio[:, on_tilt.astype(int)]
+    return column_blocks(scales_at(values, np.asarray(space.harmonic_period_deg)), angle_rad, on_tilt, gears.of_play)
 
 
 def prior_errors_at_places(

@@ -18,6 +18,7 @@ from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.importing.sightings import STEP_DEG
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, next_move
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior, names_of
@@ -119,10 +120,18 @@ def read_stars(path: Path) -> PointingTable:
     return PointingTable(tuple(stars), len(blocks) - len(stars))
 
 
-def campaign_of(stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC) -> Campaign:
+def campaign_of(
+    stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC, encoders: str | None = None
+) -> Campaign:
     """Make the campaign of a night: encoder angles as counters of `STEP_DEG`, stars as sightings.
 
     An encoder does not resolve whole turns: the azimuth axis is assumed on the turn of the star's stated azimuth.
+
+    Args:
+        stars: in time order.
+        name: of the campaign.
+        u_arcsec: standard uncertainty of a star's direction.
+        encoders: "output" or "motor" for absolute ones, on the axes or before the gears; else each night has its zero.
     """
     elevation, azimuth = np.array([star.encoder_deg for star in stars]).T
     stated = np.array([star.true_deg[1] for star in stars])
@@ -144,5 +153,7 @@ def campaign_of(stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC) 
         )
         for k, star in enumerate(stars)
     )
-    table = RigTable(encoder_priors(), mechanism=SIGHTING_HEAD)
+    none = dict.fromkeys(names_of("backlash_deg"), Prior(0.0, 0.0, "half-normal")) if encoders == "output" else {}
+    absolute = AXES if encoders in ("output", "motor") else ()
+    table = RigTable({**encoder_priors(), **none}, mechanism=SIGHTING_HEAD, absolute=absolute)
     return Campaign(tuple(moves), sightings, None, table, {"name": name})

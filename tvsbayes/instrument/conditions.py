@@ -127,6 +127,21 @@ def temperature_doubts(moves: Sequence[TimedMove]) -> list[str]:
     return sentences
 
 
+def pause_s(before: Mapping[str, object], after: Mapping[str, object], last_s: float) -> float:
+    """Seconds from the last move of a campaign to the first of a later one, by `created` of both headers; else 0.
+
+    Args:
+        before: header of the first.
+        after: header of the later one.
+        last_s: `time_s` of the last move of the first.
+    """
+    times = [header.get("created") for header in (before, after)]
+    one, other = (time if isinstance(time, datetime.datetime) else None for time in times)
+    if one is None or other is None or (one.tzinfo is None) != (other.tzinfo is None):
+        return 0.0
+    return max((other - one).total_seconds() - last_s, 0.0)
+
+
 def unseen_shifts(moves: Sequence[TimedMove], priors: Mapping[str, Prior]) -> tuple[str, ...]:
     """Parameters of the shifts of a scanner's zeros that its moves cannot determine.
 

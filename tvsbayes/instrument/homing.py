@@ -1,7 +1,8 @@
 """Unrecorded homing sides as a few hypotheses that the data can distinguish (formulation 3.1).
 
 Homing ends always at one side, always at the other, or anywhere each time; each axis whose first rows all say `unknown`
-has one such hypothesis ("way"), unless it has no play or an absolute encoder. A single unknown among recorded homings stays "anywhere".
+has one such hypothesis ("way"), unless it has no play or an absolute encoder. A single unknown among recorded homings
+stays "anywhere".
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def _error_root(
 def _play_root(
     scales: GearScales, rows: Callable[[Any], np.ndarray], angle_rad: np.ndarray, together: np.ndarray | bool
 ) -> np.ndarray:
-    """Compute a factor of the covariance of plays. Their sd scales the factor, not the covariance, which may be zero."""
+    """Compute a factor of the covariance of plays; their sd scales it afterwards, as it may be zero."""
     near = matern52(_distances(angle_rad), rows(scales.length_rad))
     near = np.where(together, near, np.eye(angle_rad.shape[-1]))
     return rows(scales.play_rad) * np.linalg.cholesky(near + JITTER * np.eye(angle_rad.shape[-1]))

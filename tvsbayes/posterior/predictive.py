@@ -208,8 +208,9 @@ def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarra
 def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarray:
     """Compute the change of spots' angles (pan, tilt) by repeating errors (draws, e), shape (draws, spots, 2)."""
     gears = arrays.gears.without_padding()
-    errors_rad, share = place_errors_rad[:, gears.rows], gears.share[: int(arrays.count)]
-    axes = [errors_rad[:, of] @ share[:, of].T for of in (~gears.on_tilt, gears.on_tilt)]
+    errors_rad, share = place_errors_rad[:, gears.rows], np.asarray(gears.share)[: int(arrays.count)]
+    on_tilt = np.asarray(gears.on_tilt)
+    axes = [errors_rad[:, of] @ share[:, of].T for of in (~on_tilt, on_tilt)]
     return np.stack(axes, axis=2)
 
 
