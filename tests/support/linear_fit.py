@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from support.partial_arrays import partial_arrays
+from support.partial_arrays import no_gears, partial_arrays
 from support.small_campaign import small_campaign
 
 from tvsbayes.calibration.pointing import INPUT_NAMES
@@ -105,7 +105,7 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
         "information": StopInformation(groups, jacobian.T @ gain, *without_places(jacobian.shape[1])),
         "linearised": linearised(jacobian, load),
         "free": np.ones(len(NAMES), dtype=bool),
-        "arrays": partial_arrays(spots=spot_arrays(readings), count=np.int32(SPOTS)),
+        "arrays": partial_arrays(spots=spot_arrays(readings), count=np.int32(SPOTS), gears=no_gears(SPOTS)),
         "draws_places": np.zeros((2048, 0)),
         "space": space,
         "z": 0.1 * np.random.default_rng(4).normal(size=len(NAMES)),

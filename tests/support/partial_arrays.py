@@ -21,5 +21,6 @@ def partial_arrays(**parts: Any) -> CampaignArrays:
 
 def no_gears(spots: int) -> GearArrays:
     """Gears that repeat no error."""
-    none = placed(np.zeros((spots, 0)))
-    return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, bool))]), none, none)
+    none = placed(np.zeros(0, bool))
+    places = Places(placed(np.zeros(0)), none, none)
+    return GearArrays(places, placed(np.zeros((spots, 0))), placed(np.zeros(0, np.int32)), none, none)

@@ -55,13 +55,13 @@ def _split_information(fit: JointFit) -> _SplitInformation:
     linear = linear_spots(fit.linearised, fit.arrays, fit.linearised.by_coordinates(fit.held))
     information = stop_information(linear.spelled_out(linear.places))
     gain = np.concatenate([group.jacobian for group in information.groups])
-    noise, places = gain.T @ gain, linear.places.shape[2] // 2
+    noise, of_play = gain.T @ gain, fit.arrays.gears.of_play
     scattered = np.einsum("nia,nip->nap", fit.linearised.slope, gain.reshape(-1, 4, gain.shape[1]))
     scattered *= np.sqrt(fit.linearised.scatter_variance)[:, :, None]
     by_looks = np.einsum("nap,naq->pq", scattered, scattered)
-    error_columns = len(NAMES) + np.arange(places)
+    error_columns = len(NAMES) + np.arange(len(of_play))
     groups = dict(fit.space.mechanism.prior_groups)
-    groups |= {TRANSMISSION_ERROR: error_columns.tolist(), PLAY_VARIATION: (error_columns + places).tolist()}
+    groups |= {TRANSMISSION_ERROR: error_columns[~of_play].tolist(), PLAY_VARIATION: error_columns[of_play].tolist()}
     return _SplitInformation(
         "pixel and aperture noise" if fit.arrays.read.any() else fit.space.mechanism.noise,
         noise - by_looks,

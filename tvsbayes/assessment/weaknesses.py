@@ -69,19 +69,22 @@ def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
     counters, count = sorted(steps), len(NAMES)
     if not 2 <= len(counters) <= FEW_COUNTERS or not len(fit.information.place_mean):
         return None
-    places = fit.arrays.gears.places
+    gears = fit.arrays.gears
+    places, errors = gears.places, np.flatnonzero(~gears.of_play)
     valid = np.asarray(places.valid)
     physical = np.asarray(fit.mode.physical)
     ratio = np.radians(physical[[INDEX[f"degrees_per_step.{a}"] for a in AXES]])
     scales = scales_at(physical, np.asarray(fit.space.harmonic_period_deg))
     known = KnownPlaces(np.asarray(places.steps)[valid], np.asarray(places.on_tilt)[valid], ratio, scales)
-    covariance = with_places(fit.z, fit.covariance, fit.information).covariance
-    error_columns = count + np.flatnonzero(valid)
+    joint = with_places(fit.z, fit.covariance, fit.information).covariance
+    # Errors that the priors fix have no column.
+    covariance = np.eye(int(valid.sum()))
+    covariance[np.ix_(gears.place[errors], gears.place[errors])] = joint[np.ix_(count + errors, count + errors)]
     widest = int(np.argmax(np.diff(counters)))
     at = known.between(np.array([counters[widest : widest + 2]]).mean(axis=1), AXES.index(axis))
     share, remainder = at.error[0], at.error_rest[0]
     left, prior = (
-        share @ covariance[np.ix_(error_columns, error_columns)] @ share + remainder**2,
+        share @ covariance @ share + remainder**2,
         share @ share + remainder**2,
     )
     if left < WEAK_VARIANCE * prior or prior <= LEAST_ERROR_RAD**2:
