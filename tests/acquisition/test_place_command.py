@@ -147,14 +147,13 @@ def test_a_program_that_takes_too_long_is_ended(mounted_rig, tmp_path):
 def test_stop_ends_the_program_too(mounted_rig, tmp_path, monkeypatch):
     run_ = Run(mounted_rig, tmp_path / "c", small_plan(), place_command=program(WAITS))
     monkeypatch.setattr(run_.stop, "requested", False)
-    control = run_.engine._control
-    heeds = control.meanwhile
+    goes_on = run_.engine._goes_on
 
     def stopped() -> bool:
         run_.stop.requested = True
-        return heeds()
+        return goes_on()
 
-    monkeypatch.setattr(control, "meanwhile", stopped)
+    monkeypatch.setattr(run_.engine, "_goes_on", stopped)
     assert run_.engine.run().reason == "interrupted"
     assert [one["exit_code"] for one in events(tmp_path / "c", "place_command")] == [None]
 

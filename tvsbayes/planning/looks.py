@@ -215,8 +215,9 @@ def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer)
             hours=jnp.zeros((1, 2)),
             tangents=jnp.zeros((1, 2, 3)) if observer.image_px is None else None,
         )
-        no_places = jnp.zeros(0, dtype=bool)
-        gears = GearArrays(Places(jnp.zeros(0), no_places, no_places), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
+        none = jnp.zeros(0, dtype=bool)
+        places = Places(jnp.zeros(0), none, none)
+        gears = GearArrays(places, jnp.zeros((1, 0)), jnp.zeros(0, dtype=jnp.int32), none, none)
         count = jnp.ones((), dtype=jnp.int32)
         arrays = CampaignArrays(pair.moves(observer.warm_minutes), spot, gears, observer.azimuth_convention, count)
         # Errors of the gears act as an offset, so their columns follow from the offset's, see `at_all`.
