@@ -103,9 +103,10 @@ def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:
 
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory) -> Path:
-    """The paper twin with the results that the report command makes where there are none."""
+    """The paper twin with the page of its Laplace approximation."""
     place = tmp_path_factory.mktemp("report") / "twin"
     shutil.copytree(TWIN, place)
+    assert run(["fit", str(place), "--no-sample"]) == 0
     assert run(["report", str(place), "--limit-deg-per-step", "1e-3", "--limit-mm", "1", "--json"]) == 1
     return place
 
