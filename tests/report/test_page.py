@@ -193,7 +193,8 @@ def test_warnings_of_check_are_on_the_first_page(evidence, no_pictures):
 def test_equal_ratios_share_a_row(evidence):
     """Without the classic method's own column; the contrast says what they differ by."""
     summary = evidence.fit.summary
-    alike = structs.replace(summary, effective=summary.effective | {"right": summary.effective["left"]})
+    lower = structs.replace(summary.effective["up"], value=0.06, interval95=(0.0598, 0.0602))
+    alike = structs.replace(summary, effective=summary.effective | {"right": summary.effective["left"], "down": lower})
     heads = [row[0] for row in answer_table(alike, None).rows]
     assert heads[0] == "left and right, deg/step" and {"up, deg/step", "down, deg/step"} <= set(heads)
     assert "left - right, \u00b5deg/step" in heads
