@@ -43,16 +43,22 @@ from tvsbayes.single_axis.axis_iso230 import AXIS_TERMS
 from tvsbayes.single_axis.axis_record import AxisResults, AxisSummary
 
 SI = {
-    **{"m": (1.0, r"\metre"), "cm": (1.0, r"\centi\metre"), "mm": (1.0, r"\milli\metre")},
-    **{"um": (1.0, r"\micro\metre"), "nm": (1.0, r"\nano\metre"), "inch": (25.4, r"\milli\metre")},
-    **{"thou": (0.0254, r"\milli\metre"), "deg": (1.0, r"\degree"), "arcmin": (1.0, r"\arcminute")},
-    **{"arcsec": (1.0, r"\arcsecond"), "rad": (1.0, r"\radian"), "mrad": (1.0, r"\milli\radian")},
-    **{
-        "urad": (1.0, r"\micro\radian"),
-        "gon": (0.9, r"\degree"),
-        "turn": (360.0, r"\degree"),
-        "counts": (1.0, r"\one"),
-    },
+    "m": (1.0, r"\metre"),
+    "cm": (1.0, r"\centi\metre"),
+    "mm": (1.0, r"\milli\metre"),
+    "um": (1.0, r"\micro\metre"),
+    "nm": (1.0, r"\nano\metre"),
+    "inch": (25.4, r"\milli\metre"),
+    "thou": (0.0254, r"\milli\metre"),
+    "deg": (1.0, r"\degree"),
+    "arcmin": (1.0, r"\arcminute"),
+    "arcsec": (1.0, r"\arcsecond"),
+    "rad": (1.0, r"\radian"),
+    "mrad": (1.0, r"\milli\radian"),
+    "urad": (1.0, r"\micro\radian"),
+    "gon": (0.9, r"\degree"),
+    "turn": (360.0, r"\degree"),
+    "counts": (1.0, r"\one"),
 }
 """Factor and unit of D-SI by the unit of readings."""
 ONE = r"\one"

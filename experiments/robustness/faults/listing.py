@@ -309,7 +309,7 @@ FAULTS = (
           "test_a_table_is_of_one_state_while_the_zero_grows"),
     Fault("a stated scatter of homings is not used", "RigTable.home_sd_deg", Returns("(0.05, 0.05)"),
           "test_homings_shift_the_zeros_as_stated"),
-    Fault("a way of homing of an absolute encoder is weighed", "homing.unrecorded", Reads("rig.absolute", "()"),
+    Fault("a homing hypothesis of an absolute encoder is weighed", "homing.unrecorded", Reads("rig.absolute", "()"),
           "test_no_way_of_homing_is_weighed_of_an_absolute_encoder_or_without_play"),
     Fault("errors that the priors fix at 0 have columns", "vary_by_position", Returns("np.ones((2, 2), dtype=bool)"),
           "test_errors_that_the_priors_fix_have_no_column"),
