@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from msgspec import structs
 from support.small_results import small_summary
@@ -14,7 +16,7 @@ from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.fit_text import FINE_DEG, classic_text, demo_text, fit_text
 from tvsbayes.report.result_tables import KEY_PARAMETERS
 from tvsbayes.report.scanner_document import verdict_of
-from tvsbayes.results.convergence import Importance, MonteCarloError, NamedValue, Sampling
+from tvsbayes.results.convergence import Agreement, Importance, MonteCarloError, NamedValue, Sampling
 from tvsbayes.results.estimates import FitSummary, Validation, ValidationTest, WeakDirection
 
 
@@ -235,3 +237,12 @@ def test_a_factor_of_one_is_no_remedy():
     assert "As fitted: Met" in verdict_of(structs.replace(small_summary(), validation=failed), (limit,)).text
     larger = structs.replace(failed, inflation=1.0051)
     assert fit_text(structs.replace(small_summary(), validation=larger)).endswith("half-width by 1.01")
+
+
+def test_a_chain_says_whether_it_agrees_with_the_weighted_draws():
+    chain = sampled("accepted", (), 900)
+    assert "the largest difference is" not in fit_text(sampled("accepted", ()))
+    for agrees, words in ((True, "agree on every result"), (False, "DISAGREE")):
+        agreement = Agreement(agrees, 4.0, NamedValue("backlash", 1.2))
+        text = fit_text(structs.replace(chain, sampling=replace(chain.sampling, agreement=agreement)))
+        assert f"emcee and importance sampling {words}: the largest difference is 1.2 Monte Carlo errors" in text

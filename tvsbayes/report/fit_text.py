@@ -61,6 +61,8 @@ def fit_text(
         tests = validation_lines(validation)
         lines = [tests[0], *lines, *tests[1:], f"what helps: {remedy(validation)}"]
     lines += answer_lines(summary)
+    if summary.sampling is not None and (agreement := agreement_line(summary.sampling, summary.tier)) is not None:
+        lines.append(agreement)
     if summary.few_stops:
         lines.append(few_stops_line(summary.few_stops, summary.estimator))
     lines += homing_lines(summary)
@@ -126,8 +128,7 @@ def detail_lines(summary: FitSummary) -> list[Part]:
     if classic_texts:
         lines.append(f"the classic estimator should report, deg/step: {', '.join(classic_texts)}")
     if summary.sampling is not None and summary.sampling.converged:
-        agreement = agreement_line(summary.sampling, summary.tier)
-        lines += [sampling_line(summary.sampling), *([] if agreement is None else [agreement])]
+        lines.append(sampling_line(summary.sampling))
     if summary.curves is not None:
         lines += lost_motion_lines(summary.curves.lost_motion)
     for entry in summary.prior_sensitivity:
