@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import openpyxl
 import pytest
 from importing.samples import FOREIGN, PLAY, RATIO, lines, readings
@@ -100,6 +101,41 @@ def test_assumptions_that_change_the_answer_are_reported(ask, tmp_path, name):
     code, document = ask("import", file, "--axis", "--to", out, "--yes")
     reading = read_axis(out).readings[-1]
     assert code == 0 and any(remark in text for text in document["assumed"]) and (reading.value, reading.u) == last
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("by", ["position", "run", "column"])
+def test_sides_of_a_compensated_axis_are_those_of_the_sheet(ask, tmp_path, by, seed):
+    """Readings that barely differ from the targets, some of them alike, say nothing of sides; the sheet does."""
+    rng, targets = np.random.default_rng(seed), [0, 20, 40, 60, 80]
+    ways = [(t, side) for side in ("forward", "backward") for t in targets[:: 1 if side == "forward" else -1]]
+    read = {way: f"{way[0] + rng.normal(0, 0.001):.3f}" for way in ways}
+    order = sorted(ways, key=lambda way: way[0]) if by == "position" else ways
+    rows = ["target (mm),direction,measured (mm)", *(f"{t},{side},{read[t, side]}" for t, side in order)]
+    if by == "column":
+        rows = [
+            "target (mm),forward (mm),backward (mm)",
+            *(f"{t},{read[t, ways[0][1]]},{read[t, ways[-1][1]]}" for t in targets),
+        ]
+    (tmp_path / "sheet.csv").write_text("\n".join(rows))
+    assert ask("import", tmp_path / "sheet.csv", "--axis", "--to", tmp_path / "out", "--yes")[0] == 0
+    campaign = read_axis(tmp_path / "out")
+    arrived, before = {}, None
+    for move in campaign.moves:
+        rises = move.approach or ("forward" if before is None or move.command > before else "backward")
+        arrived[move.move], before = (move.command, rises), move.command
+    found = sorted((*arrived[reading.move], reading.value) for reading in campaign.readings)
+    assert found == sorted((t, side, float(value)) for (t, side), value in read.items())
+
+
+def test_a_reading_at_standstill_is_one_where_readings_show_it(ask, tmp_path):
+    """The direction of a log may be that of the next move: the end of a run is then read twice from one side."""
+    values = [(c, 1, c + 0.1) for c in range(6)] + [(5, -1, 5.1)] + [(c, -1, c - 0.1) for c in range(4, -1, -1)]
+    rows = [f"{c},{'forward' if side > 0 else 'backward'},{v:.3f}" for c, side, v in values]
+    (tmp_path / "log.csv").write_text("\n".join(["target (mm),direction,measured (mm)", *rows]))
+    code, document = ask("import", tmp_path / "log.csv", "--axis", "--to", tmp_path / "out", "--yes")
+    assert code == 0 and document["moves"] == 11
+    assert any("1 row at the command before" in text for text in document["assumed"])
 
 
 def test_a_workbook_needs_no_format(ask, tmp_path):

@@ -107,6 +107,9 @@ BITS = range(8, 33)
 """Exponents of encoders that count modulo a power of two."""
 OVERSHOOT_SHARE = 0.05
 """Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
+GAP_SDS, MAD_SDS = 3.0, 1.4826
+"""Least difference of the two sides that readings show, in standard deviations of it over the commands; these by the
+median absolute deviation of normal numbers."""
 CONTRARY_MIN = 4
 """Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
 SCALES = ("length", "angle")
@@ -301,24 +304,30 @@ class _Stops:
         self._refuse_contrary()
 
     def _went_past(self) -> bool:
-        """Whether the axis overshot and returned where the side changes at one command.
+        """Whether the axis overshot and returned where the side changes at one command, as a column of sides says.
 
-        The alternative is a second reading at standstill. The axis overshot if, in most such rows, the readings change
-        as they differ between the two sides elsewhere.
+        The alternative is a second reading at standstill, under the direction of the run that begins there. Only the
+        readings can show that: in most such rows they stay, while those of the two sides differ by more than they
+        scatter. Where a row goes on against its side, as in a sheet sorted by position, no run begins.
         """
-        values_at: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+        by_side: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for command, side, value in zip(self._commands, self._sides, self._values, strict=True):
             if side and value is not None:
-                values_at[command][side].append(value)
-        gaps = [median(by_side[-1]) - median(by_side[1]) for by_side in values_at.values() if len(by_side) == 2]
+                by_side[command][side].append(value)
+        gaps = [median(values[-1]) - median(values[1]) for values in by_side.values() if len(values) == 2]
         gap = median(gaps) if gaps else 0.0
-        is_overshoot = []
-        for row in range(1, len(self._commands)):
-            value, previous, side = self._values[row], self._values[row - 1], self._sides[row]
-            reversed_here = self._commands[row] == self._commands[row - 1] and side * self._sides[row - 1] < 0
-            if reversed_here and value is not None and previous is not None:
-                is_overshoot.append(abs(value - previous + side * gap) <= abs(value - previous))
-        return 2 * sum(is_overshoot) >= len(is_overshoot)
+        if abs(gap) <= GAP_SDS * MAD_SDS * median([abs(other - gap) for other in gaps] or [0.0]):
+            return True
+        stays = []
+        for row, (command, side, value) in enumerate(zip(self._commands, self._sides, self._values, strict=True)):
+            before = self._values[row - 1] if row else None
+            if not row or command != self._commands[row - 1] or side * self._sides[row - 1] >= 0:
+                continue
+            if next((side * (c - command) < 0 for c in self._commands[row:] if c != command), False):
+                return True
+            if value is not None and before is not None:
+                stays.append(abs(value - before + side * gap) > abs(value - before))
+        return 2 * sum(stays) <= len(stays)
 
     def _refuse_contrary(self) -> None:
         """Refuse directions that are all opposite to the commands."""
