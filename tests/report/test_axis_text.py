@@ -65,6 +65,22 @@ def test_the_verdict_counts_the_warnings(clean, warnings, verdict):
     assert text.count("warning: ") == len(warnings)
 
 
+@pytest.mark.parametrize(
+    ("tier", "worst", "words"),
+    [
+        ("importance", None, None),
+        ("emcee", 2.04, "chain and weighted draws agree: the largest difference is 2.0 Monte Carlo errors"),
+        ("emcee", 7.0, "chain and weighted draws DISAGREE: the largest difference is 7.0 Monte Carlo errors"),
+        ("emcee", None, "the weighted draws were not accepted: results are those of the chain"),
+    ],
+)
+def test_a_fit_says_whether_its_chain_agrees(clean, tier, worst, words):
+    lines = axis_fit_text(structs.replace(clean, tier=tier, sampling={"agreement": worst})).splitlines()
+    assert [line for line in lines if "weighted draws" in line and "readings of" not in line] == (
+        [words] if words else []
+    )
+
+
 def test_a_fit_states_the_numbers_for_firmware(clean):
     sides = {name: structs.replace(of, value=-0.05, sd=0.0005) for name, of in clean.effective_per_command.items()}
     clean = structs.replace(clean, effective_per_command=sides, range_command=(0.0, 1250000.0))

@@ -15,6 +15,7 @@ from tvsbayes.compensation.periodic_error import LIKELY as TABLE_LIKELY
 from tvsbayes.compensation.verification import compensation_in
 from tvsbayes.display import concise
 from tvsbayes.errors import NothingToEstimate, escaped, typed
+from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.metrology.conformity import Criterion, Tolerance
 from tvsbayes.metrology.traceability import performed
@@ -273,9 +274,21 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
         *parts,
         "" if answer or any(part is not None for part in parts) else None,
         data,
+        _agreement(summary),
         *(period_table(summary), parameter_table(summary), ratio_table(summary)),
         f"verdict: {axis_verdict(summary)}",
     )
+
+
+def _agreement(summary: AxisSummary) -> str | None:
+    """Whether a chain and the weighted draws agree; None without a chain."""
+    if summary.tier in (None, IMPORTANCE):
+        return None
+    worst = summary.sampling.get("agreement")
+    if worst is None:
+        return "the weighted draws were not accepted: results are those of the chain"
+    words = "agree" if worst < AGREEMENT_LIMIT else "DISAGREE"
+    return f"chain and weighted draws {words}: the largest difference is {worst:.1f} Monte Carlo errors"
 
 
 def axis_verdict(summary: AxisSummary) -> str:
