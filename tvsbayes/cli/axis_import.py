@@ -75,6 +75,7 @@ class FileOptions:
         units: unit by field.
         assume: numbers that the file does not state, by name.
         encoders: where commands are angles of an encoder, "output", "motor" or "incremental".
+        relative: whether commands are the lengths of moves.
     """
 
     kind: str = "auto"
@@ -85,11 +86,13 @@ class FileOptions:
     units: Mapping[str, str] = field(default_factory=dict)
     assume: Mapping[str, float] = field(default_factory=dict)
     encoders: str | None = None
+    relative: bool = False
 
     def wishes(self, columns: Mapping[str, str]) -> Wishes:
         """What they say about a table."""
         coverage, status_ok = (self.assume.get(name) for name in ("coverage", "status_ok"))
-        return Wishes(columns, self.units, self.deviations, self.counts_per_turn, self.runs, coverage, status_ok)
+        of_tables = self.deviations, self.counts_per_turn, self.runs, coverage, status_ok, self.relative
+        return Wishes(columns, self.units, *of_tables)
 
 
 def log_kind(data: bytes, file: str) -> str:

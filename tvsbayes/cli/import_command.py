@@ -36,7 +36,8 @@ KINDS_OF: dict[str, tuple[str, ...]] = {
     **{"axis": (AXIS,), "sightings": (SIGHTINGS,), "kind": (POINTING, AXIS), "encoders": (POINTING, AXIS, SIGHTINGS)},
     **dict.fromkeys(("run", "runs", "unit", "deviations", "counts_per_turn"), (AXIS,)),
     "assume": (AXIS, SIGHTINGS),
-    **dict.fromkeys(("relative", "flip", "shift_moves"), (COPY, SIGHTINGS, LOOKS)),
+    **dict.fromkeys(("flip", "shift_moves"), (COPY, SIGHTINGS, LOOKS)),
+    "relative": (COPY, AXIS, SIGHTINGS, LOOKS),
     "swap": (COPY, LOOKS),
     **dict.fromkeys(("pictures", "left", "right"), (LOOKS,)),
     **dict.fromkeys(("pan_approach", "tilt_approach"), (SIGHTINGS, LOOKS)),
@@ -99,7 +100,9 @@ def import_(
         list[str] | None,
         typer.Option("--assume", help="NAME=NUMBER that a file does not state, as u_deg=0.01; repeatable."),
     ] = None,
-    relative: Annotated[bool, typer.Option("--relative", help="Counters are the steps of each move.")] = False,
+    relative: Annotated[
+        bool, typer.Option("--relative", help="Counters or commands are the lengths of moves.")
+    ] = False,
     flip: Annotated[
         list[str] | None, typer.Option("--flip", help="pan_steps or tilt_steps: write the other sign; repeatable.")
     ] = None,
@@ -172,7 +175,8 @@ def import_(
         check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
         check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")
         units = dict(_named("--unit", text, "value=um") for text in o.unit or ())
-        wish = FileOptions(o.kind, o.run, o.deviations, o.counts_per_turn, o.runs, units, assumed, o.encoders)
+        of_tables = o.deviations, o.counts_per_turn, o.runs, units, assumed, o.encoders, o.relative
+        wish = FileOptions(o.kind, o.run, *of_tables)
         task = import_readings(o.file, o.to, stated, o.sheet, wish, yes=o.yes, as_json=o.as_json)
     elif kind_of_file == SIGHTINGS:
         from tvsbayes.cli.head_commands import import_sightings

@@ -116,6 +116,9 @@ SCALES = ("length", "angle")
 """Kinds of units in which commands are target positions."""
 STATED_SHARE = 0.6
 """Least mean sign of the steps at which a single word stands for their direction."""
+MOVES_MIN, MOVES_SHARE = 4, 0.1
+"""Least number of readings, and largest part of their spread that the sum of the moves leaves, where commands are
+moves: play leaves less."""
 EXPANDED_IS_COMMON = (
     "u: an expanded uncertainty is one error that all readings share, as a certificate's is, not noise of each; "
     "campaign.toml says otherwise without u_is"
@@ -177,11 +180,17 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     units = units_of(cells, {f: c.unit for f, c in notations.items()}, wishes, assumed)
     commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
     read = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
+    homings = homings_of(cells, assumed)
+    if wishes.relative:
+        commands = summed_up(commands, homings)
+        assumed.append("command: summed up, because --relative says that each is the length of its move")
+    elif "command" not in wishes.columns and _are_moves(commands, read, homings):
+        raise table.ask("moves-or-positions", column=columns["command"])
     given_u = [u or 0.0 for u in cells.numbers("u", 0.0, NUMBER_MAX, optional=True)]
     values, stated_u, unit = in_one_unit(cells, commands, read, given_u, units, wishes, assumed)
     time_unit = stated_unit(cells, "time_s", wishes)
     times = seconds_of(cells, assumed, time_unit)
-    homings, statuses = homings_of(cells, assumed), cells.text("status")
+    statuses = cells.text("status")
     if times is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
     stops = _Stops(cells, commands, values, homings, assumed)
@@ -218,6 +227,30 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
         lines=tuple(lines),
         document=document,
     )
+
+
+def summed_up(moves: Sequence[float], homings: Sequence[bool]) -> list[float]:
+    """Positions after moves, from 0 at every homing."""
+    begun = np.cumsum(homings)
+    total, moved = np.cumsum(moves), np.asarray(moves, dtype=float)
+    before = np.array([(total - moved)[begun == k][0] for k in begun])
+    return [float(f"{x:.13g}") for x in total - before]
+
+
+def _are_moves(commands: Sequence[float], read: Sequence[float | None], homings: Sequence[bool]) -> bool:
+    """Whether the readings follow the sum of the commands, and not the commands."""
+    known = np.array([value is not None for value in read])
+    value = np.array([np.nan if v is None else v for v in read])[known]
+    if len(value) < MOVES_MIN or not np.ptp(value) > 0:
+        return False
+
+    def unexplained(x: np.ndarray) -> float:
+        return float(np.std(value - np.polyval(np.polyfit(x, value, 1), x)) if np.ptp(x) > 0 else np.std(value))
+
+    of_sums, of_commands = (
+        unexplained(np.asarray(x, dtype=float)[known]) for x in (summed_up(commands, homings), commands)
+    )
+    return of_sums < MOVES_SHARE * min(of_commands, float(np.std(value)))
 
 
 # --- rows that count -------------------------------------------------------------------------------------------------

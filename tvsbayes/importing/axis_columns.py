@@ -42,6 +42,8 @@ STEADY_SHARE, STEP_TOLERANCE = 0.7, 0.2
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 """Readings in the unit of the commands are not positions if they span less than the first share of the commands' range
 and scatter by more than the second share of their own span about a line."""
+ROOM_DEGC = (10.0, 40.0)
+"""Temperatures of a room."""
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
 """Options that say what the readings are."""
 
@@ -196,6 +198,10 @@ def _clock(table: ForeignTable, names: Sequence[str], known: Mapping[str, Column
         Question: they differ.
     """
     if len(names) == 1:
+        if _may_be_degC(known[names[0]]):
+            found = f"column {escaped(names[0])}, which could be a clock or a thermometer"
+            columns = [{field: names[0]} for field in ("time_s", "temperature_degC")]
+            raise ask_column(table, found, [choice(each, known) for each in (*columns, {"time_s": ""})])
         return names[0]
     times = [_relative_times(known[name]) for name in names]
     usable = [name for name, time in zip(names, times, strict=True) if time is not None]
@@ -206,6 +212,13 @@ def _clock(table: ForeignTable, names: Sequence[str], known: Mapping[str, Column
         return usable[0]
     found = f"{len(names)} columns that could be the clock ({listed(names)})"
     raise ask_column(table, found, [choice({"time_s": name}, known) for name in (*names, "")])
+
+
+def _may_be_degC(column: Column) -> bool:
+    """Whether a column T holds temperatures of a room as well as times."""
+    values, (low, high) = column.values, ROOM_DEGC
+    is_room = np.isfinite(values).all() and values[0] and np.all((low <= values) & (values <= high))
+    return column.name.text.strip() == "T" and bool(is_room) and float(np.ptp(values)) < 0.5 * (high - low)
 
 
 def _relative_times(column: Column) -> np.ndarray | None:

@@ -13,10 +13,12 @@ from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import refused
 from tvsbayes.importing.cells import FieldCells, columns_of
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, name_of, parse_unit, plain
+from tvsbayes.importing.words import Unit, name_of, parse_unit, part_of_unit, plain
 
 UNIT_SLOPE = 0.05
 """Largest deviation from 1 of the slope of readings over commands, where both are taken to be in one unit."""
+PART_DIGITS = 0.02
+"""Largest distance of a slope from a power of ten, decades, at which readings may count parts of their unit."""
 ANGLE_SPAN = 360.0
 
 
@@ -32,6 +34,7 @@ class Wishes:
         order: order of runs beside each other, one of `runs.ORDERS`.
         coverage: coverage factor of the column of uncertainties.
         status_ok: number of a status that means a good row.
+        relative: whether commands are the lengths of moves.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -41,6 +44,7 @@ class Wishes:
     order: str | None = None
     coverage: float | None = None
     status_ok: float | None = None
+    relative: bool = False
 
 
 def stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:
@@ -80,7 +84,7 @@ def units_of(
         unit = stated_unit(cells, name, wishes) or written.get(name) or column.unit
         if unit is None and column.unknown and name != "command":
             known = columns_of(cells.table)
-            own = [column.unknown] if name == "value" else []
+            own = [part_of_unit(column.unknown) or column.unknown] if name == "value" else []
             usual = {"time_s": ("s", "ms", "min")}.get(name, ("mm", "um", "deg", "arcsec", "counts"))
             first = {column.text: known[column.text].first}
             said = {"unit": column.unknown, "column": column.text, "field": name}
@@ -132,6 +136,8 @@ def in_one_unit(
             values = [None if v is None else rounded(unit.per_number * v) for v in values]
             assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
             unit = unit.whole
+        elif unit is not None and command_unit is not None and "value" not in wishes.units:
+            _check_parts(cells, commands, values, unit, command_unit)
         elif unit is None and (unit := _unit_of_command(commands, values, command_unit)) is not None:
             given = unit
             how = "that of the commands, which the readings follow 1 to 1; --unit value=mm says another"
@@ -142,6 +148,25 @@ def in_one_unit(
         unit = given = Unit("counts", "count", 1.0)
         assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
     return list(values), _standard_u(cells, stated_u, units.get("u"), given, unit, wishes, assumed), unit and unit.name
+
+
+def _slope(commands: Sequence[float], values: Sequence[float | None]) -> float:
+    """Slope of readings over commands by least squares; 0 where there is none."""
+    known = np.array([(c, v) for c, v in zip(commands, values, strict=True) if v is not None]).reshape(-1, 2)
+    return float(np.polyfit(*known.T, 1)[0]) if len(known) > 1 and np.ptp(known[:, 0]) > 0 else 0.0
+
+
+def _check_parts(
+    cells: FieldCells, commands: Sequence[float], values: Sequence[float | None], unit: Unit, command_unit: Unit
+) -> None:
+    """Ask where readings follow the commands but for a power of ten: a gauge in 1/100 mm whose column says mm."""
+    slope = _slope(commands, values) * (unit.in_units_of(command_unit) or 0.0)
+    if unit.kind != "length" or command_unit.kind != "length" or not slope:
+        return
+    decades = float(np.log10(abs(slope)))
+    if round(decades) and abs(decades - round(decades)) < PART_DIGITS:
+        said = {"column": cells.columns["value"], "slope": slope, "unit": unit.name, "of": command_unit.name}
+        raise cells.table.ask("parts-of-unit", each=(f"{10.0 ** -round(decades):g} {unit.name}", unit.name), **said)
 
 
 def rounded(number: float) -> float:

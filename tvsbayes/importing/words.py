@@ -270,12 +270,19 @@ def name_of(text: str) -> Name:
         if unit is not None:
             rest = text[: match.start()] + " " + text[match.end() :]
             break
-        if not unknown and _is_unit_like(match[1]):
+        if not unknown and (_is_unit_like(match[1]) or part_of_unit(match[1])):
             unknown, rest = match[1].strip(), text[: match.start()] + " " + text[match.end() :]
     words = words_of(rest)
     if unit is None and not unknown:
         unit, words = _unit_of_words(rest, words)
     return Name(text, tuple(words), unit, "" if unit else unknown)
+
+
+def part_of_unit(content: str) -> str:
+    """A number and its unit of length or angle at the end of a longer text, as in "div 0.01 mm"; "" without one."""
+    match = re.search(r"([0-9]+(?:[.,][0-9]+)?) ?([^\W\d]+)\s*$", content)
+    unit = None if match is None else parse_unit(match[2])
+    return match[0] if match and unit is not None and unit.kind in ("length", "angle") else ""
 
 
 def _is_unit_like(content: str) -> bool:
