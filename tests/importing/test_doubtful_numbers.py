@@ -1,0 +1,74 @@
+"""Numbers of an axis that contradict what their names say are asked about, and every answer reads them rightly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tvsbayes.errors import Question
+from tvsbayes.importing.axis import axis_rows
+from tvsbayes.importing.axis_units import Wishes
+from tvsbayes.importing.reader import read_foreign
+
+PLACES = np.array([0.0, 10, 20, 30, 40, 50, 40, 30, 20, 10, 0])
+SIDES = np.r_[np.ones(6), -np.ones(5)]
+READ = PLACES * 1.0002 - 0.02 * SIDES
+TEMPERATURES = 21.5 + 0.02 * np.arange(11)
+
+
+def table(tmp_path, names: str, *columns: np.ndarray):
+    rows = (",".join(f"{x:.10g}" for x in row) for row in zip(*columns, strict=True))
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join([names, *rows, ""]))
+    return read_foreign(path)
+
+
+def answers(foreign) -> list[tuple[str, ...]]:
+    with pytest.raises(Question) as asked:
+        axis_rows(foreign, Wishes())
+    return [candidate.options for candidate in asked.value.candidates]
+
+
+@pytest.mark.parametrize("name", ["dial (div 0.01mm)", "dial (1 div = 0.01 mm)", "dial (mm)"])
+def test_a_gauge_that_counts_parts_of_its_unit(name, tmp_path):
+    foreign = table(tmp_path, f"command (mm),{name}", PLACES, 100 * READ)
+    first = answers(foreign)[0]
+    assert first[0] == "--unit" and first[1].replace(" ", "") == "value=0.01mm"
+    rows = axis_rows(foreign, Wishes(units={"value": first[1].partition("=")[2]}))
+    np.testing.assert_allclose([r["value"] for r in rows.readings], READ, atol=1e-9)
+    stated = axis_rows(foreign, Wishes(units={"value": "mm"}))
+    assert stated.readings[3]["value"] == pytest.approx(100 * READ[3])
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5, 25.4, 0.4])
+def test_other_ratios_are_read_as_they_stand(factor, tmp_path):
+    rows = axis_rows(table(tmp_path, "command (mm),reading (mm)", PLACES, factor * READ), Wishes())
+    assert rows.unit == "mm" and rows.readings[3]["value"] == pytest.approx(factor * READ[3])
+
+
+@pytest.mark.parametrize("homed", [False, True])
+def test_lengths_of_moves_are_no_positions(homed, tmp_path):
+    moves, read = np.diff(PLACES), READ[1:]
+    columns, names = [moves, read], "command (mm),reading (mm)"
+    if homed:
+        columns, names = [np.tile(moves, 2), np.tile(read, 2), np.repeat([0, 1], 10)], f"{names},segment"
+    foreign = table(tmp_path, names, *columns)
+    assert answers(foreign) == [("--relative",), ("--column", "command=command (mm)")]
+    rows = axis_rows(foreign, Wishes(relative=True))
+    assert [m["command"] for m in rows.moves] == [*PLACES[1:]] * (1 + homed)
+    stated = axis_rows(foreign, Wishes(columns={"command": "command (mm)"}))
+    assert {m["command"] for m in stated.moves} == {10.0, -10.0}
+
+
+def test_positions_that_are_read_once_or_again_are_no_moves(tmp_path):
+    for places in (PLACES, np.tile([0.0, 10.0], 6), np.arange(1.0, 9.0)):
+        assert axis_rows(table(tmp_path, "command (mm),reading (mm)", places, places * 1.0002), Wishes()).moves
+
+
+def test_a_column_t_is_a_clock_or_a_thermometer(tmp_path):
+    foreign = table(tmp_path, "command (mm),reading (mm),T", PLACES, READ, TEMPERATURES)
+    assert answers(foreign) == [("--column", f"{a}") for a in ("time_s=T", "temperature_degC=T", "time_s=")]
+    rows = axis_rows(foreign, Wishes(columns={"temperature_degC": "T"}))
+    assert [m["temperature_degC"] for m in rows.moves] == pytest.approx(list(TEMPERATURES))
+    clock = axis_rows(table(tmp_path, "command (mm),reading (mm),T", PLACES, READ, 30.0 * np.arange(11)), Wishes())
+    assert clock.moves[2]["time_s"] == 60.0
