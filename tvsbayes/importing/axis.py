@@ -180,7 +180,8 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     units = units_of(cells, {f: c.unit for f, c in notations.items()}, wishes, assumed)
     commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
     read = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
-    homings = homings_of(cells, assumed)
+    of_homings = list[str]()
+    homings = homings_of(cells, of_homings)
     if wishes.relative:
         commands = summed_up(commands, homings)
         assumed.append("command: summed up, because --relative says that each is the length of its move")
@@ -190,6 +191,7 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     values, stated_u, unit = in_one_unit(cells, commands, read, given_u, units, wishes, assumed)
     time_unit = stated_unit(cells, "time_s", wishes)
     times = seconds_of(cells, assumed, time_unit)
+    assumed += of_homings
     statuses = cells.text("status")
     if times is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
