@@ -91,8 +91,8 @@ class FileOptions:
     def wishes(self, columns: Mapping[str, str]) -> Wishes:
         """What they say about a table."""
         coverage, status_ok = (self.assume.get(name) for name in ("coverage", "status_ok"))
-        of_tables = self.deviations, self.counts_per_turn, self.runs, coverage, status_ok, self.relative
-        return Wishes(columns, self.units, *of_tables)
+        runs, relative = self.runs, self.relative
+        return Wishes(columns, self.units, self.deviations, self.counts_per_turn, runs, coverage, status_ok, relative)
 
 
 def log_kind(data: bytes, file: str) -> str:

@@ -175,8 +175,9 @@ def import_(
         check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
         check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")
         units = dict(_named("--unit", text, "value=um") for text in o.unit or ())
-        of_tables = o.deviations, o.counts_per_turn, o.runs, units, assumed, o.encoders, o.relative
-        wish = FileOptions(o.kind, o.run, *of_tables)
+        wish = FileOptions(
+            o.kind, o.run, o.deviations, o.counts_per_turn, o.runs, units, assumed, o.encoders, o.relative
+        )
         task = import_readings(o.file, o.to, stated, o.sheet, wish, yes=o.yes, as_json=o.as_json)
     elif kind_of_file == SIGHTINGS:
         from tvsbayes.cli.head_commands import import_sightings
