@@ -153,7 +153,8 @@ def in_one_unit(
 def _slope(commands: Sequence[float], values: Sequence[float | None]) -> float:
     """Slope of readings over commands by least squares; 0 where there is none."""
     known = np.array([(c, v) for c, v in zip(commands, values, strict=True) if v is not None]).reshape(-1, 2)
-    return float(np.polyfit(*known.T, 1)[0]) if len(known) > 1 and np.ptp(known[:, 0]) > 0 else 0.0
+    command, value = known.T
+    return float(np.polyfit(command, value, 1)[0]) if len(known) > 1 and np.ptp(command) > 0 else 0.0
 
 
 def _check_parts(
@@ -199,21 +200,16 @@ def _unit_of_command(
     commands: Sequence[float], values: Sequence[float | None], command_unit: Unit | None
 ) -> Unit | None:
     """The commands' unit of length or angle, where readings without one follow them 1 to 1."""
-    pairs = [(c, v) for c, v in zip(commands, values, strict=True) if v is not None]
-    if command_unit is None or command_unit.kind not in ("length", "angle") or len({c for c, _ in pairs}) < 2:
+    if command_unit is None or command_unit.kind not in ("length", "angle"):
         return None
-    c, v = np.array(pairs, float).T
-    slope = float(np.polyfit(c, v, 1)[0])
-    return command_unit if abs(slope - 1.0) <= UNIT_SLOPE else None
+    return command_unit if abs(_slope(commands, values) - 1.0) <= UNIT_SLOPE else None
 
 
 def _unit_of_readings(
     cells: FieldCells, commands: Sequence[float], values: Sequence[float | None], command_unit: Unit
 ) -> Question:
     """The question of the unit of readings that do not follow commands of a length or an angle 1 to 1."""
-    pairs = np.array([(c, v) for c, v in zip(commands, values, strict=True) if v is not None], float)
-    c, v = pairs.T
-    slope = abs(float(np.polyfit(c, v, 1)[0])) if len(np.unique(c)) > 1 else 1.0
+    slope = abs(_slope(commands, values)) or 1.0
     usual = {
         "length": ("nm", "um", "1/1000 mm", "1/100 mm", "1/10 mm", "mm", "cm", "thou", "inch", "deg"),
         "angle": ("arcsec", "arcmin", "mrad", "rad", "deg", "gon", "turn", "mm"),
