@@ -128,6 +128,24 @@ def test_sides_of_a_compensated_axis_are_those_of_the_sheet(ask, tmp_path, by, s
     assert found == sorted((t, side, float(value)) for (t, side), value in read.items())
 
 
+@pytest.mark.parametrize(
+    "columns", ["target,direction,measured (mm)", "target,cycle,measured (mm)", "target,measured (mm)"]
+)
+def test_two_levels_of_one_position_are_two_stops_and_no_motion(ask, tmp_path, columns):
+    """Four readings from either side, sorted by position: the first four do not move, whatever is stated of them."""
+    rng, rows = np.random.default_rng(3), [columns]
+    for target in range(6):
+        for word, n, off in (("forward", 1, -0.03), ("backward", 2, 0.03)):
+            values = {"direction": word, "cycle": f"{n}"}.get(columns.split(",")[1])
+            middle = [] if values is None else [values]
+            rows += [",".join([f"{target}", *middle, f"{target + off + rng.normal(0, 0.001):.4f}"]) for _ in range(4)]
+    (tmp_path / "sheet.csv").write_text("\n".join(rows))
+    code, document = ask(
+        "import", tmp_path / "sheet.csv", "--axis", "--to", tmp_path / "out", "--unit", "value=mm", "--yes"
+    )
+    assert code == 0 and document["ok"] == 48 and not any("rest:" in text for text in document["assumed"])
+
+
 def test_a_reading_at_standstill_is_one_where_readings_show_it(ask, tmp_path):
     """The direction of a log may be that of the next move: the end of a run is then read twice from one side."""
     values = [(c, 1, c + 0.1) for c in range(6)] + [(5, -1, 5.1)] + [(c, -1, c - 0.1) for c in range(4, -1, -1)]

@@ -53,6 +53,33 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, case):
     imported(path, folder)
 
 
+BEYOND = "9" * 400
+"""A whole number beyond all floats."""
+
+
+@pytest.mark.parametrize(
+    ("column", "cell"),
+    [("time", BEYOND), ("reading (deg)", f"{BEYOND} 10 5"), ("reading", f"{BEYOND}/3")],
+)
+def test_whole_numbers_beyond_all_floats_are_refused(tmp_path, column, cell):
+    head = ["steps", "reading (mm)" if column == "time" else column, "time"]
+    written = {"reading (deg)": "12 30 1", "reading": "2 1/2"}.get(column, "2.5")
+    rows = [[f"{k}", written, f"{1_700_000_000_000 + 10_000 * k}"] for k in range(5)]
+    rows[3][head.index(column)] = cell
+    (tmp_path / "log.csv").write_text("\n".join(map(",".join, [head, *rows])))
+    assert imported(tmp_path / "log.csv", tmp_path) == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_workbook_whose_packed_sheet_is_damaged_is_refused(tmp_path):
+    """Its directory and sizes are whole; the bytes between them are no deflated stream."""
+    (content,) = [data for data in FILES.values() if b"xl/worksheets/sheet1.xml" in data][:1]
+    begin = content.index(b"xl/worksheets/sheet1.xml") + len(b"xl/worksheets/sheet1.xml")
+    for damage in (b"\xff" * 30, b"\x00" * 30, b"\x06" + b"\xa5" * 29):
+        (tmp_path / "log.xlsx").write_bytes(content[:begin] + damage + content[begin + 30 :])
+        assert imported(tmp_path / "log.xlsx", tmp_path) == 2
+
+
 GUIDES = {
     "PHD2": guide_log(12),
     "PHD2, two runs": guide_log(12) + guide_log(12, "-20.5 deg"),

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from tvsbayes.errors import InputError, Question
-from tvsbayes.importing.cells import Column
+from tvsbayes.importing.columns import Column
 from tvsbayes.importing.sightings import STEP_DEG, SightingWishes, field_of, sighting_rows
 from tvsbayes.importing.table import table_of
 from tvsbayes.importing.words import name_of

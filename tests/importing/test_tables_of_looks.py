@@ -17,10 +17,8 @@ from tvsbayes.importing.looks import (
     LookRows,
     LookWishes,
     field_of,
-    look_claims,
     look_columns,
     look_rows,
-    with_one_clock,
 )
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.instrument.campaign import MOVES, PIXEL_SDS, PIXELS, SPOTS, Move, Spot, parse_spots, spots_bytes
@@ -45,9 +43,7 @@ def table_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> ForeignTabl
 
 def read(table: ForeignTable, wishes: LookWishes | None = None, listed: int | None = None) -> Looks:
     wishes = wishes or LookWishes()
-    table, claims = with_one_clock(table, look_claims(table, wishes.columns))
-    look_columns(table, claims, listed is not None)
-    rows = look_rows(table, claims, wishes, listed)
+    rows = look_rows(look_columns(table, wishes.columns), wishes, listed)
     moves = None if rows.moves is None else tuple(Move(**row) for row in rows.moves)
     spots = None if rows.looks is None else tuple(Spot(**row) for row in rows.looks)
     return Looks(moves, spots, rows.assumed, rows)
@@ -320,7 +316,7 @@ def test_fields_are_the_columns_of_a_campaign():
         "direction",
     }
     names = [name for name in FIELDS if name in columns]
-    assert look_claims(table_of(names, []), {}).columns == {name: name for name in names}
+    assert look_columns(table_of(names, []), {}).taken == {name: name for name in names}
 
 
 def test_a_field_of_two_columns_is_asked():

@@ -25,7 +25,7 @@ from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.head.urdf import HeadModel, ratios_of
-from tvsbayes.importing.cells import table_document, table_lines
+from tvsbayes.importing.columns import table_document, table_lines
 from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.sightings import FIELDS, SightingWishes, sighting_rows
 from tvsbayes.importing.urdf import URDF_BYTES_MAX, HeadJoints, head_joints

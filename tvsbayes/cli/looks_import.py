@@ -20,19 +20,9 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, new_folder, read_bytes
 from tvsbayes.files.documents import toml_line
 from tvsbayes.importing.asking import listed
-from tvsbayes.importing.cells import table_document, table_lines
-from tvsbayes.importing.looks import (
-    FIELDS,
-    Claims,
-    LookRows,
-    LookWishes,
-    look_claims,
-    look_columns,
-    look_rows,
-    with_one_clock,
-)
+from tvsbayes.importing.columns import table_document, table_lines
+from tvsbayes.importing.looks import FIELDS, LookRows, LookWishes, look_columns, look_rows, open_fields
 from tvsbayes.importing.reader import read_foreign
-from tvsbayes.importing.table import ForeignTable
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.progress import Job
 
@@ -60,8 +50,16 @@ def import_looks(
 
     known = _known_moves(to)
     table = read_foreign(file, sheet)
-    table, claims, wishes = _columns(table, wishes, known is not None, interactive)
-    rows = look_rows(table, claims, wishes, None if known is None else len(known))
+    chooser = look_columns(table, wishes.columns)
+    if interactive and (wanted := open_fields(chooser, known is not None)):
+        answers = dict(wishes.columns)
+        report_line(f"{chooser.table.file} has the columns {', '.join(map(escaped, chooser.table.columns))}")
+        for name in wanted:
+            answers[name] = typer.prompt(f"which of them is {name}? (empty: none)", default="", show_default=False)
+        wishes = replace(wishes, columns=answers)
+        chooser = look_columns(table, answers)
+    table = chooser.table
+    rows = look_rows(chooser, wishes, None if known is None else len(known))
     moves = None if rows.moves is None else tuple(Move(**row) for row in rows.moves)
     looks = None if rows.looks is None else tuple(Spot(**row) for row in rows.looks)
     changed = corrected(moves, looks, correction, None if known is None else len(known))
@@ -105,26 +103,6 @@ def import_looks(
         _next_step(to, waits and booked is not None),
         CORRECT_HINT,
     )
-
-
-def _columns(
-    table: ForeignTable, wishes: LookWishes, moves_listed: bool, interactive: bool
-) -> tuple[ForeignTable, Claims, LookWishes]:
-    """The columns by field, with missing ones asked for at a terminal.
-
-    Raises:
-        InputError: missing or ambiguous columns, and no terminal.
-    """
-    table, claims = with_one_clock(table, look_claims(table, wishes.columns))
-    if interactive and (wanted := claims.open_fields(moves_listed)):
-        answers = dict(wishes.columns)
-        report_line(f"{table.file} has the columns {', '.join(map(escaped, table.columns))}")
-        for name in dict.fromkeys(wanted):
-            answers[name] = typer.prompt(f"which of them is {name}? (empty: none)", default="", show_default=False)
-        wishes = replace(wishes, columns=answers)
-        claims = look_claims(table, answers)
-    look_columns(table, claims, moves_listed)
-    return table, claims, wishes
 
 
 def _known_moves(to: Path) -> tuple[Move, ...] | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate, pairwise
 from statistics import median
 from typing import Any
 
@@ -21,19 +22,9 @@ from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import asked
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
 from tvsbayes.importing.axis_units import Wishes, in_one_unit, is_expanded, shown_units, stated_unit, units_of
-from tvsbayes.importing.cells import (
-    FieldCells,
-    Understood,
-    columns_of,
-    first_date,
-    homings_of,
-    left_out,
-    seconds_of,
-    status_of,
-    table_document,
-    table_lines,
-    temperatures_of,
-)
+from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of, temperatures_of
+from tvsbayes.importing.clock import seconds_of, stamp_of
+from tvsbayes.importing.columns import Understood, columns_of, line_through, table_document, table_lines
 from tvsbayes.importing.runs import long_table
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, name_of, parse_unit, place_of, plain, words_of
@@ -47,24 +38,31 @@ QUIET_SHARE = 0.8
 """Share of the commands, the quieter ones, whose last rows give the noise at rest."""
 MOVING_SHARE = 0.3
 """Least share of commands with rows in motion: with fewer, rows of a command are readings of one stop."""
+PLATEAU_ROWS = 3
+"""Least number of rows that rest elsewhere."""
 NOISE_SDS, DIGITS = 5.0, 3.0
 """Largest distance from rest of a row at rest: standard deviations of last rows, and digits of the readings."""
 STEP_SHARE = 0.02
 """Least distance of the first row of a command from rest, as a share of its step, at which the axis was under way."""
 
 
-def at_rest(command: np.ndarray, value: np.ndarray) -> np.ndarray:
+def at_rest(command: np.ndarray, value: np.ndarray, parts: Sequence[Sequence[str]] = ()) -> np.ndarray:
     """Whether the axis rests at each row, by the readings of each command, shape (rows,).
 
     The first rows of a command are left out while they differ from the last ones by more than the noise of these; all
-    rows of a command, where the last ones still differ. A table with few rows a command rests everywhere.
+    rows of a command, where the last ones still differ. A table with few rows a command rests everywhere, as does one
+    whose first rows rest elsewhere, neither where the axis came from nor where it ends: they are of another stop.
 
     Args:
         command: commands in time order, nan where missing, shape (rows,).
         value: readings, nan where missing.
+        parts: cells of columns that state a side or count runs: where one changes another stop begins.
     """
     rests = np.ones(len(command), bool)
-    starts = np.flatnonzero(np.r_[True, command[1:] != command[:-1]]) if len(command) else np.array([], int)
+    begins = np.r_[True, command[1:] != command[:-1]][: len(command)]
+    for cells in parts:
+        begins[1:] |= np.array([a != b for a, b in pairwise(cells)], bool)
+    starts = np.flatnonzero(begins)
     blocks = [np.arange(a, b) for a, b in zip(starts, [*starts[1:], len(command)], strict=True)]
     blocks = [block[np.isfinite(value[block])] for block in blocks]
     if len(blocks) < 2 or np.median([len(block) for block in blocks]) < ROWS_MIN:
@@ -77,6 +75,7 @@ def at_rest(command: np.ndarray, value: np.ndarray) -> np.ndarray:
     steps = np.diff(np.unique(value[np.isfinite(value)]))
     resolution = float(steps.min()) if len(steps) else 0.0
     tolerance = max(NOISE_SDS * float(noise), DIGITS * resolution)
+    elsewhere = set[int]()
     for k, (block, level) in enumerate(zip(blocks, levels, strict=True)):
         if len(block) < 2:
             continue
@@ -88,10 +87,14 @@ def at_rest(command: np.ndarray, value: np.ndarray) -> np.ndarray:
             last = np.flatnonzero(off)
             # Beyond a single outlier the axis came back: only the rows on its way count.
             run = last[: np.argmax(np.diff(np.r_[last, len(block) + 1]) > 1) + 1]
-            rests[block[: max(settled, int(run[-1]) + 1)]] = False
+            out = block[: max(settled, int(run[-1]) + 1)]
+            rests[out] = False
+            stays = len(out) >= PLATEAU_ROWS and np.ptp(value[out]) <= 2 * tolerance
+            if stays and not abs(float(np.median(value[out])) - before) <= tolerance:
+                elsewhere.add(k)
         if len(block) >= ROWS_MIN and abs(value[block[-1]] - value[block[-2]]) > tolerance and off.mean() > 0.5:
             rests[block] = False
-    under_way = np.mean([not rests[block].all() for block in blocks[1:]])
+    under_way = np.mean([k not in elsewhere and not rests[block].all() for k, block in enumerate(blocks)][1:])
     return rests if under_way >= MOVING_SHARE else np.ones(len(command), bool)
 
 
@@ -175,9 +178,8 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     assumed = [*runs.remarks, *known.remarks]
     table = _good_rows(table, columns, wishes, assumed)
     table = _resting_rows(table, columns, wishes, assumed)
-    cells, notations = FieldCells(table, columns).with_plain("command", "value", "u")
-    assumed += [column.remark for column in notations.values() if column.remark]
-    units = units_of(cells, {f: c.unit for f, c in notations.items()}, wishes, assumed)
+    cells, written = FieldCells(table, columns).with_plain(("command", "value", "u"), assumed)
+    units = units_of(cells, written, wishes, assumed)
     commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
     read = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
     of_homings = list[str]()
@@ -189,30 +191,23 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
         raise table.ask("moves-or-positions", column=columns["command"])
     given_u = [u or 0.0 for u in cells.numbers("u", 0.0, NUMBER_MAX, optional=True)]
     values, stated_u, unit = in_one_unit(cells, commands, read, given_u, units, wishes, assumed)
-    time_unit = stated_unit(cells, "time_s", wishes)
-    times = seconds_of(cells, assumed, time_unit)
+    times, statuses = seconds_of(cells, assumed, stated_unit(cells, "time_s", wishes)), cells.text("status")
     assumed += of_homings
-    statuses = cells.text("status")
-    if times is None:
-        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
-    stops = _Stops(cells, commands, values, homings, assumed)
+    moves, move_of_row, said = _moves_of(cells, commands, values, times, homings, assumed)
     readings, unread = list[dict[str, Any]](), 0
-    for row, (command, value) in enumerate(zip(commands, values, strict=True)):
-        stops.go(row, command, None if times is None else times[row])
-        is_read = value is not None or (statuses[row] and not means(statuses[row], "good"))
-        unread += not is_read and bool(statuses[row])
-        if is_read:
+    for row, value in enumerate(values):
+        if value is not None or (statuses[row] and not means(statuses[row], "good")):
             status = status_of(cells, row, {"value": value}, "reading")
-            move = stops.moves[-1]["move"]
-            readings.append(
-                {"reading": len(readings), "move": move, "value": value, "u": stated_u[row], "status": status}
-            )
-    assumed += left_out(cells, statuses, "reading") + stops.remarks()
+            reading = {"reading": len(readings), "move": move_of_row[row], "value": value}
+            readings.append({**reading, "u": stated_u[row], "status": status})
+        else:
+            unread += bool(statuses[row])
+    assumed += left_out(cells, statuses, "reading") + said
     if unread:
         assumed.append(f"status: {unread} row{'s' * (unread > 1)} called good without a reading: moves alone")
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
-    readings, wrapped = unwrapped(stops.moves, readings, folder_unit or unit or "deg", wishes.counts_per_turn)
+    readings, wrapped = unwrapped(moves, readings, folder_unit or unit or "deg", wishes.counts_per_turn)
     assumed += wrapped
     shown = Understood(columns, tuple(dict.fromkeys((*known.unused, *runs.unused))))
     lines, document = table_lines(table, shown, FIELDS, shown_units(units, unit, cells)), table_document(table, shown)
@@ -221,9 +216,9 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     reference = {"u_is": "common"} if is_expanded(cells, wishes) else {}
     if reference:
         assumed.append(EXPANDED_IS_COMMON)
-    created = first_date(cells)
+    created = stamp_of(cells.text("time_s")[0])
     return AxisRows(
-        *(stops.moves, readings, unit, tuple(assumed), (), {} if created is None else {"created": created}),
+        *(moves, readings, unit, tuple(assumed), (), {} if created is None else {"created": created}),
         axis=axis,
         reference=reference,
         lines=tuple(lines),
@@ -235,7 +230,7 @@ def summed_up(moves: Sequence[float], homings: Sequence[bool]) -> list[float]:
     """Positions after moves, from 0 at every homing."""
     begun = np.cumsum(homings)
     total, moved = np.cumsum(moves), np.asarray(moves, dtype=float)
-    before = np.array([(total - moved)[begun == k][0] for k in begun])
+    before = (total - moved)[np.searchsorted(begun, begun)]
     return [float(f"{x:.13g}") for x in total - before]
 
 
@@ -246,12 +241,11 @@ def _are_moves(commands: Sequence[float], read: Sequence[float | None], homings:
     if len(value) < MOVES_MIN or not np.ptp(value) > 0:
         return False
 
-    def unexplained(x: np.ndarray) -> float:
-        return float(np.std(value - np.polyval(np.polyfit(x, value, 1), x)) if np.ptp(x) > 0 else np.std(value))
+    def unexplained(x: Sequence[float]) -> float:
+        of_read = np.asarray(x, dtype=float)[known]
+        return float(np.std(line_through(of_read, value)[1])) if np.ptp(of_read) > 0 else np.inf
 
-    of_sums, of_commands = (
-        unexplained(np.asarray(x, dtype=float)[known]) for x in (summed_up(commands, homings), commands)
-    )
+    of_sums, of_commands = map(unexplained, (summed_up(commands, homings), commands))
     return of_sums < MOVES_SHARE * min(of_commands, float(np.std(value)))
 
 
@@ -296,7 +290,12 @@ def _resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, 
         says_yes = np.array([means(cell, "good") for cell in table.columns[name]])
         rests, how = says_yes == is_resting, f"column {escaped(name)}"
     else:
-        rests, how = at_rest(command, value), "the readings of each command"
+        sides = table.columns[columns["approach"]] if "approach" in columns else ()
+        words = [next((w for w in ("forward", "backward") if means(cell, w)), "") for cell in sides]
+        # Where no side is stated that before goes on.
+        told = list(accumulate(words, lambda before, word: word or before))
+        runs = [column.cells for column in known.values() if column.name.has("repeat") and column.whole]
+        rests, how = at_rest(command, value, [part for part in (told, *runs) if part]), "the readings of each command"
     if rests.all() or not rests.any():
         return table
     moved = int((~rests).sum())
@@ -309,128 +308,106 @@ def _resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, 
 
 
 # --- moves -----------------------------------------------------------------------------------------------------------
-class _Stops:
-    """Moves of a table, row by row, including those implied by its column of directions.
+def _moves_of(
+    cells: FieldCells,
+    commands: Sequence[float],
+    values: Sequence[float | None],
+    times: Sequence[float] | None,
+    homings: Sequence[bool],
+    assumed: list[str],
+) -> tuple[list[dict[str, Any]], list[int], list[str]]:
+    """Moves, also those implied by a column of directions, the move of each row, and what was assumed of them.
 
-    Attributes:
-        moves: moves so far.
+    Times are those of the table, else the number of the move.
     """
+    if times is None:
+        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
+    sides, temperatures = _sides(cells, commands, homings, assumed), temperatures_of(cells, assumed)
+    _refuse_contrary(cells, commands, sides, homings)
+    counts = [n for n in cells.table.columns if name_of(n).has("repeat") and n not in cells.columns.values()]
+    repeat = cells.table.columns[counts[0]] if counts else [""] * len(commands)
+    reach = OVERSHOOT_SHARE * (max(commands) - min(commands)) or 1.0
+    overshoots = _went_past(commands, sides, values)
+    moves, move_of_row, inserted, again = list[dict[str, Any]](), list[int](), 0, 0
 
-    def __init__(
-        self,
-        cells: FieldCells,
-        commands: Sequence[float],
-        values: Sequence[float | None],
-        homings: Sequence[bool],
-        assumed: list[str],
-    ) -> None:
-        self._cells, self._commands, self._values, self._homings = cells, commands, values, homings
-        self._sides = _sides(cells, commands, homings, assumed)
-        self._temperatures = temperatures_of(cells, assumed)
-        self._has_temperatures = "temperature_degC" in cells
-        counts = [
-            name for name in cells.table.columns if name_of(name).has("repeat") and name not in cells.columns.values()
-        ]
-        self._counts = cells.table.columns[counts[0]] if counts else None
-        self._reach = OVERSHOOT_SHARE * (max(commands) - min(commands)) or 1.0
-        self._overshoots = self._went_past()
-        self.moves: list[dict[str, Any]] = []
-        self._inserted = self._repeats = 0
-        self._refuse_contrary()
+    def add(command: float, at_s: float | None, homed: bool, side: int = 0, **more: Any) -> None:
+        number = len(moves)
+        segment, time_s = (moves[-1]["segment"] + homed if moves else 0), float(number) if at_s is None else at_s
+        approach = {1: "forward", -1: "backward", 0: "unknown"}[side] if homed else ""
+        more = {"temperature_degC": None, **more} if "temperature_degC" in cells else more
+        moves.append(
+            {"move": number, "segment": segment, "time_s": time_s, "command": command, "approach": approach, **more}
+        )
 
-    def _went_past(self) -> bool:
-        """Whether the axis overshot and returned where the side changes at one command, as a column of sides says.
-
-        The alternative is a second reading at standstill, under the direction of the run that begins there. Only the
-        readings can show that: in most such rows they stay, while those of the two sides differ by more than they
-        scatter. Where a row goes on against its side, as in a sheet sorted by position, no run begins.
-        """
-        by_side: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-        for command, side, value in zip(self._commands, self._sides, self._values, strict=True):
-            if side and value is not None:
-                by_side[command][side].append(value)
-        gaps = [median(values[-1]) - median(values[1]) for values in by_side.values() if len(values) == 2]
-        gap = median(gaps) if gaps else 0.0
-        if abs(gap) <= GAP_SDS * MAD_SDS * median([abs(other - gap) for other in gaps] or [0.0]):
-            return True
-        stays = []
-        for row, (command, side, value) in enumerate(zip(self._commands, self._sides, self._values, strict=True)):
-            before = self._values[row - 1] if row else None
-            if not row or command != self._commands[row - 1] or side * self._sides[row - 1] >= 0:
-                continue
-            if next((side * (c - command) < 0 for c in self._commands[row:] if c != command), False):
-                return True
-            if value is not None and before is not None:
-                stays.append(abs(value - before + side * gap) > abs(value - before))
-        return 2 * sum(stays) <= len(stays)
-
-    def _refuse_contrary(self) -> None:
-        """Refuse directions that are all opposite to the commands."""
-        steps = [b - a for a, b in zip(self._commands, self._commands[1:], strict=False)]
-        moved = [row for row, step in enumerate(steps, start=1) if step and self._sides[row] and not self._homings[row]]
-        contrary = [row for row in moved if self._sides[row] * steps[row - 1] < 0]
-        if len(contrary) >= CONTRARY_MIN and contrary == moved and {self._sides[row] for row in moved} == {-1, 1}:
-            raise self._cells.ask("contrary", contrary[0], "approach")
-
-    def go(self, row: int, command: float, at_s: float | None) -> None:
-        """Add the moves of a row, timed by the table or by the number of the move."""
-        homed = self._homings[row] or not self.moves
-        side = self._sides[row]
-        step = 0.0 if homed else command - self.moves[-1]["command"]
-        if not homed and side and side * step <= 0 and (step or self._turned(row, side)):
-            before = self.moves[-1]
-            ends = (command, before["command"])
-            via = max(ends) + self._reach if side < 0 else min(ends) - self._reach
-            self._add(via, None if at_s is None else 0.5 * (before["time_s"] + at_s), homed=False, assumed=1)
-            self._inserted += 1
-            step = command - via
+    for row, (command, side, homed) in enumerate(zip(commands, sides, homings, strict=True)):
+        homed, at_s = homed or not moves, None if times is None else times[row]
+        step = 0.0 if homed else command - moves[-1]["command"]
+        # A stop at the command before was approached again: from the other side, or as a repetition.
+        before = sides[row - 1] if row else 0
+        turned = overshoots if before and side != before else bool(before) and repeat[row] != repeat[row - 1]
+        if not homed and side and side * step <= 0 and (step or turned):
+            ends = (command, moves[-1]["command"])
+            via = max(ends) + reach if side < 0 else min(ends) - reach
+            add(via, None if at_s is None else 0.5 * (moves[-1]["time_s"] + at_s), False, assumed=1)
+            inserted, step = inserted + 1, command - via
         if homed or step:
-            self._add(command, at_s, homed=homed, side=side, temperature=self._temperatures[row])
+            more = {"temperature_degC": temperatures[row]} if "temperature_degC" in cells else {}
+            add(command, at_s, homed, side, **more)
         else:
-            self._repeats += 1
+            again += 1
+        move_of_row.append(len(moves) - 1)
+    said = []
+    if again:
+        rows = f"{again} row{'s' * (again > 1)}"
+        said.append(f"{rows} at the command before: read at that stop again, without a move")
+    if inserted:
+        name, added = escaped(cells.columns["approach"]), f"{inserted} move{'s' * (inserted > 1)} added"
+        said.append(
+            f"{added}, {reach:.6g} past the stop, where column {name} states another side than the row before gives; "
+            "--column approach= takes sides from the order only"
+        )
+    if "approach" not in cells:
+        said.append("approach: unknown at the beginning of each segment")
+    return moves, move_of_row, said
 
-    def _turned(self, row: int, side: int) -> bool:
-        """Whether a stop at the previous command was approached again: from the other side, or as a repetition."""
-        if side == self._sides[row - 1] or not self._sides[row - 1]:
-            is_next = self._counts is not None and self._counts[row] != self._counts[row - 1]
-            return is_next and bool(self._sides[row - 1])
-        return self._overshoots
 
-    def _add(
-        self,
-        command: float,
-        at_s: float | None,
-        *,
-        homed: bool,
-        side: int = 0,
-        temperature: float | None = None,
-        assumed: int = 0,
-    ) -> None:
-        number = len(self.moves)
-        move = {
-            "move": number,
-            "segment": self.moves[-1]["segment"] + homed if self.moves else 0,
-            "time_s": float(number) if at_s is None else at_s,
-            "command": command,
-            "approach": {1: "forward", -1: "backward", 0: "unknown"}[side] if homed else "",
-        }
-        move |= {"temperature_degC": temperature} if self._has_temperatures else {}
-        self.moves.append(move | ({"assumed": 1} if assumed else {}))
+def _went_past(commands: Sequence[float], sides: Sequence[int], values: Sequence[float | None]) -> bool:
+    """Whether the axis overshot and returned where the side changes at one command, as a column of sides says.
 
-    def remarks(self) -> list[str]:
-        """Assumptions about moves, in words."""
-        sentences = []
-        if n := self._repeats:
-            sentences.append(f"{n} row{'s' * (n > 1)} at the command before: read at that stop again, without a move")
-        if n := self._inserted:
-            name = escaped(self._cells.columns["approach"])
-            sentences.append(
-                f"{n} move{'s' * (n > 1)} added, {self._reach:.6g} past the stop, where column {name} states another "
-                "side than the row before gives; --column approach= takes sides from the order only"
-            )
-        if "approach" not in self._cells:
-            sentences.append("approach: unknown at the beginning of each segment")
-        return sentences
+    The alternative is a second reading at standstill, under the direction of the run that begins there. Only the
+    readings can show that: in most such rows they stay, while those of the two sides differ by more than they scatter.
+    Where a row goes on against its side, as in a sheet sorted by position, no run begins.
+    """
+    by_side: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for command, side, value in zip(commands, sides, values, strict=True):
+        if side and value is not None:
+            by_side[command][side].append(value)
+    gaps = [median(read[-1]) - median(read[1]) for read in by_side.values() if len(read) == 2]
+    gap = median(gaps) if gaps else 0.0
+    if abs(gap) <= GAP_SDS * MAD_SDS * median([abs(other - gap) for other in gaps] or [0.0]):
+        return True
+    onward, stays = [0.0] * len(commands), list[bool]()
+    for row in reversed(range(len(commands) - 1)):
+        onward[row] = commands[row + 1] - commands[row] or onward[row + 1]
+    for row in range(1, len(commands)):
+        command, side, value, before = commands[row], sides[row], values[row], values[row - 1]
+        if command != commands[row - 1] or side * sides[row - 1] >= 0:
+            continue
+        if side * onward[row] < 0:
+            return True
+        if value is not None and before is not None:
+            stays.append(abs(value - before + side * gap) > abs(value - before))
+    return 2 * sum(stays) <= len(stays)
+
+
+def _refuse_contrary(
+    cells: FieldCells, commands: Sequence[float], sides: Sequence[int], homings: Sequence[bool]
+) -> None:
+    """Refuse directions that are all opposite to the commands."""
+    ways = [sides[row] * (commands[row] - commands[row - 1]) * (not homings[row]) for row in range(1, len(commands))]
+    moved = [row for row, way in enumerate(ways, start=1) if way]
+    if len(moved) >= CONTRARY_MIN and max(ways) <= 0 and {sides[row] for row in moved} == {-1, 1}:
+        raise cells.ask("contrary", moved[0], "approach")
 
 
 def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool], assumed: list[str]) -> list[int]:
@@ -503,11 +480,7 @@ def unwrapped(
 
 
 def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
-    """Period of wrapped whole numbers: the power of two that bounds them all, if they jump by it.
-
-    Raises:
-        InputError: the readings jump by another number.
-    """
+    """Period of wrapped whole numbers: the power of two that bounds them all, if they jump by it."""
     if len(value) < 3 or np.any(value != np.round(value)):
         return None
     span = float(np.ptp(value)) + 1.0

@@ -13,20 +13,8 @@ import numpy as np
 from tvsbayes.errors import Candidate, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed
-from tvsbayes.importing.cells import (
-    Column,
-    Understood,
-    ask_column,
-    check_stated,
-    choice,
-    columns_of,
-    date_time,
-    factor_between,
-    is_clock,
-    is_segment,
-    missing_column,
-    time_of_day,
-)
+from tvsbayes.importing.clock import equal_clocks, relative_times
+from tvsbayes.importing.columns import Chooser, Column, Understood, factor_between, line_through
 from tvsbayes.importing.runs import counts_rows
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means
@@ -46,6 +34,8 @@ ROOM_DEGC = (10.0, 40.0)
 """Temperatures of a room."""
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
 """Options that say what the readings are."""
+_MEANING = {DEVIATIONS: "actual less commanded position", POSITIONS: "positions"}
+NO_READING = "; or is a column actual less commanded position: --column value=NAME --deviations"
 
 
 def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: bool | None = None) -> Understood:
@@ -60,33 +50,31 @@ def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: boo
         Question: two columns could be one field.
         InputError: a field or column that does not exist, or no column for a command or a reading.
     """
-    known = columns_of(table)
-    check_stated(list(known), stated, FIELDS)
-    taken = {field: name for field, name in stated.items() if name}
-    taken |= {f: f for f in known if f in FIELDS and f not in stated and f not in taken.values()}
-    free = {text: column for text, column in known.items() if text not in taken.values()}
-    of_role: dict[str, list[str]] = {}
-    for text, column in free.items():
-        of_role.setdefault(_role(column), []).append(text)
-    numbers = [name for role in ("command", "value", "position", "") for name in of_role.get(role, ())]
-    volts = [n for n in of_role.get("aside", ()) if (u := known[n].name.unit) and u.kind == "voltage"]
-    if len(numbers) == 1 and len(volts) == 1 and not {"command", "value"} & taken.keys():
-        ways = {"value": (volts[0], numbers[0]), "command": (numbers[0], volts[0])}
-        ways = {role: pair for role, pair in ways.items() if numbers[0] in of_role.get(role, ())} or ways
-        if len(ways) > 1:
-            candidates = [choice(dict(zip(("command", "value"), pair, strict=True)), known) for pair in ways.values()]
-            raise ask_column(table, f"positions and volts ({listed([*numbers, *volts])})", candidates)
-        taken |= dict(zip(("command", "value"), *ways.values(), strict=True))
+    chooser = Chooser.of(table, stated, FIELDS, _role)
+    numbers = chooser.of_role("command", "value", "position", "")
+    _take_volts(chooser, numbers)
     if len(numbers) < 2:
         # A column that counts the rows is no number of theirs, unless little else is there.
-        of_role.setdefault("", []).extend(of_role.get("index", ()))
-    remarks: list[str] = []
-    _take_command(table, known, of_role, taken, remarks)
-    of_role = {role: _of_device(known, names, taken["command"]) for role, names in of_role.items()}
-    _take_value(table, known, of_role, taken, stated, remarks, deviations)
-    _take_sides(table, known, of_role, taken, stated, remarks)
-    unused = tuple(text for text in known if text not in taken.values())
-    return Understood(taken, unused, tuple(remarks))
+        chooser.roles.setdefault("", []).extend(chooser.of_role("index"))
+    _take_command(chooser)
+    chooser.roles = {role: _of_device(chooser, names) for role, names in chooser.roles.items()}
+    _take_value(chooser, deviations)
+    _take_others(chooser)
+    return chooser.understood()
+
+
+def _take_volts(chooser: Chooser, numbers: Sequence[str]) -> None:
+    """Take command and reading where the only numbers are positions and volts: a sensor's, or a drive's."""
+    known, roles = chooser.known, chooser.roles
+    volts = [n for n in chooser.of_role("aside") if (u := known[n].name.unit) and u.kind == "voltage"]
+    if len(numbers) != 1 or len(volts) != 1 or {"command", "value"} & chooser.taken.keys():
+        return
+    ways = {"value": (volts[0], numbers[0]), "command": (numbers[0], volts[0])}
+    ways = {role: pair for role, pair in ways.items() if numbers[0] in roles.get(role, ())} or ways
+    columns = [dict(zip(("command", "value"), pair, strict=True)) for pair in ways.values()]
+    if len(columns) > 1:
+        raise chooser.ask(f"positions and volts ({listed([*numbers, *volts])})", list(map(chooser.answer, columns)))
+    chooser.taken |= columns[0]
 
 
 def _role(column: Column) -> str:
@@ -94,7 +82,7 @@ def _role(column: Column) -> str:
     name, unit = column.name, column.name.unit
     kind = unit.kind if unit else ""
     if name.has("temperature") or kind == "temperature":
-        return "temperature_degC" if _varied_number(column) else "aside"
+        return "temperature_degC" if bool(np.isfinite(column.values).any()) else "aside"
     if name.has("aside") or kind in ("other", "voltage"):
         return "aside"
     if kind == "time" or (name.has("time") and not kind):
@@ -106,7 +94,7 @@ def _role(column: Column) -> str:
     for role in ("moving", "resting", "status", "approach"):
         if name.has(role) and not kind and not (name.has("command", "value") and column.numeric):
             return role
-    if name.has("segment") and not kind and is_segment(column.cells):
+    if name.has("segment") and not kind and column.counts_homings:
         return "segment"
     if name.has("repeat", "index") and not kind and column.whole and not name.has("command", "value"):
         return "aside"
@@ -136,82 +124,45 @@ def _states_sides(column: Column) -> bool:
     )
 
 
-def _of_device(known: Mapping[str, Column], names: list[str], command: str) -> list[str]:
+def _of_device(chooser: Chooser, names: list[str], command: str = "") -> list[str]:
     """Of several columns of one role the one with the number of the command's, as "pos (5)" beside "target (5)"."""
-    numbers = known[command].name.numbers
-    same = [name for name in names if numbers and known[name].name.numbers == numbers]
-    return same if len(same) == 1 and all(known[name].name.numbers for name in names) else names
+    numbers = chooser.known[command or chooser.taken["command"]].name.numbers
+    of_each = [chooser.known[name].name.numbers for name in names]
+    same = [name for name, own in zip(names, of_each, strict=True) if numbers and own == numbers]
+    return same if len(same) == 1 and all(of_each) else names
 
 
-def _varied_number(column: Column) -> bool:
-    return bool(np.isfinite(column.values).any())
-
-
-def _take_sides(
-    table: ForeignTable,
-    known: Mapping[str, Column],
-    of_role: Mapping[str, list[str]],
-    taken: dict[str, str],
-    stated: Mapping[str, str],
-    remarks: list[str],
-) -> None:
-    """Take time, u, status, motion, segment, approach and temperature."""
-
-    def open_(field: str) -> bool:
-        return field not in stated and field not in taken
-
-    for field in ("segment", "approach", "status"):
-        names = of_role.get(field, [])
-        if open_(field) and len(names) > 1:
-            found = f"{len(names)} columns that could be {field} ({listed(names)})"
-            candidates = [choice({field: name}, known) for name in (*names, "")]
-            raise ask_column(table, found, candidates)
-        if open_(field) and names:
-            taken[field] = names[0]
-    temperatures = of_role.get("temperature_degC", [])
-    if open_("temperature_degC") and len(temperatures) == 1:
-        taken["temperature_degC"] = temperatures[0]
-    elif open_("temperature_degC") and temperatures:
+def _take_others(chooser: Chooser) -> None:
+    """Take segment, approach, status, temperature, motion, u and time."""
+    known, remarks = chooser.known, chooser.remarks
+    for name in ("segment", "approach", "status"):
+        chooser.take(name)
+    temperatures = chooser.roles.get("temperature_degC", [])
+    if len(temperatures) > 1 and chooser.is_open("temperature_degC"):
         remarks.append(f"temperature: none of {listed(temperatures)}; --column temperature_degC=NAME takes one")
-    moving = [*of_role.get("moving", ()), *of_role.get("resting", ())]
-    if open_("moving") and len(moving) == 1:
-        taken["moving"] = moving[0]
-    spreads = [name for name in of_role.get("u", ()) if known[name].numeric or _varied_number(known[name])]
+    for name, roles in (("temperature_degC", ("temperature_degC",)), ("moving", ("moving", "resting"))):
+        if len(names := chooser.of_role(*roles)) == 1:
+            chooser.take(name, names)
+    spreads = [name for name in chooser.of_role("u") if np.isfinite(known[name].values).any()]
     standard = [name for name in spreads if known[name].name.coverage is None]
     spreads = standard if len(standard) == 1 else spreads
-    if open_("u") and len(spreads) > 1:
-        found = f"{len(spreads)} columns of uncertainties ({listed(spreads)})"
-        raise ask_column(table, found, [choice({"u": name}, known) for name in (*spreads, "")])
-    if open_("u") and spreads:
-        if np.nanmin(known[spreads[0]].values) < 0:
-            remarks.append(f"column {escaped(spreads[0])} has negative numbers, so it is no uncertainty; set aside")
-        else:
-            taken["u"] = spreads[0]
-    if open_("time_s") and (names := of_role.get("time_s", [])):
-        taken["time_s"] = _clock(table, names, known)
-
-
-def _clock(table: ForeignTable, names: Sequence[str], known: Mapping[str, Column]) -> str:
-    """The clock: the only one, or the first of several that agree.
-
-    Raises:
-        Question: they differ.
-    """
-    if len(names) == 1:
-        if _may_be_degC(known[names[0]]):
-            found = f"column {escaped(names[0])}, which could be a clock or a thermometer"
-            columns = [{field: names[0]} for field in ("time_s", "temperature_degC")]
-            raise ask_column(table, found, [choice(each, known) for each in (*columns, {"time_s": ""})])
-        return names[0]
-    times = [_relative_times(known[name]) for name in names]
-    usable = [name for name, time in zip(names, times, strict=True) if time is not None]
-    if len(usable) == 1:
-        return usable[0]
-    first = next((time for time in times if time is not None), None)
-    if first is not None and all(time is None or _equal_clocks(first, time) for time in times):
-        return usable[0]
-    found = f"{len(names)} columns that could be the clock ({listed(names)})"
-    raise ask_column(table, found, [choice({"time_s": name}, known) for name in (*names, "")])
+    if len(spreads) == 1 and chooser.is_open("u") and np.nanmin(known[spreads[0]].values) < 0:
+        remarks.append(f"column {escaped(spreads[0])} has negative numbers, so it is no uncertainty; set aside")
+    else:
+        chooser.take("u", spreads, what="of uncertainties")
+    clocks = chooser.roles.get("time_s", [])
+    if len(clocks) > 1 and chooser.is_open("time_s"):
+        # Of several clocks that agree the first.
+        times = {n: relative_times(known[n].cells, known[n].values, known[n].name.unit) for n in clocks}
+        usable = {name: time for name, time in times.items() if time is not None}
+        first = next(iter(usable.values()), np.zeros(1))
+        if len(usable) == 1 or (usable and all(equal_clocks(first, time) for time in usable.values())):
+            clocks = list(usable)[:1]
+    elif clocks and chooser.is_open("time_s") and _may_be_degC(known[clocks[0]]):
+        found = f"column {escaped(clocks[0])}, which could be a clock or a thermometer"
+        columns = ({"time_s": clocks[0]}, {"temperature_degC": clocks[0]}, {"time_s": ""})
+        raise chooser.ask(found, list(map(chooser.answer, columns)))
+    chooser.take("time_s", clocks, what="that could be the clock")
 
 
 def _may_be_degC(column: Column) -> bool:
@@ -221,174 +172,101 @@ def _may_be_degC(column: Column) -> bool:
     return column.name.text.strip() == "T" and bool(is_room) and float(np.ptp(values)) < 0.5 * (high - low)
 
 
-def _relative_times(column: Column) -> np.ndarray | None:
-    """Seconds or numbers since the first row, scaled by the unit; None for dates without times of day."""
-    if np.isfinite(column.values).all():
-        unit = column.name.unit
-        scale = unit.scale if unit and unit.kind == "time" else 1.0
-        return scale * (column.values - column.values[0])
-    if not is_clock(column.cells) or all(len(cell) <= 10 and time_of_day(cell) is None for cell in column.cells):
-        return None
-    seconds = [
-        of_day if (of_day := time_of_day(c)) is not None else (at.timestamp() if (at := date_time(c)) else np.nan)
-        for c in column.cells
-    ]
-    return np.array(seconds) - seconds[0]
-
-
-def _equal_clocks(times: np.ndarray, others: np.ndarray) -> bool:
-    """Whether two clocks agree but for their unit, to a second or a hundredth."""
-    span, other_span = np.ptp(times), np.ptp(others)
-    scale = next(
-        (s for s in (1.0, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9) if span and abs(other_span / s / span - 1) < 0.01), 1.0
-    )
-    return bool(np.all(np.abs(others / scale - times) <= 1.0 + 0.01 * span))
-
-
-def _take_command(
-    table: ForeignTable,
-    known: Mapping[str, Column],
-    of_role: Mapping[str, list[str]],
-    taken: dict[str, str],
-    remarks: list[str],
-) -> None:
-    """Take the column of the commands.
-
-    Raises:
-        Question: several could be it.
-        InputError: none could be it.
-    """
+def _take_command(chooser: Chooser) -> None:
+    """Take the column of the commands."""
+    taken, roles = chooser.taken, chooser.roles
     if "command" in taken:
         return
-    strong, weak, others = (of_role.get(role, []) for role in ("command", "position", ""))
-    readings = of_role.get("value", []) or ([taken["value"]] if "value" in taken else [])
-    if len(strong) == 1:
-        taken["command"] = strong[0]
-        return
+    strong, weak, others = (roles.get(role, []) for role in ("command", "position", ""))
+    readings = roles.get("value", []) or ([taken["value"]] if "value" in taken else [])
+    pool = strong or weak or others
     if len(strong) > 1:
         found = f"{len(strong)} columns that could be the command ({listed(strong)})"
-        raise ask_column(table, found, [_pair(known, name, of_role, taken) for name in strong])
-    pool = weak or others
-    if readings and len(pool) == 1:
+        raise chooser.ask(found, [_pair(chooser, name) for name in strong])
+    if len(pool) == 1 and (strong or readings or len(roles.get("deviation", ())) == 1):
         taken["command"] = pool[0]
-        if not weak:
-            remarks.append(
-                f"command: column {escaped(pool[0])}, the only other one of numbers; --column command= says another"
-            )
-        return
-    if not readings and len(pool) == 1 and len(of_role.get("deviation", ())) == 1:
-        taken["command"] = pool[0]
+        if readings and not strong and not weak:
+            only = f"column {escaped(pool[0])}, the only other one of numbers"
+            chooser.remarks.append(f"command: {only}; --column command= says another")
         return
     pool = [*weak, *others, *([] if len(readings) < 2 else readings)]
     if not pool or (not readings and len(pool) < 2):
-        raise missing_column(table, taken, ["command", *(["value"] if not readings else [])], _besides(readings))
+        raise chooser.missing(["command", *(["value"] if not readings else [])], "" if readings else NO_READING)
     found = f"no column that is surely the command; numbers are in {listed([*pool, *readings])}"
-    raise ask_column(table, found, [_pair(known, name, of_role, taken) for name in pool])
+    raise chooser.ask(found, [_pair(chooser, name) for name in pool])
 
 
-def _besides(readings: Sequence[str]) -> str:
-    return "" if readings else "; or is a column actual less commanded position: --column value=NAME --deviations"
-
-
-def _pair(known: Mapping[str, Column], command: str, of_role: Mapping[str, list[str]], taken: Mapping[str, str]):
+def _pair(chooser: Chooser, command: str) -> Candidate:
     """The answer that names a command, and the reading where one is left."""
-    readings = [name for role in ("value", "position", "") for name in of_role.get(role, ()) if name != command]
-    best = _of_device(known, [name for name in of_role.get("value", ()) if name != command], command) or readings
-    columns = {"command": command}
-    if "value" not in taken and len(best) == 1:
-        columns["value"] = best[0]
-    return choice(columns, known)
+    of_value, *others = ([n for n in chooser.roles.get(role, ()) if n != command] for role in ("value", "position", ""))
+    best = _of_device(chooser, of_value, command) or [name for names in others for name in names]
+    reads = {"value": best[0]} if "value" not in chooser.taken and len(best) == 1 else {}
+    return chooser.answer({"command": command, **reads})
 
 
-def _take_value(
-    table: ForeignTable,
-    known: Mapping[str, Column],
-    of_role: Mapping[str, list[str]],
-    taken: dict[str, str],
-    stated: Mapping[str, str],
-    remarks: list[str],
-    deviations: bool | None,
-) -> None:
-    """Take the column of the readings, and set columns of deviations aside that follow from it.
-
-    Raises:
-        Question: several could be it, or the only reading is a deviation.
-        InputError: none could be it.
-    """
-    command = known[taken["command"]]
-    differences = of_role.get("deviation", [])
-    strong, weak, others = (
-        [n for n in of_role.get(role, ()) if n not in taken.values()] for role in ("value", "position", "")
-    )
-    if deviations and "value" not in taken:
-        pool = differences or strong or weak or others
-        if len(pool) == 1:
-            taken["value"] = pool[0]
-            return
-        if pool:
+def _take_value(chooser: Chooser, deviations: bool | None) -> None:
+    """Take the column of the readings, and set columns of deviations aside that follow from it."""
+    known, taken = chooser.known, chooser.taken
+    command, differences = known[taken["command"]], chooser.roles.get("deviation", [])
+    strong, weak, others = (chooser.of_role(role) for role in ("value", "position", ""))
+    if deviations and "value" not in taken and (pool := differences or strong or weak or others):
+        if len(pool) > 1:
             found = f"{len(pool)} columns that could be the deviation ({listed(pool)})"
-            raise ask_column(table, found, [choice({"value": name}, known, DEVIATIONS) for name in pool])
+            raise chooser.ask(found, [chooser.answer({"value": name}, DEVIATIONS) for name in pool])
+        taken["value"] = pool[0]
+        return
     if "value" in taken:
-        if "value" not in stated:
-            _set_aside(known, differences, taken, remarks)
+        if "value" not in chooser.stated:
+            _set_aside(chooser, differences)
         return
     following = [name for name in others if follows(command, known[name])]
-    copies = [name for name in (*weak, *following) if _repeats(command, known[name])]
-    pools = (strong, [n for n in weak if n not in copies], [n for n in following if n not in copies], weak, following)
+    own = [name for name in (*weak, *following) if not _repeats(command, known[name])]
+    pools = (strong, [n for n in weak if n in own], [n for n in following if n in own], weak, following)
     pool = next(filter(None, pools), [])
-    if len(pool) == 1:
-        taken["value"] = pool[0]
-        if pool[0] in following:
-            remarks.append(
-                f"value: column {escaped(pool[0])}, the only other following the commands; --column value= changes it"
-            )
-        unexplained = _set_aside(known, differences, taken, remarks)
-        if unexplained and (not strong or not follows(command, known[pool[0]])):
-            found = f"column {escaped(pool[0])} beside column {escaped(unexplained[0])}, which is not their difference"
-            candidates = [
-                choice({"value": pool[0]}, known),
-                *(choice({"value": n}, known, DEVIATIONS) for n in unexplained),
-            ]
-            raise ask_column(table, found, candidates)
-        _ask_what_is_left(table, known, [*strong, *weak, *others], taken)
-        if deviations is None:
-            _ask_small(table, command, known[pool[0]], known)
-        return
     if len(pool) > 1:
-        candidates = [choice({"value": name}, known) for name in pool]
-        raise ask_column(table, f"{len(pool)} columns that could be the reading ({listed(pool)})", candidates)
-    if differences:
-        if deviations is False and len(differences) == 1:
-            taken["value"] = differences[0]
-            return
+        found = f"{len(pool)} columns that could be the reading ({listed(pool)})"
+        raise chooser.ask(found, [chooser.answer({"value": name}) for name in pool])
+    if pool:
+        (name,) = pool
+        taken["value"] = name
+        if name in following:
+            only = f"column {escaped(name)}, the only other following the commands"
+            chooser.remarks.append(f"value: {only}; --column value= changes it")
+        unexplained = _set_aside(chooser, differences)
+        if unexplained and (not strong or not follows(command, known[name])):
+            found = f"column {escaped(name)} beside column {escaped(unexplained[0])}, which is not their difference"
+            answers = [chooser.answer({"value": n}, DEVIATIONS) for n in unexplained]
+            raise chooser.ask(found, [chooser.answer({"value": name}), *answers])
+        _ask_what_is_left(chooser, [*strong, *weak, *others])
+        if deviations is None:
+            _ask_small(chooser, command, known[name])
+    elif deviations is False and len(differences) == 1:
+        taken["value"] = differences[0]
+    elif differences:
         found = f"no reading but {listed(differences)}, by its name a deviation"
-        candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS) for name in differences]
-        raise ask_column(table, found, candidates, "deviations")
-    rest = [name for name in (*weak, *others, *of_role.get("u", ())) if name not in taken.values()]
-    if rest:
+        answers = [_meaning(known[name], option) for option in _MEANING for name in differences]
+        raise chooser.ask(found, answers, "deviations")
+    elif rest := [*weak, *others, *chooser.of_role("u")]:
         found = f"no column that is surely the reading; numbers are in {listed(rest)}"
-        candidates = [choice({"value": name}, known, *extra) for name in rest for extra in ((), (DEVIATIONS,))]
-        raise ask_column(table, found, candidates)
-    raise missing_column(table, taken, ["value"], _besides([]))
+        answers = [chooser.answer({"value": name}, *extra) for name in rest for extra in ((), (DEVIATIONS,))]
+        raise chooser.ask(found, answers)
+    else:
+        raise chooser.missing(["value"], NO_READING)
 
 
-def _meaning(known: Mapping[str, Column], name: str, option: str) -> Candidate:
+def _meaning(column: Column, option: str) -> Candidate:
     """The answer that a column holds deviations or positions; columns of runs are known by their names again."""
-    words = {DEVIATIONS: "actual less commanded position", POSITIONS: "positions"}[option]
-    first = {name: known[name].first}
-    return Candidate(f"{escaped(name)} ({', '.join(known[name].first)}) holds {words}", (option,), first)
+    name, first = column.name.text, column.first
+    return Candidate(f"{escaped(name)} ({', '.join(first)}) holds {_MEANING[option]}", (option,), {name: first})
 
 
-def _set_aside(
-    known: Mapping[str, Column], names: Sequence[str], taken: dict[str, str], remarks: list[str]
-) -> list[str]:
+def _set_aside(chooser: Chooser, names: Sequence[str]) -> list[str]:
     """Name columns that are the reading less the command; return those that are not."""
-    command, value = known[taken["command"]], known[taken["value"]]
-    unexplained = []
+    known, taken, unexplained = chooser.known, chooser.taken, list[str]()
     for name in [*names, *([taken["u"]] if "u" in taken else [])]:
-        formula = difference(known[name], command, value)
-        if formula:
-            remarks.append(f"column {escaped(name)} is {formula} in every row: a deviation, no uncertainty; set aside")
+        if formula := difference(known[name], known[taken["command"]], known[taken["value"]]):
+            said = f"column {escaped(name)} is {formula} in every row: a deviation, no uncertainty; set aside"
+            chooser.remarks.append(said)
             if taken.get("u") == name:
                 del taken["u"]
         elif name in names and known[name].numeric:
@@ -398,25 +276,19 @@ def _set_aside(
 
 def difference(column: Column, command: Column, value: Column) -> str:
     """The formula by which a column is the reading less the command in every row, to its digits; "" where it is not."""
-    to_reading = factor_between(command.unit, value.unit)
-    to_column = factor_between(value.unit, column.unit)
+    to_reading, to_column = factor_between(command.unit, value.unit), factor_between(value.unit, column.unit)
     if to_reading is None or to_column is None:
         return ""
     gap = (value.values - to_reading * command.values) * to_column
     rows = np.isfinite(gap) & np.isfinite(column.values)
+    if rows.sum() < 3 or not np.any(column.values[rows]):
+        return ""
     # The written digits of the difference, of the reading and of the command, in the unit of the difference.
     tolerance = _half_digit(column) + to_column * (_half_digit(value) + to_reading * _half_digit(command)) + 1e-12
-    names = escaped(value.name.text), escaped(command.name.text)
-    forms = (
-        (gap, f"{names[0]} - {names[1]}"),
-        (-gap, f"{names[1]} - {names[0]}"),
-        (np.abs(gap), f"|{names[0]} - {names[1]}|"),
-    )
-    if rows.sum() > 2 and np.any(column.values[rows] != 0):
-        for numbers, text in forms:
-            if np.all(np.abs(numbers - column.values)[rows] <= tolerance):
-                return text
-    return ""
+    a, b = escaped(value.name.text), escaped(command.name.text)
+    forms = {f"{a} - {b}": gap, f"{b} - {a}": -gap, f"|{a} - {b}|": np.abs(gap)}
+    fits = (text for text, numbers in forms.items() if np.all(np.abs(numbers - column.values)[rows] <= tolerance))
+    return next(fits, "")
 
 
 def _half_digit(column: Column) -> float:
@@ -426,10 +298,14 @@ def _half_digit(column: Column) -> float:
     return 0.5000001 * 10.0 ** -max(places, default=0)
 
 
+def _in_both(command: Column, column: Column) -> tuple[np.ndarray, np.ndarray]:
+    rows = np.isfinite(command.values) & np.isfinite(column.values)
+    return command.values[rows], column.values[rows]
+
+
 def follows(command: Column, column: Column) -> bool:
     """Whether a column follows the commands: near a line over them, or by steps in proportion to theirs."""
-    rows = np.isfinite(command.values) & np.isfinite(column.values)
-    c, v = command.values[rows], column.values[rows]
+    c, v = _in_both(command, column)
     if len(np.unique(c)) < 3 or np.ptp(v) == 0:
         return False
     if np.corrcoef(c, v)[0, 1] ** 2 >= FOLLOWS_R2:
@@ -443,55 +319,34 @@ def follows(command: Column, column: Column) -> bool:
 
 def _repeats(command: Column, column: Column) -> bool:
     """Whether a column is the command again, in the same or another unit."""
-    rows = np.isfinite(command.values) & np.isfinite(column.values)
-    c, v = command.values[rows], column.values[rows]
+    c, v = _in_both(command, column)
     if len(np.unique(c)) < 3:
         return bool(len(c)) and bool(np.all(c == v))
-    slope, level = np.polyfit(c, v, 1)
-    return bool(slope) and bool(np.max(np.abs(v - slope * c - level)) <= COPY_SHARE * np.ptp(v))
+    slope, off = line_through(c, v)
+    return bool(slope) and bool(np.max(np.abs(off)) <= COPY_SHARE * np.ptp(v))
 
 
-def _ask_what_is_left(
-    table: ForeignTable, known: Mapping[str, Column], names: Sequence[str], taken: Mapping[str, str]
-) -> None:
-    """Ask where a column that is left over follows the commands too.
-
-    Raises:
-        Question: there is one.
-    """
-    command = known[taken["command"]]
-    left = [
-        name
-        for name in names
-        if name not in taken.values() and follows(command, known[name]) and not _repeats(command, known[name])
-    ]
+def _ask_what_is_left(chooser: Chooser, names: Sequence[str]) -> None:
+    """Ask where a column that is left over follows the commands too."""
+    taken, known = chooser.taken, chooser.known
+    command, left = known[taken["command"]], [name for name in names if name not in taken.values()]
+    left = [name for name in left if follows(command, known[name]) and not _repeats(command, known[name])]
     if left:
-        answers = [choice({"value": name}, known) for name in (taken["value"], *left)]
+        answers = [chooser.answer({"value": name}) for name in (taken["value"], *left)]
         # The column left over may be what was commanded.
-        answers += [choice({"command": name, "value": taken["value"]}, known) for name in left]
-        raise table.ask("reading-left", answers=answers, value=taken["value"], left=left)
+        answers += [chooser.answer({"command": name, "value": taken["value"]}) for name in left]
+        raise chooser.table.ask("reading-left", answers=answers, value=taken["value"], left=left)
 
 
-def _ask_small(table: ForeignTable, command: Column, value: Column, known: Mapping[str, Column]) -> None:
-    """Ask where readings in the unit of the commands are too small and too loose to be positions.
-
-    Raises:
-        Question: they are.
-    """
-    units = command.unit, value.unit
-    factor = value.unit and command.unit and value.unit.in_units_of(command.unit)
-    rows = np.isfinite(command.values) & np.isfinite(value.values)
-    if not factor or units[0].kind not in ("length", "angle") or rows.sum() < 4:  # type: ignore[union-attr]
+def _ask_small(chooser: Chooser, command: Column, value: Column) -> None:
+    """Ask where readings in the unit of the commands are too small and too loose to be positions."""
+    unit, (c, v) = command.unit, _in_both(command, value)
+    factor = value.unit.in_units_of(unit) if value.unit and unit and unit.kind in ("length", "angle") else None
+    if not factor or unit is None or len(c) < 4:
         return
-    c, v = command.values[rows], factor * value.values[rows]
+    v = factor * v
     span = np.ptp(v)
-    if not 0 < span < SMALL_SHARE * np.ptp(c):
-        return
-    slope, level = np.polyfit(c, v, 1)
-    if np.std(v - slope * c - level) > LOOSE_SHARE * span:
-        name = value.name.text
-        found = (
-            f"readings in column {escaped(name)} that span {span:.3g} {units[0].name} over {np.ptp(c):.6g} of commands"  # type: ignore[union-attr]
-        )
-        candidates = [_meaning(known, name, option) for option in (DEVIATIONS, POSITIONS)]
-        raise ask_column(table, found, candidates, "deviations")
+    if 0 < span < SMALL_SHARE * np.ptp(c) and np.std(line_through(c, v)[1]) > LOOSE_SHARE * span:
+        found = f"readings in column {escaped(value.name.text)} that span {span:.3g} {unit.name} over {np.ptp(c):.6g}"
+        answers = [_meaning(value, option) for option in _MEANING]
+        raise chooser.ask(f"{found} of commands", answers, "deviations")

@@ -11,7 +11,8 @@ import numpy as np
 from tvsbayes.errors import Question, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import refused
-from tvsbayes.importing.cells import FieldCells, columns_of
+from tvsbayes.importing.cells import FieldCells
+from tvsbayes.importing.columns import columns_of, line_through
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Unit, name_of, parse_unit, part_of_unit, plain
 
@@ -125,25 +126,26 @@ def in_one_unit(
     unit, command_unit = units["value"], units["command"]
     if not wishes.deviations and len(set(values)) > 2 and list(values) == list(commands):
         assumed.append("value: equals the command in every row: what was read, or the command again?")
+    of_scale = command_unit if command_unit is not None and command_unit.kind in ("length", "angle") else None
+    given = unit
     if wishes.deviations:
         factor = _deviation_factor(cells, unit, command_unit)
         values = [None if d is None else rounded(c + factor * d) for c, d in zip(commands, values, strict=True)]
         assumed.append("value: the command plus the deviation, because --deviations says so")
         given, unit = unit or command_unit, command_unit or unit
-    else:
-        given = unit
-        if unit is not None and unit.per_number != 1.0:
-            values = [None if v is None else rounded(unit.per_number * v) for v in values]
-            assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
-            unit = unit.whole
-        elif unit is not None and command_unit is not None and "value" not in wishes.units:
-            _check_parts(cells, commands, values, unit, command_unit)
-        elif unit is None and (unit := _unit_of_command(commands, values, command_unit)) is not None:
-            given = unit
-            how = "that of the commands, which the readings follow 1 to 1; --unit value=mm says another"
-            assumed.append(f"unit: {unit.name}, {how}")
-    if unit is None and command_unit is not None and command_unit.kind in ("length", "angle"):
-        raise _unit_of_readings(cells, commands, values, command_unit)
+    elif unit is not None and unit.per_number != 1.0:
+        values = [None if v is None else rounded(unit.per_number * v) for v in values]
+        assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
+        unit = unit.whole
+    elif unit is not None and command_unit is not None and "value" not in wishes.units:
+        _check_parts(cells, commands, values, unit, command_unit)
+    elif unit is None and of_scale is not None:
+        slope = _slope(commands, values)
+        if not abs(slope - 1.0) <= UNIT_SLOPE:
+            raise _unit_of_readings(cells, abs(slope) or 1.0, of_scale)
+        given = unit = of_scale
+        how = "that of the commands, which the readings follow 1 to 1; --unit value=mm says another"
+        assumed.append(f"unit: {unit.name}, {how}")
     if unit is None and _are_counts(cells.text("value")):
         unit = given = Unit("counts", "count", 1.0)
         assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
@@ -152,9 +154,8 @@ def in_one_unit(
 
 def _slope(commands: Sequence[float], values: Sequence[float | None]) -> float:
     """Slope of readings over commands by least squares; 0 where there is none."""
-    known = np.array([(c, v) for c, v in zip(commands, values, strict=True) if v is not None]).reshape(-1, 2)
-    command, value = known.T
-    return float(np.polyfit(command, value, 1)[0]) if len(known) > 1 and np.ptp(command) > 0 else 0.0
+    known = np.array([(c, v) for c, v in zip(commands, values, strict=True) if v is not None], float).reshape(-1, 2)
+    return line_through(*known.T)[0] if len(np.unique(known[:, 0])) > 1 else 0.0
 
 
 def _check_parts(
@@ -176,12 +177,7 @@ def rounded(number: float) -> float:
 
 
 def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit | None) -> float:
-    """Units of the command per unit of a deviation.
-
-    Raises:
-        Question: a unit that is missing.
-        InputError: units of two kinds.
-    """
+    """Units of the command per unit of a deviation."""
     if unit is None and command_unit is None:
         return 1.0
     table = cells.table
@@ -196,20 +192,8 @@ def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit |
     return factor
 
 
-def _unit_of_command(
-    commands: Sequence[float], values: Sequence[float | None], command_unit: Unit | None
-) -> Unit | None:
-    """The commands' unit of length or angle, where readings without one follow them 1 to 1."""
-    if command_unit is None or command_unit.kind not in ("length", "angle"):
-        return None
-    return command_unit if abs(_slope(commands, values) - 1.0) <= UNIT_SLOPE else None
-
-
-def _unit_of_readings(
-    cells: FieldCells, commands: Sequence[float], values: Sequence[float | None], command_unit: Unit
-) -> Question:
+def _unit_of_readings(cells: FieldCells, slope: float, command_unit: Unit) -> Question:
     """The question of the unit of readings that do not follow commands of a length or an angle 1 to 1."""
-    slope = abs(_slope(commands, values)) or 1.0
     usual = {
         "length": ("nm", "um", "1/1000 mm", "1/100 mm", "1/10 mm", "mm", "cm", "thou", "inch", "deg"),
         "angle": ("arcsec", "arcmin", "mrad", "rad", "deg", "gon", "turn", "mm"),
@@ -247,9 +231,6 @@ def _standard_u(
         result: unit of the readings written.
         wishes: what the user states.
         assumed: sentences, to which what was done is added.
-
-    Raises:
-        Question: the units of u and of the readings are of two kinds, or that of the readings is missing.
     """
     if "u" not in cells:
         return list(stated)

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from tvsbayes.importing.cells import FieldCells, homings_of, seconds_of, temperatures_of
+from tvsbayes.importing.cells import FieldCells, homings_of, temperatures_of
+from tvsbayes.importing.clock import seconds_of
 
 AXES = ("pan", "tilt")
 COUNTERS = ("pan_steps", "tilt_steps")

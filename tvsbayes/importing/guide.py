@@ -12,9 +12,10 @@ import csv
 import datetime
 import math
 import re
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from statistics import median
 from typing import Any, NamedTuple
@@ -23,7 +24,8 @@ from tvsbayes.errors import Candidate, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.axis import AxisRows
-from tvsbayes.importing.cells import DAY_S, columns_of, time_of_day
+from tvsbayes.importing.clock import over_midnight, time_of_day
+from tvsbayes.importing.columns import columns_of
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import place_of
 
@@ -72,6 +74,14 @@ _HEADER = {
 }
 _CALIBRATED = re.compile(rf"Calibration guide speeds: RA = {_NUMBER} a-s/s")
 _MOUNT, _PIER = re.compile(r"^Mount = ([^,]*)"), re.compile(r"\bPier side = (\w+)")
+_EVENTS = (
+    (re.compile(r"Settling (?:started|complete|failed)"), "", True),
+    (re.compile(r"DITHER by"), "dither", True),
+    (re.compile(r"SET LOCK POSITION|LOCK SHIFT"), "", True),
+    (re.compile(r"received RESUME|Resumed"), "pause", True),
+    (re.compile(r"(?=.*Guiding parameter change).* RA "), "change of the RA algorithm", False),
+)
+"""INFO lines: their words, what is counted, and whether the zero is new after them."""
 _WORM = re.compile(r"^!WormPeriod\s*=\s*(\d+(?:\.\d+)?)", re.MULTILINE)
 
 
@@ -139,79 +149,74 @@ def read_runs(text: str, file: str, ra_axis: float | None = None) -> list[GuideR
     Raises:
         InputError: no run, or a table of frames without a required column.
     """
-    if MAXIM in text:
-        lines = text.splitlines()
-        starts = [k for k, line in enumerate(lines) if MAXIM in line]
-        parts = [_maxim_run(a + 1, lines[a:b], ra_axis == 2) for a, b in pairwise([*starts, len(lines)])]
-        return _kept(parts, "MaxIm", file)
+    program = "MaxIm" if MAXIM in text else "KStars" if text.lstrip("\ufeff").startswith("KStars") else "PHD2"
+    found = _maxim_runs(text.splitlines(), ra_axis == 2) if program == "MaxIm" else _guided_runs(text, file)
+    runs = [run for run in found if run.frames]
+    if not runs:
+        raise refused("no-guiding", file)
+    return [replace(run, number=k, program=program) for k, run in enumerate(runs, start=1)]
+
+
+def _guided_runs(text: str, file: str) -> list[GuideRun]:
+    """The runs of PHD2 and KStars."""
     runs: list[GuideRun] = []
     run: GuideRun | None = None
-    columns: list[str] | None = None
-    settling, calibrating, calibration_steps = False, False, 0
-    program, calibration = ("KStars" if text.lstrip("\ufeff").startswith("KStars") else "PHD2"), dict[str, float]()
-    for number, text_line in enumerate(text.splitlines(), start=1):
-        line = text_line.strip()
+    columns: list[str] = []
+    settling, calibrating, steps, speeds = False, False, 0, dict[str, float]()
+    for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
         if line.startswith(BEGINS):
-            run = GuideRun(len(runs) + 1, number, line[len(BEGINS) :], header=dict(calibration))
-            columns, settling, calibrating = None, False, False
-            run.counts["calibration step"], calibration_steps = calibration_steps, 0
+            run = GuideRun(0, number, line.removeprefix(BEGINS), header=dict(speeds))
             runs.append(run)
+            run.counts["calibration step"], steps = steps, 0
+            columns, settling, calibrating = [], False, False
         elif line.startswith("Calibration Begins at"):
             calibrating, run = True, None
         elif calibrating:
             if (match := _CALIBRATED.search(line)) and math.isfinite(speed := float(match[1])):
-                calibration["calibrated_speed"] = speed
-            calibration_steps += line.startswith(("West,", "East,", "North,", "South,", "Backlash,"))
+                speeds["calibrated_speed"] = speed
+            steps += line.startswith(("West,", "East,", "North,", "South,", "Backlash,"))
         elif run is None or not line:
             continue
         elif line.startswith(ENDS):
             run.ended, run = True, None
         elif line.startswith("INFO:"):
-            settling = _event(run, line, settling)
+            _, name, is_break = next((event for event in _EVENTS if event[0].search(line)), ("", "", False))
+            run.counts.update([name] if name else [])
+            run.breaks |= {len(run.frames)} if is_break else set()
+            settles = re.search(r"Settling (?:complete|failed)", line) is None
+            settling = "Settling started" in line or (settling and settles)
         elif line.startswith("Frame,"):
             columns = line.split(",")
             if missing := [name for name in NEEDED if name not in columns]:
                 raise refused("frame-columns", file, line=number, names=missing, needed=NEEDED)
-        elif columns is None:
-            _header(run, line)
-        else:
+        elif columns:
             _frame(run, number, line, columns, settling)
-    return _kept(runs, program, file)
-
-
-def _kept(runs: list[GuideRun], program: str, file: str) -> list[GuideRun]:
-    """Runs with frames, numbered."""
-    runs = [run for run in runs if run.frames]
-    for k, run in enumerate(runs, start=1):
-        run.number, run.program = k, program
-    if not runs:
-        raise refused("no-guiding", file)
+        else:
+            _header(run, line)
     return runs
 
 
-def _maxim_run(first: int, lines: Sequence[str], is_y: bool) -> GuideRun:
-    """A run of MaxIm: a positive correction moves the star to larger numbers, so that it acts as a negative pulse."""
-    run = GuideRun(1, first, lines[0].partition(MAXIM)[2].strip(), mount="a mount of MaxIm", ended=True)
-    days_s, before_s, start_s = 0.0, None, None
-    for number, line in enumerate(lines[1:], start=first + 1):
-        cells = [cell.strip() for cell in line.split(",")]
-        if (at_s := time_of_day(cells[0])) is None:
-            continue
-        days_s += DAY_S * (before_s is not None and at_s < before_s - DAY_S / 2)
-        before_s, start_s = at_s, at_s if start_s is None else start_s
-        time_s = at_s + days_s - start_s
-        numbers = [float(cell) if NUMBER.fullmatch(cell) else math.nan for cell in cells[1:7]]
-        offset, correction_s = (numbers[2 + is_y], numbers[4 + is_y]) if len(numbers) == 6 else (math.nan, math.nan)
-        late = time_s < (run.frames[-1].time_s if run.frames else 0.0)
-        if late or not (abs(offset) <= RAW_MAX_PX and 1000 * abs(correction_s) <= PULSE_MAX_MS):
-            (
+def _maxim_runs(lines: Sequence[str], is_y: bool) -> Iterator[GuideRun]:
+    """Runs of MaxIm: a positive correction moves the star to larger numbers, so that it acts as a negative pulse."""
+    starts = [k for k, line in enumerate(lines) if MAXIM in line]
+    for first, end in pairwise([*starts, len(lines)]):
+        begins = lines[first].partition(MAXIM)[2].strip()
+        run = GuideRun(0, first + 1, begins, mount="a mount of MaxIm", ended=True)
+        rows = [(number, lines[number - 1]) for number in range(first + 2, end + 1)]
+        timed = [(of_day, *row) for row in rows if (of_day := time_of_day(row[1].split(",")[0].strip())) is not None]
+        clocks_s = over_midnight([of_day for of_day, *_ in timed])
+        for clock_s, (_, number, line) in zip(clocks_s, timed, strict=True):
+            time_s, cells = clock_s - clocks_s[0], [cell.strip() for cell in line.split(",")[1:7]]
+            numbers = [float(cell) if NUMBER.fullmatch(cell) else math.nan for cell in cells]
+            offset, correction_s = numbers[2 + is_y : 5 + is_y : 2] if len(numbers) == 6 else (math.nan, math.nan)
+            late = time_s < (run.frames[-1].time_s if run.frames else 0.0)
+            if not late and abs(offset) <= RAW_MAX_PX and 1000 * abs(correction_s) <= PULSE_MAX_MS:
+                run.frames.append(GuideFrame(number, time_s, offset, -1000.0 * correction_s, False))
+            elif not late and "fade" in line.lower():
                 run.dropped_s.append(time_s)
-                if not late and "fade" in line.lower()
-                else run.counts.update(["damaged row"])
-            )
-        else:
-            run.frames.append(GuideFrame(number, time_s, offset, -1000.0 * correction_s, False))
-    return run
+            else:
+                run.counts["damaged row"] += 1
+        yield run
 
 
 def _header(run: GuideRun, line: str) -> None:
@@ -222,25 +227,6 @@ def _header(run: GuideRun, line: str) -> None:
         run.mount = match[1].strip()
     if match := _PIER.search(line):
         run.pier = match[1]
-
-
-def _event(run: GuideRun, line: str, settling: bool) -> bool:
-    """Apply an INFO line to the run; return whether the mount settles from here on."""
-    if "Settling started" in line:
-        run.breaks.add(len(run.frames))
-        return True
-    if "Settling complete" in line or "Settling failed" in line:
-        run.breaks.add(len(run.frames))
-        return False
-    if "DITHER by" in line or "SET LOCK POSITION" in line or "LOCK SHIFT" in line:
-        run.counts["dither"] += "DITHER by" in line
-        run.breaks.add(len(run.frames))
-    elif "received RESUME" in line or "Resumed" in line:
-        run.counts["pause"] += 1
-        run.breaks.add(len(run.frames))
-    elif "Guiding parameter change" in line and " RA " in line:
-        run.counts["change of the RA algorithm"] += 1
-    return settling
 
 
 def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settling: bool) -> None:
@@ -285,26 +271,11 @@ def run_rows(runs: Sequence[GuideRun]) -> list[dict[str, object]]:
     ]
 
 
-@dataclass(frozen=True)
-class _Scale:
-    """Conversion of a log to angles of the axis, and its sources in words."""
-
-    pixel_arcsec: float
-    cos_declination: float
-    pulse_arcsec_per_s: float
-    drive_arcsec_per_s: float
-    assumed: tuple[str, ...]
-
-
-def _scale(run: GuideRun, runs: Sequence[GuideRun], stated: Mapping[str, float], file: str) -> _Scale:
-    """The conversion of a run.
-
-    Raises:
-        Question: nothing decides the rate of the pulses, or statements of it disagree.
-        InputError: a number that the log does not state, with the option that states it.
-    """
-    known = {**run.header, **stated}
-    is_maxim = run.program == "MaxIm"
+def _scale(
+    run: GuideRun, runs: Sequence[GuideRun], stated: Mapping[str, float], file: str, assumed: list[str]
+) -> tuple[float, float, float, float]:
+    """Pixel scale, cosine of the declination, rates of pulses and drive, arcsec/s; their sources go to `assumed`."""
+    known, is_maxim = {**run.header, **stated}, run.program == "MaxIm"
     needed = {"pixel_arcsec": "the pixel scale", "declination_deg": "the declination"}
     if is_maxim:
         needed |= {"pulse_arcsec_per_s": "the rate of a pulse"} if any(f.pulse_ms for f in run.frames) else {}
@@ -322,25 +293,24 @@ def _scale(run: GuideRun, runs: Sequence[GuideRun], stated: Mapping[str, float],
     if not 0 < pixel <= PIXEL_MAX_ARCSEC:
         raise refused("pixel-scale", file, line=run.line, pixel=pixel, most=PIXEL_MAX_ARCSEC)
     cosine = math.cos(math.radians(declination))
-    assumed = [f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg="]
-    assumed.append(f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=")
-    if is_maxim and "pulse_arcsec_per_s" not in stated:
-        pulse = 0.0
-        assumed.append("no corrections: the star's way is the axis' own")
-    elif "pulse_arcsec_per_s" in stated:
-        pulse = stated["pulse_arcsec_per_s"]
+    pulse, text = stated.get("pulse_arcsec_per_s", 0.0), "no corrections: the star's way is the axis' own"
+    if "pulse_arcsec_per_s" in stated:
+        text = f"pulses turn the axis by {pulse:g} arcsec/s, as stated"
         ratios = [abs(1000 * f.raw_px / f.pulse_ms) for f in run.frames if f.pulse_ms and is_maxim]
-        most = median(ratios) * pixel / cosine if ratios else math.inf
-        if pulse > (1 + RATES_AGREE) * most:
+        if ratios and pulse > (1 + RATES_AGREE) * (most := median(ratios) * pixel / cosine):
             # A guider corrects at most what it sees.
             raise asked("large-pulses", file, line=run.line, pulse=pulse, most=most)
-        assumed.append(f"pulses turn the axis by {pulse:g} arcsec/s, as stated")
-    else:
+    elif not is_maxim:
         pulse, text = _logged_pulse(run, runs, pixel, declination, file)
-        assumed.append(f"{text}; --assume pulse_arcsec_per_s=")
+        text += "; --assume pulse_arcsec_per_s="
     drive = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
-    assumed.append(f"the drive turns at {drive:.6g} arcsec/s; --assume drive_arcsec_per_s=")
-    return _Scale(pixel, cosine, pulse, drive, tuple(assumed))
+    assumed += [
+        f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg=",
+        f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=",
+        text,
+        f"the drive turns at {drive:.6g} arcsec/s; --assume drive_arcsec_per_s=",
+    ]
+    return pixel, cosine, pulse, drive
 
 
 def _hypotheses(run: GuideRun, pixel: float, declination_deg: float) -> dict[str, float]:
@@ -365,11 +335,7 @@ def _hypotheses(run: GuideRun, pixel: float, declination_deg: float) -> dict[str
 def _logged_pulse(
     run: GuideRun, runs: Sequence[GuideRun], pixel: float, declination_deg: float, file: str
 ) -> tuple[float, str]:
-    """Rate of the axis during a pulse, arcsec/s, and its source in words: the hypothesis that other statements support.
-
-    Raises:
-        Question: hypotheses that nothing decides between; statements that disagree; a rate above sidereal.
-    """
+    """Rate of the axis during a pulse, arcsec/s, and its source: the hypothesis that other statements support."""
     rates = _hypotheses(run, pixel, declination_deg)
     header, cosine = run.header, math.cos(math.radians(declination_deg))
     if not rates:
@@ -402,14 +368,9 @@ def _logged_pulse(
 
 def _other_rates(run: GuideRun, runs: Sequence[GuideRun]) -> float | None:
     """The rate that the runs of a log state alike, arcsec/s: one hypothesis is the same at all declinations."""
-    rows = []
-    for other in runs:
-        if {"pixel_arcsec", "declination_deg", "x_rate"} <= other.header.keys() and abs(
-            other.header["declination_deg"]
-        ) < 85:
-            rates = [*_hypotheses(other, other.header["pixel_arcsec"], other.header["declination_deg"]).values()]
-            if len(rates) == 2:
-                rows.append(rates)
+    headers = ((other, other.header.get("pixel_arcsec"), other.header.get("declination_deg")) for other in runs)
+    rates = [[*_hypotheses(o, p, d).values()] for o, p, d in headers if p is not None and d is not None and abs(d) < 85]
+    rows = [row for row in rates if len(row) == 2]
     if len(rows) < 2 or run.program == "KStars":
         return None
     spreads = [max(column) / min(column) - 1 for column in zip(*rows, strict=True)]
@@ -431,70 +392,64 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
     Raises:
         InputError: a number that neither `stated` nor the log contains, or fewer than three usable frames.
     """
-    scale = _scale(run, runs, stated, file)
-    sign = 1.0
-    assumed: tuple[str, ...] = ASSUMED
+    assumed: list[str] = []
+    pixel, cosine, pulse, drive = _scale(run, runs, stated, file, assumed)
+    sign = math.copysign(1.0, stated.get("pe_sign", 1.0)) if run.program == "MaxIm" else 1.0
     if run.program == "MaxIm":
-        sign = math.copysign(1.0, stated.get("pe_sign", 1.0))
         which, where = ("Y" if stated.get("ra_axis") == 2 else "X"), "lags" if sign > 0 else "is ahead"
-        assumed = ("a correction acts after its frame: motion = offset - corrections of the frames before",)
-        assumed += (f"sign: where {which} grows the axis {where}; --assume pe_sign={-sign:g} says the other",)
+        assumed.append("a correction acts after its frame: motion = offset - corrections of the frames before")
+        assumed.append(f"sign: where {which} grows the axis {where}; --assume pe_sign={-sign:g} says the other")
+    else:
+        assumed += ASSUMED
     moves: list[dict[str, Any]] = []
-    frames: list[tuple[float, int, float | None, str]] = []
-    pulse_sum, needs_move = 0.0, True
+    rows: list[_Row] = []
+    pulses, needs_move = 0.0, True
     for k, (_, time_s, raw, pulse_ms, settling) in enumerate(run.frames):
         needs_move = needs_move or k in run.breaks
-        status, value = "settling" if settling else "ok", None
-        if not settling:
-            if needs_move:
-                moves.append(_drive_move(len(moves), time_s, scale.drive_arcsec_per_s))
-                pulse_sum, needs_move = 0.0, False
-            motion = raw * scale.pixel_arcsec / scale.cos_declination + pulse_sum
-            value = scale.drive_arcsec_per_s * time_s - sign * motion
-        frames.append((time_s, len(moves) - 1, value, status))
-        pulse_sum += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
-    used = sum(value is not None for _, _, value, _ in frames)
+        if needs_move and not settling:
+            moves.append(_drive_move(len(moves), time_s, drive))
+            pulses, needs_move = 0.0, False
+        value = None if settling else drive * time_s - sign * (raw * pixel / cosine + pulses)
+        rows.append((time_s, len(moves) - 1, value, "settling" if settling else "ok"))
+        pulses += pulse_ms / 1000.0 * pulse
+    used = sum(value is not None for _, _, value, _ in rows)
     if used < 3:
         raise refused("few-frames", file, line=run.line, count=used)
-    # Frames before the first stretch belong to no move.
-    frames += [(time_s, -1, None, "dropped") for time_s in run.dropped_s]
     starts_s = [move["time_s"] for move in moves]
-    rows = [
-        (time_s, max(0, sum(start_s <= time_s for start_s in starts_s) - 1) if move < 0 else move, value, status)
-        for time_s, move, value, status in sorted(frames, key=lambda row: row[0])
-        if time_s >= starts_s[0]
-    ]
-    readings = [
-        {
-            "reading": k,
-            "move": move,
-            "value": None if v is None else round(v, 4),
-            "u": 0.0,
-            "status": status,
-            "time_s": t,
-        }
-        for k, (t, move, v, status) in enumerate(rows)
-    ]
-    axis = {**PRIORS, **_search_of([time_s for time_s, *_ in rows])}
-    header = {"rate": scale.drive_arcsec_per_s, **_header_of(run, file)}
+    rows += [(t, bisect_right(starts_s, t) - 1, None, "dropped") for t in run.dropped_s]
+    # Frames before the first stretch belong to no move.
+    rows = [(t, max(0, m), v, said) for t, m, v, said in sorted(rows, key=lambda row: row[0]) if t >= starts_s[0]]
     notes = (_frames_text(run, used, len(moves)), *_remarks(run))
-    return AxisRows(moves, readings, "arcsec", (*scale.assumed, *assumed), notes, header, axis)
+    return _drive_rows(drive, moves, rows, assumed, notes, _header_of(run, file))
+
+
+_Row = tuple[float, int, float | None, str]
+"""Time, move, value and status of a reading."""
+
+
+def _drive_rows(
+    rate: float,
+    moves: list[dict[str, Any]],
+    rows: Sequence[_Row],
+    assumed: Sequence[str],
+    notes: tuple[str, ...],
+    header: Mapping[str, object],
+    axis: Mapping[str, Any] | None = None,
+) -> AxisRows:
+    """Readings of a drive at a constant rate; an unknown period is from a minute to a third of the run, s, if any."""
+    readings = [
+        {"reading": k, "move": m, "value": None if v is None else round(v, 4), "u": 0.0, "status": status, "time_s": t}
+        for k, (t, m, v, status) in enumerate(rows)
+    ]
+    span_s = rows[-1][0] - rows[0][0]
+    between = {"periods_in": "seconds", "period_between": [60.0, round(span_s / 3.0, 0)]} if span_s > 360.0 else {}
+    entries = {**PRIORS, **(between if axis is None else axis)}
+    return AxisRows(moves, readings, "arcsec", tuple(assumed), notes, {"rate": rate, **header}, entries)
 
 
 def _drive_move(number: int, time_s: float, rate: float) -> dict[str, Any]:
-    return {
-        "move": number,
-        "segment": number,
-        "time_s": time_s,
-        "command": round(rate * time_s, 6),
-        "approach": "forward",
-    }
-
-
-def _search_of(times_s: Sequence[float]) -> dict[str, Any]:
-    """The range of an unknown period, s: from a minute to a third of the run; nothing for a short run."""
-    span_s = times_s[-1] - times_s[0]
-    return {"periods_in": "seconds", "period_between": [60.0, round(span_s / 3.0, 0)]} if span_s > 360.0 else {}
+    at = {"move": number, "segment": number, "time_s": time_s}
+    return {**at, "command": round(rate * time_s, 6), "approach": "forward"}
 
 
 # --- tables of time and periodic error -------------------------------------------------------------------------------
@@ -518,19 +473,16 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
     Raises:
         InputError: no times or errors, or fewer than three of them.
     """
-    known = columns_of(table)
-    worm = _WORM.search(text)
+    known, worm = columns_of(table), _WORM.search(text)
     errors = [n for n, c in known.items() if place_of(c.name.words, "periodic-error") is not None and c.numeric]
     times = [n for n, c in known.items() if c.name.has("time") and c.numeric]
     if worm and not errors and len(known) == 3:
         times, _, errors = ([name] for name in known)
     if len(errors) != 1 or len(times) != 1:
         raise refused("periodic-error", table.file, line=table.first_line, times=len(times), errors=len(errors))
-    time_unit, error_unit = known[times[0]].name.unit, known[errors[0]].name.unit
+    time_unit, unit = (known[name].name.unit for name in (*times, *errors))
     scale_s = time_unit.scale if time_unit and time_unit.kind == "time" else 1.0
-    scale = 3600.0 * error_unit.scale * error_unit.per_number if error_unit and error_unit.kind == "angle" else 1.0
-    sign = math.copysign(1.0, stated.get("pe_sign", 1.0))
-    rate = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
+    scale = 3600.0 * unit.scale * unit.per_number if unit and unit.kind == "angle" else 1.0
     pairs = [
         (scale_s * float(t), scale * float(e))
         for t, e in zip(table.columns[times[0]], table.columns[errors[0]], strict=True)
@@ -538,25 +490,23 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
     ]
     if len(pairs) < 3 or any(b[0] < a[0] for a, b in pairwise(pairs)):
         raise refused("few-errors", table.file, count=len(pairs))
-    readings = [
-        {"reading": k, "move": 0, "value": round(rate * t + sign * e, 4), "u": 0.0, "status": "ok", "time_s": t}
-        for k, (t, e) in enumerate(pairs)
-    ]
-    axis: dict[str, Any] = {**PRIORS, **_search_of([t for t, _ in pairs])}
-    unit, where = "arcsec" if error_unit is None else error_unit.name, "ahead of" if sign > 0 else "behind"
+    sign = math.copysign(1.0, stated.get("pe_sign", 1.0))
+    rate = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
+    columns = f"times in column {escaped(times[0])}, periodic error in column {escaped(errors[0])}"
     assumed = [
-        f"times in column {escaped(times[0])}, periodic error in column {escaped(errors[0])}, {unit}",
+        f"{columns}, {unit.name if unit else 'arcsec'}",
         f"the drive turns at {rate:.6g} arcsec/s; --assume drive_arcsec_per_s=",
-        f"sign: a positive error is an axis {where} its drive; --assume pe_sign={-sign:g} says the other",
+        f"sign: a positive error is an axis {'ahead of' if sign > 0 else 'behind'} its drive; "
+        f"--assume pe_sign={-sign:g} says the other",
+        *([f"the worm's period: {worm[1]} s, as the file says"] if worm else []),
     ]
-    if worm:
-        axis = {**PRIORS, "periods_in": "seconds", "periods": [float(worm[1])]}
-        assumed.append(f"the worm's period: {worm[1]} s, as the file says")
-    header = {"rate": rate, "name": table.file[:200]}
-    notes = (f"{len(pairs)} of {len(table)} rows are numbers",)
-    return AxisRows([_drive_move(0, pairs[0][0], rate)], readings, "arcsec", tuple(assumed), notes, header, axis)
+    axis = {"periods_in": "seconds", "periods": [float(worm[1])]} if worm else None
+    notes, header = (f"{len(pairs)} of {len(table)} rows are numbers",), {"name": table.file[:200]}
+    rows: list[_Row] = [(t, 0, rate * t + sign * e, "ok") for t, e in pairs]
+    return _drive_rows(rate, [_drive_move(0, pairs[0][0], rate)], rows, assumed, notes, header, axis)
 
 
+# --- texts -----------------------------------------------------------------------------------------------------------
 def _several(count: int, name: str) -> str:
     return f"{count} {name}{'s' * (count != 1)}"
 
@@ -572,23 +522,21 @@ def _frames_text(run: GuideRun, used: int, stretches: int) -> str:
     return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {words} ({', '.join(breaks)})"
 
 
-def _remarks(run: GuideRun) -> list[str]:
+def _remarks(run: GuideRun) -> Iterator[str]:
     """Further remarks on a run."""
-    remarks = [f"pier side {run.pier}"]
+    yield f"pier side {run.pier}"
     if not run.ended:
-        remarks.append("the log does not say that the run ended: it may be cut off")
-    times = [frame.time_s for frame in run.frames]
-    step = median([b - a for a, b in pairwise(times)] or [0.0])
-    pulses = [abs(frame.pulse_ms) for frame in run.frames]
+        yield "the log does not say that the run ended: it may be cut off"
+    step = median([b.time_s - a.time_s for a, b in pairwise(run.frames)] or [0.0])
+    pulses, limit_ms = [abs(frame.pulse_ms) for frame in run.frames], run.header.get("pulse_max_ms")
     if long_pulses := sum(p > 1000.0 * step for p in pulses):
-        remarks.append(f"{long_pulses} pulses last longer than the {step:.2g} s between frames and act in part later")
-    if (limit_ms := run.header.get("pulse_max_ms")) and (at_limit := sum(p >= limit_ms for p in pulses)):
-        remarks.append(f"{at_limit} pulses at their limit of {limit_ms:g} ms")
+        yield f"{long_pulses} pulses last longer than the {step:.2g} s between frames and act in part later"
+    if limit_ms and (at_limit := sum(p >= limit_ms for p in pulses)):
+        yield f"{at_limit} pulses at their limit of {limit_ms:g} ms"
     if n := run.counts["frame with a saturated star"]:
-        remarks.append(f"{n} frame{'s' * (n > 1)} with a saturated star, used")
+        yield f"{_several(n, 'frame')} with a saturated star, used"
     if n := run.counts["change of the RA algorithm"]:
-        remarks.append(f"{n} change{'s' * (n > 1)} of the RA algorithm during the run")
-    return remarks
+        yield f"{_several(n, 'change')} of the RA algorithm during the run"
 
 
 def _header_of(run: GuideRun, file: str) -> dict[str, object]:

@@ -11,26 +11,15 @@ import datetime
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_kind import ID_MAX
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import refused
-from tvsbayes.importing.cells import (
-    FieldCells,
-    Understood,
-    ask_column,
-    check_stated,
-    choice,
-    columns_of,
-    date_time,
-    is_segment,
-    left_out,
-    readable,
-    status_of,
-    time_of_day,
-)
+from tvsbayes.importing.cells import FieldCells, left_out, readable, status_of
+from tvsbayes.importing.clock import date_time, joined_clock, stamp_of, time_of_day
+from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of, missing_columns
 from tvsbayes.importing.counters import AXES, COUNTERS, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
@@ -39,6 +28,7 @@ from tvsbayes.importing.words import Unit, means, name_of, place_of, unit_named,
 PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
 CORRELATIONS = ("ruv_left", "ruv_right")
+NEEDED = (*PIXELS, *COUNTERS)
 FOUR_POINT = ("experiment", "point")
 """Fields of the four-point method; a table has both or neither."""
 PICTURES = ("picture", "picture_left", "picture_right")
@@ -71,7 +61,7 @@ _NAMED = (
 )
 """Fields in the order of their lists of words."""
 _MARKS = {"", *"01", "true", "false", "True", "False", "TRUE", "FALSE"}
-_LABELLED = re.compile(r"[^\W\d]+[ _.#-]*([0-9]{1,9})")
+_LABELLED = re.compile(r"\A[^\W\d]+[ _.#-]*([0-9]{1,9})\Z")
 """A number behind a word: P1, exp 07."""
 
 
@@ -126,43 +116,37 @@ class LookRows:
 
 
 # --- columns ---------------------------------------------------------------------------------------------------------
-class Claims(NamedTuple):
-    """Columns by field, fields that several columns match, and columns that match none."""
-
-    columns: dict[str, str]
-    ambiguous: dict[str, tuple[str, ...]]
-    unused: tuple[str, ...]
-
-    def open_fields(self, moves_listed: bool) -> list[str]:
-        """Fields that are needed and not known, and those that several columns match."""
-        looked, moved = not {*PIXELS}.isdisjoint(self.columns), not {*COUNTERS}.isdisjoint(self.columns)
-        needed = [*(PIXELS if looked or not moved else ()), *(COUNTERS if moved or not moves_listed else ())]
-        return [*(name for name in needed if name not in self.columns), *self.ambiguous]
-
-
-def look_claims(table: ForeignTable, stated: Mapping[str, str]) -> Claims:
-    """Assign columns to fields by their names.
+def look_columns(table: ForeignTable, stated: Mapping[str, str]) -> Chooser:
+    """The columns by field, as far as each field has one alone; a date and a time of day in two columns are one clock.
 
     Raises:
         InputError: a field or column that does not exist is stated.
     """
-    names = list(table.columns)
-    check_stated(names, stated, FIELDS)
-    taken = {name: text for name, text in stated.items() if text}
-    free = [text for text in names if text not in taken.values()]
-    taken |= {text: text for text in free if text in FIELDS and text not in stated}
-    claims: dict[str, list[str]] = {}
-    for text in (text for text in free if text not in taken.values()):
-        role = field_of(text)
-        # A reference or a home offset that changes with every row counts no homings.
-        cells = table.columns[text]
-        role = None if role == "segment" and not (is_segment(cells) or {*cells} <= _MARKS) else role
-        if role is not None and role not in taken and role not in stated:
-            claims.setdefault(role, []).append(text)
-    taken |= {role: texts[0] for role, texts in claims.items() if len(texts) == 1}
-    ambiguous = {role: tuple(texts) for role, texts in claims.items() if len(texts) > 1}
-    used = {*taken.values(), *(text for texts in ambiguous.values() for text in texts)}
-    return Claims(taken, ambiguous, tuple(text for text in names if text not in used))
+    chooser = Chooser.of(table, stated, FIELDS, _role)
+    clocks = chooser.roles.get("time_s", []) if chooser.is_open("time_s") else []
+    kinds = {_kind_of_clock(table.columns[name]): name for name in clocks}
+    if len(clocks) == 2 and kinds.keys() == {"day", "hour"}:
+        name = " ".join(clocks)
+        stamps = joined_clock(table.columns[kinds["day"]], table.columns[kinds["hour"]])
+        chooser.table = replace(table, columns={**table.columns, name: stamps})
+        chooser.known = {n: c for n, c in columns_of(chooser.table).items() if n not in clocks}
+        chooser.roles["time_s"] = [name]
+    for role, names in chooser.roles.items():
+        if len(names) == 1:
+            chooser.take(role)
+    return chooser
+
+
+def _kind_of_clock(cells: Sequence[str]) -> str:
+    """Whether all cells are days, or times of day; else ""."""
+    kinds = {"hour" if time_of_day(cell) is not None else "day" if date_time(cell) else "" for cell in cells}
+    return kinds.pop() if len(kinds) == 1 else ""
+
+
+def _role(column: Column) -> str | None:
+    """The field to which a column belongs; a reference that changes with every row counts no homings."""
+    role = field_of(column.name.text)
+    return role if role != "segment" or column.counts_homings or {*column.cells} <= _MARKS else None
 
 
 def field_of(name: str) -> str | None:
@@ -186,88 +170,84 @@ def field_of(name: str) -> str | None:
     return next((known[word] for word in words if word in known), None)
 
 
-def look_columns(table: ForeignTable, claims: Claims, moves_listed: bool) -> None:
-    """Ask for columns that are needed and not known, or known twice.
-
-    Raises:
-        Question: several columns could be one field, and nothing else is missing.
-        InputError: no column for a needed field.
-    """
-    wanted = list(dict.fromkeys(claims.open_fields(moves_listed)))
-    missing = [name for name in wanted if name not in claims.ambiguous]
-    if not wanted:
-        return
-    known = columns_of(table)
-    if not missing:
-        role, texts = next(iter(claims.ambiguous.items()))
-        answers = [choice({role: text}, known) for text in texts]
-        answers += [] if role in (*PIXELS, *COUNTERS) else [choice({role: ""}, known)]
-        listed = " or ".join(map(escaped, texts))
-        raise ask_column(table, f"{len(texts)} columns that could be {role} ({listed})", answers)
-    ambiguous = [f"{role} ({' or '.join(map(escaped, texts))})" for role, texts in claims.ambiguous.items()]
-    understood = ", ".join(f"{name} = {escaped(claims.columns[name])}" for name in FIELDS if name in claims.columns)
-    options = " ".join(f"--column {name}=NAME" for name in wanted)
-    optional = [name for name in wanted if name not in (*PIXELS, *COUNTERS)]
-    hint = f"; --column {optional[0]}= where there is none" if optional else ""
-    if {*claims.columns}.isdisjoint((*PIXELS, *COUNTERS)):
-        hint += "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
-    if not understood and not ambiguous:
-        hint += "; if that line is a title, delete it, so that the first holds the names of the columns"
-    said = {"fields": ", ".join([*missing, *ambiguous]), "known": understood or "nothing"}
-    names = ", ".join(map(escaped, table.columns))
-    raise refused("missing-column", table.file, line=table.first_line, names=names, options=options, hint=hint, **said)
+def _claimed_twice(chooser: Chooser) -> dict[str, list[str]]:
+    return {role: names for role, names in chooser.roles.items() if len(names) > 1 and chooser.is_open(role)}
 
 
-def _by_distance(claims: Claims, table: ForeignTable, stated: Mapping[str, str]) -> str | None:
+def open_fields(chooser: Chooser, moves_listed: bool) -> list[str]:
+    """Fields that are needed and not known, and those that several columns match."""
+    looked, moved = not {*PIXELS}.isdisjoint(chooser.taken), not {*COUNTERS}.isdisjoint(chooser.taken)
+    needed = [*(PIXELS if looked or not moved else ()), *(COUNTERS if moved or not moves_listed else ())]
+    missing = [name for name in needed if name not in chooser.taken]
+    return list(dict.fromkeys([*missing, *_claimed_twice(chooser)]))
+
+
+def _check_open(chooser: Chooser, moves_listed: bool) -> None:
+    """Ask for columns that are needed and not known, or known twice."""
+    twice, wanted = _claimed_twice(chooser), open_fields(chooser, moves_listed)
+    missing = [name for name in wanted if name not in twice]
+    texts = {role: " or ".join(map(escaped, names)) for role, names in twice.items()}
+    if wanted and not missing:
+        role, names = next(iter(twice.items()))
+        answers = [chooser.answer({role: name}) for name in (*names, *([] if role in NEEDED else [""]))]
+        raise chooser.ask(f"{len(names)} columns that could be {role} ({texts[role]})", answers)
+    if wanted:
+        optional = [name for name in wanted if name not in NEEDED]
+        hint = f"; --column {optional[0]}= where there is none" if optional else ""
+        if {*chooser.taken}.isdisjoint(NEEDED):
+            hint += "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it "
+            hint += "points"
+        known = {name: chooser.taken[name] for name in FIELDS if name in chooser.taken}
+        fields = [*missing, *(f"{role} ({text})" for role, text in texts.items())]
+        raise missing_columns(chooser.table, known, fields, wanted, hint)
+
+
+def _by_distance(chooser: Chooser) -> str | None:
     """The column of distances that names the sheet where no other does.
 
     That needs one unused column of a distance, whose every value fills one run of rows: a sheet that is put back to a
     distance is a new placement, and a distance of each row is none. A lab book's sheet stands at two distances in turn.
     """
-    seen, book = {*PIXELS} <= {*claims.columns}, {*FOUR_POINT} <= {*claims.columns}
-    if "target" in {*claims.columns, *claims.ambiguous, *stated} or not (seen or book):
+    seen, book = {*PIXELS} <= {*chooser.taken}, {*FOUR_POINT} <= {*chooser.taken}
+    unused = chooser.understood().unused
+    named = [text for text in unused if place_of(words_of(text), "distance", WORDS) is not None]
+    if not chooser.is_open("target") or not (seen or book) or len(named) != 1:
         return None
-    named = [text for text in claims.unused if place_of(words_of(text), "distance", WORDS) is not None]
-    if len(named) != 1:
-        return None
-    filled = [cell for cell in table.columns[named[0]] if cell]
-    runs = [filled[k] for k in range(len(filled)) if k == 0 or filled[k] != filled[k - 1]]
+    filled = [cell for cell in chooser.table.columns[named[0]] if cell]
     if book and not seen:
         return named[0] if len({*filled}) <= BOOK_PLACES_MAX else None
+    runs = [filled[k] for k in range(len(filled)) if k == 0 or filled[k] != filled[k - 1]]
     is_placement = runs and len({*runs}) == len(runs) and min(map(filled.count, runs)) >= PLACEMENT_ROWS
     return named[0] if is_placement else None
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
-def look_rows(table: ForeignTable, claims: Claims, wishes: LookWishes, moves_listed: int | None = None) -> LookRows:
+def look_rows(chooser: Chooser, wishes: LookWishes, moves_listed: int | None = None) -> LookRows:
     """Derive moves and looks from a table.
 
     Args:
-        table: the table.
-        claims: its columns by field; see `look_claims`, `look_columns`.
+        chooser: its columns by field; see `look_columns`.
         wishes: what the user states.
         moves_listed: number of moves that are known already, for a table of looks alone.
 
     Raises:
-        Question: times that step back.
-        InputError: a cell is not a value of its field, or the moves of looks are unknown.
+        Question: a field of two columns; times that step back.
+        InputError: no column for a needed field, a cell is not a value of its field, or the moves of looks are unknown.
     """
+    table, assumed = chooser.table, list[str]()
+    _check_open(chooser, moves_listed is not None)
     table.require_rows()
-    columns, unused, assumed = dict(claims.columns), list(claims.unused), list[str]()
-    if (distance := _by_distance(claims, table, wishes.columns)) is not None:
-        columns["target"] = distance
-        unused.remove(distance)
+    if (distance := _by_distance(chooser)) is not None:
+        chooser.taken["target"] = distance
+    columns, unused = dict(chooser.taken), [*chooser.understood().unused]
     seen = not {*PIXELS}.isdisjoint(columns)
     if seen or not wishes.pictures:
         # Pictures of looks with centres are of no use here.
-        named = [name for name in BOOKED if name in columns]
-        unused += [
-            columns.pop(name)
-            for name in named
-            if name not in wishes.columns and (seen or name == "direction" or not {*FOUR_POINT} <= {*columns})
-        ]
+        named = [name for name in BOOKED if name in columns and name not in wishes.columns]
+        is_book = not seen and {*FOUR_POINT} <= {*columns}
+        unused += [columns.pop(name) for name in named if not is_book or name == "direction"]
     cells = FieldCells(table, columns)
-    moves, units = None, _units(cells, wishes)
+    moves, aperture = None, _aperture_unit(cells, wishes)
     if all(name in cells for name in COUNTERS):
         rows = moves_of_rows(cells, whole_counters(cells), assumed, relative=wishes.relative, approach=wishes.approach)
         moves, move_of_row = rows.moves, rows.move_of_row
@@ -278,87 +258,42 @@ def look_rows(table: ForeignTable, claims: Claims, wishes: LookWishes, moves_lis
         what = "pixels" if seen else "a point or a picture"
         text = f"moves: those of the table; rows without {what} are moves without a look, which play remembers too"
         assumed.insert(len(assumed) - wishes.relative, text)
-    if moves is not None and not seen and not book:
+    elif moves is not None:
         assumed += _renumbered(cells, move_of_row)
-    looks: list[dict[str, Any]] | None = None
-    row_of_look: list[int] = []
-    if seen or book:
-        looks, row_of_look = _looks(cells, move_of_row, wishes, assumed, seen)
+    looks: dict[int, dict[str, Any]] = (
+        _looks(cells, move_of_row, wishes, aperture, assumed, seen) if seen or book else {}
+    )
     if distance is not None:
         assumed.append(
             f"target: every value of {escaped(distance)} is one placement of the sheet; --column target= says no"
         )
-    files = [cells.text(name) for name in PICTURES if name in cells]
-    pictures = [tuple(column[row].strip() for column in files) for row in row_of_look] if files else []
+    files = {columns[name]: cells.text(name) for name in PICTURES if name in cells}
     if files and not wishes.pictures:
-        names = ", ".join(escaped(columns[name]) for name in PICTURES if name in columns)
+        names = ", ".join(map(escaped, files))
         assumed.append(
             f"pictures: {names} names them; --pictures FOLDER brings them into frames/, for `tvsbayes detect`"
         )
-    created = _created(cells.text("time_s")[0]) if moves is not None else None
-    order = Understood({name: columns[name] for name in FIELDS if name in columns}, tuple(unused))
-    lines = [table.lines[row] for row in row_of_look]
-    directions = [cells.text("direction")[row] for row in row_of_look] if "direction" in cells else []
+    units = {**dict.fromkeys(PIXELS, f"px from {wishes.pixels_from}"), **dict.fromkeys(PIXEL_SDS, "px")}
+    units |= {**dict.fromkeys(COUNTERS, "steps"), "aperture_deg": aperture.name}
+    unit = name_of(columns.get("time_s", "")).unit
+    units["time_s"] = unit.name if unit is not None and unit.kind == "time" else "s"
+    directions = cells.text("direction")
     return LookRows(
-        moves, looks, pictures, directions or [""] * len(lines), lines, created, tuple(assumed), order, units
+        moves,
+        list(looks.values()) if seen or book else None,
+        [tuple(column[row].strip() for column in files.values()) for row in looks] if files else [],
+        [directions[row] for row in looks],
+        [table.lines[row] for row in looks],
+        stamp_of(cells.text("time_s")[0]) if moves is not None else None,
+        tuple(assumed),
+        Understood({name: columns[name] for name in FIELDS if name in columns}, tuple(unused)),
+        units,
     )
 
 
-def with_one_clock(table: ForeignTable, claims: Claims) -> tuple[ForeignTable, Claims]:
-    """The table with a column of dates and one of times of day as one column of times."""
-    names = claims.ambiguous.get("time_s", ())
-    cells = [table.columns[name] for name in names]
-    if len(names) != 2:
-        return table, claims
-    kinds = [
-        {
-            "day" if time_of_day(cell) is None and date_time(cell) else "hour" if time_of_day(cell) is not None else ""
-            for cell in own
-        }
-        for own in cells
-    ]
-    if sorted(map(sorted, kinds)) != [["day"], ["hour"]]:
-        return table, claims
-    days, hours = cells if kinds[0] == {"day"} else cells[::-1]
-    name = " ".join(names)
-    stamps = tuple(f"{_day(day)}T{_hour(hour)}" for day, hour in zip(days, hours, strict=True))
-    ambiguous = {role: texts for role, texts in claims.ambiguous.items() if role != "time_s"}
-    columns = {**claims.columns, "time_s": name}
-    return replace(table, columns={**table.columns, name: stamps}), Claims(columns, ambiguous, claims.unused)
-
-
-def _created(cell: str) -> datetime.datetime | None:
-    """The date and time of a cell, without a zone where it states none."""
-    at = None if NUMBER.fullmatch(cell) else date_time(cell)
-    zoned = re.search(r"(?:Z|[+-]\d\d:?\d\d)$", cell)
-    return at if at is None or zoned else at.replace(tzinfo=None)
-
-
-def _day(cell: str) -> str:
-    at = date_time(cell)
-    assert at is not None
-    return at.date().isoformat()
-
-
-def _hour(cell: str) -> str:
-    seconds = time_of_day(cell) or 0.0
-    return f"{int(seconds // 3600):02d}:{int(seconds // 60) % 60:02d}:{seconds % 60:09.6f}"
-
-
-def _units(cells: FieldCells, wishes: LookWishes) -> dict[str, str]:
-    """Unit by field, as shown."""
-    units = {**dict.fromkeys(PIXELS, f"px from {wishes.pixels_from}"), **dict.fromkeys(PIXEL_SDS, "px")}
-    units |= dict.fromkeys(COUNTERS, "steps")
-    if "aperture_deg" in cells:
-        units["aperture_deg"] = _aperture_unit(cells, wishes).name
-    if "time_s" in cells:
-        unit = name_of(cells.columns["time_s"]).unit
-        units["time_s"] = unit.name if unit is not None and unit.kind == "time" else "s"
-    return units
-
-
 def _aperture_unit(cells: FieldCells, wishes: LookWishes) -> Unit:
-    unit = name_of(cells.columns["aperture_deg"]).unit if wishes.angle_unit is None else unit_named(wishes.angle_unit)
+    named = name_of(cells.columns.get("aperture_deg", "")).unit
+    unit = named if wishes.angle_unit is None else unit_named(wishes.angle_unit)
     return unit if unit is not None and unit.kind == "angle" else unit_named("deg")
 
 
@@ -394,73 +329,57 @@ def _renumbered(cells: FieldCells, move_of_row: Sequence[int]) -> list[str]:
 
 
 def _looks(
-    cells: FieldCells, move_of_row: Sequence[int], wishes: LookWishes, assumed: list[str], seen: bool
-) -> tuple[list[dict[str, Any]], list[int]]:
-    """The looks of a table, with centres or waiting for pictures, and the row of each."""
-    pixels = [cells.numbers(name, -PIXEL_MAX, PIXEL_MAX, optional=True) for name in PIXELS]
-    sds = [cells.numbers(name, -SD_MAX, SD_MAX, optional=True) if name in cells else None for name in PIXEL_SDS]
-    if seen and any(column is None for column in sds):
+    cells: FieldCells,
+    move_of_row: Sequence[int],
+    wishes: LookWishes,
+    aperture: Unit,
+    assumed: list[str],
+    seen: bool,
+) -> dict[int, dict[str, Any]]:
+    """The looks of a table by row, with centres or waiting for pictures; the other rows are moves without a look."""
+    pixels = {name: cells.numbers(name, -PIXEL_MAX, PIXEL_MAX, optional=True) for name in PIXELS}
+    sds = {name: cells.numbers(name, -SD_MAX, SD_MAX, optional=True) for name in PIXEL_SDS if name in cells}
+    if seen and len(sds) < len(PIXEL_SDS):
         text = f"standard uncertainty of a centroid: {wishes.sd_px:g} px; --sd-px states another"
-        assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in sds) else text)
+        assumed.append(text if sds else f"{text}, the fit finds the scale")
     numbers = cells.whole("spot", 0, ID_MAX, optional=True)
-    statuses, targets = cells.text("status"), cells.text("target")
-    remarks = list[str]()
+    statuses, remarks = cells.text("status"), list[str]()
     four = _four_point(cells, remarks, not seen)
-    pictures = [cells.text(name) for name in PICTURES if name in cells]
-    marks = [*pixels, [status or None for status in statuses]] if seen else [four["point"] if four else [], *pictures]
-    # The other rows are moves without a look.
-    is_look = [
-        any(row) if not seen else any(v is not None for v in row) for row in zip(*(m for m in marks if m), strict=True)
-    ]
-    look_numbers = [number for number, is_one in zip(numbers, is_look, strict=True) if is_one]
-    unique = None not in look_numbers and len({*look_numbers}) == len(look_numbers)
+    waiting = [four.get("point", []), *(cells.text(name) for name in PICTURES if name in cells)]
+    if seen:
+        marks = zip(*pixels.values(), statuses, strict=True)
+        rows = [row for row, mark in enumerate(marks) if any(value not in (None, "") for value in mark)]
+    else:
+        rows = [row for row, mark in enumerate(zip(*filter(None, waiting), strict=True)) if any(mark)]
+    given = [numbers[row] for row in rows]
+    unique = None not in given and len({*given}) == len(given)
     if "spot" in cells and not unique:
         assumed.append("spot: numbers are missing or repeated, so looks are numbered by their rows")
     assumed += remarks
-    correlations = {
-        name: [
-            0.0 if value is None else value
-            for value in cells.numbers(name, -CORRELATION_MAX, CORRELATION_MAX, optional=True)
-        ]
-        for name in CORRELATIONS
-        if name in cells
-    }
-    readings: list[float | None] = [None] * len(statuses)
-    if "aperture_deg" in cells:
-        unit = _aperture_unit(cells, wishes)
-        limit = APERTURE_MAX_DEG / (scale := unit.scale * unit.per_number)
-        readings = [
-            None if v is None else scale * v for v in cells.numbers("aperture_deg", -limit, limit, optional=True)
-        ]
-    looks, row_of_look = list[dict[str, Any]](), list[int]()
-    for row, move in enumerate(move_of_row):
-        if not is_look[row]:
-            continue
-        centre = dict(zip(PIXELS, (column[row] for column in pixels), strict=True))
-        if not seen:
-            waits = means(statuses[row], "good") or statuses[row].strip().lower() in ("", UNDETECTED)
-            status = UNDETECTED if waits else status_of(cells, row, {}, "look")
+    values: dict[str, Sequence[Any]] = dict(four)
+    for name in (name for name in CORRELATIONS if name in cells):
+        values[name] = [v or 0.0 for v in cells.numbers(name, -CORRELATION_MAX, CORRELATION_MAX, optional=True)]
+    readings = cells.scaled("aperture_deg", aperture, -APERTURE_MAX_DEG, APERTURE_MAX_DEG)
+    looks, targets = dict[int, dict[str, Any]](), cells.text("target")
+    for row in rows:
+        centre = {name: column[row] for name, column in pixels.items()}
+        word = statuses[row].strip()
+        if seen:
+            status = "no centre in the table" if None in centre.values() and not word else None
         else:
-            no_centre = None in centre.values() and not statuses[row].strip()
-            status = "no centre in the table" if no_centre else status_of(cells, row, centre, "look")
-        values = {name: column[row] for name, column in (four | correlations).items()}
+            status = UNDETECTED if means(statuses[row], "good") or word.lower() in ("", UNDETECTED) else None
+        status = status or status_of(cells, row, centre if seen else {}, "look")
+        look: dict[str, Any] = {"spot": numbers[row] if unique else row, "move": move_of_row[row]}
+        look |= {"target": readable(targets[row], "sheet", 100), "aperture_deg": readings[row], "status": status}
+        look |= {name: column[row] for name, column in values.items()}
         if status == "ok":
-            values |= {name: value - wishes.pixels_from for name, value in centre.items() if value is not None}
-            values |= {n: _sd_px(cells, row, n, column, wishes) for n, column in zip(PIXEL_SDS, sds, strict=True)}
-        number = numbers[row] if unique else row
-        target = readable(targets[row], "sheet", 100)
-        looks.append(
-            {"spot": number, "move": move, "target": target, "aperture_deg": readings[row], "status": status, **values}
-        )
-        row_of_look.append(row)
+            look |= {name: value - wishes.pixels_from for name, value in centre.items() if value is not None}
+            look |= {name: _sd_px(cells, row, name, sds[name]) if name in sds else wishes.sd_px for name in PIXEL_SDS}
+        looks[row] = look
     if "status" in cells:
-        waiting = [
-            s
-            for s, is_one in zip(statuses, is_look, strict=True)
-            if seen or (is_one and s.strip().lower() != UNDETECTED)
-        ]
-        assumed += left_out(cells, waiting, "look")
-    return looks, row_of_look
+        of_looks = statuses if seen else [statuses[r] for r in rows if statuses[r].strip().lower() != UNDETECTED]
+        assumed += left_out(cells, of_looks, "look")
+    return looks
 
 
 def _four_point(cells: FieldCells, assumed: list[str], book: bool) -> dict[str, list[int | None]]:
@@ -480,14 +399,9 @@ def _four_point(cells: FieldCells, assumed: list[str], book: bool) -> dict[str, 
                 numbers[row], filled = numbers[row - 1], filled + 1
     if filled:
         assumed.append(f"experiment: {filled} rows with a point alone are of the experiment above them")
-    texts = {"experiment": numbers, "point": cells.text("point")}
     # P1, exp 07.
-    plain = {
-        cells.columns[name]: tuple(
-            _LABELLED.sub(r"\1", cell) if _LABELLED.fullmatch(cell) else cell for cell in texts[name]
-        )
-        for name in fields
-    }
+    texts = {cells.columns["experiment"]: numbers, cells.columns["point"]: cells.text("point")}
+    plain = {name: tuple(_LABELLED.sub(r"\1", cell) for cell in own) for name, own in texts.items()}
     numbered = replace(cells, table=replace(cells.table, columns={**cells.table.columns, **plain}))
     limits = {"experiment": (0, ID_MAX), "point": (1, POINT_MAX)}
     rows = list(zip(*(numbered.whole(name, *limits[name], optional=True) for name in FOUR_POINT), strict=True))
@@ -498,10 +412,8 @@ def _four_point(cells: FieldCells, assumed: list[str], book: bool) -> dict[str, 
     return {name: list(column) for name, column in zip(FOUR_POINT, zip(*whole, strict=True), strict=True)}
 
 
-def _sd_px(cells: FieldCells, row: int, name: str, column: Sequence[float | None] | None, wishes: LookWishes) -> float:
+def _sd_px(cells: FieldCells, row: int, name: str, column: Sequence[float | None]) -> float:
     """The standard uncertainty of a centre; cells of rows without a centre are not checked."""
-    if column is None:
-        return wishes.sd_px
     sd = column[row]
     if sd is None or sd < SD_MIN:
         allowed = f"a number from {SD_MIN:g} to {SD_MAX:g} where the look is ok"

@@ -17,6 +17,7 @@ from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX, NUMBER
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.importing.asking import refused
+from tvsbayes.importing.clock import over_midnight
 from tvsbayes.importing.table import WORKBOOKS, ForeignTable, Row, Rows, headed, table_of_rows
 from tvsbayes.importing.text import text_of, text_table_rows
 from tvsbayes.importing.workbook import sheet_rows
@@ -114,8 +115,8 @@ USUAL_SHARE = 0.97
 """Share of a name's values with one number of decimals, from which a value with fewer was cut."""
 REPEATED_SHARE = 0.1
 """Largest share of lines equal to the line before, below which such a line was sent twice."""
-DAY_S = 86400.0
 NAMED_MAX = 6
+TIME = "time (s)"
 _PAIR = re.compile(
     r"(?P<name>[^\W\d][^:=,;|\t]*?)\s*[:=]\s*(?P<value>[+-]?(?:\d+[.,]\d+|\d+\.?|\.\d+)(?:[eE][+-]?\d+)?)"
     r"(?:\s*(?P<unit>\u00b0|mm|um|\u00b5m|deg|rad|counts|steps|ms|us|s)(?![\w:]))?\s*(?:[,;|\t]\s*|\s+|$)"
@@ -155,28 +156,30 @@ def paired_rows(text: str, file: str) -> Rows | None:
     rows, orphans = _blocks(stream, usual)
     if len(usual) < 2 or len(rows) < 2:
         return None
-    damaged |= orphans
     names = [*usual, *(name for name in counts if name not in usual)]
-    times = _times([row[usual[0]].clock_s for row in rows])
-    head = ["time (s)"] * (timed := times is not None and "time (s)" not in names) + names
-    body = []
-    for k, row in enumerate(rows):
-        cells = [row[name].value if name in row else "" for name in names]
-        first = min(pair.line for pair in row.values())
-        body.append(Row(first, [f"{times[k]:.6f}", *cells] if timed and times is not None else cells))
-    notes = ['lines of "name: value"']
+    clocks_s = [clock_s for row in rows if (clock_s := row[usual[0]].clock_s) is not None]
+    times_s = over_midnight(clocks_s) if len(clocks_s) == len(rows) and TIME not in names else []
+    body = [
+        Row(
+            min(pair.line for pair in row.values()),
+            [
+                *(f"{times_s[k] - times_s[0]:.6f}" for _ in times_s[:1]),
+                *(row[name].value if name in row else "" for name in names),
+            ],
+        )
+        for k, row in enumerate(rows)
+    ]
     others = [n for n, _ in lines if n not in pairs_of]
-    between = [n for n in others if body[0].line < n]
-    damaged |= set(between)
-    if n := len(others) - len(between):
+    before = [n for n in others if n <= body[0].line]
+    damaged |= orphans | ({*others} - {*before})
+    notes = ['lines of "name: value"']
+    if n := len(before):
         notes.append(f"{n} line{'s' * (n > 1)} before the first row left out")
     if damaged:
         named = ", ".join(map(str, sorted(damaged)[:NAMED_MAX])) + " ..." * (len(damaged) > NAMED_MAX)
-        one = len(damaged) == 1
-        notes.append(
-            f"line{'' if one else 's'} {named} left out: lost, repeated or cut beside {'it' if one else 'them'}"
-        )
-    return Rows([Row(body[0].line, head), *body], notes)
+        s, them = ("", "it") if len(damaged) == 1 else ("s", "them")
+        notes.append(f"line{s} {named} left out: lost, repeated or cut beside {them}")
+    return Rows([Row(body[0].line, [*([TIME] if times_s else []), *names]), *body], notes)
 
 
 def _pairs(number: int, line: str) -> list[_Pair]:
@@ -184,15 +187,11 @@ def _pairs(number: int, line: str) -> list[_Pair]:
     clock = _CLOCK.match(line)
     content = line[clock.end() if clock else 0 :]
     found = list(_PAIR.finditer(content))
-    if not found or "".join(match.group() for match in found) != content:
+    if "".join(match.group() for match in found) != content:
         return []
     clock_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) if clock else None
-    return [
-        _Pair(
-            number, m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""), m["value"].replace(",", "."), clock_s
-        )
-        for m in found
-    ]
+    names = [m["name"].strip() + (f" ({m['unit']})" if m["unit"] else "") for m in found]
+    return [_Pair(number, name, m["value"].replace(",", "."), clock_s) for name, m in zip(names, found, strict=True)]
 
 
 def _repeated_lines(lines: list[tuple[int, str]], pairs_of: dict[int, list[_Pair]]) -> set[int]:
@@ -203,18 +202,13 @@ def _repeated_lines(lines: list[tuple[int, str]], pairs_of: dict[int, list[_Pair
 
 def _cut_lines(stream: list[_Pair]) -> set[int]:
     """Lines with a value of fewer decimals than nearly all others of its name."""
-    decimals = {pair: len(pair.value.partition(".")[2]) for pair in stream}
-    by_name: dict[str, Counter[int]] = {}
-    for pair, places in decimals.items():
-        by_name.setdefault(pair.name, Counter())[places] += 1
-    usual = {name: counts.most_common(1)[0] for name, counts in by_name.items()}
-    return {
-        pair.line
-        for pair, places in decimals.items()
-        if places < usual[pair.name][0]
-        and by_name[pair.name].total() >= VALUES_MIN
-        and usual[pair.name][1] >= USUAL_SHARE * (by_name[pair.name].total() - 1)
-    }
+    cut = set[int]()
+    for name in {pair.name for pair in stream}:
+        places = [(len(pair.value.partition(".")[2]), pair.line) for pair in stream if pair.name == name]
+        (usual, count), *_ = Counter(decimals for decimals, _ in places).most_common(1)
+        if len(places) >= VALUES_MIN and count >= USUAL_SHARE * (len(places) - 1):
+            cut |= {line for decimals, line in places if decimals < usual}
+    return cut
 
 
 def _blocks(stream: list[_Pair], usual: list[str]) -> tuple[list[dict[str, _Pair]], set[int]]:
@@ -222,70 +216,29 @@ def _blocks(stream: list[_Pair], usual: list[str]) -> tuple[list[dict[str, _Pair
 
     Where several values of the last names follow one of the first, each makes a row with it.
     """
-    signatures = Counter(tuple(names) for names in _split(stream, usual))
-    signature = signatures.most_common(1)[0][0] if signatures else ()
-    rows: list[dict[str, _Pair]] = []
-    orphans: set[int] = set()
-    block: list[_Pair] = []
-    extras: dict[str, _Pair] = {}
-
-    def end() -> None:
-        names = [pair.name for pair in block]
-        heads = {pair.name: pair for pair in block if signature.count(pair.name) == 1}
-        repeats = [name for name in dict.fromkeys(signature) if signature.count(name) > 1]
-        if not block or names[0] != signature[0]:
-            orphans.update(pair.line for pair in block)
-        elif len(heads) < len(set(signature) - set(repeats)):
+    names = [pair.name for pair in stream if pair.name in usual]
+    starts = {k for k, name in enumerate(names) if name == usual[0]}
+    parts = Counter(tuple(names[a:b]) for a, b in pairwise(sorted({0, len(names)} | starts)))
+    signature = parts.most_common(1)[0][0] if parts else ("",)
+    heads = {name for name in signature if signature.count(name) == 1}
+    repeats = [name for name in dict.fromkeys(signature) if name not in heads]
+    rows, orphans = list[dict[str, _Pair]](), set[int]()
+    block, extras = list[_Pair](), dict[str, _Pair]()
+    for pair in (*stream, None):
+        if block and (pair is None or pair.name == signature[0]):
+            head = {of.name: of for of in block if of.name in heads}
+            values = [[of for of in block if of.name == name] for name in repeats]
             # A move whose reading was lost is a move.
-            rows.append({**heads, **extras})
-        elif not repeats:
-            rows.append({**heads, **extras})
-        else:
-            values = [[pair for pair in block if pair.name == name] for name in repeats]
-            rows.extend(
-                {**heads, **extras, **dict(zip(repeats, parts, strict=True))} for parts in zip(*values, strict=False)
-            )
-        block.clear()
-        extras.clear()
-
-    for pair in stream:
-        if pair.name not in usual:
+            together = zip(*values, strict=False) if values and len(head) == len(heads) else [()]
+            rows += [{**head, **extras, **{of.name: of for of in part}} for part in together]
+            block, extras = [], {}
+        if pair is not None and pair.name not in usual:
             extras[pair.name] = pair
-            continue
-        if pair.name == (signature[0] if signature else "") and block:
-            end()
-        place = len(block)
-        if place < len(signature) and pair.name == signature[place]:
+        elif pair is not None and len(block) < len(signature) and pair.name == signature[len(block)]:
             block.append(pair)
-        elif pair.name in signature[place:] and not block:
+        elif pair is not None:
             orphans.add(pair.line)
-        else:
-            orphans.add(pair.line)
-    end()
     return rows, orphans
-
-
-def _split(stream: list[_Pair], usual: list[str]) -> list[list[str]]:
-    """Names of the usual values, from one first name to the next."""
-    blocks: list[list[str]] = []
-    for pair in stream:
-        if pair.name in usual:
-            if pair.name == usual[0] or not blocks:
-                blocks.append([])
-            blocks[-1].append(pair.name)
-    return blocks
-
-
-def _times(clocks_s: list[float | None]) -> list[float] | None:
-    """Seconds since the first row; a step back by more than half a day is midnight."""
-    if any(clock is None for clock in clocks_s):
-        return None
-    times, days = [], 0.0
-    for k, clock_s in enumerate(clocks_s):
-        if k and clock_s < clocks_s[k - 1] - DAY_S / 2:  # type: ignore[operator]
-            days += DAY_S
-        times.append(clock_s + days)  # type: ignore[operator]
-    return [time_s - times[0] for time_s in times]
 
 
 def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:

@@ -203,11 +203,7 @@ def _are_runs(runs: Sequence[Run], table: ForeignTable) -> bool:
 
 
 def _command(table: ForeignTable, runs: Sequence[Run]) -> str:
-    """The column of the commands beside the runs.
-
-    Raises:
-        Question: none or several could be it.
-    """
+    """The column of the commands beside the runs."""
     names = {run.name.text for run in runs}
     rest = [name_of(text) for text, cells in table.columns.items() if text not in names and _numeric(cells)]
     rest = [name for name in rest if all(table.columns[name.text])]
@@ -243,11 +239,7 @@ def counts_rows(cells: Sequence[str]) -> bool:
 
 
 def _order(table: ForeignTable, runs: Sequence[Run]) -> str:
-    """`FORWARD` where odd and even, first and second runs agree within scatter.
-
-    Raises:
-        Question: they differ, or the columns may be repeated readings of one stop.
-    """
+    """`FORWARD` where odd and even, first and second runs agree within scatter."""
     names = [run.name.text for run in runs]
     values = [[float(cell) if cell else math.nan for cell in table.columns[name]] for name in names]
     is_reading = _are_readings(runs)

@@ -12,13 +12,15 @@ import json
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice, permutations
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tvsbayes.errors import Candidate, InputError, escaped
 from tvsbayes.importing.asking import asked, refused
-from tvsbayes.importing.cells import SUMMER_TIME_S
+from tvsbayes.importing.clock import SUMMER_TIME_S
+from tvsbayes.importing.columns import line_through
 from tvsbayes.importing.table import ForeignTable, table_of
 from tvsbayes.importing.words import place_of, words_of
 
@@ -33,6 +35,8 @@ ROWS_KEPT = 2000
 INFLATED_BYTES_MAX, MESSAGE_BYTES_MAX = 64 * 2**20, 2**20
 KLIPPER_TURN = 65536
 """Counts per turn of an angle sensor in Klipper (klippy/extras/angle.py, ANGLE_BITS)."""
+PAIRS_MAX = 20
+"""Largest number of pairs of series that are asked about."""
 INVALID = 3
 """Severity of a value that is none (EPICS, alarm.h)."""
 _CAMONITOR = re.compile(
@@ -160,12 +164,7 @@ def _series(rows: Sequence[tuple[float, float]]) -> Series:
 
 
 def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> tuple[str, str]:
-    """Names of the series of command and reading: as stated, else by words in their names.
-
-    Raises:
-        Question: the names do not decide.
-        InputError: fewer than two series change.
-    """
+    """Names of the series of command and reading: as stated, else by words in their names."""
     changing = [name for name, values in series.items() if values.changes]
     listed = ", ".join(f"{escaped(name)} ({len(series[name].times_s)} values)" for name in changing) or "none"
     by_name = {name: name for name in series} | {re.sub(r" \([^()]*\)$", "", name): name for name in series}
@@ -182,27 +181,23 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
             names[field] = matching[0]
             free.remove(matching[0])
     missing = [field for field in ("command", "value") if field not in names]
-    if len(missing) == 1 and len(free) == 1:
-        names[missing[0]] = free[0]
-    elif missing and len(free) < len(missing):
+    if len(free) < len(missing):
         raise refused("few-series", file, series=listed)
-    elif missing:
-        pairs = [
-            {**names, "command": c, "value": v}
-            for c in ([names["command"]] if "command" in names else free)
-            for v in ([names["value"]] if "value" in names else free)
-            if c != v
-        ]
-        candidates = [
-            Candidate(
-                f"command {escaped(p['command'])}, reading {escaped(p['value'])}",
-                ("--column", f"command={p['command']}", "--column", f"value={p['value']}"),
-                {name: [f"{x:g}" for x in series[name].values[:3]] for name in p.values()},
-            )
-            for p in pairs
-        ]
-        raise asked("series", file, answers=candidates, series=listed)
-    return names["command"], names["value"]
+    pairs = [
+        {**names, **dict(zip(missing, chosen, strict=True))}
+        for chosen in islice(permutations(free, len(missing)), PAIRS_MAX)
+    ]
+    if len(pairs) == 1:
+        return pairs[0]["command"], pairs[0]["value"]
+    candidates = [
+        Candidate(
+            f"command {escaped(p['command'])}, reading {escaped(p['value'])}",
+            ("--column", f"command={p['command']}", "--column", f"value={p['value']}"),
+            {name: [f"{x:g}" for x in series[name].values[:3]] for name in p.values()},
+        )
+        for p in pairs
+    ]
+    raise asked("series", file, answers=candidates, series=listed)
 
 
 def _joined(
@@ -239,9 +234,7 @@ def _command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]
 
 def _scatter(commands: np.ndarray, values: np.ndarray) -> float:
     """Scatter of readings about a line over their commands; infinite where these are one."""
-    if len(np.unique(commands)) < 2:
-        return np.inf
-    return float(np.std(values - np.polyval(np.polyfit(commands, values, 1), commands)))
+    return float(np.std(line_through(commands, values)[1])) if len(np.unique(commands)) > 1 else np.inf
 
 
 # --- Klipper ---------------------------------------------------------------------------------------------------------
@@ -338,11 +331,7 @@ def _messages(data: bytes, file: str) -> Iterator[dict[str, Any]]:
 
 
 def _checked(params: Mapping[str, Any], kind: str, file: str) -> np.ndarray:
-    """Rows of one message: of angles time and counts; of a queue of steps, see `_queue`.
-
-    Raises:
-        InputError: fields of another form.
-    """
+    """Rows of one message: of angles time and counts; of a queue of steps, see `_queue`."""
     try:
         with np.errstate(all="raise"):
             rows = (

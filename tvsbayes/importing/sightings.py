@@ -13,20 +13,8 @@ from typing import Any
 
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.asking import listed
-from tvsbayes.importing.cells import (
-    Column,
-    FieldCells,
-    Understood,
-    ask_column,
-    check_stated,
-    choice,
-    columns_of,
-    is_segment,
-    left_out,
-    missing_column,
-    status_of,
-)
+from tvsbayes.importing.cells import FieldCells, left_out, status_of
+from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of
 from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
@@ -44,8 +32,12 @@ TURNS_MAX = 3
 """Turns of azimuth that a table may count."""
 UNITS_ASKED = ("mrad", "arcmin", "arcsec")
 """Units of elevations beyond 90 deg, in the order in which they are asked for."""
-ANGLE_MAX_DEG, ELEVATION_MAX_DEG = 360.0 * TURNS_MAX, 90.0
-U_MAX_DEG = 30.0
+ELEVATION_MAX_DEG = 90.0
+LIMITS_DEG = {
+    "azimuth_deg": (-360.0 * TURNS_MAX, 360.0 * TURNS_MAX),
+    "elevation_deg": (-ELEVATION_MAX_DEG, ELEVATION_MAX_DEG),
+    "u_deg": (0.0, 30.0),
+}
 
 
 @dataclass(frozen=True)
@@ -98,25 +90,12 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
     table.require_rows()
     known = sighting_columns(table, wishes.columns)
     assumed = list(known.remarks)
-    cells, notations = FieldCells(table, known.columns).with_plain(*NEEDED, "u_deg")
-    assumed += [column.remark for column in notations.values() if column.remark]
-    written = {name: column.unit for name, column in notations.items()}
+    cells, written = FieldCells(table, known.columns).with_plain((*NEEDED, "u_deg"), assumed)
     units = _units(cells, columns_of(table), written, wishes, assumed)
     of_encoders = [name for name in COUNTERS if name in units]
     counters = _counters(cells, units, assumed)
     rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
-    angles: dict[str, list[float | None]] = {}
-    for name, low, high in zip(
-        (*ANGLES, "u_deg"),
-        (-ANGLE_MAX_DEG, -ELEVATION_MAX_DEG, 0.0),
-        (ANGLE_MAX_DEG, ELEVATION_MAX_DEG, U_MAX_DEG),
-        strict=True,
-    ):
-        if name in cells:
-            scale = units[name].scale * units[name].per_number
-            angles[name] = [
-                None if v is None else scale * v for v in cells.numbers(name, low / scale, high / scale, optional=True)
-            ]
+    angles = {name: cells.scaled(name, units[name], *ends) for name, ends in LIMITS_DEG.items() if name in cells}
     if "u_deg" not in cells:
         u = U_DEG if wishes.u_deg is None else wishes.u_deg
         angles["u_deg"] = [u] * len(table)
@@ -146,37 +125,22 @@ def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understo
         Question: two columns could be one field.
         InputError: a field or column that does not exist, or no column for a needed field.
     """
-    known = columns_of(table)
-    check_stated(list(known), stated, FIELDS)
-    taken = {name: text for name, text in stated.items() if text}
-    taken |= {f: f for f in known if f in FIELDS and f not in stated and f not in taken.values()}
-    claims: dict[str, list[str]] = {}
-    for text, column in known.items():
-        role = field_of(column)
-        if text not in taken.values() and role is not None and role not in taken and role not in stated:
-            claims.setdefault(role, []).append(text)
+    chooser = Chooser.of(table, stated, FIELDS, field_of)
+    known, roles = chooser.known, chooser.roles
     for angle, counter in zip(ANGLES, COUNTERS, strict=True):
         # "M1 az" beside "azimuth_rad": whole numbers without a unit are the counters.
         names = [text for text, column in known.items() if field_of(column) == angle and text not in stated.values()]
         whole = [name for name in names if known[name].whole and known[name].name.unit is None]
-        if len(names) == 2 and len(whole) == 1 and not ({counter} & (claims.keys() | taken.keys() | stated.keys())):
-            claims[counter], claims[angle] = whole, [name for name in names if name not in whole]
-    for role, names in claims.items():
+        if len(names) == 2 and len(whole) == 1 and counter not in roles and chooser.is_open(counter):
+            roles[counter], roles[angle] = whole, [name for name in names if name not in whole]
+    for role, names in roles.items():
         # Of two directions the one that was found.
-        found = [
-            name
-            for name in names
-            if known[name].name.words and place_of(known[name].name.words, "observed") is not None
-        ]
-        names = found if len(found) == 1 and role in ANGLES else names
-        if len(names) > 1:
-            candidates = [choice({role: name}, known) for name in (*names, *([] if role in NEEDED else [""]))]
-            raise ask_column(table, f"{len(names)} columns that could be {role} ({listed(names)})", candidates)
-        taken[role] = names[0]
-    if missing := [name for name in NEEDED if name not in taken]:
-        raise missing_column(table, taken, missing)
-    unused = tuple(text for text in known if text not in taken.values())
-    return Understood(taken, unused)
+        found = [name for name in names if place_of(known[name].name.words, "observed") is not None]
+        found = found if len(found) == 1 and role in ANGLES else names
+        chooser.take(role, found, optional=role not in NEEDED)
+    if missing := [name for name in NEEDED if name not in chooser.taken]:
+        raise chooser.missing(missing)
+    return chooser.understood()
 
 
 def field_of(column: Column) -> str | None:
@@ -204,7 +168,7 @@ def field_of(column: Column) -> str | None:
         return "time_s"
     if place_of(words, "move") is not None:
         return "move"
-    if name.has("segment") and is_segment(column.cells):
+    if name.has("segment") and column.counts_homings:
         return "segment"
     return "status" if name.has("status") else None
 
@@ -216,11 +180,7 @@ def _units(
     wishes: SightingWishes,
     assumed: list[str],
 ) -> dict[str, Unit]:
-    """Units of angles by field; whole counters have none.
-
-    Raises:
-        Question: angles within a radian's turn, of columns without a unit; a unit that is not known.
-    """
+    """Units of angles by field; whole counters have none."""
     stated = None if wishes.angle_unit is None else unit_named(wishes.angle_unit)
     units: dict[str, Unit] = {}
     for name in (*ANGLES, *COUNTERS, "u_deg"):
@@ -271,18 +231,16 @@ def _possible_units(cells: FieldCells) -> list[str]:
 
 def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) -> list[tuple[int, int]]:
     """Counters of every row, with angles of encoders in steps of `STEP_DEG`."""
-    of_encoders: dict[str, Sequence[int]] = {}
-    for name in (name for name in COUNTERS if name in units):
-        unit = units[name]
-        scale = unit.scale * unit.per_number
-        limit = COUNTER_MAX * STEP_DEG / scale
-        of_encoders[name] = [round(scale / STEP_DEG * (v or 0.0)) for v in cells.numbers(name, -limit, limit)]
-        assumed.append(
-            f"{name}: angles in {unit.name} as they stand, without whole turns, in steps of {STEP_DEG:g} deg"
-        )
-    if len(of_encoders) == len(COUNTERS):
-        return list(zip(*(of_encoders[name] for name in COUNTERS), strict=True))
-    if not of_encoders:
+    if not units.keys() & {*COUNTERS}:
         return whole_counters(cells)
-    columns = [of_encoders.get(name) or cells.whole(name, -COUNTER_MAX, COUNTER_MAX) for name in COUNTERS]
+    columns = list[Sequence[int]]()
+    for name in COUNTERS:
+        if name not in units:
+            columns.append([number or 0 for number in cells.whole(name, -COUNTER_MAX, COUNTER_MAX)])
+            continue
+        unit, scale = units[name], units[name].scale * units[name].per_number / STEP_DEG
+        limit = COUNTER_MAX / scale
+        columns.append([round(scale * (v or 0.0)) for v in cells.numbers(name, -limit, limit)])
+        how = f"as they stand, without whole turns, in steps of {STEP_DEG:g} deg"
+        assumed.append(f"{name}: angles in {unit.name} {how}")
     return list(zip(*columns, strict=True))

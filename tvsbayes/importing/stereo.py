@@ -427,11 +427,7 @@ class _Reader:
         return _Pose(turns[1].T @ turns[0], turns[1].T @ shift, right["P"], right["P"], source)
 
     def _check_direction(self, pose: _Pose) -> None:
-        """Note the meaning of R and of its transpose, where nothing else in the file determines it.
-
-        Raises:
-            InputError: the camera matrices are transposed, so that R may be too.
-        """
+        """Note the meaning of R and of its transpose, where nothing else in the file determines it."""
         path = pose.turn.path
         if self.transposed is not None:
             raise pose.turn.refuse("maybe-transposed", place=self.transposed.place, path=path)

@@ -6,6 +6,7 @@ import datetime
 import io
 import re
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 
@@ -76,7 +77,7 @@ def _checked_archive(data: bytes, file: str) -> str:
             is_ods = any(part.filename == "content.xml" for part in parts)
             pages = [p for p in parts if re.fullmatch(r"content\.xml|xl/worksheets/[^/]*\.xml", p.filename)]
             area = max((_area(archive.read(page), is_ods) for page in pages), default=0)
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError, zlib.error) as error:
         raise refused("damaged-book", file, error="", remedy="save it again") from error
     if area > CELLS_MAX:
         raise refused("large-sheet", file, rows=CSV_ROWS_MAX, cells=CELLS_MAX)

@@ -32,7 +32,7 @@ OUTPUT = ROOT / "experiments" / "output" / "strangers_tables"
 DRAWS = {
     **{kinds.long_table: 38, kinds.unit_row: 6, kinds.two_sensors: 4, kinds.unknown_unit: 2, kinds.no_unit: 2},
     **{runs.runs_with_words: 18, runs.grouped_runs: 6, runs.turning_runs: 1.5, runs.runs_without_words: 3},
-    **{runs.runs_to_and_fro: 2, runs.deviations: 6, runs.averages: 4},
+    **{runs.runs_to_and_fro: 2, runs.deviations: 6, runs.averages: 4, runs.compensated: 3, runs.sorted_by_position: 2},
     **{logs.telemetry: 3, logs.labview: 4, logs.remark_names: 6, logs.serial: 6, logs.camonitor: 2, logs.sightings: 8},
     **{reports.tolerances: 5, reports.wrapped: 2, reports.sheet_with_means: 2, reports.blocks: 1.5},
     **dict.fromkeys((reports.positions_across, reports.two_axes, reports.numbered_sensors, reports.repeats), 1),

@@ -221,6 +221,54 @@ def deviations(rng: np.random.Generator, language: str) -> Drawn:
     )
 
 
+def compensated(rng: np.random.Generator, language: str) -> Drawn:
+    """An axis after compensation: readings barely differ from the targets, and forward ones from backward ones.
+
+    The sheet is sorted by position, or by runs, or has a column for each direction: it says the sides, readings do not.
+    """
+    axis, _ = same_domain_axis(rng)
+    scatter = max(axis.scatter, 0.7 * axis.digit)
+    axis = replace(axis, per_command=1.0, zero=0.0, scatter=scatter, play=scatter * rng.uniform(0, 1), geared=False)
+    runs = draw_runs(rng, axis, (1, -1) * int(rng.integers(1, 4)))
+    layout = pick(rng, ("positions", "runs", "columns"))
+    if layout == "columns":
+        pair, pairs = pick(rng, words.RUN_SIDES[language]), len(runs.sides) // 2
+        names = [word if pairs == 1 else f"{word} {k + 1}" for k in range(pairs) for word in pair]
+        sheet = side_by_side(rng, runs, names, language)
+        return Drawn("a compensated axis", sheets.any_file(rng, sheet), truth_of(axis, runs.readings()))
+    rows = [
+        (command, side, values[k])
+        for side, values in zip(runs.sides, runs.values, strict=True)
+        for k, command in list(enumerate(axis.commands))[::side]
+    ]
+    rows = sorted(rows, key=lambda row: row[0]) if layout == "positions" else rows
+    return _with_sides(rng, axis, rows, language, "a compensated axis")
+
+
+def sorted_by_position(rng: np.random.Generator, language: str) -> Drawn:
+    """A sheet by position and side, with several readings of each."""
+    axis, _ = same_domain_axis(rng)
+    count = int(rng.integers(2, 6))
+    stops = [(command, side) for command in axis.commands for side in (1, -1) for _ in range(count)]
+    rows = [(command, side, axis.value(command, side, rng)) for command, side in stops]
+    return _with_sides(rng, axis, rows, language, "by position and side")
+
+
+def _with_sides(
+    rng: np.random.Generator, axis: Axis, rows: Sequence[tuple[Decimal, int, Decimal]], language: str, kind: str
+) -> Drawn:
+    """A row for each reading, with its direction."""
+    command, reading = names_of(rng, axis, language)
+    sides = pick(rng, words.SIDES[language])
+    columns: dict[str, Sequence[Cell]] = {
+        headed(rng, command, axis.command_unit, language): [c for c, _, _ in rows],
+        pick(rng, words.DIRECTION[language]): [sides[side < 0] for _, side, _ in rows],
+        with_unit(rng, reading, axis.unit, language): [v for _, _, v in rows],
+    }
+    truth = truth_of(axis, [Reading(float(c), float(v), side) for c, side, v in rows])
+    return Drawn(kind, sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth)
+
+
 def averages(rng: np.random.Generator, language: str) -> Drawn:
     """The means of a laser's software: Target, Forward, Reverse, System, 2 Std Devn, Dead Zone."""
     axis, small = same_domain_axis(rng)
