@@ -49,7 +49,7 @@ _TABLES = ("csv", "epics", "klipper")
 KINDS_OF = {
     **{"run": ("phd2",), "assume": KINDS, "column": _TABLES, "unit": _TABLES, "deviations": ("csv",)},
     "encoders": _TABLES,
-    **{"runs": ("csv",), "counts_per_turn": _TABLES, "sheet": ("csv", "pe")},
+    **{"runs": ("csv",), "relative": ("csv",), "counts_per_turn": _TABLES, "sheet": ("csv", "pe")},
 }
 """Kinds for which an option is."""
 _NONE = {"value": 0.0, "u": 0.0}
@@ -192,7 +192,7 @@ def _check_options(kind: str, opts: FileOptions, stated: Mapping[str, str], shee
     """Refuse options that a file of this kind would ignore."""
     given: dict[str, object] = {"run": opts.run, "column": stated or None, "unit": opts.units or None}
     given |= {"deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn, "sheet": sheet, "runs": opts.runs}
-    given["encoders"] = opts.encoders
+    given |= {"encoders": opts.encoders, "relative": opts.relative or None}
     refused = {name: value for name, value in given.items() if kind not in KINDS_OF[name]}
     refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **refused)
 
