@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from statistics import median
 from typing import Any
 
@@ -293,7 +293,9 @@ def _resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, 
         sides = table.columns[columns["approach"]] if "approach" in columns else ()
         words = [next((w for w in ("forward", "backward") if means(cell, w)), "") for cell in sides]
         # Where no side is stated that before goes on.
-        told = list(accumulate(words, lambda before, word: word or before))
+        told = list[str]()
+        for word in words:
+            told.append(word or (told[-1] if told else ""))
         runs = [column.cells for column in known.values() if column.name.has("repeat") and column.whole]
         rests, how = at_rest(command, value, [part for part in (told, *runs) if part]), "the readings of each command"
     if rests.all() or not rests.any():
