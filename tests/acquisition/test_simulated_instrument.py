@@ -15,7 +15,7 @@ from tvsbayes.acquisition.observation import TwinObserver
 from tvsbayes.acquisition.operator import SimulatedOperator
 from tvsbayes.acquisition.session import begin
 from tvsbayes.acquisition.simulated_instrument import Instrument
-from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.parameters import RIG_NAMES, Prior
 from tvsbayes.twin.physics import mirror_chain
@@ -27,12 +27,11 @@ def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monk
     """Without chance the engine on the device model sees what `simulate` computes from the plan."""
     for name in ("SHEET_DEPTH_SD_MM", "SHEET_TILT_SD_DEG"):
         monkeypatch.setattr(f"tvsbayes.twin.simulated_campaign.{name}", 0.0)
-    monkeypatch.setattr("tvsbayes.instrument.rig.HOME_SD_DEG", 0.0)
     # Gears that repeat their errors; drift goes with the time, and the engine's clock is not the plan's.
     scales = {"transmission_error_deg": 0.05, "play_variation_deg": 0.02}
     geared = {f"{name}.{axis}": Prior(scale, 0.0) for name, scale in scales.items() for axis in AXES}
     truth = draw_truth(replace(mounted_rig, truth={**mounted_rig.truth, **geared}), np.random.default_rng(3))
-    still = {name: 0.0 for name in truth.parameters if name.startswith(("stop_sd_deg", "drift"))}
+    still = {name: 0.0 for name in truth.parameters if name.startswith(("stop_sd_deg", "drift", "home_sd"))}
     truth = replace(truth, parameters={**truth.parameters, **still, "pixel_scale": 0.0})
     plan = small_plan(3, rehome=True)
     wanted = simulate(mounted_rig, plan, 1, truth).campaign
@@ -108,7 +107,7 @@ def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
     positioner.home()
     positioner.move_to(0, 0)
     # What is left is the home offset.
-    assert abs(instrument.state_deg().mirror_angles_deg[0]) < 5 * HOME_SD_DEG
+    assert abs(instrument.state_deg().mirror_angles_deg[0]) < 5 * p["home_sd_deg.pan"]
 
 
 def test_camera_that_looks_on_does_not_change_the_motion(mounted_rig):

@@ -76,11 +76,11 @@ def test_a_zero_that_creeps_is_no_deviation_of_the_stops(mixed_fit):
     """Of 100 campaigns whose zeros walk farther than stops scatter at most 1 % raise an alarm, at 1e-4."""
     plain = mixed_fit.linearised
     creeping = eqx.tree_at(
-        lambda lin: (lin.stop_variance, lin.drift_variance),
+        lambda lin: (lin.stop_variance, lin.zero_variance),
         plain,
-        (0.25 * plain.stop_variance, 100.0 * plain.drift_variance),
+        (0.25 * plain.stop_variance, 100.0 * plain.zero_variance),
     )
-    walked, stopped = (np.sqrt(v.sum(axis=0)) for v in (creeping.drift_variance, creeping.stop_variance[:1]))
+    walked, stopped = (np.sqrt(v.sum(axis=0)) for v in (creeping.zero_variance, creeping.stop_variance[:1]))
     assert np.all(walked > stopped)
     columns = np.zeros((len(plain.residual), 4, 0))
     alarms, squares = 0, []

@@ -17,8 +17,9 @@ from experiments.common.jax_density import log_density, without_padding
 from tvsbayes.estimators import likelihood as density
 from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, spot_constants
 from tvsbayes.estimators.likelihood import no_draw
+from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES
+from tvsbayes.instrument.parameters import HOME_SD_NAMES, INDEX, LOOK_SCATTER_NAMES, NAMES
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.model.parameter_space import half_normal_coordinate, parameter_space
@@ -73,22 +74,25 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
 @pytest.mark.parametrize(
     "homings",
     [
-        {"absolute": ("pan",)},
-        {"absolute": ("pan", "tilt")},
-        {"stated_home_sd_deg": {"pan": 0.2, "tilt": 0.001}},
-        {"absolute": ("tilt",), "stated_home_sd_deg": {"pan": 0.001}},
+        (("pan",), ()),
+        (("pan", "tilt"), ()),
+        ((), (1.5, -4.0)),
+        (("tilt",), (-4.0, 0.0)),
     ],
 )
-def test_homings_shift_the_zeros_as_stated(dozen, evaluate, homings):
+def test_homings_shift_the_zeros_by_their_scatter(dozen, evaluate, homings):
     """None sets that of an absolute encoder, which walks on; play, stops and the other axis are as they were."""
-    campaign = replace(dozen.campaign, rig=replace(dozen.campaign.rig, **homings))
-    arrays = jax.tree.map(jnp.asarray, campaign_arrays(campaign))
-    z = random_points(dozen, 1, 0.3)[0]
+    absolute, coordinates = homings
+    campaign = replace(dozen.campaign, rig=replace(dozen.campaign.rig, absolute=absolute))
+    arrays, z = jax.tree.map(jnp.asarray, campaign_arrays(campaign)), random_points(dozen, 1, 0.3)[0]
+    if coordinates:
+        z[[INDEX[name] for name in HOME_SD_NAMES]] = coordinates
     evaluated = evaluate(z, dozen.space, arrays)
     dense = dense_log_density(campaign, evaluated)
     assert evaluated.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+    z[[INDEX[name] for name in HOME_SD_NAMES]] = 0.0
     plain = evaluate(z, dozen.space, dozen.arrays).log_likelihood
-    assert abs(plain - dense) > LOG_UNIT, "the entry changes nothing here"
+    assert abs(plain - dense) > LOG_UNIT, "it changes nothing here"
 
 
 @pytest.mark.parametrize("coordinates", [(1.0, -0.5), (3.0, -8.0), (-8.0, 6.0)])
@@ -318,3 +322,16 @@ def test_angles_are_compared_on_the_circle(dozen, evaluate):
     one, two = (evaluate(dozen.z, dozen.space, a).log_likelihood for a in (dozen.arrays, turned))
     # 2 pi adds rounding of 1e-15 rad to a reading with an sd of 3e-4 rad.
     assert one == pytest.approx(two, abs=10 * FINE_UNIT)
+
+
+def test_the_scatter_of_homings_is_estimated_where_several_were_seen(dozen):
+    """Of one segment it stays at its median, of an absolute encoder at none."""
+    campaign, columns = dozen.campaign, [INDEX[name] for name in HOME_SD_NAMES]
+    first, *others = (replace(move, segment=0) for move in campaign.moves)
+    once = first, *(replace(move, pan_approach="", tilt_approach="") for move in others)
+    for given, expected in (
+        (campaign, [True, True]),
+        (replace(campaign, moves=once), [False, False]),
+        (replace(campaign, rig=replace(campaign.rig, absolute=("tilt",))), [True, False]),
+    ):
+        assert Problem(given, given.rig).free[columns].tolist() == expected

@@ -21,7 +21,7 @@ from tvsbayes.instrument.parameters import (
 
 def test_names_are_those_of_the_documents():
     assert NAMES == (*RIG_PRIORS, *STEREO_PARAMETER_NAMES) and RIG_NAMES == tuple(RIG_PRIORS)
-    assert len(set(NAMES)) == len(NAMES) == 86
+    assert len(set(NAMES)) == len(NAMES) == 88
     assert all(NAMES[index] == name for name, index in INDEX.items())
 
 
@@ -34,7 +34,7 @@ def test_the_order_of_stored_draws():
         *("pixel_scale", "focal_scale", "baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
         *("aperture_sd_deg", "harmonic_deg", "transmission_error_deg", "transmission_error_length_deg"),
         *("play_variation_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg", "look_scatter_deg"),
-        *("creep_deg", "creep_minutes", "thermal_deg_per_K"),
+        *("creep_deg", "creep_minutes", "thermal_deg_per_K", "home_sd_deg"),
         *("stereo.left", "stereo.right", "stereo.rotation_rad", "stereo.translation_mm"),
     )
     assert tuple(BLOCKS) == blocks
@@ -56,7 +56,7 @@ def test_every_default_lies_in_its_range():
 def test_noise_and_receiver():
     gears = "transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"
     plain = (*BLOCKS["stop_sd_deg"], "pixel_scale", "aperture_sd_deg")
-    assert NOISE_NAMES == (*plain, *names_of(*gears, "harmonic_amplitude_deg", "look_scatter_deg"))
+    assert NOISE_NAMES == (*plain, *names_of(*gears, "harmonic_amplitude_deg", "look_scatter_deg", "home_sd_deg"))
     assert RECEIVER_NAMES == ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg", "aperture_sd_deg")
     assert {RIG_PRIORS[name].distribution for name in plain} == {"log-normal"}
 

@@ -180,6 +180,7 @@ FIELDS: dict[str, tuple[str, tuple[int, ...], float]] = {
         for i, axis in enumerate(("pan", "tilt"))
         for block, field in (("creep_deg", "creep_rad"), ("thermal_deg_per_K", "thermal_rad_per_K"))
     },
+    **{f"home_sd_deg.{axis}": ("noise.home_sd_rad", (i,), DEG) for i, axis in enumerate(("pan", "tilt"))},
     "creep_minutes": ("transmission.zero_shift.creep_minutes", (), 1.0),
     "pixel_scale": ("noise.pixel_scale", (), 1.0),
     "focal_scale": ("cameras.focal_scale", (), 1.0),

@@ -50,11 +50,9 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     # Cameras as stated: a campaign is triangulated with the stated ones, a plan's sheets stand where they stand.
     drawn = draw_truth(mounted_rig, np.random.default_rng(3)).parameters | {"focal_scale": 1.0}
     z = instruments_in(knowledge, [Truth(drawn, mounted_rig.stereo)]).z[0]
-    quiet = {name: 0.0 for name in drawn if name.startswith("stop_sd_deg")} | {"pixel_scale": 0.0}
     # Homings of this run leave the zeros where they are; fit and plan do not know it.
-    with monkeypatch.context() as still:
-        still.setattr("tvsbayes.instrument.rig.HOME_SD_DEG", 0.0)
-        run = simulate(mounted_rig, dozen_plan(), 4, Truth({**drawn, **quiet}, mounted_rig.stereo), aperture=True)
+    quiet = {name: 0.0 for name in drawn if name.startswith(("stop_sd_deg", "home_sd_deg"))} | {"pixel_scale": 0.0}
+    run = simulate(mounted_rig, dozen_plan(), 4, Truth({**drawn, **quiet}, mounted_rig.stereo), aperture=True)
     assert all(spot.status == "ok" for spot in run.campaign.spots)
     problem = Problem(run.campaign, mounted_rig.table)
     with jax.enable_x64(True):

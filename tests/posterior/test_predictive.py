@@ -14,7 +14,6 @@ from support.small_campaign import small_campaign
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.estimators.likelihood import no_draw
-from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, names_of
 from tvsbayes.posterior import predictive
@@ -26,6 +25,7 @@ from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
 DRAWS = 2000
 SDS_DEG = {"left": 0.16, "right": 0.02, "up": 0.08, "down": 0.04}
 PLAY_SD_DEG = 0.11
+HOME_SD_DEG = 0.05
 
 
 def variances_by_hand(moves, spot) -> tuple[float, float]:
@@ -75,6 +75,7 @@ def errors_deg(dozen):
     physical = np.ones((DRAWS, len(NAMES)))
     for name, sd in SDS_DEG.items():
         physical[:, INDEX[f"stop_sd_deg.{name}"]] = sd
+    physical[:, [INDEX[name] for name in names_of("home_sd_deg")]] = HOME_SD_DEG
     for name in ("pixel_scale", *names_of("drift_deg_per_root_hour", "look_scatter_deg")):
         physical[:, INDEX[name]] = 0.0
     return taken_again_deg(dozen, physical, play_deg, 4), play_deg
@@ -113,6 +114,7 @@ def test_an_absolute_zero_walks_on_over_homings(dozen):
     spots, moves = ordered_spots(campaign), campaign.moves
     physical = np.zeros((DRAWS, len(NAMES)))
     physical[:, [INDEX[name] for name in names_of("drift_deg_per_root_hour")]] = 2.0
+    physical[:, [INDEX[name] for name in names_of("home_sd_deg")]] = HOME_SD_DEG
     of_pan = replace(dozen, campaign=campaign, arrays=campaign_arrays(campaign))
     errors = taken_again_deg(of_pan, physical, np.zeros((len(spots), 2)), 6)
     begun = {m.segment: m.time_s for m in reversed(moves)}
@@ -124,8 +126,8 @@ def test_an_absolute_zero_walks_on_over_homings(dozen):
 def test_looks_taken_again_scatter_about_their_stops(dozen):
     """By 0.2 deg of pan and 0.1 of tilt, at every look another; stops, homings and play that err by nothing."""
     count = len(ordered_spots(dozen.campaign))
-    none = np.zeros(dozen.arrays.spots.home_variance_rad2.shape)
-    dozen = replace(dozen, arrays=eqx.tree_at(lambda a: a.spots.home_variance_rad2, dozen.arrays, none))
+    none = np.zeros(dozen.arrays.spots.homed.shape)
+    dozen = replace(dozen, arrays=eqx.tree_at(lambda a: a.spots.homed, dozen.arrays, none))
     physical = np.zeros((DRAWS, len(NAMES)))
     physical[:, [INDEX[name] for name in names_of("look_scatter_deg")]] = 0.2, 0.1
     errors = taken_again_deg(dozen, physical, np.zeros((count, 2)), 5)

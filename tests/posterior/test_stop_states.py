@@ -67,7 +67,7 @@ def test_what_states_leave_of_residuals_is_woodburys():
 
 
 def test_no_states_take_nothing():
-    nothing = StopStates(np.zeros((8, 0)), np.zeros((0, 4)), np.zeros(0))
+    nothing = StopStates(np.zeros((8, 0)), np.zeros((0, 6)), np.zeros(0))
     elimination = Elimination.of(nothing, np.zeros((3, 0)), np.zeros((3, 0)))
     assert elimination.whitened(np.zeros((0, 2))).shape == (3, 0, 2)
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.twin.physics import play
 
@@ -36,6 +35,7 @@ def physical(evaluated: SimpleNamespace) -> dict[str, float]:
         values[f"transmission_error_length_deg.{name}"] = np.degrees(model.gears.length_rad[axis])
         values[f"play_variation_deg.{name}"] = np.degrees(model.gears.play_rad[axis])
         values[f"drift_deg_per_root_hour.{name}"] = np.degrees(model.gears.drift_rad_per_root_hour[axis])
+        values[f"home_sd_deg.{name}"] = np.degrees(model.noise.home_sd_rad[axis])
         values[f"look_scatter_deg.{name}"] = np.degrees(model.noise.look_scatter_rad[axis])
         for number in range(3):
             amplitude, period = model.gears.amplitude_rad[axis, number], model.gears.period_rad[axis, number]
@@ -134,7 +134,6 @@ def side(directions: tuple[str, ...]) -> int:
 def angle_covariances(campaign: Campaign, values: dict[str, float], *, persistent: bool = True) -> np.ndarray:
     """Covariance of what the angles (pan, tilt) of all ordered spots are off by, rad^2, shape (2, n, n)."""
     moves, spots = campaign.moves, ordered_spots(campaign)
-    homings_deg = dict.fromkeys(SENSES, HOME_SD_DEG) | campaign.rig.stated_home_sd_deg
     homing_h = {m.segment: m.time_s / 3600 for m in reversed(moves)}
     covariances = np.zeros((2, len(spots), len(spots)))
     for axis, name in enumerate(SENSES):
@@ -150,7 +149,7 @@ def angle_covariances(campaign: Campaign, values: dict[str, float], *, persisten
                 # The zero of an absolute encoder is one for all segments, and walks from the first move on.
                 absolute, hours = name in campaign.rig.absolute, min(one.time_s, other.time_s) / 3600
                 if one.segment == other.segment:
-                    shared += homings_deg[name] ** 2 * (one.segment > 0 and not absolute)
+                    shared += values[f"home_sd_deg.{name}"] ** 2 * (one.segment > 0 and not absolute)
                     shared += band_sd[first.move] * band_sd[second.move]
                 if one.segment == other.segment or absolute:
                     hours -= homing_h[0 if absolute else one.segment]

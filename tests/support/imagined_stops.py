@@ -24,7 +24,7 @@ def linearised(residual: np.ndarray, slope: np.ndarray, angles: np.ndarray) -> L
         "play_sd_rad": (2,),
         "predicted": (5,),
         "stop_variance": (2,),
-        "drift_variance": (2,),
+        "zero_variance": (2,),
         "scatter_variance": (2,),
     }
     shapes |= {"place_columns": (4, 0)}

@@ -53,7 +53,7 @@ def linearised(jacobian: np.ndarray, load: np.ndarray) -> Linearised:
         "play_sd_rad": (2,),
         "mirror_angles_rad": (2,),
         "predicted": (5,),
-        "drift_variance": (2,),
+        "zero_variance": (2,),
         "scatter_variance": (2,),
     }
     shapes |= {"residual": (4,), "place_columns": (4, 0), "predicted_jacobian": (5, len(NAMES))}
@@ -78,7 +78,7 @@ def spot_arrays(readings: bool) -> SpotArrays:
     # A spot of the padding does not count.
     aperture[[1, -1]] = readings, 1.0
     shapes = {"pixels": (4,), "whitening": (4, 4), "aperture_rad": (), "triangulated_mm": (3,), "weight": ()}
-    shapes |= {"redraw_mix": (2, 2), "hours": (2,), "home_variance_rad2": (2,)}
+    shapes |= {"redraw_mix": (2, 2), "hours": (2,), "homed": (2,)}
     with jax.enable_x64(True):
         return SpotArrays(
             move_index=placed(np.zeros(size, np.int32)),

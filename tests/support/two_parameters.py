@@ -26,7 +26,7 @@ ROWS = 4
 
 def no_states() -> StopStates:
     """Of axes that stop exactly."""
-    return StopStates(np.zeros((ROWS, 0)), np.zeros((0, 4)), np.zeros(0))
+    return StopStates(np.zeros((ROWS, 0)), np.zeros((0, 6)), np.zeros(0))
 
 
 def linear_campaign(along: np.ndarray, prior: np.ndarray, noise: int) -> LinearCampaign:

@@ -14,7 +14,7 @@ import pytest
 from support.commands import steps
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import DIRECTION_SIGNS, HOME_SD_DEG
+from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
@@ -72,20 +72,22 @@ def test_stop_error_is_redrawn_though_play_absorbs_the_move(fixed):
 
 
 def test_home_offsets(rig):
-    """None in the first segment; later ones N(0, HOME_SD_DEG^2)."""
+    """None in the first segment; later ones scatter by the true rig's sd, which is drawn."""
     plan = steps(*[("home", 0, 0)] * 400)
-    offsets = np.array(simulate(rig, plan, 1).truth.home_offsets_deg)
-    assert np.array_equal(offsets[0], [0.0, 0.0])
-    assert np.std(offsets[1:]) == pytest.approx(HOME_SD_DEG, rel=4 / np.sqrt(2 * 798))
+    truth = simulate(rig, plan, 1).truth
+    offsets = np.array(truth.home_offsets_deg)
+    sds = [truth.parameters[f"home_sd_deg.{axis}"] for axis in ("pan", "tilt")]
+    assert np.array_equal(offsets[0], [0.0, 0.0]) and sds[0] != sds[1]
+    assert np.std(offsets[1:], axis=0) == pytest.approx(sds, rel=4 / np.sqrt(2 * 399))
 
 
 def test_homings_are_as_the_rig_states(rig):
     """An absolute zero is set by none and drifts on; the other axis' homings scatter as stated."""
-    table = replace(rig.table, absolute=("pan",), stated_home_sd_deg={"tilt": 0.2})
+    table = replace(rig.table, absolute=("pan",))
     plan = steps(*[("home", 0, 0), ("move", 100, 50)] * 400)
     truth = draw_truth(rig, np.random.default_rng(0)).with_gears()
     drifts = names_of("drift_deg_per_root_hour")
-    truth = replace(truth, parameters=truth.parameters | dict.fromkeys(drifts, 0.02))
+    truth = replace(truth, parameters=truth.parameters | dict.fromkeys(drifts, 0.02) | {"home_sd_deg.tilt": 0.2})
     costs_s = {"move_s": 60.0, "look_s": 0.0, "placement_s": 0.0}
     realised = simulate(replace(rig, table=table, costs_s=costs_s), plan, 1, truth).truth
     offsets, drift = np.array(realised.home_offsets_deg), np.array(realised.drift_deg)

@@ -272,7 +272,7 @@ class Instrument:
     def _found_home(self, axis: int) -> None:
         """Set the counter of an axis, with a new home offset, 0 in the first segment."""
         keeps_zero = AXES[axis] in self.rig.table.absolute
-        sd_deg = self.rig.table.home_sd_deg[axis]
+        sd_deg = 0.0 if keeps_zero else self.truth.parameters[f"home_sd_deg.{AXES[axis]}"]
         offset = 0.0 if axis in self._unhomed else sd_deg * self._homes.standard_normal()
         self._unhomed.discard(axis)
         gear = self._gears[axis]

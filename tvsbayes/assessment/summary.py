@@ -28,6 +28,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
+    HOME_SD_NAMES,
     INDEX,
     LATE_NAMES,
     QUANTITIES,
@@ -124,12 +125,14 @@ class _Source:
 
 
 def _absent(fit: JointFit) -> set[str]:
-    """Return parameters absent from the model: of gear errors, scatter of looks and shifts of zeros."""
+    """Return parameters absent from the model: of gear errors, scatter of looks and of homings, shifts of zeros."""
     none = {name for name in ABSENT_AT_ZERO if not fit.free[INDEX[name]] and fit.values[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")
     none |= set(fit.space.mechanism.fixed)
+    homed = np.asarray(fit.arrays.spots.homed).any(axis=0)
+    none |= {name for name, seen in zip(HOME_SD_NAMES, homed, strict=True) if not seen}
     return none | ({"creep_minutes"} if set(names_of("creep_deg")) <= none else set())
 
 

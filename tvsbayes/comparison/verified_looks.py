@@ -37,6 +37,7 @@ from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.inference.stored_posterior import answer_of
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.homing import scatter_of_prior
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
@@ -273,7 +274,7 @@ def verify_looks(
         unit="deg",
         needed=None if judgement.needed is None else -(-judgement.needed // 2),
         looks=True,
-        remarks=_remarks(fit.campaign, looks, aimed),
+        remarks=_remarks(fit, looks, aimed),
     )
 
 
@@ -369,7 +370,8 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
         what = f"the nominal counters of {AXES[k]} are those of the calibration: there is no correction to verify"
         raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
     noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
-    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + campaign.rig.home_sd_deg[k] ** 2
+    home_sd_deg = campaign.rig.priors[f"home_sd_deg.{AXES[k]}"].value
+    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + home_sd_deg**2
     # A play smaller than the uncertainty of a look cannot be distinguished from none, and does not affect the promise.
     visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
     worlds = off if visible else off[:1]
@@ -395,9 +397,11 @@ def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.nda
     return np.asarray(output_deg(values, axis, aimed.steps[:, k], aimed.sides[:, k], calibration.period_deg.get(axis)))
 
 
-def _remarks(campaign: Campaign, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:
+def _remarks(fit: JointFit, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:
     """Return further remarks for the user."""
-    remarks = []
+    campaign, remarks = fit.campaign, []
+    if fit.home_sd_by_prior:
+        remarks.append(scatter_of_prior(fit.home_sd_by_prior))
     outside = sum(not aimed.calibration.covers(*steps) for steps in aimed.steps.tolist())
     if outside:
         remarks.append(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from msgspec import structs
 
 from tvsbayes.comparison.departures import LOOKS_MIN, Departure, DrawnDepartures, StatedChange, single_change, tested
 from tvsbayes.errors import NothingToEstimate
@@ -19,7 +20,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
-from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.conditions import pause_s
 from tvsbayes.instrument.copies import refuse_same_looks
@@ -51,9 +52,9 @@ CHANGES = (*_pose("cameras", "stereo"), *_pose("positioner", "extrinsics"), *_GE
 """Tested changes of what a stereo pair sees, with the sizes that must be detected."""
 _LEAN = tuple(f"azimuth_axis_tilt_deg.{side}" for side in ("north", "east"))
 SIGHTED_CHANGES = (
-    # These sizes exceed the uncertainty of a homing.
+    # These sizes exceed the usual scatter of homings, 0.05 deg.
     *(
-        single_change(f"zero: {angle}", f"{angle}_zero_deg", 5 * HOME_SD_DEG, "deg")
+        single_change(f"zero: {angle}", f"{angle}_zero_deg", 0.25, "deg")
         for angle in ("azimuth", "elevation")
     ),
     StatedChange("base: lean", _LEAN, ("base: lean to azimuth 0", "base: lean to azimuth 90"), 0.1, "deg"),
@@ -207,4 +208,5 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         )
     watched = WatchedLooks(fit, looks)
     hashes = input_hashes(fit.campaign)["stereo"], input_hashes(looks)["stereo"]
-    return tested(watched.departures(seed), watched.looks, hashes[0] == hashes[1], seed)
+    result = tested(watched.departures(seed), watched.looks, hashes[0] == hashes[1], seed)
+    return structs.replace(result, home_sd_by_prior=fit.home_sd_by_prior)

@@ -51,7 +51,7 @@ def innovations(lin: LinearLooks, arrays: CampaignArrays, before: Belief) -> See
     both = jnp.concatenate([lin.residual[..., None], lin.residual_jacobian, -lin.place_columns], axis=2)
     columns = turned.of_many(tuple(both.transpose(1, 2, 0)))
     observed, free = (jnp.stack(part).transpose(2, 0, 1) for part in (columns[:2], columns[2:]))
-    rows = filter_rows(observed, turned.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, arrays.spots)
+    rows = filter_rows(observed, turned.slope, lin.play_sd_rad, lin.stop_variance, lin.zero_variance, arrays.spots)
     result = filtered(rows, before)
     return eqx.tree_at(lambda f: f.standardised, result, jnp.concatenate([result.standardised, free], axis=1))
 

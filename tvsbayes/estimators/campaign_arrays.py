@@ -43,9 +43,8 @@ class SpotArrays(eqx.Module):
     `whitening` maps a pixel residual to stated standard deviations. `weight` scales a spot's information (1, or below
     for the robust option), `valid` is 0 for padding and excluded spots. `redraw[axis]` is whether the axis has a new
     stop error since the previous spot, with variance `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up).
-    `new_segment` is whether a segment began, `new_zero` whether with it the zero of (pan, tilt). `home_variance_rad2`
-    is that of its offset, 0 where it is known; `hours` is the time over which it walked, since the previous spot or a
-    later homing.
+    `new_segment` is whether a segment began, `new_zero` whether with it the zero of (pan, tilt). `homed` is 1 where
+    this has an unknown offset; `hours` is the time over which it walked, since the previous spot or a later homing.
 
     For sightings `triangulated_mm` is the direction of the head, a unit vector of frame P; `tangents` are the unit
     vectors along azimuth and elevation there (None for a stereo pair). The pixels are then angles on the sphere about
@@ -64,7 +63,7 @@ class SpotArrays(eqx.Module):
     redraw_mix: Float[Array, "spots 2 2"]
     new_segment: Bool[Array, " spots"]
     new_zero: Bool[Array, "spots 2"]
-    home_variance_rad2: Float[Array, "spots 2"]
+    homed: Float[Array, "spots 2"]
     hours: Float[Array, "spots 2"]
     tangents: Float[Array, "spots 2 3"] | None = None
 
@@ -290,7 +289,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
         redraw_mix=padded(new.redraw_mix, size),
         new_segment=padded(new.new_segment, size, False, bool),
         new_zero=padded(new.new_zero, size, False, bool),
-        home_variance_rad2=padded(new.homed * np.radians(campaign.rig.home_sd_deg) ** 2, size),
+        homed=padded(new.homed, size),
         hours=padded(new.hours, size),
         tangents=tangents,
     )

@@ -28,13 +28,13 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES
+from tvsbayes.instrument.parameters import HOME_SD_NAMES, INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
-from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.model.parameter_space import HOME_COLUMNS, ParameterSpace
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.stored_draws import StoredMode
 from tvsbayes.statistics.intervals import NORMAL_95
@@ -168,6 +168,12 @@ class JointFit(Shown):
     def held(self) -> np.ndarray:
         """Mark the parameters that the linearisation takes as known, shape (p,)."""
         return held_by(self.free)
+
+    @property
+    def home_sd_by_prior(self) -> tuple[str, ...]:
+        """Return the axes whose scatter of homings is that of the prior, since the campaign has one segment."""
+        open_u = np.where(self.free, 0.0, np.append(self.space.u, np.zeros(len(self.free) - len(RIG_NAMES))))
+        return tuple(axis for axis, u in zip(AXES, open_u[HOME_COLUMNS], strict=True) if u > 0)
 
     @property
     def stored(self) -> StoredMode:
@@ -400,10 +406,11 @@ def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformat
 def _drawn(joint: Gaussian, free: Bool[np.ndarray, " parameters"], seed: int) -> np.ndarray:
     """Draw coordinates, then errors at places, shape (draws, p + e).
 
-    Shifts of the zeros that are not estimated keep their mean: the draws of the others then do not depend on them.
+    Shifts of the zeros and scatters of homings that are not estimated keep their mean: the draws of the others then do
+    not depend on them.
     """
     drawn = np.ones(len(joint.mean), dtype=bool)
-    drawn[[INDEX[name] for name in ZERO_SHIFT_NAMES if not free[INDEX[name]]]] = False
+    drawn[[INDEX[name] for name in (*ZERO_SHIFT_NAMES, *HOME_SD_NAMES) if not free[INDEX[name]]]] = False
     both = np.tile(joint.mean, (LAPLACE_DRAWS, 1))
     both[:, drawn] = laplace_draws(joint.mean[drawn], joint.covariance[np.ix_(drawn, drawn)], seed)
     return both

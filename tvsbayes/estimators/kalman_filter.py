@@ -40,7 +40,7 @@ def filter_rows(
     slope: Float[Array | np.ndarray, "spots components 2"],
     play_sd_rad: Float[Array | np.ndarray, "spots 2"],
     stop_variance: Float[Array | np.ndarray, "spots 2"],
-    drift_variance: Float[Array | np.ndarray, "spots 2"],
+    zero_variance: Float[Array | np.ndarray, "spots 2"],
     spots: SpotArrays,
     functions: ModuleType = jnp,
 ) -> FilterRows:
@@ -51,18 +51,18 @@ def filter_rows(
         slope: d(predicted)/d(pan, tilt).
         play_sd_rad: sd of the position in the play, zero where it is known.
         stop_variance: from `stop_variances`.
-        drift_variance: from `drift_variances`.
+        zero_variance: from `zero_variances`.
         spots: which of them follow a homing or have new stop errors.
         functions: jax.numpy or numpy.
     """
     xp, pairs = functions, (len(spots.valid), 2)
     segment = xp.broadcast_to(spots.new_segment[:, None], pairs)
-    drawn, zero = xp.where(spots.redraw, stop_variance, 0.0), spots.home_variance_rad2 + drift_variance
+    drawn = xp.where(spots.redraw, stop_variance, 0.0)
     return FilterRows(
         residual=xp.asarray(residual),
         load=xp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
         keep=xp.where(xp.concatenate([spots.redraw, spots.new_zero, segment], axis=1), 0.0, 1.0),
-        variance=xp.concatenate([drawn, zero, xp.where(segment, 1.0, 0.0)], axis=1),
+        variance=xp.concatenate([drawn, zero_variance, xp.where(segment, 1.0, 0.0)], axis=1),
     )
 
 

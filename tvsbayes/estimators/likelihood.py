@@ -51,9 +51,9 @@ def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float
     return jnp.sum(spots.redraw_mix * stop_sd_rad**2, axis=2)
 
 
-def drift_variances(drift_rad_per_root_hour: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
-    """Compute the variance of the drift of the zeros (pan, tilt) since the previous spot, or since a later homing."""
-    return spots.hours * drift_rad_per_root_hour**2
+def zero_variances(model: Model, spots: SpotArrays) -> Float[Array, "spots 2"]:
+    """Compute the variance of the zeros (pan, tilt) since the previous spot: of a homing, and of the drift since."""
+    return spots.homed * model.noise.home_sd_rad**2 + spots.hours * model.gears.drift_rad_per_root_hour**2
 
 
 def scatter_variances(scatter_rad: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
@@ -76,7 +76,7 @@ class LookTerms(eqx.Module):
     terms: SpotResiduals
     play_sd_rad: Float[Array, "spots 2"]
     stop_variance: Float[Array, "spots 2"]
-    drift_variance: Float[Array, "spots 2"]
+    zero_variance: Float[Array, "spots 2"]
     scatter_variance: Float[Array, "spots 2"]
     to_states: ToStates
 
@@ -100,7 +100,7 @@ def look_terms(
         terms,
         angles.play_sd_rad,
         stop_variances(model.noise.stop_sd_rad, spots),
-        drift_variances(jnp.asarray(model.gears.drift_rad_per_root_hour), spots),
+        zero_variances(model, spots),
         scattered,
         ToStates.of(terms.by_pan, terms.by_tilt, scattered),
     )
@@ -124,7 +124,7 @@ def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | No
     terms, turned = given.terms, given.to_states
     first, second, *free = turned.of_many(terms.residual)
     load, slope = jnp.stack([first, second], axis=1), turned.slope
-    rows = filter_rows(load, slope, given.play_sd_rad, given.stop_variance, given.drift_variance, arrays.spots)
+    rows = filter_rows(load, slope, given.play_sd_rad, given.stop_variance, given.zero_variance, arrays.spots)
     log_scale = terms.log_scale + turned.log_scale - 0.5 * sum(number**2 for number in free)
     return FilterInput(rows, slope, log_scale)
 

@@ -40,7 +40,7 @@ class LinearLooks(eqx.Module):
     mirror_angles_rad: Float[Array | np.ndarray, "spots 2"]
     predicted: Float[Array | np.ndarray, "spots 5"]
     stop_variance: Float[Array | np.ndarray, "spots 2"]
-    drift_variance: Float[Array | np.ndarray, "spots 2"]
+    zero_variance: Float[Array | np.ndarray, "spots 2"]
     scatter_variance: Float[Array | np.ndarray, "spots 2"]
     place_columns: Float[Array | np.ndarray, "spots 4 errors"]
     residual_jacobian: Float[Array | np.ndarray, "spots 4 parameters"]
@@ -137,7 +137,7 @@ def linearise(
         mirror_angles_rad=jnp.stack([looks.pan_rad, looks.tilt_rad], axis=1),
         predicted=jnp.stack(looks.predicted, axis=1),
         stop_variance=given.stop_variance,
-        drift_variance=given.drift_variance,
+        zero_variance=given.zero_variance,
         scatter_variance=given.scatter_variance,
         place_columns=place_columns(slope, arrays.gears),
         residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),
@@ -179,7 +179,7 @@ def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) 
         jacobian: d(prediction)/d(quantities of interest), shape (spots, 4, columns).
     """
     spots = jax.tree.map(lambda x: np.asarray(x)[: len(lin.residual)], arrays.spots)
-    variances = np.asarray(lin.stop_variance), np.asarray(lin.drift_variance)
+    variances = np.asarray(lin.stop_variance), np.asarray(lin.zero_variance)
     residual, slope, play_sd_rad = (np.asarray(part) for part in (lin.residual, lin.slope, lin.play_sd_rad))
     rows = filter_rows(residual, slope, play_sd_rad, *variances, spots, functions=np)
     load, keep, variance = np.asarray(rows.load), np.asarray(rows.keep), np.asarray(rows.variance)

@@ -25,7 +25,7 @@ from tvsbayes.estimators.linear_spots import (
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.conditions import unseen_shifts
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HOME_SD_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.parameter_space import RATIO_COLUMNS, ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
@@ -123,7 +123,11 @@ class Problem:
         arrays = campaign_arrays(campaign, table)
         self.arrays = arrays.weighed(arrays.used * used, np.ones(0) if weight is None else weight)
         readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
-        self.free = free_mask(self.space, any(readings), unseen_shifts(campaign.moves, table.priors))
+        homed = np.asarray(self.arrays.spots.homed)[: len(self.spots)][self.arrays.used].any(axis=0)
+        unseen = unseen_shifts(campaign.moves, table.priors)
+        # A single segment says nothing on the scatter of homings, which stays at its median.
+        unseen += tuple(name for name, seen in zip(HOME_SD_NAMES, homed, strict=True) if not seen)
+        self.free = free_mask(self.space, any(readings), unseen)
         self.noise = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & self.free)
         self.held = held_by(self.free)
         self.repeated = np.isin(NAMES, GEAR_ERROR_NAMES) & self.free

@@ -29,8 +29,6 @@ HOME_APPROACH: tuple[PanApproach, TiltApproach] = ("left", "up")
 """Default side from which homing ends, per axis."""
 FULL_TURN_DEG = 360.0
 """Period of the wheel (the output member); a shorter one is the pinion's."""
-HOME_SD_DEG = 0.05
-"""Standard deviation of the home offset of every segment after the first (formulation 3.2, fixed)."""
 
 
 def direction_of(axis: str, change: float) -> str:

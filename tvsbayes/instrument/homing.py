@@ -41,6 +41,12 @@ def unrecorded(moves: Sequence[Move], rig: RigTable) -> tuple[str, ...]:
     return tuple(axis for axis in driven if {getattr(m, f"{axis}_approach") for m in moves} <= {"", "unknown"})
 
 
+def scatter_of_prior(axes: Sequence[str]) -> str:
+    """Say that the scatter of homings of these axes is their priors'."""
+    words = " and of ".join(axes)
+    return f"the scatter of homings of {words} is the prior's, home_sd_deg in [rig.prior]: the campaign has one homing"
+
+
 def ways(axis: str) -> dict[str, float]:
     """Homing hypotheses of an axis, with their prior probabilities."""
     return {**dict.fromkeys(reversed(SIDES[axis]), ONE_SIDED_CHANCE), ANYWHERE: 1 - 2 * ONE_SIDED_CHANCE}

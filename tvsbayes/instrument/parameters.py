@@ -157,6 +157,8 @@ _PARAMETERS = (
             "the time constant of the creep"),
     *_block("thermal_deg_per_K", AXES, "deg/K", Prior(0.0, 0.01), (-10.0, 10.0, 10.0),
             "the shift of the zero per kelvin", "zero per kelvin, {0}"),
+    *_block("home_sd_deg", AXES, "deg", Prior(0.05, 1.0, "log-normal"), (1e-9, 10.0, 5.0),
+            "the scatter of homings, sd", "homing scatter {0}", noise=True),
     *_cameras(),
 )  # fmt: skip
 _TURN, _TERM = Prior(0.0, 10.0), Prior(0.0, 0.5)
@@ -240,7 +242,9 @@ CREEP_NAMES = names_of("creep_deg", "creep_minutes")
 """Creep of the zeros during warm-up, and its time constant, which both zeros share."""
 ZERO_SHIFT_NAMES = names_of("creep_deg", "creep_minutes", "thermal_deg_per_K")
 """Shifts of the zeros in time and with the temperature."""
-LATE_NAMES = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
+HOME_SD_NAMES = names_of("home_sd_deg")
+"""Sds of the shift of a zero by a homing, by axis."""
+LATE_NAMES = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES, *HOME_SD_NAMES)
 """Parameters that earlier versions did not have: files omit them where they have their defaults."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)

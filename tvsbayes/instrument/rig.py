@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 from tvsbayes.errors import InputError, closest, entry_refusal, escaped
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG, HOME_SD_DEG
+from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, HOME_KEYS, LIMIT_KEYS, CounterLimits
 from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, WORDS, Mechanism, mechanism_named
 from tvsbayes.instrument.parameters import (
@@ -49,7 +49,7 @@ class RigTable:
     `harmonic_period_deg` maps "pan" and "tilt", where declared, to the periods of the transmission error in
     degrees of the output, 1 to `PERIODS_MAX` different ones: `FULL_TURN_DEG` for the wheel, less for pinion and teeth.
     `harmonic_deg` belongs to the first period, `harmonic_amplitude_deg.<axis>.<number>` to each. `absolute` names the
-    axes whose encoders keep their zero over a homing; `stated_home_sd_deg` is the sd of a homing's shift by axis.
+    axes whose encoders keep their zero over a homing; its shift by one is 0.
 
     Raises:
         InputError: harmonics or amplitudes of an axis without their period.
@@ -60,20 +60,17 @@ class RigTable:
     harmonic_period_deg: dict[str, tuple[float, ...]] = field(default_factory=dict)
     mechanism: Mechanism = TWO_MIRROR
     absolute: tuple[str, ...] = ()
-    stated_home_sd_deg: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         priors = {**self.mechanism.priors, **self.priors}
         for name in PERIODIC_NAMES:
             if priors[name] == RIG_PRIORS[name] and not _has_period(name, self.harmonic_period_deg):
                 priors[name] = replace(priors[name], value=0.0, u=0.0)
+        for axis in self.absolute:
+            name = f"home_sd_deg.{axis}"
+            priors[name] = replace(priors[name], value=0.0, u=0.0)
         object.__setattr__(self, "priors", priors)
         require_periods(self.priors, self.harmonic_period_deg)
-
-    @property
-    def home_sd_deg(self) -> tuple[float, ...]:
-        """Sd of the shift of the zero of (pan, tilt) by a homing: as stated, 0 of an absolute encoder."""
-        return tuple(0.0 if a in self.absolute else self.stated_home_sd_deg.get(a, HOME_SD_DEG) for a in AXES)
 
     @property
     def first_period_deg(self) -> dict[str, float]:
@@ -128,16 +125,10 @@ class Rig(WithStereo):
         return CounterLimits.of(self.positioner)
 
 
-_HOME_NAMES = {f"home_sd_deg.{axis}": axis for axis in AXES}
 _PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in AXES}
 _PERIOD_MIN_DEG = 1e-6
-_HOME_SD_DEG = (1e-9, 10.0, 5.0)
-"""Lowest and highest sd of a homing's shift, and highest u."""
 _GROUPS = {
-    name.rsplit(".", n)[0]
-    for kind in MECHANISMS.values()
-    for name in (*kind.names, *_PERIOD_NAMES, *_HOME_NAMES)
-    for n in (1, 2, 3)
+    name.rsplit(".", n)[0] for kind in MECHANISMS.values() for name in (*kind.names, *_PERIOD_NAMES) for n in (1, 2, 3)
 }
 
 
@@ -187,8 +178,6 @@ def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[
 def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     """The remedy for a name that is not allowed in its table."""
     stem, _, last = name.partition(".")
-    if name in _HOME_NAMES:
-        return "it belongs in [rig.prior]"
     if name in _PERIOD_NAMES:
         return "it belongs in [rig] itself: tooth counts fix it, so it has no prior and no other truth"
     parameter = parameter_of(name)
@@ -281,18 +270,6 @@ def _parse_periods(keys: Keys, key: str) -> tuple[float, ...]:
     return keys.numbers(key, _PERIOD_MIN_DEG, FULL_TURN_DEG, PERIODS_MAX)
 
 
-def _parse_home_sd(keys: Keys, key: str, absolute: bool) -> float:
-    """The sd of a homing's shift, deg, taken as exact."""
-    if absolute:
-        allowed, remedy = "no entry for an axis in `absolute`", "leave one of them out: no homing sets an absolute zero"
-        raise keys.refuse(key, "absolute", allowed, remedy)
-    stated = keys.quantity(key, *_HOME_SD_DEG)
-    if stated.u != 0:
-        remedy = "write u = 0: the value is used as it stands, and not estimated"
-        raise keys.table(key).refuse("u", "number", "exactly 0", remedy)
-    return stated.value
-
-
 def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> None:
     """Check as `require_periods`, with the location in the file."""
     name = _without_period(priors, period_deg)
@@ -337,13 +314,13 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
     }
     declared = _parse_priors(own_entries)
     # Any parameter may stand in [rig.prior], also one that belongs to [rig].
-    prior_entries = _named_entries(table.table("prior"), (*prior_names, *declared_names, *_HOME_NAMES))
+    prior_entries = _named_entries(table.table("prior"), (*prior_names, *declared_names))
     absolute = table.some_words("absolute", AXES) if "absolute" in table else ()
-    home_sd_deg: dict[str, float] = {
-        axis: _parse_home_sd(*prior_entries.pop(name), axis in absolute)
-        for name, axis in _HOME_NAMES.items()
-        if name in prior_entries
-    }
+    for name in (f"home_sd_deg.{axis}" for axis in absolute):
+        if name in prior_entries:
+            keys, key = prior_entries[name]
+            allowed = "no entry for an axis in `absolute`"
+            raise keys.refuse(key, "absolute", allowed, "leave one of them out: no homing sets an absolute zero")
     prior = _parse_priors(prior_entries)
     for name in declared:
         if name in prior:
@@ -355,7 +332,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
         raise table.refuse(key, "unknown-key", "no aperture", "leave it out: a head has no receiver", f"the name {key}")
     azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
     convention: Literal["in-plane", "azimuth"] = "azimuth" if azimuth else "in-plane"
-    return RigTable({**prior, **declared}, convention, period_deg, mechanism, absolute, home_sd_deg)
+    return RigTable({**prior, **declared}, convention, period_deg, mechanism, absolute)
 
 
 def rig_table_toml(table: RigTable) -> str:
@@ -381,9 +358,8 @@ def rig_table_toml(table: RigTable) -> str:
     periodic = [entry(name) for name in PERIODIC_NAMES if _has_period(name, table.harmonic_period_deg)]
     declared = map(entry, _names_at("rig", kind))
     omitted = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
+    omitted |= {f"home_sd_deg.{axis}" for axis in table.absolute}
     priors = [entry(name) for name in _names_at("rig.prior", kind) if name not in {*PERIODIC_NAMES, *omitted}]
-    homings = {name: table.stated_home_sd_deg[a] for name, a in _HOME_NAMES.items() if a in table.stated_home_sd_deg}
-    priors += [toml_line(name, {"value": float(sd_deg), "u": 0.0}) for name, sd_deg in homings.items()]
     absolute = [toml_line("absolute", list(table.absolute))] if table.absolute else []
     return (
         "\n".join(["[rig]", *declared, *periods, toml_line(*own), *absolute, "[rig.prior]", *priors, *periodic]) + "\n"

@@ -27,6 +27,7 @@ from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, Mechanism
 from tvsbayes.instrument.parameters import (
     BLOCKS,
     COLUMNS,
+    HOME_SD_NAMES,
     INDEX,
     KINDS,
     LOOK_SCATTER_NAMES,
@@ -67,6 +68,7 @@ class Noise(eqx.Module):
     stop_sd_rad: Float[Array, "2 2"]
     look_scatter_rad: Float[Array, "2"]
     pixel_scale: Scalar
+    home_sd_rad: Float[Array, "2"]
 
 
 class Model(eqx.Module):
@@ -230,11 +232,11 @@ def scale_of(mechanism: Mechanism) -> np.ndarray:
 
 STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
 """Coordinates of the stop sds by axis and side, (right, left) and (down, up): shape (2, 2)."""
-SCATTER_COLUMNS, RATIO_COLUMNS, DRIFT_COLUMNS = (
+SCATTER_COLUMNS, RATIO_COLUMNS, DRIFT_COLUMNS, HOME_COLUMNS = (
     np.array([INDEX[name] for name in names])
-    for names in (LOOK_SCATTER_NAMES, BLOCKS["degrees_per_step"], BLOCKS["drift_deg_per_root_hour"])
+    for names in (LOOK_SCATTER_NAMES, BLOCKS["degrees_per_step"], BLOCKS["drift_deg_per_root_hour"], HOME_SD_NAMES)
 )
-"""Coordinates of the looks' scatter, of the mean ratios and of the zeros' drift by axis."""
+"""Coordinates by axis of the looks' scatter, of the mean ratios, of the zeros' drift and of their shift by a homing."""
 
 
 def _camera_columns(*parts: str) -> slice | np.ndarray:
@@ -302,6 +304,7 @@ def model_of(
             stop_sd_rad=jnp.reshape(block("stop_sd_deg"), (2, 2))[:, ::-1],
             look_scatter_rad=block("look_scatter_deg"),
             pixel_scale=block("pixel_scale"),
+            home_sd_rad=block("home_sd_deg"),
         ),
         gears=GearScales(
             error_rad=block("transmission_error_deg"),

@@ -37,12 +37,19 @@ from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import CREEP_NAMES, NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary
 from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
-from tvsbayes.instrument.rig import Rig, RigTable
+from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import counters_made, redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import MoveArrays, mirror_angles, trace
-from tvsbayes.model.parameter_space import RATIO_COLUMNS, Model, ParameterSpace, parameter_space, physical_at
+from tvsbayes.model.parameter_space import (
+    HOME_COLUMNS,
+    RATIO_COLUMNS,
+    Model,
+    ParameterSpace,
+    parameter_space,
+    physical_at,
+)
 from tvsbayes.planning.gear_places import (
     NO_PLACES,
     FittedErrors,
@@ -58,9 +65,9 @@ SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
 """Looks are padded to this size or a power of four above it; moves to twice that."""
 
 
-def home_variances_rad2(rig: RigTable) -> np.ndarray:
-    """Return the variances of the shift of (pan, tilt) by a homing, shape (2,)."""
-    return np.radians(np.maximum(rig.home_sd_deg, KEPT_SD_DEG)) ** 2
+def home_variances_rad2(z: np.ndarray, space: ParameterSpace) -> np.ndarray:
+    """Return the variances of the shift of (pan, tilt) by a homing at coordinates (p,), shape (2,)."""
+    return np.radians(np.maximum(physical_at(z, space).value[HOME_COLUMNS], KEPT_SD_DEG)) ** 2
 
 
 @dataclass(frozen=True)
@@ -99,7 +106,7 @@ class Knowledge:
     @property
     def home_variances_rad2(self) -> np.ndarray | None:
         """Return those of the homing that begins a session; None where it is the first."""
-        return home_variances_rad2(self.rig.table) if self.after_data else None
+        return home_variances_rad2(self.z, self.space) if self.after_data else None
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -268,7 +275,7 @@ def expect(
     jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
     jacobian = jnp.concatenate([jacobian, lin.slope @ turning], axis=2)
     columns = jnp.concatenate([jacobian, lin.slope], axis=2)
-    inputs = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, spots)
+    inputs = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.zero_variance, spots)
 
     def step(belief, row):
         updated = kalman_update(belief.renewed(row), row)
@@ -311,7 +318,7 @@ def design_arrays(
             redraw_mix=padded(redraw_arrays.redraw_mix, size),
             new_segment=padded(redraw_arrays.new_segment, size, False, bool),
             new_zero=padded(redraw_arrays.new_zero, size, False, bool),
-            home_variance_rad2=padded(redraw_arrays.homed * np.radians(rig.table.home_sd_deg) ** 2, size),
+            homed=padded(redraw_arrays.homed, size),
             hours=padded(redraw_arrays.hours, size),
             tangents=None if rig.has_images else padded(np.zeros((count, 2, 3)), size),
         ),

@@ -211,7 +211,7 @@ def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer)
             redraw_mix=jnp.where(pair.side[None, :, None] * np.array([-1.0, 1.0]) > 0, 1.0, 0.0),
             new_segment=jnp.ones(1, dtype=bool),
             new_zero=jnp.ones((1, 2), dtype=bool),
-            home_variance_rad2=jnp.zeros((1, 2)),
+            homed=jnp.zeros((1, 2)),
             hours=jnp.zeros((1, 2)),
             tangents=jnp.zeros((1, 2, 3)) if observer.image_px is None else None,
         )

@@ -121,7 +121,7 @@ class WatchDesigns:
         self.fit, self.seed = fit, seed
         self.campaign = homed(fit.campaign, fit.sides)
         self.z = noise_draws(fit, 2, seed).centre
-        self._home_variances = home_variances_rad2(self.campaign.rig)
+        self._home_variances = home_variances_rad2(fit.z, fit.space)
         spots = ordered_spots(self.campaign)
         used = fit.arrays.used
         self.rig = _rig_of(self.campaign, spots, used) if rig is None else rig
@@ -426,6 +426,7 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
         false_alarm_rate=FALSE_ALARM_RATE,
         met=all(change.power >= POWER_MIN for change in changes),
         changes=changes,
+        home_sd_by_prior=fit.home_sd_by_prior,
     )
 
 

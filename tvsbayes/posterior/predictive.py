@@ -23,7 +23,13 @@ from tvsbayes.estimators.looks import WINDOW, observe_with_stop_errors
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.compiled import compiled, in_batches
-from tvsbayes.model.parameter_space import DRIFT_COLUMNS, SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
+from tvsbayes.model.parameter_space import (
+    DRIFT_COLUMNS,
+    HOME_COLUMNS,
+    SCATTER_COLUMNS,
+    STOP_COLUMNS,
+    ParameterSpace,
+)
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.statistics.streams import Stream, random_stream
 
@@ -270,7 +276,8 @@ def looks_again(
     fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
     rows = np.arange(count)[:, None]
     error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
-    home = np.sqrt(arrays.home_variance_rad2) * generator.standard_normal((len(z), count, 2))
+    home_rad = np.radians(physical[:, None, HOME_COLUMNS])
+    home = np.sqrt(arrays.homed) * home_rad * generator.standard_normal((len(z), count, 2))
     segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(count), 0))
     # Row at which the zero of each axis was set last, for all draws.
     zero = np.maximum.accumulate(np.where(arrays.new_zero, rows, 0), axis=0)[None]

@@ -15,7 +15,7 @@ import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots
-from tvsbayes.model.parameter_space import STOP_COLUMNS
+from tvsbayes.model.parameter_space import HOME_COLUMNS, STOP_COLUMNS
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,8 @@ class StopStates:
 
     Attributes:
         load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
-        variance: variances at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
+        variance: variances at the fit's noise scales, by direction (right, left, down, up), then by homings of (pan,
+            tilt), shape (m, 6).
         constant: variances of all other states, shape (m,).
     """
 
@@ -59,22 +60,25 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     spots, states = linear.load.shape[0], linear.load.shape[2]
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
     physical = np.asarray(fit.mode.physical)
-    variance_of = np.radians(physical[STOP_COLUMNS]) ** 2
+    variance_of, homed = np.radians(physical[STOP_COLUMNS]) ** 2, np.asarray(fit.arrays.spots.homed)
+    of_homing = np.diag(np.radians(physical[HOME_COLUMNS]) ** 2)
     times = []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
         for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
-            by_direction = np.zeros((2, 2))
+            by_scale, rest = np.zeros(6), 0.0
             if state < 2:
-                by_direction[state] = mix[begin, state] * variance_of[state]
-            rest = 0.0 if state < 2 else linear.variance[begin, state]
-            if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
-                times.append((end, begin, state, by_direction.ravel(), rest))
+                by_scale[2 * state : 2 * state + 2] = mix[begin, state] * variance_of[state]
+            else:
+                by_scale[4:] = homed[begin, state - 2] * of_homing[state - 2] if state < 4 else 0.0
+                rest = max(linear.variance[begin, state] - by_scale.sum(), 0.0)
+            if linear.load[begin:end, :, state].any() and by_scale.sum() + rest > 0:
+                times.append((end, begin, state, by_scale, rest))
     times.sort(key=lambda each: each[:3])
-    load, variance, constant = np.zeros((spots, 4, len(times))), np.zeros((len(times), 4)), np.zeros(len(times))
-    for column, (end, begin, state, *variances) in enumerate(times):
+    load, variance, constant = np.zeros((spots, 4, len(times))), np.zeros((len(times), 6)), np.zeros(len(times))
+    for column, (end, begin, state, by_scale, rest) in enumerate(times):
         load[begin:end, :, column] = linear.load[begin:end, :, state]
-        variance[column], constant[column] = variances
+        variance[column], constant[column] = by_scale, rest
     return StopStates(load.reshape(4 * spots, len(times)), variance, constant)
 
 

@@ -28,6 +28,7 @@ from tvsbayes.model.gear_processes import BlockRoot, column_blocks
 from tvsbayes.model.parameter_space import (
     DRIFT_COLUMNS,
     FARTHEST_SD,
+    HOME_COLUMNS,
     RATIO_COLUMNS,
     SCATTER_COLUMNS,
     STOP_COLUMNS,
@@ -541,7 +542,7 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
     stops, looks = stop_states(fit, linear), look_noise(fit)
     drifts = walks(fit, stops)
-    by_noise = STOP_COLUMNS.reshape(4, 1) == noise
+    by_noise = np.append(STOP_COLUMNS, HOME_COLUMNS)[:, None] == noise
     gears = fit.arrays.gears.without_padding()
     columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, gears.columns)
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
@@ -568,7 +569,7 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
             along=(linear.jacobian[..., others] @ wide).reshape(4 * spots, -1),
             states=stops,
             by_noise=stops.variance @ by_noise,
-            # Stop errors whose sd is not estimated keep their variance.
+            # Stops and homings whose sd is not estimated keep their variance.
             constant=stops.constant + stops.variance @ ~by_noise.any(axis=1),
             places=np.column_stack([columns, drifts.columns]),
             prior=(wide.T * precision) @ wide,

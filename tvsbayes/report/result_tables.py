@@ -27,7 +27,7 @@ KEY_PARAMETERS = (
 """Parameters of the last table of a fit."""
 HEAD_PARAMETERS = tuple(term.name for term in HEAD_TERMS.values())
 """The terms of a head, which follow them."""
-MORE_PARAMETERS = names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm")
+MORE_PARAMETERS = names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm", "home_sd_deg")
 """Parameters of the table of details."""
 SHARE_SHOWN = 5e-4
 """Least share of a variance in a table: smaller shares are printed as 0.0 %."""

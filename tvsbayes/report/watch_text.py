@@ -6,6 +6,7 @@ import math
 
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped
+from tvsbayes.instrument.homing import scatter_of_prior
 from tvsbayes.report.document import terminal
 from tvsbayes.report.tables import TableView
 from tvsbayes.results.watch_record import CANNOT_TELL, LOOKS_MAX, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
@@ -102,7 +103,7 @@ def watch_plan_text(plan: WatchPlan) -> str:
     table = TableView(
         "What `watch` will notice", ["change", "of", "noticed by this plan", f"looks for {power} of it alone"], rows
     )
-    lines = [summary]
+    lines = [summary, *([scatter_of_prior(plan.home_sd_by_prior)] if plan.home_sd_by_prior else [])]
     for c in plan.changes:
         if c.power >= plan.power_wanted:
             continue

@@ -61,6 +61,7 @@ class Watch(Shown, Record, frozen=True):
         p_all: probability of residuals this large at the fitted noise; it raises no alarm.
         changes: every change that is tested.
         same_cameras: whether the new looks state the campaign's stereo calibration.
+        home_sd_by_prior: axes whose scatter of homings is that of the prior.
     """
 
     verdict: Verdict
@@ -71,6 +72,7 @@ class Watch(Shown, Record, frozen=True):
     p_all: Probability
     changes: Annotated[tuple[SeenChange, ...], Meta(min_length=1)]
     same_cameras: bool
+    home_sd_by_prior: tuple[str, ...] = ()
 
     def unseen(self, power: float) -> tuple[SeenChange, ...]:
         """Changes that the looks detect with less than this power."""
@@ -117,6 +119,7 @@ class WatchPlan(Shown, Record, frozen=True, kw_only=True):
         changes: power for each change.
         plan: file of its steps.
         steps: the plan; not part of the document.
+        home_sd_by_prior: axes whose scatter of homings is that of the prior.
     """
 
     looks: Looks
@@ -129,6 +132,7 @@ class WatchPlan(Shown, Record, frozen=True, kw_only=True):
     changes: Annotated[tuple[PlannedChange, ...], Meta(min_length=1)]
     plan: str | UnsetType = UNSET
     steps: tuple[PlanStep, ...]
+    home_sd_by_prior: tuple[str, ...] = ()
     beside: ClassVar = ("steps",)
 
     def shown(self) -> View:

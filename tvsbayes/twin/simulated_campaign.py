@@ -205,7 +205,8 @@ def _drive(
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
     segments = np.array([m.segment for m in moves], int)
     first = np.diff(segments, prepend=-1) != 0
-    home_draws = np.array(rig.home_sd_deg) * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
+    home_sd_deg = [0.0 if axis in rig.absolute else p[f"home_sd_deg.{axis}"] for axis in SIDES]
+    home_draws = np.array(home_sd_deg) * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
     home_draws[0] = 0.0
     stop_draws = streams.stops.standard_normal((len(moves), 2))
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
