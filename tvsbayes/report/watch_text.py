@@ -83,6 +83,7 @@ def watch_text(watch: Watch, power_min: float, looks: str = "looks") -> str:
         lines += [f"cannot see {c.size:g} {escaped(c.unit)} of {c.what}: {HELPS[c.what]}" for c in unseen]
     if watch.verdict != MOVED and watch.p_all < watch.false_alarm_rate:
         lines.append(f"warning: the {looks} scatter more than the calibration says (p = {watch.p_all:.2g})")
+    lines += [scatter_of_prior(watch.home_sd_by_prior)] if watch.home_sd_by_prior else []
     return terminal(*lines, "", table)
 
 
