@@ -19,6 +19,7 @@ from tvsbayes.instrument.parameters import (
     CREEP_NAMES,
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
+    HOME_SD_NAMES,
     INDEX,
     NAMES,
     RECEIVER_NAMES,
@@ -62,7 +63,7 @@ def summary(fitted) -> FitSummary:
 
 
 def test_every_parameter_of_the_contract_is_there_and_only_those(fitted, summary):
-    optional = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *CREEP_NAMES, *names_of("thermal_deg_per_K"))
+    optional = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *CREEP_NAMES, *names_of("thermal_deg_per_K"), *HOME_SD_NAMES)
     absent = {name for name in optional if not fitted.free[INDEX[name]]}
     expected = set(NAMES) - set(RECEIVER_NAMES) - absent
     expected |= {f"degrees_per_step.{d}" for d in ("left", "right", "up", "down")} | {"effective_mirror_offset_mm"}

@@ -12,7 +12,7 @@ from support.coarse_planning import ROUNDING
 from tvsbayes.instrument.plan import plan_minutes
 from tvsbayes.planning.candidates import Positions
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import PARAMETERS, information_of
+from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
     LookArrays,
@@ -36,7 +36,7 @@ def test_looks_add_up_to_the_plan_they_make(knowledge, pool, seen):
     arranged = arrange(pool.looks[picks], knowledge.sheets, pool.run_up)
     kept = replace(knowledge.rig, table=replace(knowledge.rig.table, absolute=("pan",)))
     for after_data, rig in ((False, knowledge.rig), (True, knowledge.rig), (True, kept)):
-        known = replace(knowledge, after_data=after_data, rig=rig)
+        known = replace(prior_knowledge(rig), after_data=after_data)
         variances = known.home_variances_rad2
         exact = information_of(arranged.steps, known).fisher
         quick = information_of_looks(
