@@ -89,7 +89,7 @@ AXIS_QUANTITIES: Quantities[AxisQuantity] = Quantities(
     _key("drift_per_root_hour", "half-normal", 0.0005, 0.0, "drift of the zero per root hour"),
     _key("stop_sd", "log-normal", 0.0005, 1.5, "scatter of stops"),
     *AxisQuantity.many("stop_sd", CONTRAST_PARTS, unit="{unit}", label="scatter of stops, {0}"),
-    _key("home_sd", "log-normal", 0.001, 1.5, "scatter of homings"),
+    _key("home_sd", "log-normal", 0.0001, 2.0, "scatter of homings"),
     _key("reading_scale", "log-normal", None, 0.5, "scatter of readings / u", "1"),
     _key("creep", "normal", 0.0005, 0.0, "zero creeps while warming up"),
     _key("creep_minutes", "log-normal", None, 0.8, "time constant of creep, minutes", "min", median=20.0),
@@ -107,8 +107,10 @@ AXIS_QUANTITIES: Quantities[AxisQuantity] = Quantities(
 AXIS_KEYS = {name: key for name, key in AXIS_QUANTITIES.items() if isinstance(key, AxisKey)}
 """Shares of the travel: half-normals and stop scatter come from eleven stepper axes measured by others, where left-out
 positions, with the scales integrated out, lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some per
-cent; any reversal determines it well, so a wide prior is harmless. Seeing: errors of readings in motion that last for
-seconds, caused by air, a guider's loop or the reader; its sd is in units of a reading's u."""
+cent; any reversal determines it well, so a wide prior is harmless. Homings: index marks repeat to a micrometre, worn
+switches to some tenths of a millimetre; a prior that excluded the former would be most of a promise after three homings.
+Seeing: errors of readings in motion that last for seconds, caused by air, a guider's loop or the reader; its sd is in
+units of a reading's u."""
 CONTRAST_SHARE = 1e-4
 """sd of the difference of both directions' ratios over the ratio, of an axis that is not read in a length: gears have
 one ratio. With a larger sd, two ratios would explain the warming of a machine on a long path."""
