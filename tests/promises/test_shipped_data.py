@@ -107,7 +107,7 @@ def test_twins_state_the_mounted_rig_and_hold_another(name: str):
     stated = {"ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt", "pixel_scale"}
     allowed_equal = stated if name == "paper_twin" else set()
     equal = {parameter for parameter, z in distances.items() if z == 0}
-    perfect = {*GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES, *CREEP_NAMES, *names_of("thermal_deg_per_K")}
+    perfect = {*GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES, *CREEP_NAMES, *names_of("thermal_deg_per_K", "home_sd_deg")}
     assert equal - perfect == allowed_equal, "gears are perfect, looks and zeros stand still"
     offset = truth.stereo.vector - campaign.stereo.vector
     chi2 = offset @ np.linalg.solve(campaign.stereo.parameter_covariance, offset)
