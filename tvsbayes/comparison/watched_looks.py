@@ -53,10 +53,7 @@ CHANGES = (*_pose("cameras", "stereo"), *_pose("positioner", "extrinsics"), *_GE
 _LEAN = tuple(f"azimuth_axis_tilt_deg.{side}" for side in ("north", "east"))
 SIGHTED_CHANGES = (
     # These sizes exceed the usual scatter of homings, 0.05 deg.
-    *(
-        single_change(f"zero: {angle}", f"{angle}_zero_deg", 0.25, "deg")
-        for angle in ("azimuth", "elevation")
-    ),
+    *(single_change(f"zero: {angle}", f"{angle}_zero_deg", 0.25, "deg") for angle in ("azimuth", "elevation")),
     StatedChange("base: lean", _LEAN, ("base: lean to azimuth 0", "base: lean to azimuth 90"), 0.1, "deg"),
     single_change("beam: not square", "beam_not_square_deg", 0.1, "deg"),
     *_GEARS,
