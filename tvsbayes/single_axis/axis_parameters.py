@@ -108,7 +108,7 @@ AXIS_KEYS = {name: key for name, key in AXIS_QUANTITIES.items() if isinstance(ke
 """Shares of the travel: half-normals and stop scatter come from eleven stepper axes measured by others, where left-out
 positions, with the scales integrated out, lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some per
 cent; any reversal determines it well, so a wide prior is harmless. Homings: index marks repeat to a micrometre, worn
-switches to some tenths of a millimetre; a prior that excluded the former would be most of a promise after three homings.
+switches to tenths of a millimetre; a prior that excluded the former would be most of a promise after a few homings.
 Seeing: errors of readings in motion that last for seconds, caused by air, a guider's loop or the reader; its sd is in
 units of a reading's u."""
 CONTRAST_SHARE = 1e-4
