@@ -127,10 +127,12 @@ def one_axis(task: tuple[bool, int, int]) -> dict[str, object]:
     starts_s = np.array([m.time_s for m in campaign.moves if m.approach])
     degC = screw.degC(np.array([m.time_s for m in campaign.moves]))
 
-    def used(command: np.ndarray, side: np.ndarray, table: Correction, rng: np.random.Generator) -> np.ndarray:
+    def used(
+        command: np.ndarray, side: np.ndarray, table: Correction, rng: np.random.Generator, uses: int = 1
+    ) -> np.ndarray:
         warm_s = rng.choice(starts_s) + 3600.0 * made.hours * rng.random(len(command))
         added = screw.growth(warm_s, rng.uniform(degC.min(), degC.max(), len(command)))
-        home = screw.home * rng.standard_normal() if homings > 1 else 0.0
+        home = screw.home * (homings > 1) * np.resize(rng.standard_normal(uses), len(command))
         return screw.stands(table.sent(command, side), side, rng) + added + home - command
 
     places = np.tile(np.repeat(means.command, 2), RUNS)
@@ -142,7 +144,7 @@ def one_axis(task: tuple[bool, int, int]) -> dict[str, object]:
         each = [off[(places == c) & (sides == s)].mean() for c in means.command for s in (1, -1)]
         e.append(float(np.ptp(each)))
     command, side = rng.uniform(*made.range_command, 2 * FRESH), np.repeat([1, -1], FRESH)
-    error = used(command, side, ours, rng) - made.offset
+    error = used(command, side, ours, rng, uses=2 * FRESH) - made.offset
     error = np.abs(error - error.mean() if homings == 1 else error)
     promised = {name: made.promise[name].error95 for name in SIDES}
     row |= {"e": e[0], "e_means": e[1], "promised": promised}
