@@ -1,14 +1,16 @@
-"""Numbers of an axis that contradict what their names say are asked about, and every answer reads them rightly."""
+"""Tables whose numbers contradict what their names say are asked about, and every answer reads them rightly."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from tvsbayes.errors import Question
+from tvsbayes.errors import InputError, Question
 from tvsbayes.importing.axis import axis_rows
 from tvsbayes.importing.axis_units import Wishes
+from tvsbayes.importing.looks import LookWishes, look_columns, look_rows
 from tvsbayes.importing.reader import read_foreign
+from tvsbayes.importing.sightings import SightingWishes, sighting_rows
 
 PLACES = np.array([0.0, 10, 20, 30, 40, 50, 40, 30, 20, 10, 0])
 SIDES = np.r_[np.ones(6), -np.ones(5)]
@@ -72,3 +74,44 @@ def test_a_column_t_is_a_clock_or_a_thermometer(tmp_path):
     assert [m["temperature_degC"] for m in rows.moves] == pytest.approx(list(TEMPERATURES))
     clock = axis_rows(table(tmp_path, "command (mm),reading (mm),T", PLACES, READ, 30.0 * np.arange(11)), Wishes())
     assert clock.moves[2]["time_s"] == 60.0
+
+
+def test_rows_of_two_axes_are_no_axis(tmp_path):
+    rows = "".join(f"X,{c:g},{v:.4f}\nY,{c / 2:g},{v / 2:.4f}\n" for c, v in zip(PLACES, READ, strict=True))
+    (tmp_path / "t.csv").write_text(f"axis,target (mm),actual (mm)\n{rows}")
+    with pytest.raises(InputError, match="rows of X, Y in column axis"):
+        axis_rows(read_foreign(tmp_path / "t.csv"), Wishes())
+    (tmp_path / "one.csv").write_text(f"axis,target (mm),actual (mm)\n{rows}".replace("Y", "X"))
+    assert axis_rows(read_foreign(tmp_path / "one.csv"), Wishes()).moves
+
+
+def test_errors_of_directions_are_no_directions(tmp_path):
+    rows = "".join(f"{p},{p},{0.001 * p},0.01\n" for p in range(0, 900, 100))
+    (tmp_path / "t.csv").write_text(f"pan_steps,tilt_steps,az_err_deg,el_err_deg\n{rows}")
+    with pytest.raises(InputError, match="no column that is surely azimuth_deg, elevation_deg"):
+        sighting_rows(read_foreign(tmp_path / "t.csv"), SightingWishes())
+
+
+@pytest.mark.parametrize("names", ["pan,tilt,camera,u,v", "pan,tilt,cam,x_px,y_px", "pan,tilt,Kamera,Spalte,Zeile"])
+@pytest.mark.parametrize("order", [("left", "right"), ("R", "L")])
+def test_a_row_for_each_camera_of_a_look(names, order, tmp_path):
+    def pixels(pan: int, camera: str) -> str:
+        return f"{600 + 2 * pan + 30 * (camera in ('left', 'L'))},{400 + pan}"
+
+    rows = [f"{pan},0,{camera},{pixels(pan, camera)}" for pan in (0, 100, 200) for camera in order]
+    (tmp_path / "t.csv").write_text("\n".join([names, *rows, ""]))
+    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), LookWishes()).looks
+    assert [(k["u_left_px"], k["v_left_px"], k["u_right_px"]) for k in looks] == [
+        (630 + 2 * pan, 400 + pan, 600 + 2 * pan) for pan in (0, 100, 200)
+    ]
+    (tmp_path / "t.csv").write_text("\n".join([names, *rows[1:], ""]))
+    with pytest.raises(InputError, match="a look without a row of either camera"):
+        look_columns(read_foreign(tmp_path / "t.csv"), {})
+
+
+def test_pixels_of_no_camera_are_refused(tmp_path):
+    (tmp_path / "t.csv").write_text("pan,tilt,u,v\n0,0,600,400\n100,0,800,400\n")
+    with pytest.raises(InputError, match="no column gives to a camera"):
+        look_columns(read_foreign(tmp_path / "t.csv"), {})
+    (tmp_path / "t.csv").write_text("pan,tilt,x,y\n0,0,600,400\n100,0,800,400\n")
+    assert look_columns(read_foreign(tmp_path / "t.csv"), {}).taken

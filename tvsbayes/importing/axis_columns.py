@@ -12,12 +12,12 @@ import numpy as np
 
 from tvsbayes.errors import Candidate, escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.asking import listed
+from tvsbayes.importing.asking import listed, refused
 from tvsbayes.importing.clock import equal_clocks, relative_times
 from tvsbayes.importing.columns import Chooser, Column, Understood, factor_between, line_through
 from tvsbayes.importing.runs import counts_rows
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import means
+from tvsbayes.importing.words import means, place_of
 
 FIELDS = ("command", "value", "u", "status", "segment", "time_s", "approach", "temperature_degC", "moving")
 """All fields of a table of an axis."""
@@ -32,6 +32,8 @@ SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 and scatter by more than the second share of their own span about a line."""
 ROOM_DEGC = (10.0, 40.0)
 """Temperatures of a room."""
+MACHINES_MAX, MACHINE_ROWS = 8, 3
+"""Largest number of axes or readers in a table, and fewest rows of each."""
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
 """Options that say what the readings are."""
 _MEANING = {DEVIATIONS: "actual less commanded position", POSITIONS: "positions"}
@@ -60,6 +62,7 @@ def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: boo
     chooser.roles = {role: _of_device(chooser, names) for role, names in chooser.roles.items()}
     _take_value(chooser, deviations)
     _take_others(chooser)
+    _refuse_several(chooser)
     return chooser.understood()
 
 
@@ -163,6 +166,18 @@ def _take_others(chooser: Chooser) -> None:
         columns = ({"time_s": clocks[0]}, {"temperature_degC": clocks[0]}, {"time_s": ""})
         raise chooser.ask(found, list(map(chooser.answer, columns)))
     chooser.take("time_s", clocks, what="that could be the clock")
+
+
+def _refuse_several(chooser: Chooser) -> None:
+    """Refuse rows of several axes or readers: a column that names them."""
+    for text in chooser.understood().unused:
+        column = chooser.known[text]
+        names = dict.fromkeys(filter(None, column.cells))
+        enough = min(map(column.cells.count, names), default=0) >= MACHINE_ROWS
+        if place_of(column.name.words, "machine") is not None and 1 < len(names) <= MACHINES_MAX and enough:
+            table = chooser.table
+            said = {"name": text, "machines": list(names)}
+            raise refused("several-machines", table.file, line=table.first_line, **said)
 
 
 def _may_be_degC(column: Column) -> bool:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tvsbayes.errors import escaped
+from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_kind import ID_MAX
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import refused
@@ -60,6 +60,8 @@ _NAMED = (
     "temperature_degC",
 )
 """Fields in the order of their lists of words."""
+PLACES = ("x", "y")
+"""Words of columns that hold places of other things than spots as well."""
 _MARKS = {"", *"01", "true", "false", "True", "False", "TRUE", "FALSE"}
 _LABELLED = re.compile(r"\A[^\W\d]+[ _.#-]*([0-9]{1,9})\Z")
 """A number behind a word: P1, exp 07."""
@@ -122,7 +124,7 @@ def look_columns(table: ForeignTable, stated: Mapping[str, str]) -> Chooser:
     Raises:
         InputError: a field or column that does not exist is stated.
     """
-    chooser = Chooser.of(table, stated, FIELDS, _role)
+    chooser = Chooser.of(by_look(table, stated), stated, FIELDS, _role)
     clocks = chooser.roles.get("time_s", []) if chooser.is_open("time_s") else []
     kinds = {_kind_of_clock(table.columns[name]): name for name in clocks}
     if len(clocks) == 2 and kinds.keys() == {"day", "hour"}:
@@ -135,6 +137,58 @@ def look_columns(table: ForeignTable, stated: Mapping[str, str]) -> Chooser:
         if len(names) == 1:
             chooser.take(role)
     return chooser
+
+
+def by_look(table: ForeignTable, stated: Mapping[str, str]) -> ForeignTable:
+    """A table with a row for each camera of a look as one with a row for each look; other tables are unchanged.
+
+    Raises:
+        InputError: a look has no row of either camera, or no column says which camera a row is of.
+    """
+    pixels = {text: found for text in table.columns if (found := _pixel_of(text))}
+    axes = list(pixels.values())
+    several = {"u", "v"} - {*axes} or len({*axes}) != len(axes)
+    if several or {*stated, *map(field_of, table.columns)} & {*PIXELS}:
+        return table
+    sides = {text: [_side_of(cell) for cell in cells] for text, cells in table.columns.items() if text not in pixels}
+    cameras = [text for text, found in sides.items() if {*found} == {"left", "right"}]
+
+    def refuse(what: str) -> InputError:
+        return refused("rows-of-cameras", table.file, line=table.first_line, lack=what, columns=list(pixels))
+
+    if len(cameras) != 1:
+        if all({*words_of(text)} & {*PLACES} for text in pixels):
+            return table
+        raise refuse("pixels that no column gives to a camera")
+    camera = sides[cameras[0]]
+    others = [text for text in table.columns if text not in pixels and text != cameras[0]]
+    pairs = list(zip(range(0, len(table) - 1, 2), range(1, len(table), 2), strict=True))
+    same = all(
+        camera[a] != camera[b] and all(table.columns[t][a] == table.columns[t][b] for t in others) for a, b in pairs
+    )
+    if len(table) % 2 or not same:
+        raise refuse("a look without a row of either camera")
+    columns = {text: tuple(table.columns[text][a] for a, _ in pairs) for text in others}
+    for text, axis in pixels.items():
+        for side in ("left", "right"):
+            cells = tuple(table.columns[text][a if camera[a] == side else b] for a, b in pairs)
+            columns[f"{axis}_{side}_px"] = cells
+    kind = f"{table.kind}, two rows a look by column {escaped(cameras[0])}"
+    return replace(table, kind=kind, columns=columns, lines=tuple(table.lines[a] for a, _ in pairs))
+
+
+def _pixel_of(name: str) -> str:
+    """Whether a column holds u or v, or their uncertainty su or sv, of a camera that it does not name."""
+    words = words_of(name)
+    found = [c for c in ("u", "v", "left", "right", "spread", "distance") if place_of(words, c, WORDS) is not None]
+    if not found or found[0] not in ("u", "v") or found[1:] not in ([], ["spread"]):
+        return ""
+    return f"{'s' * (len(found) == 2)}{found[0]}"
+
+
+def _side_of(cell: str) -> str:
+    sides = [side for side in ("left", "right") if place_of(words_of(cell), side, WORDS) is not None]
+    return sides[0] if len(sides) == 1 else ""
 
 
 def _kind_of_clock(cells: Sequence[str]) -> str:

@@ -160,6 +160,9 @@ def field_of(column: Column) -> str | None:
     if len(of_axis) == 1:
         if "approach" in words:
             return f"{AXES[of_axis[0]]}_approach"
+        if name.has("deviation"):
+            # The error of a direction is none.
+            return None
         counted = place_of(words, "counter") is not None and place_of(words, "observed") is None
         return COUNTERS[of_axis[0]] if counted else ANGLES[of_axis[0]]
     if name.has("aside") or of_axis:
