@@ -175,9 +175,8 @@ def _refuse_several(chooser: Chooser) -> None:
         names = dict.fromkeys(filter(None, column.cells))
         enough = min(map(column.cells.count, names), default=0) >= MACHINE_ROWS
         if place_of(column.name.words, "machine") is not None and 1 < len(names) <= MACHINES_MAX and enough:
-            table = chooser.table
-            said = {"name": text, "machines": list(names)}
-            raise refused("several-machines", table.file, line=table.first_line, **said)
+            line = chooser.table.first_line
+            raise refused("several-machines", chooser.table.file, line=line, name=text, machines=list(names))
 
 
 def _may_be_degC(column: Column) -> bool:
