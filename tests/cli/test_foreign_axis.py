@@ -146,6 +146,27 @@ def test_two_levels_of_one_position_are_two_stops_and_no_motion(ask, tmp_path, c
     assert code == 0 and document["ok"] == 48 and not any("rest:" in text for text in document["assumed"])
 
 
+def test_titles_of_direction_above_columns_of_dimensions(ask, tmp_path):
+    """A "Cote" of numbers is a dimension: only "C\u00f4t\u00e9" of words is a column of sides."""
+    blocks = [
+        [title, "Cote (mm);Lecture (mm)", *(f"{t};{t + off}" for t in targets)]
+        for title, targets, off in (("Avant 1", range(5), 0.25), ("Arri\u00e8re 1", range(4, -1, -1), 0.5))
+    ]
+    (tmp_path / "log.txt").write_text("\n".join(line for block in blocks for line in block), encoding="utf-8")
+    code, document = ask("import", tmp_path / "log.txt", "--axis", "--to", tmp_path / "out", "--yes")
+    assert code == 0 and document["columns"]["approach"]["column"] == "direction"
+
+
+@pytest.mark.parametrize(("unit", "turned"), [("", False), (" (deg)", True)])
+def test_play_of_an_unknown_unit_is_no_turn(ask, tmp_path, unit, turned):
+    """Where the commands turn back and nowhere else degrees jump by a turn, readings of no unit by their play."""
+    values = [(c, 10 * c) for c in range(8)] + [(c, 10 * c + 360) for c in range(6, -1, -1)]
+    (tmp_path / "log.csv").write_text("\n".join([f"steps,reading{unit}", *(f"{c},{v}.5" for c, v in values)]))
+    code, _ = ask("import", tmp_path / "log.csv", "--axis", "--to", tmp_path / "out", "--yes")
+    read = [reading.value for reading in read_axis(tmp_path / "out").readings]
+    assert code == 0 and read == [v + 0.5 - 360 * (turned and k > 7) for k, (_, v) in enumerate(values)]
+
+
 def test_a_reading_at_standstill_is_one_where_readings_show_it(ask, tmp_path):
     """The direction of a log may be that of the next move: the end of a run is then read twice from one side."""
     values = [(c, 1, c + 0.1) for c in range(6)] + [(5, -1, 5.1)] + [(c, -1, c - 0.1) for c in range(4, -1, -1)]

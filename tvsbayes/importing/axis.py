@@ -207,7 +207,7 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
         assumed.append(f"status: {unread} row{'s' * (unread > 1)} called good without a reading: moves alone")
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
-    readings, wrapped = unwrapped(moves, readings, folder_unit or unit or "deg", wishes.counts_per_turn)
+    readings, wrapped = unwrapped(moves, readings, folder_unit or unit, wishes.counts_per_turn)
     assumed += wrapped
     shown = Understood(columns, tuple(dict.fromkeys((*known.unused, *runs.unused))))
     lines, document = table_lines(table, shown, FIELDS, shown_units(units, unit, cells)), table_document(table, shown)
@@ -444,14 +444,18 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
 
 # --- whole turns -----------------------------------------------------------------------------------------------------
 def unwrapped(
-    moves: Sequence[Mapping[str, Any]], readings: list[dict[str, Any]], unit: str, counts_per_turn: float | None = None
+    moves: Sequence[Mapping[str, Any]],
+    readings: list[dict[str, Any]],
+    stated: str | None,
+    counts_per_turn: float | None = None,
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """The readings with whole turns added where an encoder or autocollimator wraps, and a sentence on it.
 
     Args:
         moves: rows of moves.
         readings: rows of readings.
-        unit: unit of the readings; lengths are unchanged unless the readings count to a power of two.
+        stated: unit of the readings, degrees where none is stated; lengths are unchanged unless the readings count to a
+            power of two.
         counts_per_turn: period of the wrapping, in the readings' unit; 0: no wrapping.
 
     Raises:
@@ -462,6 +466,7 @@ def unwrapped(
     usable = [k for k, reading in enumerate(readings) if reading["status"] == "ok" and reading["value"] is not None]
     command = np.array([moves[readings[k]["move"]]["command"] for k in usable])
     value = np.array([readings[k]["value"] for k in usable], dtype=float)
+    unit = stated or "deg"
     of_angle = parse_unit(unit)
     turn = (
         counts_per_turn
@@ -472,6 +477,13 @@ def unwrapped(
     # An outlier also jumps, and back, but not by whole turns.
     if turn is None or not jumps or any(abs(jump - round(jump)) > TURN_TOLERANCE for jump in jumps.values()):
         return readings, []
+    if stated is None and counts_per_turn is None:
+        way = np.sign(np.diff(command))
+        went = [next((w for w in reversed(way[: row - 1]) if w), 0.0) for row in jumps]
+        goes = [next((w for w in way[row - 1 :] if w), 0.0) for row in jumps]
+        if all(a * b < 0 for a, b in zip(went, goes, strict=True)):
+            # Where the commands turn back, and nowhere else, readings of an unknown unit jump by their play.
+            return readings, []
     rows, turns = list(readings), 0
     for row, k in enumerate(usable):
         turns -= round(jumps.get(row, 0.0))

@@ -312,7 +312,9 @@ def _without_titles(
     body = [(row, of) for row, of in zip(rows, sides, strict=True) if row.line not in titles]
     are_runs = all(of for _, of in body) and len({of for _, of in body}) > 1
     named = ", ".join(f'"{escaped(text, 30)}"' for text in list(titles.values())[:3]) + " ..." * (len(titles) > 3)
-    if not are_runs or any(place_of(words_of(name or ""), "approach") is not None for name in names):
+    # "Cote" of numbers is a dimension, "C\u00f4t\u00e9" of words a side.
+    of_words = [name or "" for k, name in enumerate(names) if k not in numeric]
+    if not are_runs or any(place_of(words_of(name), "approach") is not None for name in of_words):
         one = len(titles) == 1
         return names, [row for row, _ in body], f"line{'s' * (not one)} of text left out ({named})"
     note = f"runs one below the other, with the directions of their titles ({named})"
@@ -327,30 +329,22 @@ def side_named(text: str) -> str:
 
 
 def _names(rows: Sequence[Row], width: int) -> tuple[list[str | None], Sequence[Row], str]:
-    """Names of the columns, from one header line or two, the rows below, and a note on the second line."""
-    head, body, note = list(rows[0].cells), rows[1:], ""
-    if len(body) > 1 and _is_second_header(body[0].cells, body[1].cells):
-        below = body[0].cells
-        units = [
-            parse_unit(cell.strip("()[] ")) is not None or not words_of(cell) or means(cell, "empty") for cell in below
-        ]
-        if all(units) or not any(head[k] == "" and below[k] for k in range(width)):
+    """Names of the columns, from one header line or more, the rows below, and a note on the other lines."""
+    head, body, notes = list(rows[0].cells), rows[1:], list[str]()
+    while len(body) > 1 and _is_second_header(body[0].cells, body[1].cells):
+        below, are_units = body[0].cells, _all_units(body[0].cells)
+        if are_units:
             marks = ["" if not cell or means(cell, "empty") else f" ({cell.strip('()[] ')})" for cell in below]
-            note = "units in the row below the names" if all(units) else "names in two rows"
-            if not all(units):
-                marks = [f" {cell}" if cell else "" for cell in below]
             head = [name and f"{name}{mark}" for name, mark in zip(head, marks, strict=True)]
         else:
-            group = ""
+            # Below a group of columns its name is that of the first.
+            group, grouped = "", any(below[k] and not head[k] for k in range(width))
             for k in range(width):
-                group = head[k] or group
-                head[k] = f"{group} {below[k]}".strip()
-            note = "names in two rows"
+                group = head[k] or group if grouped else head[k]
+                head[k] = f"{group} {below[k]}".strip() if grouped or head[k] else ""
+        notes.append("units in the row below the names" if are_units else "names in two rows")
         body = body[1:]
-        if len(body) > 1 and _is_second_header(body[0].cells, body[1].cells):
-            inner, body, _ = _names([Row(rows[0].line, head), *body], width)
-            return inner, body, "names in three rows"
-    return _unique(head), body, note
+    return _unique(head), body, "names in three rows" if len(notes) > 1 else "".join(notes)
 
 
 def _is_second_header(cells: Sequence[str], next_cells: Sequence[str]) -> bool:
