@@ -197,7 +197,7 @@ def edited_tables(place: Path, rng: random.Random) -> str:
         (place / "edited.csv").write_bytes(data)
         out = place / "edited" / str(k)
         try:
-            found = import_readings(place / "edited.csv", out, {}, None, FileOptions(), yes=True, as_json=True)
+            found = import_readings(place / "edited.csv", out, None, FileOptions(), yes=True, as_json=True)
             found.write()
             read_axis(out)
             outcomes["read"] += 1

@@ -32,7 +32,7 @@ def imported(path, folder):
     """Import a file as an axis and as sightings; whether it was refused."""
     refused = 0
     try:
-        import_readings(path, folder / "out", {}, None, FileOptions(), yes=True, as_json=True)
+        import_readings(path, folder / "out", None, FileOptions(), yes=True, as_json=True)
     except InputError as error:
         assert error.remedy or error.message
         refused += 1
@@ -105,7 +105,7 @@ def test_damaged_guide_logs_are_read_or_refused(tmp_path_factory, case):
     path.write_bytes(case[1])
     try:
         stated = FileOptions(assume=MAXIM if case[0] == "MaxIm" else {})
-        found = import_readings(path, out, {}, None, stated, yes=True, as_json=True)
+        found = import_readings(path, out, None, stated, yes=True, as_json=True)
     except InputError as error:
         assert error.remedy or error.message
         return

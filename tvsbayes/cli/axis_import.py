@@ -69,30 +69,16 @@ class FileOptions:
     Attributes:
         kind: "auto" or one of `KINDS`.
         run: number of a run of a guide log.
-        deviations: whether readings are actual minus commanded position; None where the names decide.
-        counts_per_turn: counts after which readings restart.
-        runs: order of runs beside each other.
-        units: unit by field.
         assume: numbers that the file does not state, by name.
         encoders: where commands are angles of an encoder, "output", "motor" or "incremental".
-        relative: whether commands are the lengths of moves.
+        table: what is stated of a table.
     """
 
     kind: str = "auto"
     run: int | None = None
-    deviations: bool | None = None
-    counts_per_turn: float | None = None
-    runs: str | None = None
-    units: Mapping[str, str] = field(default_factory=dict)
     assume: Mapping[str, float] = field(default_factory=dict)
     encoders: str | None = None
-    relative: bool = False
-
-    def wishes(self, columns: Mapping[str, str]) -> Wishes:
-        """What they say about a table."""
-        coverage, status_ok = (self.assume.get(name) for name in ("coverage", "status_ok"))
-        runs, relative = self.runs, self.relative
-        return Wishes(columns, self.units, self.deviations, self.counts_per_turn, runs, coverage, status_ok, relative)
+    table: Wishes = field(default_factory=Wishes)
 
 
 def log_kind(data: bytes, file: str) -> str:
@@ -120,16 +106,16 @@ def refuse_log(file: Path) -> None:
 
 
 def import_readings(
-    file: Path, to: Path, stated: Mapping[str, str], sheet: str | None, wish: FileOptions, *, yes: bool, as_json: bool
+    file: Path, to: Path, sheet: str | None, wish: FileOptions, *, yes: bool, as_json: bool
 ) -> Import | None:
     """Import a table or log of an axis into a folder that is new or has only the tables of the template.
 
     Returns None where the runs of a log were listed instead.
     """
-    data, name = read_bytes(file, CSV_BYTES_MAX), escaped(file.name)
+    data, name, stated = read_bytes(file, CSV_BYTES_MAX), escaped(file.name), wish.table.columns
     kind = log_kind(data, name) if wish.kind == "auto" else wish.kind
     if kind == "phd2":
-        _check_options(kind, wish, stated, sheet)
+        _check_options(kind, wish, sheet)
         runs = read_runs(text_of(data, name).text, name, wish.assume.get("ra_axis"))
         if wish.run is None and len(runs) > 1:
             _list_runs(file, to, runs, yes=yes, as_json=as_json)
@@ -139,7 +125,7 @@ def import_readings(
         table, text = _table(kind, data, file, sheet, stated)
         if kind == "csv" and not stated and text and is_periodic_error(text, table):
             kind = "pe"
-        _check_options(kind, wish, stated, sheet)
+        _check_options(kind, wish, sheet)
         if kind == "pe":
             rows = periodic_error_rows(table, text, wish.assume)
             lines = [f"{table.file}: {table.kind}; {len(table)} rows, {LOGS[kind]}"]
@@ -150,7 +136,7 @@ def import_readings(
                 if kind in ("epics", "klipper") and "time_s" in table.columns
                 else {}
             )
-            rows = axis_rows(table, wish.wishes({**stated, **named}), unit_of_folder(to))
+            rows = axis_rows(table, replace(wish.table, columns={**stated, **named}), unit_of_folder(to))
             rows = replace(rows, axis={**rows.axis, **ENCODER_ENTRIES.get(wish.encoders or "", {})})
             lines, document = list(rows.lines), dict(rows.document)
     _refuse_filled(to)
@@ -188,11 +174,12 @@ def _import_of(rows: AxisRows, lines: Sequence[str], document: Mapping[str, Any]
     return Import(lines, document, lambda: _write(to, rows), f"`{command}`", hint, outcome)
 
 
-def _check_options(kind: str, opts: FileOptions, stated: Mapping[str, str], sheet: str | None) -> None:
+def _check_options(kind: str, opts: FileOptions, sheet: str | None) -> None:
     """Refuse options that a file of this kind would ignore."""
-    given: dict[str, object] = {"run": opts.run, "column": stated or None, "unit": opts.units or None}
-    given |= {"deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn, "sheet": sheet, "runs": opts.runs}
-    given |= {"encoders": opts.encoders, "relative": opts.relative or None}
+    table = opts.table
+    given: dict[str, object] = {"run": opts.run, "column": table.columns or None, "unit": table.units or None}
+    given |= {"deviations": table.deviations, "counts_per_turn": table.counts_per_turn, "sheet": sheet}
+    given |= {"runs": table.order, "encoders": opts.encoders, "relative": table.relative or None}
     refused = {name: value for name, value in given.items() if kind not in KINDS_OF[name]}
     refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **refused)
 

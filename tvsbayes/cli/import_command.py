@@ -167,6 +167,7 @@ def import_(
         task = _pointing_table(o.file, o.to, o.encoders)
     elif kind_of_file == AXIS:
         from tvsbayes.cli.axis_import import KINDS, FileOptions, import_readings
+        from tvsbayes.importing.axis_units import Wishes
         from tvsbayes.importing.guide import ASSUMPTIONS
         from tvsbayes.importing.runs import ORDERS
 
@@ -175,10 +176,10 @@ def import_(
         check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
         check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")
         units = dict(_named("--unit", text, "value=um") for text in o.unit or ())
-        wish = FileOptions(
-            o.kind, o.run, o.deviations, o.counts_per_turn, o.runs, units, assumed, o.encoders, o.relative
-        )
-        task = import_readings(o.file, o.to, stated, o.sheet, wish, yes=o.yes, as_json=o.as_json)
+        of_u = assumed.get("coverage"), assumed.get("status_ok")
+        table = Wishes(stated, units, o.deviations, o.counts_per_turn, o.runs, *of_u, relative=o.relative)
+        wish = FileOptions(o.kind, o.run, assumed, o.encoders, table)
+        task = import_readings(o.file, o.to, o.sheet, wish, yes=o.yes, as_json=o.as_json)
     elif kind_of_file == SIGHTINGS:
         from tvsbayes.cli.head_commands import import_sightings
         from tvsbayes.importing.sightings import SightingWishes
