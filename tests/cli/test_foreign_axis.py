@@ -157,6 +157,69 @@ def test_titles_of_direction_above_columns_of_dimensions(ask, tmp_path):
     assert code == 0 and document["columns"]["approach"]["column"] == "direction"
 
 
+ROWS = [(c, f"{c + off:.3f}") for off, run in ((0.01, range(6)), (0.04, range(5, -1, -1))) for c in run]
+"""Of an axis read to and fro."""
+
+
+def markdown() -> str:
+    """Two runs in thousandths of an inch."""
+    rows = [f"{k} | {1000 * k + 1} | {1000 * k + 2}|" for k in range(5)]
+    return "\n".join(['Position [inch] | Run 1 [0.001"] | Run 2 [0.001"]|', ":---: | :---: | :---:|", *rows])
+
+
+def telemetry() -> str:
+    """Ten rows a command: the first comes to rest two counts late, those of another flicker by two."""
+    rows = [(1000, 994), *[(1000, 996)] * 9]
+    for k in range(1, 5):
+        at = 1000 + 200 * k
+        rows += [(at, at - 170 + 40 * n) for n in range(4)] + [(at, at - 4 + (k == 3) * (n % 3)) for n in range(9)]
+    return "\n".join(["target pos,pos", *(f"{c},{v}" for c, v in rows)])
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "readings"),
+    [
+        (markdown(), "inch", [1e-3 * (1000 * k + n) for n in (1, 2) for k in range(5)]),
+        (
+            telemetry(),
+            "counts",
+            [*[996] * 9, *(v - 4 + (v == 1600) * (n % 3) for v in range(1200, 2000, 200) for n in range(9))],
+        ),
+        (
+            "Ist (mm);Soll (mm)\n" + "".join(f"{v};{c}\n" for c, v in [(-1, "#N/A"), *ROWS]),
+            "mm",
+            [float(v) for _, v in ROWS],
+        ),
+    ],
+    ids=["an inch in Markdown", "a row that still moves", "a row that begins with no value"],
+)
+def test_small_marks_that_change_what_is_read(ask, tmp_path, text, unit, readings):
+    (tmp_path / "log.txt").write_text(text, encoding="utf-8")
+    code, _ = ask("import", tmp_path / "log.txt", "--axis", "--to", tmp_path / "out", "--yes", "--runs", "forward")
+    campaign = read_axis(tmp_path / "out")
+    assert code == 0 and campaign.unit == unit
+    assert [reading.value for reading in campaign.readings] == pytest.approx(readings)
+    # A command that was not read is a move.
+    assert campaign.moves[0].command == (-1 if "#N/A" in text else campaign.moves[0].command)
+
+
+def test_a_position_beside_a_deviation_and_a_column_of_nobodys_words_is_asked(ask, tmp_path):
+    rows = [f"{c};{v};{float(v) - c:.3f}" for c, v in ROWS]
+    (tmp_path / "log.csv").write_text("\n".join(["Fahrwunsch (mm);Winkel (mm);Abw (mm)", *rows]), encoding="utf-8")
+    assert_error(ask("import", tmp_path / "log.csv", "--axis", "--to", tmp_path / "out", "--yes")[1], "missing-column")
+
+
+def test_a_sheet_of_words_before_a_table_with_units_in_its_cells(ask, tmp_path):
+    book = openpyxl.Workbook()
+    book.active.append(["Operator: A. B."])
+    page = book.create_sheet("Data")
+    for row in (("Motor (rev)", "Reading"), *((c, f"{v} mm") for c, v in ROWS)):
+        page.append(row)
+    book.save(tmp_path / "log.xlsx")
+    code, document = ask("import", tmp_path / "log.xlsx", "--axis", "--to", tmp_path / "out", "--yes")
+    assert code == 0 and document["ok"] == len(ROWS)
+
+
 @pytest.mark.parametrize(("unit", "turned"), [("", False), (" (deg)", True)])
 def test_play_of_an_unknown_unit_is_no_turn(ask, tmp_path, unit, turned):
     """Where the commands turn back and nowhere else degrees jump by a turn, readings of no unit by their play."""

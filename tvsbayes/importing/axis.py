@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 import numpy as np
@@ -40,8 +40,9 @@ MOVING_SHARE = 0.3
 """Least share of commands with rows in motion: with fewer, rows of a command are readings of one stop."""
 PLATEAU_ROWS = 3
 """Least number of rows that rest elsewhere."""
-NOISE_SDS, DIGITS = 5.0, 3.0
-"""Largest distance from rest of a row at rest: standard deviations of last rows, and digits of the readings."""
+NOISE_SDS, DIGITS, FLICKER_DIGITS = 5.0, 1.5, 3.0
+"""Largest distance from rest of a row at rest: standard deviations of last rows, and digits of the readings; more of
+these, up to the last number, where the last rows of the command differ by them."""
 STEP_SHARE = 0.02
 """Least distance of the first row of a command from rest, as a share of its step, at which the axis was under way."""
 
@@ -74,11 +75,12 @@ def at_rest(command: np.ndarray, value: np.ndarray, parts: Sequence[Sequence[str
     noise = np.sqrt(np.mean(variances[: max(1, round(QUIET_SHARE * len(variances)))]))
     steps = np.diff(np.unique(value[np.isfinite(value)]))
     resolution = float(steps.min()) if len(steps) else 0.0
-    tolerance = max(NOISE_SDS * float(noise), DIGITS * resolution)
+    least = max(NOISE_SDS * float(noise), DIGITS * resolution)
     elsewhere = set[int]()
     for k, (block, level) in enumerate(zip(blocks, levels, strict=True)):
         if len(block) < 2:
             continue
+        tolerance = max(least, min(float(np.ptp(value[tails[k]])), FLICKER_DIGITS * resolution))
         off = np.abs(value[block] - level) > tolerance
         before = levels[k - 1] if k else np.nan
         way = abs(level - before) if np.isfinite(before) else np.inf
@@ -110,9 +112,10 @@ BITS = range(8, 33)
 """Exponents of encoders that count modulo a power of two."""
 OVERSHOOT_SHARE = 0.05
 """Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
-GAP_SDS, MAD_SDS = 3.0, 1.4826
-"""Least difference of the two sides that readings show, in standard deviations of it over the commands; these by the
-median absolute deviation of normal numbers."""
+LOG_RATIO = 10.0
+"""Least logarithm of a likelihood ratio by which readings say that the axis stood still."""
+MAD_SDS = 1.4826
+"""Standard deviations in a median absolute deviation of normal numbers."""
 CONTRARY_MIN = 4
 """Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
 SCALES = ("length", "angle")
@@ -377,8 +380,8 @@ def _went_past(commands: Sequence[float], sides: Sequence[int], values: Sequence
     """Whether the axis overshot and returned where the side changes at one command, as a column of sides says.
 
     The alternative is a second reading at standstill, under the direction of the run that begins there. Only the
-    readings can show that: in most such rows they stay, while those of the two sides differ by more than they scatter.
-    Where a row goes on against its side, as in a sheet sorted by position, no run begins.
+    readings can show that, by a likelihood ratio: they stay, while those of the two sides differ by more than they
+    scatter. Where a row goes on against its side, as in a sheet sorted by position, no run begins.
     """
     by_side: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for command, side, value in zip(commands, sides, values, strict=True):
@@ -386,20 +389,23 @@ def _went_past(commands: Sequence[float], sides: Sequence[int], values: Sequence
             by_side[command][side].append(value)
     gaps = [median(read[-1]) - median(read[1]) for read in by_side.values() if len(read) == 2]
     gap = median(gaps) if gaps else 0.0
-    if abs(gap) <= GAP_SDS * MAD_SDS * median([abs(other - gap) for other in gaps] or [0.0]):
-        return True
-    onward, stays = [0.0] * len(commands), list[bool]()
+    groups = [group for read in by_side.values() for group in read.values()]
+    within = sum((value - fmean(group)) ** 2 for group in groups for value in group)
+    freedom = max(sum(map(len, groups)) - len(groups), 1)
+    # Of the difference of two readings.
+    variance = max(2.0 * within / freedom, (MAD_SDS * median([abs(other - gap) for other in gaps] or [0.0])) ** 2)
+    onward, stays = [0.0] * len(commands), 0.0
     for row in reversed(range(len(commands) - 1)):
         onward[row] = commands[row + 1] - commands[row] or onward[row + 1]
     for row in range(1, len(commands)):
-        command, side, value, before = commands[row], sides[row], values[row], values[row - 1]
-        if command != commands[row - 1] or side * sides[row - 1] >= 0:
+        side, value, before = sides[row], values[row], values[row - 1]
+        if commands[row] != commands[row - 1] or side * sides[row - 1] >= 0:
             continue
         if side * onward[row] < 0:
             return True
         if value is not None and before is not None:
-            stays.append(abs(value - before + side * gap) > abs(value - before))
-    return 2 * sum(stays) <= len(stays)
+            stays += (value - before + side * gap) ** 2 - (value - before) ** 2
+    return stays <= 2.0 * LOG_RATIO * variance
 
 
 def _refuse_contrary(

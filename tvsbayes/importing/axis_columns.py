@@ -197,7 +197,8 @@ def _take_command(chooser: Chooser) -> None:
     if len(strong) > 1:
         found = f"{len(strong)} columns that could be the command ({listed(strong)})"
         raise chooser.ask(found, [_pair(chooser, name) for name in strong])
-    if len(pool) == 1 and (strong or readings or len(roles.get("deviation", ())) == 1):
+    alone = len(weak) + len(others) == 1 == len(roles.get("deviation", ()))
+    if len(pool) == 1 and (strong or readings or alone):
         taken["command"] = pool[0]
         if readings and not strong and not weak:
             only = f"column {escaped(pool[0])}, the only other one of numbers"

@@ -24,6 +24,7 @@ from tvsbayes.importing.table import (
     is_number,
     names_first,
 )
+from tvsbayes.importing.words import means
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """Separators in the order in which they are tried: a decimal comma must not be taken for one."""
@@ -86,8 +87,10 @@ def _text_rows(text: str, file: str) -> tuple[list[Row], str, list[tuple[int, st
 
 
 def _is_remark(line: str) -> bool:
-    """Whether a line is a remark; "#;Position" begins with a name for the number of the row."""
-    return line.lstrip().startswith(REMARKS) and not re.match(r'\s*"?#"?\s*[;,|\t]', line)
+    """Whether a line is a remark; "#;Position" begins with a name for the number of the row, "#N/A;5" with no value."""
+    first = re.split(r"[;,|\t]", line, maxsplit=1)[0].strip(' "')
+    is_value = first != line.strip() and (first == "#" or means(first, "empty"))
+    return line.lstrip().startswith(REMARKS) and not is_value
 
 
 def _divided(body: Sequence[tuple[int, str]], separator: str, file: str) -> list[Row]:
@@ -122,7 +125,8 @@ def _markdown_rows(lines: Sequence[tuple[int, str]]) -> list[tuple[int, str]]:
         content = line.strip()[outer[0] :]
         content = content[:-1] if outer[1] and content.endswith("|") else content
         if ("|" in content and not re.fullmatch(r"[\s|:-]+", content)) or (rows and "|" not in line):
-            rows.append((number, content.replace('"', "'")))
+            # An inch is no quote; a cell that begins with a mark of repetition is.
+            rows.append((number, re.sub(r'((?:^|\|)\s*)"', r"\1'", content)))
     return rows
 
 

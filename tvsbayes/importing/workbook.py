@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_table import CSV_ROWS_MAX
 from tvsbayes.importing.asking import asked, refused
-from tvsbayes.importing.table import Number, Row, Rows, cleaned, is_number
+from tvsbayes.importing.table import Number, Row, Rows, cleaned, is_value
 
 UNPACKED_BYTES_MAX = 64 * 2**20
 """Largest sum of the sizes that the parts of a workbook state."""
@@ -61,7 +61,7 @@ def sheet_rows(data: bytes, file: str, sheet: str | None) -> Rows:
 
 def _holds_table(rows: Sequence[Row]) -> bool:
     """Whether rows hold two columns of numbers."""
-    counts = Counter(k for row in rows for k, cell in enumerate(row.cells) if is_number(cell))
+    counts = Counter(k for row in rows for k, cell in enumerate(row.cells) if is_value(cell))
     return sum(count > 2 for count in counts.values()) > 1
 
 
