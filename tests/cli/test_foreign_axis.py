@@ -209,6 +209,23 @@ def test_a_position_beside_a_deviation_and_a_column_of_nobodys_words_is_asked(as
     assert_error(ask("import", tmp_path / "log.csv", "--axis", "--to", tmp_path / "out", "--yes")[1], "missing-column")
 
 
+@pytest.mark.parametrize("unit", ["", " mm"])
+def test_the_commands_of_another_axis_name_no_machine(ask, tmp_path, unit):
+    rows = [f"{c}{unit}\t{v}{unit}\t{c}{unit}\t{v}{unit}" for c, v in ROWS]
+    head = "Joint 1 DEMAND\tJoint 1 FEEDBACK\tJoint 2 DEMAND\tJoint 2 FEEDBACK"
+    (tmp_path / "log.dat").write_text("\n".join([head, *rows]))
+    answer = ("--column", "command=Joint 1 DEMAND", "--column", "value=Joint 1 FEEDBACK")
+    code, document = ask("import", tmp_path / "log.dat", "--axis", "--to", tmp_path / "out", "--yes", *answer)
+    assert code == 0 and document["ok"] == len(ROWS)
+
+
+def test_numbers_of_homings_may_have_a_sign(ask, tmp_path):
+    rows = [f"+{1 + k // len(ROWS)},{c},{v}" for k, (c, v) in enumerate([*ROWS, *ROWS])]
+    (tmp_path / "log.csv").write_text("\n".join(["homing,target (mm),measured (mm)", *rows]))
+    assert ask("import", tmp_path / "log.csv", "--axis", "--to", tmp_path / "out", "--yes")[0] == 0
+    assert {move.segment for move in read_axis(tmp_path / "out").moves} == {0, 1}
+
+
 def test_a_sheet_of_words_before_a_table_with_units_in_its_cells(ask, tmp_path):
     book = openpyxl.Workbook()
     book.active.append(["Operator: A. B."])

@@ -174,7 +174,10 @@ def _refuse_several(chooser: Chooser) -> None:
         column = chooser.known[text]
         names = dict.fromkeys(filter(None, column.cells))
         enough = min(map(column.cells.count, names), default=0) >= MACHINE_ROWS
-        if place_of(column.name.words, "machine") is not None and 1 < len(names) <= MACHINES_MAX and enough:
+        # Commands of another axis, "Joint 2 demand", name no machine.
+        is_machine = place_of(column.name.words, "machine") is not None
+        is_machine = is_machine and not column.unit and not column.name.has("command", "value", "position")
+        if is_machine and 1 < len(names) <= MACHINES_MAX and enough:
             line = chooser.table.first_line
             raise refused("several-machines", chooser.table.file, line=line, name=text, machines=list(names))
 

@@ -170,6 +170,11 @@ def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]
     return temperatures
 
 
+def mark_of(cell: str) -> str:
+    """A cell of a column that marks or numbers homings, without its sign."""
+    return cell.lower().removeprefix("+")
+
+
 def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
     """Whether the axes homed before each row but the first, which always begins a segment.
 
@@ -178,7 +183,7 @@ def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
     """
     if "segment" not in cells:
         return [False] * len(cells.table)
-    words = [word.lower() for word in cells.text("segment")]
+    words = list(map(mark_of, cells.text("segment")))
     flags = [FLAGS.get(word) for word in words]
     are_marks = None not in flags and any(previous and not current for previous, current in pairwise(flags))
     changes = map(bool, flags[1:]) if are_marks else (previous != current for previous, current in pairwise(words))

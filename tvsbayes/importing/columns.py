@@ -17,7 +17,7 @@ import numpy as np
 from tvsbayes.errors import Candidate, InputError, Question, closest, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
-from tvsbayes.importing.cells import FLAGS, plain_column
+from tvsbayes.importing.cells import FLAGS, mark_of, plain_column
 from tvsbayes.importing.clock import is_clock
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Name, Unit, name_of
@@ -77,7 +77,7 @@ class Column:
     @property
     def counts_homings(self) -> bool:
         """Whether its cells count homings or mark them: few small whole numbers or marks that seldom change."""
-        words = [word.lower() for word in self.cells]
+        words = list(map(mark_of, self.cells))
         changes = sum(a != b for a, b in pairwise(words))
         if all(word in FLAGS or (word.isdigit() and int(word) <= SEGMENT_MAX) for word in words):
             return changes <= SEGMENT_SHARE * max(len(words), 4)
