@@ -114,8 +114,8 @@ OVERSHOOT_SHARE = 0.05
 """Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
 LOG_RATIO = 10.0
 """Least logarithm of a likelihood ratio by which readings say that the axis stood still."""
-MAD_SDS = 1.4826
-"""Standard deviations in a median absolute deviation of normal numbers."""
+GAPS_MIN = 3
+"""Least number of commands, but those where the axis turns, at which both sides were read."""
 CONTRARY_MIN = 4
 """Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
 SCALES = ("length", "angle")
@@ -387,13 +387,19 @@ def _went_past(commands: Sequence[float], sides: Sequence[int], values: Sequence
     for command, side, value in zip(commands, sides, values, strict=True):
         if side and value is not None:
             by_side[command][side].append(value)
-    gaps = [median(read[-1]) - median(read[1]) for read in by_side.values() if len(read) == 2]
-    gap = median(gaps) if gaps else 0.0
+    pairs = zip(pairwise(commands), pairwise(sides), strict=True)
+    turns = {a for (a, b), (before, side) in pairs if a == b and before * side < 0}
+    elsewhere = [read for command, read in by_side.items() if len(read) == 2 and command not in turns]
+    gaps = [median(read[-1]) - median(read[1]) for read in elsewhere]
+    if len(gaps) < GAPS_MIN:
+        return True
+    gap = median(gaps)
     groups = [group for read in by_side.values() for group in read.values()]
     within = sum((value - fmean(group)) ** 2 for group in groups for value in group)
     freedom = max(sum(map(len, groups)) - len(groups), 1)
     # Of the difference of two readings.
-    variance = max(2.0 * within / freedom, (MAD_SDS * median([abs(other - gap) for other in gaps] or [0.0])) ** 2)
+    scatter = sum((other - fmean(gaps)) ** 2 for other in gaps) / (len(gaps) - 1)
+    variance = max(2.0 * within / freedom, scatter)
     onward, stays = [0.0] * len(commands), 0.0
     for row in reversed(range(len(commands) - 1)):
         onward[row] = commands[row + 1] - commands[row] or onward[row + 1]
