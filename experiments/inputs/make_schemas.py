@@ -10,7 +10,13 @@ from typing import Any
 
 from experiments.common.command_line import print_only
 from experiments.common.rows import ROOT
-from tvsbayes.results.compensation_record import COMPENSATION_FORMAT, Compensation, Verification
+from tvsbayes.results.compensation_record import (
+    AIMED_FORMAT,
+    COMPENSATION_FORMAT,
+    AimedPromise,
+    Compensation,
+    Verification,
+)
 from tvsbayes.results.fit_record import Provenance, fit_schema
 from tvsbayes.results.records import schema_of
 from tvsbayes.results.watch_record import Watch, WatchPlan
@@ -32,6 +38,10 @@ def schemas() -> dict[str, dict[str, Any]]:
         "compensation-1": (
             f"results/compensation.json of an axis folder, {COMPENSATION_FORMAT}",
             schema_of(Compensation, Provenance, format={"const": COMPENSATION_FORMAT}, inputs=AxisInputs),
+        ),
+        "aimed-promise-1": (
+            f"results/compensation.json of a scanner or head, {AIMED_FORMAT}",
+            schema_of(AimedPromise, Provenance, format={"const": AIMED_FORMAT}),
         ),
         "verification-1": ("verify --json", schema_of(Verification)),
         "watch-plan-1": ("plan --watch --json", schema_of(WatchPlan)),

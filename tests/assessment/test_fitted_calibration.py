@@ -15,6 +15,7 @@ from support.small_campaign import seen_steps, small_campaign
 from tvsbayes.assessment.causes import causes_of
 from tvsbayes.assessment.fitted_calibration import calibration_of, calibration_of_draws
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
+from tvsbayes.calibration.states import shifts_at
 from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import INDEX, Prior
@@ -96,10 +97,14 @@ def test_what_only_readings_tell_takes_its_prior_without_them():
 def test_calibration_of_a_fit_brings_its_causes(mounted_rig):
     fit = fit_of(*linear_problem(), mounted_rig)
     one = calibration_of(fit)
-    causes = causes_of(fit)
+    causes = causes_of(fit, states=one.states)
     assert (one.estimator, one.causes) == ("laplace", causes.names)
     np.testing.assert_array_equal(one.cause_covariance, causes.covariance)
-    np.testing.assert_array_equal(one.inputs, fit.draws.physical[:, [INDEX[name] for name in INPUT_NAMES]])
+    at_homing = fit.draws.physical[:, [INDEX[name] for name in INPUT_NAMES]]
+    shifts = shifts_at(one.zeros, one.states)
+    for axis, zero in enumerate(("pan_zero_emission_deg", "tilt_zero_deg")):
+        at_homing[:, INPUT_NAMES.index(zero)] += shifts[:, axis]
+    np.testing.assert_array_equal(one.inputs, at_homing)
 
 
 class Drawn(NamedTuple):

@@ -7,20 +7,22 @@ are taken as known. Quantities in the units of their names.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from tvsbayes.assessment.weaknesses import moved_directions, whole_gradients
-from tvsbayes.calibration.pointing import INPUT_NAMES
+from tvsbayes.calibration.pointing import COMPLEX_STEP, INPUT_NAMES
+from tvsbayes.calibration.states import ZERO_NAMES, total_shift
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.parameters import HEADLINES, INDEX, KINDS, NAMES, QUANTITIES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD, physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
+from tvsbayes.statistics.predicted_readings import State
 
 STOP_ERRORS = "stop errors of the campaign"
 LOOK_SCATTER = "scatter of the campaign's looks"
@@ -86,7 +88,7 @@ class Causes:
     covariance: np.ndarray
 
 
-def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
+def causes_of(fit: JointFit, by_places: np.ndarray | None = None, states: Mapping[Axis, State] | None = None) -> Causes:
     """Split the covariance of a fit by cause (formulation 5).
 
     An error e of the data shifts an estimate by S J^T C^-1 e, an error of prior j by its sd by S e_j, with S the
@@ -97,6 +99,7 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
     Args:
         fit: a converged fit.
         by_places: further inputs, as d(input)/d(errors at places, N(0, 1) a priori), shape (inputs, errors).
+        states: by axis, at which the zeros are inputs; None: at the homing.
     """
     information = _split_information(fit)
     parts = {
@@ -109,7 +112,13 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
         share[columns, columns] = 1.0
         parts[stem] = share
     inputs = [INDEX[name] for name in INPUT_NAMES]
-    slope = np.asarray(physical_at(fit.z, fit.space).slope)[inputs]
+    at = physical_at(fit.z, fit.space)
+    slopes = np.asarray(at.slope)
+    slope, own_names = slopes[inputs], fit.space.mechanism.named(INPUT_NAMES)
+    moved = np.asarray(at.value) + 1j * COMPLEX_STEP * np.eye(len(NAMES))
+    for (axis, state), zero in zip((states or {}).items(), fit.space.mechanism.zeros, strict=bool(states)):
+        shift = total_shift({name: moved[:, INDEX[name]] for name in ZERO_NAMES}, axis, state)[:, 0]
+        slope[own_names.index(zero)] += shift.imag / COMPLEX_STEP @ slopes
     spread = slope @ information.posterior[: len(NAMES)]
     if by_places is not None:
         spread = np.concatenate([spread, by_places @ information.posterior[len(NAMES) :]])

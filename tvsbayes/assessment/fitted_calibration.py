@@ -15,10 +15,11 @@ from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, Cause
 from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
 from tvsbayes.assessment.summary import equal_laplace_draws, seen_range
 from tvsbayes.calibration.drawn_looks import noise_of_a_look
-from tvsbayes.calibration.frames import extrinsics_of
+from tvsbayes.calibration.frames import EXTRINSICS_NAMES
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, shifts_at, states_of
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
@@ -44,7 +45,7 @@ def calibration_of_draws(
     """Build a calibration from the columns that coordinates depend on.
 
     Baseline, C0, the aperture's zero and its noise are drawn from their priors without readings, since a sampler holds
-    them fixed.
+    them fixed. Zeros are those at the mean state of the campaign's looks, draw by draw.
 
     Args:
         names: public names of the columns of `physical`.
@@ -70,6 +71,12 @@ def calibration_of_draws(
             column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
     named_inputs = campaign.rig.mechanism.named(INPUT_NAMES)
     inputs = np.stack([column[name] for name in named_inputs], axis=1)
+    zeros, extrinsics = (columns_of(names, physical, wanted) for wanted in (ZERO_NAMES, EXTRINSICS_NAMES))
+    states = states_of(campaign) if len(zeros) else {}
+    if states:
+        shifts = shifts_at(zeros, states)
+        inputs[:, [named_inputs.index(name) for name in campaign.rig.mechanism.zeros]] += shifts
+        extrinsics = poses_at(extrinsics, named_inputs, shifts[:, 0])
     noise = noise_of_a_look(column)
     table = NO_GEARS if gears is None else gears.table
     if gears is not None:
@@ -93,8 +100,10 @@ def calibration_of_draws(
         inputs=inputs,
         noise=noise,
         gears=table,
-        extrinsics=extrinsics_of(names, physical),
+        extrinsics=extrinsics,
         names=named_inputs,
+        states=states,
+        zeros=zeros,
     )
 
 
@@ -135,7 +144,9 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     counters = seen_range(fit)
     range_steps = np.array([counters[axis] for axis in AXES], dtype=float)
     calibration = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, range_steps, gears)
-    causes = _with_left_open(causes_of(fit, gears.by_places), gears) if gears.table.size else causes_of(fit)
+    by_places = gears.by_places if gears.table.size else None
+    causes = causes_of(fit, by_places, calibration.states)
+    causes = _with_left_open(causes, gears) if gears.table.size else causes
     return replace(calibration, causes=causes.names, cause_covariance=causes.covariance)
 
 

@@ -184,6 +184,10 @@ class Drive:
 
     def counter(self, angle_deg: float, side: int) -> int:
         """Compute the counter whose mirror angle is nearest to a given one, reached on a side (+1 left or up, -1)."""
+        return round(self.position(angle_deg, side))
+
+    def position(self, angle_deg: float, side: int) -> float:
+        """Compute the counter, before rounding, at which the mirror has an angle, reached on a side."""
         ratio, steps = self.ratio, 0.0
         for _ in range(AIM_STEPS):
             at = output_deg(self.values_at(steps), self.axis, steps, side, self.period_deg, math)
@@ -191,7 +195,7 @@ class Drive:
             steps += change
             if abs(change) < 1e-9:
                 break
-        return round(steps)
+        return steps
 
     def arrival(self, angle_deg: float, side: str | None, limits: tuple[float, float] | None) -> Arrival:
         """Plan the approach to a mirror angle; the default side is left or up, else the other one within limits.

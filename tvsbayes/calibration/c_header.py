@@ -6,6 +6,7 @@ Degrees, mm, steps by suffix; literals have as many digits as a double holds.
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -27,10 +28,10 @@ _UNCOMMENTED = re.compile(r"[^A-Za-z0-9 .,:()+=_-]")
 """Characters not allowed in a comment of C: its end, trigraphs, backslashes, non-ASCII."""
 
 
-def calibration_header(calibration: Calibration, origin: Origin | None = None) -> str:
+def calibration_header(calibration: Calibration, origin: Origin | None = None, promise: str = "") -> str:
     """Write a C header with the estimates and the beam as a function of the counters, for a Teensy or similar.
 
-    Its first lines have `origin` and the SHA-256 of the same calibration as JSON.
+    Its first lines have `origin` and the SHA-256 of the same calibration as JSON; they end with a `promise` in words.
 
     Raises:
         InputError: the calibration is of a head, for which there is no header.
@@ -53,6 +54,7 @@ def calibration_header(calibration: Calibration, origin: Origin | None = None) -
         f"steps: azimuth {error.u95_azimuth_deg:.3f} deg, elevation {error.u95_elevation_deg:.3f} deg; "
         f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm."
     )
+    stated += "".join(f"\n * {line}" for line in textwrap.wrap(promise, 110))
     template = template.replace("@ORIGIN@", _origin_lines(calibration, origin))
     return template.replace("@EXPECTED_ERROR@", stated).replace("@VALUES@", "\n".join(lines))
 

@@ -17,17 +17,19 @@ from typing import Any, NotRequired, TypedDict, cast
 
 import numpy as np
 
-from tvsbayes.calibration.frames import EXTRINSICS_NAMES, NO_POSE, extrinsics_of
+from tvsbayes.calibration.frames import EXTRINSICS_NAMES, NO_POSE
 from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, shifts_at
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
 from tvsbayes.files.packages import own_version
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.mechanisms import MECHANISMS
+from tvsbayes.statistics.predicted_readings import State
 
 CALIBRATION_FORMAT = "tvsbayes-calibration/2"
 FORMATS = ("tvsbayes-calibration/1", CALIBRATION_FORMAT)
@@ -48,6 +50,7 @@ class _Tables(TypedDict):
     inputs_sha256: Mapping[str, str]
     causes: list[str]
     gear_steps: NotRequired[Mapping[str, list[float]]]
+    states: NotRequired[Mapping[str, Mapping[str, float]]]
 
 
 class _Moments(TypedDict):
@@ -82,6 +85,7 @@ class CalibrationDocument(TypedDict):
     overshoot_steps: Mapping[str, int]
     range_steps: Mapping[str, list[float]]
     gear_errors: NotRequired[Mapping[str, GearErrors]]
+    state: NotRequired[Mapping[str, Mapping[str, float]]]
     inputs: Mapping[str, str]
     expected_error: dict[str, object]
     origin: NotRequired[dict[str, str]]
@@ -96,6 +100,7 @@ def calibration_arrays(calibration: Calibration) -> dict[str, np.ndarray]:
         inputs_sha256=calibration.inputs_sha256,
         causes=list(calibration.causes),
         gear_steps=_gear_steps(calibration),
+        states={axis: state._asdict() for axis, state in calibration.states.items()},
     )
     others = {
         "format": CALIBRATION_FORMAT,
@@ -180,6 +185,7 @@ def _document(calibration: Calibration) -> CalibrationDocument:
         "overshoot_steps": dict(calibration.overshoot_steps),
         "range_steps": {axis: list(steps) for axis, steps in calibration.seen_steps.items()},
         "gear_errors": gear_errors(calibration),
+        "state": {axis: state._asdict() for axis, state in calibration.states.items()},
         "inputs": dict(calibration.inputs_sha256),
         "expected_error": asdict(expected_error(calibration)),
     }
@@ -300,6 +306,12 @@ def calibration_of_arrays(file: Mapping[str, np.ndarray], path: Path = DRAWS) ->
         if str(file["format"]) not in FORMATS or not columns:
             raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
         tables = _tables(str(file["tables"]), path)
+        states = _states(tables.get("states", {}))
+        # They are among the draws of `fit.json`, row by row with the inputs.
+        known, physical = (file["names"].tolist(), file["physical"]) if "names" in file else ([], NO_POSE)
+        zeros, extrinsics = (columns_of(known, physical, wanted) for wanted in (ZERO_NAMES, EXTRINSICS_NAMES))
+        if states:
+            extrinsics = poses_at(extrinsics, names, shifts_at(zeros, states)[:, 0])
         return _shaped(
             Calibration(
                 mean=file["mean"],
@@ -316,13 +328,19 @@ def calibration_of_arrays(file: Mapping[str, np.ndarray], path: Path = DRAWS) ->
                 causes=tuple(tables["causes"]),
                 cause_covariance=file["cause_covariance"],
                 gears=NO_GEARS if str(file["format"]) == FORMATS[0] else table_of(tables["gear_steps"]),
-                # They are among the draws of `fit.json`, row by row with the inputs.
-                extrinsics=extrinsics_of(file["names"].tolist(), file["physical"]) if "names" in file else NO_POSE,
+                extrinsics=extrinsics,
                 names=names,
+                states=states,
+                zeros=zeros,
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise damaged_calibration(path, error) from error
+
+
+def _states(stored: Mapping[str, Mapping[str, float]]) -> dict[Axis, State]:
+    """States by axis, of both axes or none; a missing or other key is a `KeyError` or `TypeError`."""
+    return {axis: State(**{name: float(n) for name, n in stored[axis].items()}) for axis in AXES if stored}
 
 
 def _tables(text: str, path: Path) -> _Tables:
@@ -367,6 +385,7 @@ def read_calibration_json(path: Path) -> Calibration:
                 cause_covariance=np.zeros((0, len(mean), len(mean))),
                 gears=gears,
                 names=names,
+                states=_states(d.get("state", {})),
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

@@ -5,7 +5,7 @@ S and camera are related to P by the extrinsics of the fit: rotation vector, rad
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -23,13 +23,6 @@ OPENCV_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """From S to OpenCV's axes of the left camera, x right, y down, z along its view: X = z_cv, Y = -x_cv, Z = -y_cv."""
 ROTATION_STEP_RAD = 1e-5
 """Step of central differences of a rotation: truncation 1e-11, rounding 1e-11."""
-
-
-def extrinsics_of(names: Sequence[str], physical: np.ndarray) -> np.ndarray:
-    """Select the extrinsics of draws (n, names), shape (n, 6); (0, 6) where they are not among the names."""
-    if not set(EXTRINSICS_NAMES) <= set(names):
-        return NO_POSE
-    return physical[:, [names.index(name) for name in EXTRINSICS_NAMES]]
 
 
 def refuse_frame(frame: str, extrinsics: np.ndarray) -> None:

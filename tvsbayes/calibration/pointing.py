@@ -33,6 +33,7 @@ from tvsbayes.calibration.optics import (
     range_components,
     unit_vector,
 )
+from tvsbayes.calibration.states import ZERO_NAMES
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, Axis, sides_of
@@ -40,13 +41,14 @@ from tvsbayes.instrument.counter_limits import unseen
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import OPTICS_NAMES, names_of
 from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.predicted_readings import State
 
 INPUT_NAMES: tuple[str, ...] = (
     *names_of("degrees_per_step", "backlash_deg", "harmonic_deg", "tilt_zero_deg"),
     *OPTICS_NAMES,
     *names_of("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
 )
-"""Inputs of a coordinate. Contrasts are not among them: after homing a counter has its mean ratio."""
+"""Inputs of a coordinate. Contrasts are not among them: they act by the travel, which is part of the state."""
 NO_INPUTS: Values = {}
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
 """Noises of a look; those of stops include the scatter of the look, see `drawn_looks.noise_of_a_look`."""
@@ -102,6 +104,9 @@ class Calibration(Shown):
         gears: counters at which errors of the gears are tabulated; none without repeating errors.
         extrinsics: draws (n, 6) of `EXTRINSICS_NAMES`, row by row with `inputs`; none where only the moments were kept.
         names: names of the inputs: `INPUT_NAMES`, or those of a head in their places.
+        states: state by axis at which `mean` and `inputs` hold, the mean of the campaign's looks; empty in results of
+            0.3: at the homing, switched on just then.
+        zeros: draws (n, k) of `ZERO_NAMES`, row by row with `inputs`; none where only the moments were kept.
     """
 
     mean: np.ndarray
@@ -120,6 +125,8 @@ class Calibration(Shown):
     gears: GearTable = NO_GEARS
     extrinsics: np.ndarray = field(default_factory=NO_POSE.copy)
     names: tuple[str, ...] = INPUT_NAMES
+    states: Mapping[Axis, State] = field(default_factory=dict)
+    zeros: np.ndarray = field(default_factory=lambda: np.zeros((0, len(ZERO_NAMES))))
 
     def shown(self) -> View:
         """Show estimates with their standard uncertainties, and the range of the looks' counters."""
@@ -444,9 +451,8 @@ class Calibration(Shown):
         target = self._target(xyz_mm, azimuth_deg, elevation_deg)
         arrivals = []
         for index, (axis, angle_deg) in enumerate(zip(AXES, mirror_angles(self.estimates, target), strict=True)):
-            drive = Drive(axis, partial(self._values_on, index), self.period_deg.get(axis), self.overshoot_steps[axis])
             wanted = None if approach is None else approach[index]
-            arrivals.append(drive.arrival(angle_deg, wanted, (limits or {}).get(axis)))
+            arrivals.append(self.drive(axis).arrival(angle_deg, wanted, (limits or {}).get(axis)))
         pan, tilt = arrivals
         reached = pan.side, tilt.side
         ray = self.ray(pan.steps, tilt.steps, reached)
@@ -471,9 +477,13 @@ class Calibration(Shown):
             u95_mm=self.beam_u95_mm(counters, sides, reach),
         )
 
-    def _values_on(self, index: int, counter: float) -> dict[str, Any]:
-        """Return best estimates with one axis at a counter."""
-        return self.estimates_at((counter, 0.0) if index == 0 else (0.0, counter))
+    def drive(self, axis: Axis) -> Drive:
+        """Return the conversion between counters and mirror angles of an axis."""
+
+        def values_at(counter: float) -> dict[str, Any]:
+            return self.estimates_at((counter, 0.0) if axis == AXES[0] else (0.0, counter))
+
+        return Drive(axis, values_at, self.period_deg.get(axis), self.overshoot_steps[axis])
 
     @staticmethod
     def _target(xyz_mm: ArrayLike | None, azimuth_deg: float | None, elevation_deg: float | None) -> Point | Direction:

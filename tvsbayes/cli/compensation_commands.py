@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +22,7 @@ from tvsbayes.cli.app import (
     keep,
     report_line,
 )
+from tvsbayes.cli.kept_promise import promise_document, promise_of
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
@@ -66,7 +66,8 @@ def compensate(
     ] = None,
     letter: Annotated[str, typer.Option("--letter", help="Axis in settings of grbl: X, Y, Z, A, B or C.")] = "X",
     period: Annotated[
-        float | None, typer.Option("--period", help="Of a pec table, in commands (strongest wave).")
+        float | None,
+        typer.Option("--period", help="Of a table by phase, pec or csv, in commands (pec: strongest wave)."),
     ] = None,
     force: Force = False,
     seed: Seed = 0,
@@ -75,8 +76,8 @@ def compensate(
     """Correction table of a controller, with a bound on its errors.
 
     Nothing is applied. With -o that bound, the promise, is kept in results/compensation.json, for `verify`. Of a
-    scanner `--to header` gives its calibration for a microcontroller; its promise is that of `locate`. Of a pan-tilt
-    head `--to urdf` gives its model: zeros, axes and reductions of the joints, and YAML with their covariance.
+    scanner `--to header` gives its calibration for a microcontroller. Of a pan-tilt head `--to urdf` gives its model:
+    zeros, axes and reductions of the joints, and YAML with their covariance.
     """
     from tvsbayes.compensation.formats import Wish, checked
     from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
@@ -100,10 +101,10 @@ def compensate(
         if mechanism.terms:
             from tvsbayes.cli.head_commands import compensate as compensate_head
 
-            compensate_head(campaign, out, force, as_json)
+            compensate_head(campaign, out, force, seed, as_json)
         else:
             check_output(out, kind=EXPORTS[to], force=force)
-            export_calibration(campaign, to, out, as_json)
+            export_calibration(campaign, to, out, as_json, promised=True, seed=seed)
         return
     _check_choice("--applied-by", applied_by, APPLIERS)
     _check_choice("--letter", letter, tuple(LETTERS))
@@ -157,24 +158,40 @@ def _name_other_promises(
         report_line(f"note: the promise of {table} stays: `verify --table FILE` tests it, `verify` alone this one")
 
 
-def export_calibration(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
-    """Print the calibration for another language, or write it into a file."""
+def export_calibration(
+    campaign: Path, kind: str, out: Path | None, as_json: bool, *, promised: bool = False, seed: int = 0
+) -> None:
+    """Print the calibration for another language, or write it into a file; where `promised`, keep its promise."""
     from tvsbayes.calibration.c_header import calibration_header
     from tvsbayes.calibration.calibration_file import Origin, calibration_json
     from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.report.compensation_text import aimed_text, aimed_words
 
     data = read_campaign(campaign)
     with waiting() as progress:
-        calibration = StoredOrFitted(data, report_line, progress).calibration
+        results = StoredOrFitted(data, report_line, progress)
+        calibration = results.calibration
     origin = Origin.of(data)
+    promise = promise_of(results, kind, seed) if kind == "header" else None
     stored = calibration_json(calibration, origin)
-    text = calibration_header(calibration, origin) if kind == "header" else json.dumps(stored, indent=1)
-    document: Mapping[str, Any] = {"header": text} if kind == "header" else stored
-    if out is not None:
-        write_atomically(out, f"{text.rstrip()}\n".encode())
-        finish({"files": {kind: str(out)}}, f"written: {escaped(str(out), 200)}", as_json)
+    words = "" if promise is None else aimed_words(promise)
+    text = calibration_header(calibration, origin, words) if kind == "header" else json.dumps(stored, indent=1)
+    document: dict[str, Any] = {"header": text} if kind == "header" else dict(stored)
+    if promised and promise is not None:
+        document |= promise_document(promise, results, seed)
+    if out is None:
+        finish(document, text.rstrip("\n"), as_json)
         return
-    finish(document, text.rstrip("\n"), as_json)
+    write_atomically(out, f"{text.rstrip()}\n".encode())
+    files, said = {kind: str(out)}, f"written: {escaped(str(out), 200)}"
+    if promised and promise is not None:
+        document.pop("header")
+        said = f"{aimed_text(promise)}\n{said}\nnext: aim with it, then {command_line('verify', campaign, 'FRESH')}"
+        place = output_place(campaign, "results") / "compensation.json"
+        files |= {"compensation": str(place)} if keep(document, place) else {}
+        finish({**document, "files": files}, said, as_json)
+        return
+    finish({"files": files}, said, as_json)
 
 
 def _check_choice(option: str, given: str, allowed: tuple[str, ...]) -> None:

@@ -14,17 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tvsbayes.cli.app import check_output, command_line, finish, report_line, write_files
+from tvsbayes.cli.app import check_output, command_line, finish, keep, report_line, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
+from tvsbayes.cli.kept_promise import promise_document, promise_of
 from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.display import concise
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_kind import templates
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically, write_folder
+from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
-from tvsbayes.head.urdf import HeadModel, ratios_of
+from tvsbayes.head.urdf import UNSAID, HeadModel, ratios_of
 from tvsbayes.importing.columns import table_document, table_lines
 from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.sightings import FIELDS, SightingWishes, sighting_rows
@@ -276,12 +277,13 @@ def _urdf_files(
     return {**templates, **with_priors(templates, priors, tables)}
 
 
-def compensate(folder: Path, out: Path | None, force: bool, as_json: bool) -> None:
+def compensate(folder: Path, out: Path | None, force: bool, seed: int, as_json: bool) -> None:
     """Write the model of the robot with the estimated terms, and YAML with their covariance."""
     import yaml
 
     from tvsbayes.calibration.calibration_file import Origin
     from tvsbayes.comparison.verified_looks import accepted_calibration
+    from tvsbayes.report.compensation_text import aimed_text
 
     yaml_path = None if out is None else out.with_name(f"{out.name}.yaml")
     for place in (out, yaml_path):
@@ -317,6 +319,12 @@ def compensate(folder: Path, out: Path | None, force: bool, as_json: bool) -> No
         for axis, joint in document["joints"].items()
     ]
     lines += [f"not in the file: {words}" for words in document["unsaid"]]
+    results = StoredOrFitted(data, report_line)
+    promise = promise_of(results, "urdf", seed, UNSAID)
+    promised = {} if promise is None else promise_document(promise, results, seed)
+    if promise is not None:
+        lines.append(aimed_text(promise))
+        document["promise"] = promised["promise"]
     files: dict[str, str] = {}
     if out is None or yaml_path is None:
         described = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
@@ -325,9 +333,12 @@ def compensate(folder: Path, out: Path | None, force: bool, as_json: bool) -> No
         write_atomically(out, text)
         write_atomically(yaml_path, f"# {origin_text}\n{yaml.safe_dump(document, sort_keys=False)}".encode())
         files = {"urdf": str(out), "yaml": str(yaml_path)}
+        place = output_place(folder, "results") / "compensation.json"
+        if promised and keep(promised, place):
+            files["compensation"] = str(place)
         lines.append(f"written: {', '.join(files.values())}")
         lines.append(f"next: load it in place of the old model, then {command_line('verify', folder, 'FRESH')}")
-    finish({**document, "target": "urdf", "files": files}, "\n".join(lines), as_json)
+    finish({**promised, **document, "target": "urdf", "files": files}, "\n".join(lines), as_json)
 
 
 def classic(folder: Path, as_json: bool) -> None:

@@ -1,8 +1,9 @@
 """Verification of a scanner's or head's pointing by looks at counters that `steps-for` or the header computed.
 
-Every look gives both mirror angles, observed less predicted, with the covariance of `watched_looks`.
-`compensation.verification` judges them as readings of two axes. "Not applied" means counters by the nominal degrees per
-step without play; the correction is the difference. Mirror angles in degrees, points in mm.
+Every look gives both mirror angles, observed less aimed, with the covariance of `watched_looks`; the aim is of the
+calibration's state, the prediction of the look's own. `compensation.verification` judges them as readings of two axes.
+"Not applied" means counters by the nominal degrees per step without play; the correction is the difference. Mirror
+angles in degrees, points in mm.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ import numpy as np
 from tvsbayes.calibration.aiming import Direction, mirror_angles
 from tvsbayes.calibration.calibration_file import calibration_of_arrays
 from tvsbayes.calibration.optics import beam_components, output_deg
-from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
+from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.calibration.predicted_angles import PredictedAngles
+from tvsbayes.calibration.states import states_at
 from tvsbayes.comparison.departures import LOOKS_MIN
 from tvsbayes.comparison.watched_looks import WatchedLooks
+from tvsbayes.compensation.aimed_promise import homings_of
 from tvsbayes.compensation.promise import bound_of, refuse_answer
 from tvsbayes.compensation.verification import (
     IDENTIFIED,
@@ -43,10 +47,10 @@ from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.model.parameter_space import physical_at
-from tvsbayes.results.compensation_record import Millimetres, Verification
+from tvsbayes.results.compensation_record import Millimetres, ShiftFree, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
 from tvsbayes.results.store import stored_fit
-from tvsbayes.statistics.predicted_readings import PredictedReadings
+from tvsbayes.statistics.predicted_readings import PredictedReadings, less_means
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
@@ -54,8 +58,8 @@ NOISE_DRAWS = 32
 """Draws of the noise scales, geometry and cameras integrated out."""
 RUN_UP = 2
 """Run-up of a plan as a multiple of the overshoot that takes up the play."""
-CANDIDATES, DRAWS = 9, 1000
-"""Counters tried for each axis, from both sides; draws of the calibration for their covariance."""
+CANDIDATES = 9
+"""Counters tried for each axis, from both sides."""
 DISTANCE_MM = 1000.0
 """Default distance at which errors are stated in mm."""
 PROMISED_DRAWS = 4000
@@ -206,22 +210,32 @@ def _other(aimed: AimedLooks) -> np.ndarray:
 
 
 def _millimetres(
-    aimed: AimedLooks, measured: SeenAngles, before: np.ndarray, distance_mm: float, seed: int
+    aimed: AimedLooks, promised: PredictedReadings, before: np.ndarray, after: np.ndarray, distance_mm: float, seed: int
 ) -> Millimetres:
-    """Compute errors of points at a distance, and the promised bound of 95 % of them."""
+    """Compute errors of points at a distance, and the promised bound of 95 % of them, from those of mirror angles."""
     slopes = aimed.slopes_mm(distance_mm)
 
     def lengths(angles: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.einsum("mxa,...ma->...mx", slopes, angles.reshape(*angles.shape[:-1], -1, 2)), axis=-1)
 
-    promised = PredictedReadings(np.zeros((len(measured.covariance), len(measured.value))), measured.covariance)
     drawn = lengths(promised.drawn(PROMISED_DRAWS, random_stream(seed, Stream.PROMISED_LENGTHS)))
     return Millimetres(
         distance_mm=distance_mm,
         before=size_of(lengths(before)),
-        after=size_of(lengths(measured.value)),
+        after=size_of(lengths(after)),
         promised95=float(np.quantile(drawn, 0.95)),
     )
+
+
+def shifts_deg(watched: WatchedLooks, calibration: Calibration) -> np.ndarray:
+    """Compute what the states of looks add to their angles, expected, off the calibration's state: (2 m,)."""
+    looks = [watched.problem.spots[k] for k in watched.usable]
+    shifts = np.zeros((len(looks), len(AXES)))
+    if calibration.states:
+        for k, (axis, states) in enumerate(states_at(watched.joined, looks).items()):
+            machine = PredictedAngles(calibration, watched.fit.campaign, axis, 0.0)
+            shifts[:, k] += sum(each.pooled().mean for each in machine.shifts(states, machine.state).values())
+    return shifts.ravel()
 
 
 def verify_looks(
@@ -249,28 +263,39 @@ def verify_looks(
         )
     aimed = AimedLooks.of(calibration, looks, used)
     nominal = aimed.nominal_steps({name: prior.value for name, prior in fit.campaign.rig.priors.items()})
-    angles = SeenAngles.of(fit, WatchedLooks(fit, looks), aimed.sides, seed)
+    watched = WatchedLooks(fit, looks)
+    angles, shifts = SeenAngles.of(fit, watched, aimed.sides, seed), shifts_deg(watched, calibration)
+    error = angles.value + shifts
 
     @cache
     def at(common: float, play: float) -> PredictedReadings:
-        off = aimed.off_deg(nominal, common, play).ravel()
+        off = shifts + aimed.off_deg(nominal, common, play).ravel()
         return PredictedReadings(np.tile(off, (len(angles.covariance), 1)), angles.covariance)
 
-    aim = np.zeros(len(angles.value))
+    aim = np.zeros(len(error))
     travel = float(np.max(np.ptp(aimed.ratios * aimed.steps, axis=0)))
-    trial = Trial(at, angles.value, aim, _other(aimed), travel, np.zeros((len(aim), len(aim))), angles.noise)
-    judgement = judged(trial, seed)
-    before = judgement.without.pooled().mean
+    # Axes whose scatter of homings was not read: one shift common to all of each does not count.
+    free = [homings_of(fit.campaign)[axis] == 1 for axis in AXES]
+    groups = np.tile(np.diag(free), len(aimed.steps))
+    shift = travel**2 * (groups.T.astype(float) @ groups)
+    judgement = judged(Trial(at, error, aim, _other(aimed), travel, shift, angles.noise), seed)
+    kept = less_means(groups)
+    before, after, promised = kept @ judgement.without.pooled().mean, kept @ error, judgement.promised.less(groups)
+    every = np.arange(len(aim))
+    first = size_of(after), bound_of(promised, aim, every)
     return Verification(
         verdict=judgement.verdict,
         p=judgement.p,
         worlds=judgement.worlds,
         before=size_of(before),
-        after=size_of(angles.value),
-        promised95=bound_of(judgement.promised, aim, np.arange(len(aim))),
+        after=first[0],
+        promised95=first[1],
         readings=len(aimed.steps),
         # Directions have no lengths.
-        millimetres=_millimetres(aimed, angles, before, distance_mm, seed) if looks.has_images else None,
+        millimetres=_millimetres(aimed, promised, before, after, distance_mm, seed) if looks.has_images else None,
+        shift_free=ShiftFree(*first) if any(free) else None,
+        after_with_homing=size_of(error) if any(free) else None,
+        promised95_with_homing=bound_of(judgement.promised, aim, every) if any(free) else None,
         unit="deg",
         needed=None if judgement.needed is None else -(-judgement.needed // 2),
         looks=True,
@@ -370,8 +395,9 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
         what = f"the nominal counters of {AXES[k]} are those of the calibration: there is no correction to verify"
         raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
     noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
-    home_sd_deg = campaign.rig.priors[f"home_sd_deg.{AXES[k]}"].value
-    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + home_sd_deg**2
+    machine = PredictedAngles(calibration, campaign, AXES[k], steps[:, 1 - k])
+    common = machine.expected(steps[:, k], sides[:, k]).pooled().covariance
+    common += machine.scatter(sides[:, k], machine.state, 0.0)["homing"].mean(axis=0)
     # A play smaller than the uncertainty of a look cannot be distinguished from none, and does not affect the promise.
     visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
     worlds = off if visible else off[:1]
@@ -386,15 +412,6 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     )
     chosen = [i for i, count in zip(reach.tolist(), visits.visits, strict=True) for _ in range(int(count))]
     return _AxisStops([VerifyStop(float(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
-
-
-def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.ndarray:
-    """Compute mirror angles (draws, m) of one axis by the draws of the calibration."""
-    inputs, gears = np.split(calibration.inputs[:DRAWS], [len(INPUT_NAMES)], axis=1)
-    values = dict(zip(calibration.names, inputs.T[..., None], strict=True))
-    values |= calibration.gears.at(gears, (aimed.steps[:, 0], aimed.steps[:, 1]))
-    axis = AXES[k]
-    return np.asarray(output_deg(values, axis, aimed.steps[:, k], aimed.sides[:, k], calibration.period_deg.get(axis)))
 
 
 def _remarks(fit: JointFit, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:

@@ -115,6 +115,7 @@ class WatchedLooks:
         self.fit, self.first = fit, len(ordered_spots(campaign))
         joined = after_each_other(campaign, homed(looks, fit.sides))
         used = np.append(fit.arrays.used, in_sight(joined)[self.first :])
+        self.joined = joined
         self.problem = Problem(joined, fit.table, used, np.asarray(fit.arrays.spots.weight)[: self.first])
         self.looks = int(used[self.first :].sum())
         apply = fit.space.mechanism.documented.issuperset

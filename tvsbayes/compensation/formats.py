@@ -15,7 +15,7 @@ import numpy as np
 
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.errors import InputError
-from tvsbayes.results.compensation_record import AppliedBy, Compensation
+from tvsbayes.results.compensation_record import AppliedBy, Compensation, TableRow
 
 Holds = Literal["table", "ratio and play", "ratio", "period"]
 LINUXCNC_DECIMALS = 7
@@ -78,16 +78,26 @@ def _commented(made: Compensation, origin: Origin) -> list[str]:
 
 
 CSV_COLUMNS = ("command", "forward", "backward", "u_forward", "u_backward")
+PHASE_COLUMNS = ("phase", "add_forward", "add_backward", "u_forward", "u_backward")
 
 
 def _csv(made: Compensation, origin: Origin) -> str:
+    names = PHASE_COLUMNS if (period := made.settings.get("period_command")) else CSV_COLUMNS
     rows = [
-        ",".join(number(getattr(row, name), 12 if name == "command" else 9) for name in CSV_COLUMNS)
-        for row in made.table
+        ",".join(number(v, d) for v, d in zip(_cells(made, row), (12, *[9] * 4), strict=True)) for row in made.table
     ]
     says = "# columns: reading expected at a command, arriving forward (rising command) or backward; standard"
+    if period:
+        says = f"# period: {number(period)} commands; columns: command within a period, what is added to it arriving"
+        says += " forward (rising command) or backward; standard"
     says += " uncertainty of a single arrival"
-    return "\n".join([*_commented(made, origin), says, ",".join(CSV_COLUMNS), *rows, ""])
+    return "\n".join([*_commented(made, origin), says, ",".join(names), *rows, ""])
+
+
+def _cells(made: Compensation, row: TableRow) -> tuple[float, ...]:
+    if "period_command" in made.settings:
+        return row.command, row.add_forward, row.add_backward, row.u_forward, row.u_backward
+    return row.command, row.forward, row.backward, row.u_forward, row.u_backward
 
 
 def _linuxcnc(made: Compensation, origin: Origin) -> str:
@@ -250,6 +260,7 @@ class Format:
         in_force: name of the setting whose present value is changed, "" for none.
         unsaid: errors that it cannot correct, in words.
         beside: the same for a second file for programs, YAML; None for most formats.
+        by_phase: whether it may hold what repeats with a period, over its phase.
     """
 
     holds: Holds
@@ -258,11 +269,12 @@ class Format:
     in_force: str = ""
     unsaid: tuple[str, ...] = ()
     beside: Callable[[Compensation, Origin], str] | None = None
+    by_phase: bool = False
 
 
 _NO_POSITION = "error by position remains: the format has no entry for it"
 FORMATS: Mapping[str, Format] = {
-    "csv": Format("table", _csv),
+    "csv": Format("table", _csv, by_phase=True),
     "linuxcnc": Format("table", _linuxcnc),
     "header": Format("table", _header),
     # gnea/grbl, doc/markdown/settings.md: $100 to $102 are steps per mm; no setting compensates backlash.
@@ -293,7 +305,12 @@ FORMATS: Mapping[str, Format] = {
         unsaid=("a URDF holds zero and ratio: play and error by position remain",),
         beside=_urdf_yaml,
     ),
-    "pec": Format("period", _pec, unsaid=("a table of one period holds no play, only errors that repeat with it",)),
+    "pec": Format(
+        "period",
+        _pec,
+        unsaid=("a table of one period holds no play, only errors that repeat with it",),
+        by_phase=True,
+    ),
 }
 
 
@@ -309,7 +326,7 @@ class Wish:
         resolution: least command that is carried out; 0 where it is fine.
         in_force: present value of the setting, for formats that change one.
         letter: letter of the axis in the settings of grbl: X, Y, Z, A, B or C.
-        period: period of a period's table, in commands; None for that of the strongest wave.
+        period: period of a table by phase, in commands; None: of pec that of the strongest wave, of csv no such table.
     """
 
     target: str = "csv"
@@ -342,6 +359,6 @@ def checked(wish: Wish) -> Format:
         raise InputError("usage", f"--in-force {wish.in_force:g}", allowed="more than 0", remedy=remedy)
     if wish.in_force is not None and not form.in_force:
         raise InputError("usage", f"--in-force is not for --to {wish.target}", remedy="leave it out")
-    if wish.period is not None and form.holds != "period":
+    if wish.period is not None and not form.by_phase:
         raise InputError("usage", f"--to {wish.target} takes no --period", remedy="leave it out")
     return form

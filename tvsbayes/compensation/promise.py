@@ -23,7 +23,7 @@ from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.files.packages import own_version
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import CAUSES, Compensation, SidePromise, TableRow
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis
+from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, axis_hashes, read_axis
 from tvsbayes.single_axis.axis_density import line_weights
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
@@ -35,10 +35,13 @@ from tvsbayes.statistics.streams import Stream, random_stream
 
 NODES_FEW, NODES_MANY = 13, 41
 """Least and largest number of lines of a table: positions read, and midpoints where these are few."""
-PERIOD_NODES = 129
-"""Nodes of a period's table over the range."""
+PERIOD_NODES, PHASE_NODES, PERIODS_MAX = 129, 33, 4
+"""Nodes of a pec table over the range, of a table by phase over its period, and most periods averaged for that."""
+OF_PHASE = "a table by phase holds both sides of what repeats with its period; ratio and all else stay"
 TRIED, STATES = 20, 2
 """Number of commands at which the promise is evaluated, from each side, and of states of use at each."""
+TRIED_STOPS = 2 * TRIED * STATES
+"""Number of stops of a use at which the promise is evaluated."""
 UNIT_COMMANDS = 0.2
 """Largest difference of the ratio from 1 or -1 for commands to count in the unit of readings."""
 ONE_SIDED = "every stop was read from one side: the play is not determined; its prior sets the error on the other side"
@@ -116,10 +119,11 @@ def table_commands(rows: AxisRows) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Shaped:
-    """Errors in the terms of a format: a correction without rounding, and the format's numbers."""
+    """Errors in the terms of a format: a correction without rounding, the format's numbers, the line by phase."""
 
     correction: Correction
     settings: dict[str, float] = field(default_factory=dict)
+    per_command: float = 0.0
 
 
 def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wish, line: np.ndarray) -> _Shaped:
@@ -195,23 +199,60 @@ def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _
     """
     low, high = float(at.command[0]), float(at.command[-1])
     spacing = float(np.max(np.diff(at.command)))
-    if not 8 * spacing <= period <= high - low:
-        message = f"--period {period:g}: positions every {spacing:g} commands over {high - low:g}"
-        allowed = "at least eight positions in a period, and a whole period in the range"
-        remedy = f"state a period from {8 * spacing:g} to {high - low:g} commands, or read more positions"
-        raise InputError("usage", message, allowed=allowed, remedy=remedy)
+    _refuse_period(period, spacing, high - low)
     middle = at.mean.mean(axis=0)
     off = middle - np.polyval(np.polyfit(at.command, middle, 1), at.command)
 
-    def waves(command: np.ndarray) -> np.ndarray:
-        # The mean over periods is fitted by four harmonics.
-        phase = 2 * np.pi * command / period
-        return np.column_stack([f(k * phase) for k in range(1, 5) for f in (np.cos, np.sin)])
-
-    amplitudes = np.linalg.lstsq(waves(at.command), off, rcond=None)[0]
+    # The mean over periods is fitted by harmonics.
+    amplitudes = np.linalg.lstsq(_harmonics(at.command, period), off, rcond=None)[0]
     command = np.linspace(low, high, PERIOD_NODES)
-    added = -waves(command) @ amplitudes / fitted
+    added = -_harmonics(command, period) @ amplitudes / fitted
     return _Shaped(Correction(command, added, added, resolution), {"period_command": period})
+
+
+def _by_phase(
+    machine: PredictedMachine, rows: AxisRows, fitted: float, period: float, resolution: float
+) -> tuple[_Expected, _Shaped]:
+    """Average each side's errors from one line over periods: the readings of the first period, and the correction.
+
+    The line's slope is that beside four harmonics of the period, where more than one period was read.
+
+    Raises:
+        InputError: the range is shorter than a period, or its phases are read too coarsely.
+    """
+    low, high = float(rows.positions[0]), float(rows.positions[-1])
+    phases = np.sort(np.mod(rows.positions - low, period)) if period > 0 else np.zeros(1)
+    gap = float(np.max(np.diff(phases, append=phases[0] + period)))
+    _refuse_period(period, gap, high - low)
+    nodes = low + period * np.linspace(0.0, 1.0, PHASE_NODES)
+    periods = np.linspace(0, (high - low) // period - 1, PERIODS_MAX).round()
+    each = [_expected(machine, nodes + k * period, rows.both_sides) for k in np.unique(periods)]
+    command, mean = np.array([at.command for at in each]), np.array([at.mean for at in each])
+    at_once, middle = command.ravel(), mean.mean(axis=1).ravel()
+    waves = _harmonics(at_once, period) if len(each) > 1 else np.zeros((len(at_once), 0))
+    line = np.linalg.lstsq(np.column_stack([at_once, np.ones_like(at_once), waves]), middle, rcond=None)[0][:2]
+    off = (mean - np.polyval(line, command)[:, None]).mean(axis=0)
+    off[:, [0, -1]] = off[:, [0, -1]].mean(axis=1, keepdims=True)
+    variance = np.mean([at.variance for at in each], axis=0)
+    forward, backward = _rounded(-off / fitted, 1.0, "csv")
+    correction = Correction(nodes, forward, backward, resolution, period)
+    at = _Expected(nodes, np.polyval(line, nodes) + off, variance, rows.both_sides)
+    return at, _Shaped(correction, {"period_command": period}, float(line[0]))
+
+
+def _harmonics(command: np.ndarray, period: float) -> np.ndarray:
+    """Cosines and sines of the first four harmonics of a period at commands (m,), shape (m, 8)."""
+    phase = 2 * np.pi * command / period
+    return np.column_stack([f(k * phase) for k in range(1, 5) for f in (np.cos, np.sin)])
+
+
+def _refuse_period(period: float, spacing: float, length: float) -> None:
+    """Refuse a period that the positions read do not resolve, or that exceeds their range."""
+    if not 8 * spacing <= period <= length:
+        message = f"--period {period:g}: positions every {spacing:g} commands over {length:g}"
+        allowed = "at least eight positions in a period, and a whole period in the range"
+        remedy = f"state a period from {8 * spacing:g} to {length:g} commands, or read more positions"
+        raise InputError("usage", message, allowed=allowed, remedy=remedy)
 
 
 def bound_of(stops: PredictedReadings, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
@@ -230,7 +271,7 @@ def bound_of(stops: PredictedReadings, aim: np.ndarray, members: np.ndarray, shi
 
 
 @dataclass(frozen=True)
-class _Tried:
+class TriedUse:
     """Stops of a use at which the promise is evaluated.
 
     Attributes:
@@ -268,8 +309,8 @@ class _Tried:
         return scatter + max(float(used_square - table_square), 0.0)
 
 
-def _promise(tried: _Tried, shift: bool, zero_free: bool) -> dict[str, SidePromise]:
-    """Compute the remaining errors by side, and those due to each cause alone.
+def promised_sides(tried: TriedUse, shift: bool, zero_free: bool) -> dict[str, SidePromise]:
+    """Compute the remaining errors, forward and backward, and those due to each cause alone.
 
     Args:
         tried: stops of a use.
@@ -338,17 +379,23 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     shift = form.zero_free or homings == 1
     with Job({"table": 1.0, "promise": 2.0}, progress) as job:
         job.begin("table")
-        at = _expected(machine, table_commands(rows), rows.both_sides)
-        shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
+        by_phase = form.holds == "table" and wish.period is not None
+        if by_phase:
+            at, shaped = _by_phase(machine, rows, fitted, float(wish.period or 0.0), wish.resolution)
+            nominal = _nominal(campaign, shaped.per_command, wish)
+        else:
+            at = _expected(machine, table_commands(rows), rows.both_sides)
+            shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
         job.begin("promise")
-        aimed = (_offset(at, nominal) if form.holds == "table" else None, nominal)
-        offset, tried = _tried(machine, shaped.correction, (low, high), aimed, reading_u(campaign), seed)
-        promise = _promise(tried, shift, form.zero_free)
+        aimed = (_offset(at, nominal) if form.holds == "table" and not by_phase else None, nominal)
+        offset, tried = tried_use(machine, shaped.correction, (low, high), aimed, reading_u(campaign), seed)
+        promise = promised_sides(tried, shift, form.zero_free)
         run_up = _run_up(machine, rows.positions, fitted, wish.resolution)
     added = tried.added_variance(shift)
     by_side = np.array([added[tried.side == side].mean() for _, side in SIDES])
     table = _table(replace(at, variance=at.variance + by_side[:, None]), shaped.correction)
     use, state = machine.use, machine.state
+    around = _by_position_alone(campaign, form, by_phase, TURNS.get(campaign.unit, 0.0) / abs(fitted), high - low)
     return Compensation(
         target=wish.target,
         machine=str(campaign.header.get("serial") or campaign.header.get("name") or ""),
@@ -366,20 +413,26 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         table=table,
         settings=shaped.settings,
         promise=promise,
-        unsaid=(*form.unsaid, *(() if rows.both_sides else (ONE_SIDED,)), *_unreachable(campaign, low, high, run_up)),
+        unsaid=(
+            *form.unsaid,
+            *((OF_PHASE,) if by_phase else ()),
+            *around,
+            *(() if rows.both_sides else (ONE_SIDED,)),
+            *_unreachable(campaign, low, high, run_up),
+        ),
         state={name: float(value) for name, value in state._asdict().items()},
         kelvin=use.kelvin if rows.kelvin is not None else None,
     )
 
 
-def _tried(
+def tried_use(
     machine: PredictedMachine,
     correction: Correction,
     between: tuple[float, float],
     aimed: tuple[float | None, float],
     u: float,
     seed: int,
-) -> tuple[float, _Tried]:
+) -> tuple[float, TriedUse]:
     """Predict a use; offset and stops. `aimed` is the line of the aim; without its offset errors have the mean 0."""
     low, high = between
     # Commands between the lines of the table are tested too.
@@ -391,7 +444,7 @@ def _tried(
     if offset is None:
         offset = float((table.pooled().mean - nominal * command).mean())
     states = machine.use.states(len(table.mean), len(command), random_stream(seed, Stream.PROMISE, 1))
-    return offset, _Tried(
+    return offset, TriedUse(
         side=side,
         after=machine.expected(sent, side, states),
         before=machine.expected(command, side, states),
@@ -399,6 +452,18 @@ def _tried(
         shifts=machine.shifts(states, machine.state),
         scatter=machine.scatter(side, states, u),
         aim=offset + nominal * command,
+    )
+
+
+def _by_position_alone(
+    campaign: AxisCampaign, form: Format, by_phase: bool, turn: float, read: float
+) -> tuple[str, ...]:
+    """Say of an axis that goes round, a turn of `turn` commands, what a table by position does not hold."""
+    if form.holds != "table" or by_phase or campaign.unit not in TURNS or read < turn:
+        return ()
+    return (
+        "the axis goes round: the table is by position, for the turns read alone; one by phase, both sides, is "
+        f"`--to csv --period N`, N the commands of a turn, about {number(turn, 4)}",
     )
 
 

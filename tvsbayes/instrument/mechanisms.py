@@ -75,6 +75,11 @@ class Mechanism:
         return self.named(("tilt_zero_deg",))[0]
 
     @cached_property
+    def zeros(self) -> tuple[str, str]:
+        """Names of the parameters that shift the pan angle and the tilt angle as a whole."""
+        return "azimuth_zero_deg" if "azimuth_zero_deg" in self.names else "pan_zero_emission_deg", self.tilt_zero
+
+    @cached_property
     def prior_groups(self) -> dict[str, list[int]]:
         """Coordinates by cause of uncertainty, the stereo calibration first."""
         columns = list(enumerate(self.parameters.values()))

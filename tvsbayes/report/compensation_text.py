@@ -19,6 +19,7 @@ from tvsbayes.results.compensation_record import (
     OTHER_MACHINE,
     TWICE,
     WRONG_SIGN,
+    AimedPromise,
     Compensation,
     Verification,
 )
@@ -57,6 +58,14 @@ HELPS = {
     "readings": "the readings themselves; a better reference",
 }
 """Remedies by the largest cause of the remaining error."""
+AIMED_HELPS = {
+    "homing": "the scatter of homings; look after several homings, or aim without homing in between",
+    "table": "the calibration itself; look more, at more counters",
+    "format": "what the format cannot hold, and whole steps; the header and `steps-for` hold both sides by counter",
+    "travel": "a contrast of the directions; of gears whose teeth keep step state `ratio_contrast_deg_per_step` 0, u 0 "
+    "in [rig.prior], else home after less travel",
+}
+"""The same for a scanner or head, where they differ."""
 DRIVE_HELPS = {
     "format": "waves of other periods, which a table of one period does not hold",
     "drift": "the walk of the zero; guide",
@@ -64,7 +73,7 @@ DRIVE_HELPS = {
 """The same for a drive at constant rate, where they differ."""
 
 
-def promise_table(result: Compensation) -> TableView:
+def promise_table(result: Compensation | AimedPromise) -> TableView:
     """Remaining error by side, and the error that each cause alone would leave; causes that leave none are left out."""
     sides = result.sides
     causes = [cause for cause in CAUSES if any(promise.causes.get(cause, 0.0) for promise in sides.values())]
@@ -72,7 +81,7 @@ def promise_table(result: Compensation) -> TableView:
     for side, promise in sides.items():
         sizes = [promise.without95, promise.error95, *(promise.causes.get(cause, 0.0) for cause in causes)]
         rows.append([side.removeprefix("arriving "), *map(two_digits, sizes)])
-    shift = ", but for one shift common to all," if result.shift_free else ""
+    shift = f", but for one shift common to all{_of_axes(result)}," if _shift_free(result) else ""
     caption = f"95 % of errors{shift} are at most, {escaped(result.unit)}; each cause alone"
     return TableView(caption, ["" if result.in_motion else "arriving", "without", "after", *causes], rows)
 
@@ -92,8 +101,8 @@ def sizes_table(verification: Verification) -> TableView:
     columns = ["", "RMS", "worst"]
     if (points := verification.millimetres) is not None:
         columns += [f"RMS at {points.distance_mm:.10g} mm, mm", "worst, mm"]
-        for row, size in zip(rows, (points.before, points.after), strict=True):
-            row += [two_digits(size.rms), two_digits(size.worst)]
+        for row, size in zip(rows, (points.before, points.after, None), strict=False):
+            row += ["", ""] if size is None else [two_digits(size.rms), two_digits(size.worst)]
     scope = " of both axes" * verification.looks + ", and of points" * (points is not None)
     return TableView(f"errors, {escaped(verification.unit)}{scope}", columns, rows)
 
@@ -109,9 +118,7 @@ def _promise_text(verification: Verification) -> str:
 
 def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
     """A compensation as text."""
-    unit, (low, high), sides = escaped(result.unit), result.range_command, result.sides.values()
-    counted = [cause for cause in CAUSES if cause != "homing" or not result.shift_free]
-    largest = max(counted, key=lambda cause: max(promise.causes.get(cause, 0.0) for promise in sides))
+    unit, (low, high), largest = escaped(result.unit), result.range_command, _largest(result)
     shift = ", but for one shift common to all" if result.zero_free else ""
     lines: list[Part] = [
         f"compensation for {result.target}: {len(result.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
@@ -128,9 +135,57 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
     return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
 
 
-def _homing_remarks(result: Compensation) -> list[str]:
+def aimed_text(result: AimedPromise) -> str:
+    """The promise of a calibration as text."""
+    what = {"header": "header and `steps-for`", "urdf": "URDF"}.get(result.target, result.target)
+    counters = [f"{axis} {low:.10g} to {high:.10g}" for axis, (low, high) in result.range_steps.items()]
+    travel = " and ".join(f"{steps:.4g} steps of {axis}" for axis, steps in result.travel_steps.items())
+    run_up = " and ".join(f"{steps} steps of {axis}" for axis, steps in result.reversal_steps.items())
+    return terminal(
+        f"aimed by its calibration ({what}), counters {', '.join(counters)}",
+        "",
+        promise_table(result),
+        "",
+        f"the promise holds between these counters, within {two_digits(result.hours)} h and {travel} of travel since "
+        f"homing{_kelvin(result)}",
+        f"arrive with at least {run_up} of travel on a side",
+        f"largest remaining error: {(HELPS | AIMED_HELPS)[_largest(result)]}",
+        *_homing_remarks(result),
+    )
+
+
+def aimed_words(result: AimedPromise) -> str:
+    """The promise of a calibration in a sentence."""
+    sizes = ", ".join(f"{side} {two_digits(each.error95)}" for side, each in result.sides.items())
+    homed = ", ".join(f"{side} {two_digits(each.error95_with_homing or 0.0)}" for side, each in result.sides.items())
+    shift = f", but for one shift common to all{_of_axes(result)}," if result.free_axes else ""
+    with_homing = f"; with the next homing's error: {homed}" if result.free_axes else ""
+    return f"Promise: 95 % of errors{shift} at most, {escaped(result.unit)}, arriving {sizes}{with_homing}."
+
+
+def _shift_free(result: Compensation | AimedPromise) -> bool:
+    return bool(result.free_axes) if isinstance(result, AimedPromise) else result.shift_free
+
+
+def _of_axes(result: Compensation | AimedPromise) -> str:
+    """The axes whose errors are less a shift, where there are two."""
+    return f" of {' and of '.join(result.free_axes)}" if isinstance(result, AimedPromise) else ""
+
+
+def _largest(result: Compensation | AimedPromise) -> str:
+    """The largest cause of the remaining error."""
+    counted = [cause for cause in CAUSES if cause != "homing" or not _shift_free(result)]
+    return max(counted, key=lambda cause: max(promise.causes.get(cause, 0.0) for promise in result.sides.values()))
+
+
+def _kelvin(result: Compensation | AimedPromise) -> str:
+    low, high = result.kelvin or (0.0, 0.0)
+    return f", at temperatures as read, over {two_digits(high - low)} K" if result.kelvin else ""
+
+
+def _homing_remarks(result: Compensation | AimedPromise) -> list[str]:
     """What the promise rests on where one homing alone was read, and what the next one may add."""
-    if not result.shift_matters:
+    if not (result.free_axes if isinstance(result, AimedPromise) else result.shift_matters):
         return []
     homed = [
         f"{side} {two_digits(promise.error95_with_homing)}"
@@ -140,7 +195,8 @@ def _homing_remarks(result: Compensation) -> list[str]:
     remark = (
         "one homing was read, or none: the promise is of errors but for one shift common to all, as within one homing"
     )
-    prior = "with the next homing's error, which its prior alone determines, home_sd in [axis], 95 % are at most: "
+    where = "home_sd_deg in [rig.prior]" if isinstance(result, AimedPromise) else "home_sd in [axis]"
+    prior = f"with the next homing's error, which its prior alone determines, {where}, 95 % are at most: "
     return [f"{remark}; {prior}{', '.join(homed)} {escaped(result.unit)}"]
 
 
@@ -155,11 +211,9 @@ def _validity(result: Compensation) -> list[str]:
             f"the error that repeats every {result.settings['period_command']:.6g} commands{seconds}: {size} "
             f"{escaped(result.unit)} peak to peak",
         ]
-    low, high = result.kelvin or (0.0, 0.0)
-    kelvin = f", at temperatures as read, over {two_digits(high - low)} K" if result.kelvin else ""
     return [
         f"the promise holds between these commands, within {two_digits(result.hours)} h and "
-        f"{result.travel_command:.4g} commands of travel since homing{kelvin}",
+        f"{result.travel_command:.4g} commands of travel since homing{_kelvin(result)}",
         f"arrive with at least {result.reversal_command:.4g} commands of travel on a side",
     ]
 

@@ -26,6 +26,8 @@ from tvsbayes.results.records import (
 )
 
 COMPENSATION_FORMAT = "tvsbayes-compensation/1"
+AIMED_FORMAT = "tvsbayes-aimed-promise/1"
+"""Of `results/compensation.json` of a scanner or head."""
 VERIFICATION_FORMAT = "tvsbayes-verification/1"
 AppliedBy = Literal["controller", "host"]
 Verdict = Literal["KEPT", "BROKEN", "CANNOT TELL"]
@@ -188,6 +190,59 @@ class Compensation(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         left = ", ".join(f"{side} {promise.error95:.3g}" for side, promise in self.sides.items())
         title = f"Compensation for {self.target}: left after applying, 95 %: {left} {self.unit}"
         return View(title, ("command", "forward", "backward", "u_forward", "u_backward"), rows)
+
+
+class AimedPromise(Shown, Record, frozen=True, kw_only=True, omit_defaults=True):
+    """The promised bound of the pointing errors of a scanner or head that is aimed by its calibration.
+
+    Attributes:
+        target: "header", whose counters are those of `steps-for`, or "urdf".
+        machine: name or serial number, as in `campaign.toml`.
+        unit: unit of errors, "deg" of a mirror or joint: the turn of the axis that moves the beam as far, seen from
+            where looks are seen, at their distance.
+        table: SHA-256 of the calibration as JSON.
+        range_steps: counters of each axis between which the promise holds, those of the looks.
+        reversal_steps: travel of each axis, steps, after which an arrival is on one side whatever came before.
+        hours, travel_steps: limits since homing for which the promise holds, travel by axis: the campaign's longest
+            segment.
+        homings: number whose zeros the campaign saw, by axis, 1 of an encoder that keeps its zero: the promise of an
+            axis is then of errors less one common shift.
+        promise: promised errors by side; none of an axis that never moved.
+        unsaid: corrections that the format cannot express, in words.
+        state: state of the calibration by axis, as in `Compensation`; `travel` in steps.
+        kelvin: range of temperatures of the promise, less that of the first move; None where none was recorded.
+    """
+
+    target: str
+    machine: str
+    unit: str
+    table: str
+    range_steps: dict[str, tuple[float, float]]
+    reversal_steps: dict[str, Count]
+    hours: NotNegative
+    travel_steps: dict[str, NotNegative]
+    homings: dict[str, Count]
+    promise: dict[str, SidePromise]
+    unsaid: tuple[str, ...]
+    state: dict[str, dict[str, float]]
+    kelvin: tuple[float, float] | None = None
+    in_motion: ClassVar = False
+
+    @property
+    def sides(self) -> dict[str, SidePromise]:
+        """The promise by side of arrival."""
+        return self.promise
+
+    @property
+    def free_axes(self) -> tuple[str, ...]:
+        """Axes whose promise is of errors less one shift common to all, since nothing but a prior tells their zero."""
+        return tuple(axis for axis, count in self.homings.items() if count == 1)
+
+    def shown(self) -> View:
+        """Show the promise."""
+        rows = [(side, each.without95, each.error95, each.error95_with_homing) for side, each in self.promise.items()]
+        title = f"Promise of a calibration ({self.target}): 95 % of errors, {self.unit}"
+        return View(title, ("arriving", "without", "after", "with homing"), rows)
 
 
 class ErrorSize(Record, frozen=True):

@@ -85,10 +85,12 @@ class PredictedReadings:
 
     def centred(self) -> PredictedReadings:
         """The readings less their mean: one common shift taken off."""
-        rows = self.covariance - self.covariance.mean(axis=1, keepdims=True)
-        return PredictedReadings(
-            self.mean - self.mean.mean(axis=1, keepdims=True), rows - rows.mean(axis=2, keepdims=True)
-        )
+        return self.less(np.ones((1, self.mean.shape[1]), dtype=bool))
+
+    def less(self, groups: np.ndarray) -> PredictedReadings:
+        """The readings less the mean of each group, masks (g, r)."""
+        kept = less_means(groups)
+        return PredictedReadings(self.mean @ kept, kept @ self.covariance @ kept)
 
     def drawn(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Readings (count, r) drawn from the mixture, the same number from each draw."""
@@ -108,6 +110,12 @@ class PredictedReadings:
     def log_density(self, value: np.ndarray, additional: np.ndarray | None = None) -> float:
         """Log density of readings (r,) under the mixture of equal draws; `additional` as in `log_densities`."""
         return log_mean(self.log_densities(value, additional))
+
+
+def less_means(groups: np.ndarray) -> np.ndarray:
+    """Compute the matrix (r, r) that takes from readings the mean of each of disjoint groups, masks (g, r)."""
+    shares = groups / np.maximum(groups.sum(axis=1, keepdims=True), 1)
+    return np.eye(groups.shape[1]) - groups.T.astype(float) @ shares
 
 
 def log_mean(logs: Sequence[float] | np.ndarray) -> float:
