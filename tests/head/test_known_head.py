@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import yaml
 from support.commands import assert_error
 
+from tvsbayes.calibration.states import ZERO_NAMES, total_shift
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.importing.urdf import head_joints
 from tvsbayes.instrument.axes import AXES
@@ -19,7 +21,7 @@ from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, read_plan
 from tvsbayes.instrument.rig import Rig, RigTable
-from tvsbayes.pipeline import calibrate
+from tvsbayes.pipeline import calibrate, load_calibration
 from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.posterior.transport import transport
@@ -113,12 +115,17 @@ def test_a_model_is_corrected_and_marked(ask, known_head, tmp_path):
     folder, truth = known_head
     out = tmp_path / "new.urdf"
     code, document = ask("compensate", folder, "--to", "urdf", "-o", out)
-    assert code == 0 and document["files"] == {"urdf": str(out), "yaml": f"{out}.yaml"}
+    promise = str(folder / "results" / "compensation.json")
+    assert code == 0 and document["files"] == {"urdf": str(out), "yaml": f"{out}.yaml", "compensation": promise}
     kept = yaml.safe_load((tmp_path / "new.urdf.yaml").read_text())
     u = dict(zip(kept["names"], np.sqrt(np.diag(kept["covariance"])), strict=True))
     terms = head_joints(out.read_bytes(), "new.urdf", dict.fromkeys(AXES)).terms
+    # Zeros are those at the calibration's state: with the creep, and the contrast of the directions by travel.
+    true, state = dict(truth.parameters), load_calibration(folder).states["pan"]
+    draws = {name: np.array([true[name]]) for name in ZERO_NAMES}
+    true["azimuth_zero_deg"] += float(total_shift(draws, "pan", state)[0, 0])
     for name in ("azimuth_axis_tilt_deg.north", "axes_not_square_deg", "azimuth_zero_deg"):
-        assert abs(terms[name] - truth.parameters[name]) < 4 * u[name], name
+        assert abs(terms[name] - true[name]) < 4 * u[name], name
     assert ask("compensate", folder, "--to", "urdf", "-o", out)[0] == 0, "a model of ours is replaced"
     for place in (folder / "head.urdf", tmp_path / "again.urdf"):
         (tmp_path / "again.urdf").write_bytes(UNIT)
@@ -146,10 +153,12 @@ def test_fresh_looks_show_whether_the_calibration_is_applied(ask, known_head, tm
     assert ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")[0] == 0
     steps = read_plan(tmp_path / "plan.csv", SIGHTING_HEAD)
     priors = read_campaign(folder).rig.priors
-    true, nominal = truth.parameters, {name: prior.value for name, prior in priors.items()}
+    nominal, calibration = {name: prior.value for name, prior in priors.items()}, load_calibration(folder)
 
     def sent(pan, tilt):
-        aim = direction(true, true["degrees_per_step.pan"] * pan, true["degrees_per_step.tilt"] * tilt)
+        # The direction that the calibration gives these counters, at its state.
+        x, y, z = calibration.beam_at((float(pan), float(tilt)), (0.0, 0.0), math).direction
+        aim = np.degrees([np.arctan2(y, x), np.arcsin(z)])
         angles = np.zeros(2)
         for _ in range(10):
             angles += np.degrees(np.angle(np.exp(1j * np.radians(aim - direction(nominal, *angles)))))
