@@ -120,7 +120,7 @@ def test_a_model_is_corrected_and_marked(ask, known_head, tmp_path):
     kept = yaml.safe_load((tmp_path / "new.urdf.yaml").read_text())
     u = dict(zip(kept["names"], np.sqrt(np.diag(kept["covariance"])), strict=True))
     terms = head_joints(out.read_bytes(), "new.urdf", dict.fromkeys(AXES)).terms
-    # Zeros are those at the calibration's state: with the creep, and the contrast of the directions by travel.
+    # Zeros are those at the calibration's state, with the creep.
     true, state = dict(truth.parameters), load_calibration(folder).states["pan"]
     draws = {name: np.array([true[name]]) for name in ZERO_NAMES}
     true["azimuth_zero_deg"] += float(total_shift(draws, "pan", state)[0, 0])

@@ -45,7 +45,7 @@ def calibration_of_draws(
     """Build a calibration from the columns that coordinates depend on.
 
     Baseline, C0, the aperture's zero and its noise are drawn from their priors without readings, since a sampler holds
-    them fixed. Zeros are those at the mean state of the campaign's looks, draw by draw.
+    them fixed. Zeros are those at one state (`states_of`), draw by draw.
 
     Args:
         names: public names of the columns of `physical`.

@@ -104,8 +104,8 @@ class Calibration(Shown):
         gears: counters at which errors of the gears are tabulated; none without repeating errors.
         extrinsics: draws (n, 6) of `EXTRINSICS_NAMES`, row by row with `inputs`; none where only the moments were kept.
         names: names of the inputs: `INPUT_NAMES`, or those of a head in their places.
-        states: state by axis at which `mean` and `inputs` hold, the mean of the campaign's looks; empty in results of
-            0.3: at the homing, switched on just then.
+        states: state by axis at which `mean` and `inputs` hold (`states_of`); empty in results of 0.3: at the homing,
+            switched on just then.
         zeros: draws (n, k) of `ZERO_NAMES`, row by row with `inputs`; none where only the moments were kept.
     """
 

@@ -1,6 +1,6 @@
 """States of a machine with two axes: time, travel and temperature since the homing, and the shifts of its zeros.
 
-A calibration is of one stated state for all counters and both sides, the mean of the campaign's looks. deg, steps.
+A calibration is of one stated state for all counters and both sides: `states_of`. deg, steps.
 """
 
 from __future__ import annotations
@@ -96,12 +96,17 @@ def states_at(campaign: Campaign, looks: Sequence[Look]) -> dict[Axis, State]:
 
 
 def states_of(campaign: Campaign) -> dict[Axis, State]:
-    """Compute the mean state of a campaign's looks by axis; empty without looks."""
+    """Compute the state of a calibration by axis: the mean of the looks, without travel; empty without looks.
+
+    Travel shifts a zero by the contrast of the directions alone, from the homing on: a machine that is homed and sent
+    to a point has none.
+    """
     if not (looks := ordered_spots(campaign)):
         return {}
-    return {
+    means = {
         axis: State(*(float(np.mean(each)) for each in state)) for axis, state in states_at(campaign, looks).items()
     }
+    return {axis: state._replace(travel=0.0) for axis, state in means.items()}
 
 
 def uses_of(campaign: Campaign) -> dict[Axis, Use]:

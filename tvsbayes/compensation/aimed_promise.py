@@ -1,6 +1,6 @@
 """The promise of a scanner's or head's calibration: the bound of pointing errors by axis and side.
 
-The calibration is the table: one state, the mean of the campaign's looks, for all counters and both sides. The promise
+The calibration is the table: one state (`calibration.states`) for all counters and both sides. The promise
 is that of `compensation.promise`, over posterior and use. Counters in steps, errors in degrees of mirror or joint.
 """
 
