@@ -42,7 +42,7 @@ def test_a_gauge_that_counts_parts_of_its_unit(name, tmp_path):
     assert stated.readings[3]["value"] == pytest.approx(100 * READ[3])
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.5, 25.4, 0.4])
+@pytest.mark.parametrize("factor", [1.0, 1.5, 25.4, 0.0125])
 def test_other_ratios_are_read_as_they_stand(factor, tmp_path):
     rows = axis_rows(table(tmp_path, "command (mm),reading (mm)", PLACES, factor * READ), Wishes())
     assert rows.unit == "mm" and rows.readings[3]["value"] == pytest.approx(factor * READ[3])
@@ -115,3 +115,22 @@ def test_pixels_of_no_camera_are_refused(tmp_path):
         look_columns(read_foreign(tmp_path / "t.csv"), {})
     (tmp_path / "t.csv").write_text("pan,tilt,x,y\n0,0,600,400\n100,0,800,400\n")
     assert look_columns(read_foreign(tmp_path / "t.csv"), {}).taken
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mil", 1.0), ("0.001 in", 1.0), ("in", 1e-3)])
+def test_lengths_that_hardly_change_with_the_commands_are_deviations_or_positions(unit, scale, tmp_path):
+    deviation = scale * (-2.8 * PLACES - 0.3 * SIDES)
+    foreign = table(tmp_path, f"command (in),reading [{unit}]", PLACES, deviation)
+    assert answers(foreign) == [("--deviations",), ("--positions",)]
+    read = [r["value"] for r in axis_rows(foreign, Wishes(deviations=True)).readings]
+    np.testing.assert_allclose(read, PLACES + 1e-3 * (-2.8 * PLACES - 0.3 * SIDES), atol=1e-9)
+
+
+def test_readings_that_go_their_own_way_are_asked_about(tmp_path):
+    """The sign of the command stands in a column of its own."""
+    steps = np.array([-400.0, -300, -200, -100, 0, 100, 200, 300, 400])
+    foreign = table(tmp_path, "steps,angle_deg", np.abs(steps), 0.018 * steps)
+    columns = ("--column", "command=steps", "--column", "value=angle_deg")
+    assert answers(foreign) == [columns, (*columns, "--deviations")]
+    stated = axis_rows(foreign, Wishes(columns={"command": "steps", "value": "angle_deg"}))
+    assert len(stated.readings) == len(steps)

@@ -34,6 +34,8 @@ ROOM_DEGC = (10.0, 40.0)
 """Temperatures of a room."""
 MACHINES_MAX, MACHINE_ROWS = 8, 3
 """Largest number of axes or readers in a table, and fewest rows of each."""
+STRAY_ROWS, STRAY_R2 = 6, 0.5
+"""Least number of readings, and largest squared correlation with the commands, of readings that go their own way."""
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
 """Options that say what the readings are."""
 _MEANING = {DEVIATIONS: "actual less commanded position", POSITIONS: "positions"}
@@ -62,6 +64,8 @@ def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: boo
     chooser.roles = {role: _of_device(chooser, names) for role, names in chooser.roles.items()}
     _take_value(chooser, deviations)
     _take_others(chooser)
+    if deviations is None and not {"command", "value"} & stated.keys():
+        _ask_whether_it_follows(chooser)
     _refuse_several(chooser)
     return chooser.understood()
 
@@ -166,6 +170,18 @@ def _take_others(chooser: Chooser) -> None:
         columns = ({"time_s": clocks[0]}, {"temperature_degC": clocks[0]}, {"time_s": ""})
         raise chooser.ask(found, list(map(chooser.answer, columns)))
     chooser.take("time_s", clocks, what="that could be the clock")
+
+
+def _ask_whether_it_follows(chooser: Chooser) -> None:
+    """Ask where the reading goes its own way: signs in another column, an encoder of another axis."""
+    names = {name: chooser.taken[name] for name in ("command", "value")}
+    command, value = (chooser.known[text] for text in names.values())
+    c, v = _in_both(command, value)
+    if len(c) < STRAY_ROWS or len(np.unique(c)) < 3 or np.ptp(v) == 0 or follows(command, value):
+        return
+    if np.corrcoef(c, v)[0, 1] ** 2 < STRAY_R2:
+        found = f"readings in column {escaped(names['value'])} that do not follow column {escaped(names['command'])}"
+        raise chooser.ask(found, [chooser.answer(names), chooser.answer(names, DEVIATIONS)])
 
 
 def _refuse_several(chooser: Chooser) -> None:

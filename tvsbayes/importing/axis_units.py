@@ -20,6 +20,8 @@ UNIT_SLOPE = 0.05
 """Largest deviation from 1 of the slope of readings over commands, where both are taken to be in one unit."""
 PART_DIGITS = 0.02
 """Largest distance of a slope from a power of ten, decades, at which readings may count parts of their unit."""
+SLOPE_DECADES = 2.0
+"""Largest distance of such a slope from 1, decades: deviations from a scale that is off change by less than 1 %."""
 ANGLE_SPAN = 360.0
 
 
@@ -137,8 +139,6 @@ def in_one_unit(
         values = [None if v is None else rounded(unit.per_number * v) for v in values]
         assumed.append(f"value: numbers of {unit.per_number:g} {unit.name}, turned into {unit.name}")
         unit = unit.whole
-    elif unit is not None and command_unit is not None and "value" not in wishes.units:
-        _check_parts(cells, commands, values, unit, command_unit)
     elif unit is None and of_scale is not None:
         slope = _slope(commands, values)
         if not abs(slope - 1.0) <= UNIT_SLOPE:
@@ -146,6 +146,8 @@ def in_one_unit(
         given = unit = of_scale
         how = "that of the commands, which the readings follow 1 to 1; --unit value=mm says another"
         assumed.append(f"unit: {unit.name}, {how}")
+    if unit is not None and command_unit is not None and "value" not in wishes.units and wishes.deviations is None:
+        _check_slope(cells, commands, values, unit, command_unit)
     if unit is None and _are_counts(cells.text("value")):
         unit = given = Unit("counts", "count", 1.0)
         assumed.append("unit: whole numbers over more than 360, so counts; --unit value=deg says another")
@@ -158,16 +160,18 @@ def _slope(commands: Sequence[float], values: Sequence[float | None]) -> float:
     return line_through(*known.T)[0] if len(np.unique(known[:, 0])) > 1 else 0.0
 
 
-def _check_parts(
+def _check_slope(
     cells: FieldCells, commands: Sequence[float], values: Sequence[float | None], unit: Unit, command_unit: Unit
 ) -> None:
-    """Ask where readings follow the commands but for a power of ten: a gauge in 1/100 mm whose column says mm."""
+    """Ask where lengths do not follow lengths: a gauge in 1/100 mm whose column says mm, deviations called readings."""
     slope = _slope(commands, values) * (unit.in_units_of(command_unit) or 0.0)
     if unit.kind != "length" or command_unit.kind != "length" or not slope:
         return
     decades = float(np.log10(abs(slope)))
+    said = {"column": cells.columns["value"], "slope": slope, "unit": unit.name, "of": command_unit.name}
+    if abs(decades) > SLOPE_DECADES and abs(decades - round(decades)) >= PART_DIGITS:
+        raise cells.table.ask("slope", **said)
     if round(decades) and abs(decades - round(decades)) < PART_DIGITS:
-        said = {"column": cells.columns["value"], "slope": slope, "unit": unit.name, "of": command_unit.name}
         raise cells.table.ask("parts-of-unit", each=(f"{10.0 ** -round(decades):g} {unit.name}", unit.name), **said)
 
 
