@@ -114,7 +114,8 @@ def test_two_homings_leave_no_shift_free(calibration, campaign):
 def test_absolute_encoders_have_no_homing(calibration, campaign):
     table = replace(campaign.rig, absolute=("pan", "tilt"))
     kept = aimed_promise(calibration, replace(campaign, rig=table), "header")
-    assert kept.homings == {"pan": 1, "tilt": 1}
+    assert kept.homings == {"pan": 0, "tilt": 0} and kept.free_axes == ()
+    assert all(each.error95 > each.shift_free95 for each in kept.promise.values())
     assert all(each.causes["homing"] == 0 for each in kept.promise.values())
 
 

@@ -76,10 +76,10 @@ def _axis_promise(
 
 
 def homings_of(campaign: Campaign) -> dict[str, int]:
-    """Count the homings whose zeros were seen, by axis; 1 of an encoder that keeps its zero."""
+    """Count the homings whose zeros were seen, by axis; 0 of an encoder that keeps its zero, which no shift frees."""
     segment = {move.move: move.segment for move in campaign.moves}
     seen = len({segment[spot.move] for spot in ordered_spots(campaign)})
-    return {axis: 1 if axis in campaign.rig.absolute else seen for axis in AXES}
+    return {axis: 0 if axis in campaign.rig.absolute else seen for axis in AXES}
 
 
 def aimed_promise(

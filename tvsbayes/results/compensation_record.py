@@ -205,8 +205,8 @@ class AimedPromise(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         reversal_steps: travel of each axis, steps, after which an arrival is on one side whatever came before.
         hours, travel_steps: limits since homing for which the promise holds, travel by axis: the campaign's longest
             segment.
-        homings: number whose zeros the campaign saw, by axis, 1 of an encoder that keeps its zero: the promise of an
-            axis is then of errors less one common shift.
+        homings: number whose zeros the campaign saw, by axis; with 1 the promise of an axis is of errors less one
+            common shift, with 0, of an encoder that keeps its zero, of all.
         promise: promised errors by side; none of an axis that never moved.
         unsaid: corrections that the format cannot express, in words.
         state: state of the calibration by axis, as in `Compensation`; `travel` in steps.
