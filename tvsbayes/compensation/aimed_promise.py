@@ -12,6 +12,7 @@ from tvsbayes.calibration.calibration_file import calibration_json, content_sha2
 from tvsbayes.calibration.optics import output_deg
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.calibration.predicted_angles import PredictedAngles
+from tvsbayes.calibration.states import uses_of
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.promise import TRIED_STOPS, promised_sides, tried_use
 from tvsbayes.instrument.axes import AXES, SIDES, Axis
@@ -97,17 +98,15 @@ def aimed_promise(
     Raises:
         NothingToEstimate: the calibration has no draws of the shifts of its zeros.
     """
-    homings, uses = homings_of(campaign), {}
+    homings, uses = homings_of(campaign), uses_of(campaign)
     promise: dict[str, SidePromise] = {}
     for axis in AXES:
-        machine = PredictedAngles(calibration, campaign, axis, 0.0)
-        uses[axis] = machine.use
         promise |= _axis_promise(calibration, campaign, axis, target == "urdf", homings[axis] == 1, seed)
     low, high = uses["pan"].kelvin
     return AimedPromise(
         target=target,
         machine=str(campaign.header.get("serial") or campaign.header.get("instrument") or ""),
-        unit=machine.unit,
+        unit=PredictedAngles.unit,
         table=content_sha256(calibration_json(calibration)),
         range_steps={axis: (ends[0], ends[1]) for axis, ends in calibration.seen_steps.items()},
         reversal_steps=dict(calibration.overshoot_steps),
