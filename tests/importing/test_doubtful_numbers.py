@@ -42,6 +42,11 @@ def test_a_gauge_that_counts_parts_of_its_unit(name, tmp_path):
     assert stated.readings[3]["value"] == pytest.approx(100 * READ[3])
 
 
+def test_a_gauge_that_counts_parts_of_its_unit_beside_steps(tmp_path):
+    foreign = table(tmp_path, "steps,dial (div 0.01mm)", 80 * PLACES, 100 * READ)
+    assert answers(foreign)[0] == ("--unit", "value=0.01mm")
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.5, 25.4, 0.0125])
 def test_other_ratios_are_read_as_they_stand(factor, tmp_path):
     rows = axis_rows(table(tmp_path, "command (mm),reading (mm)", PLACES, factor * READ), Wishes())
@@ -50,14 +55,15 @@ def test_other_ratios_are_read_as_they_stand(factor, tmp_path):
 
 @pytest.mark.parametrize("homed", [False, True])
 def test_lengths_of_moves_are_no_positions(homed, tmp_path):
-    moves, read = np.diff(PLACES), READ[1:]
+    # It ends away from where it began, so that a second run without a homing would go on from there.
+    places, moves, read = PLACES[1:-1], np.diff(PLACES)[:-1], READ[1:-1]
     columns, names = [moves, read], "command (mm),reading (mm)"
     if homed:
-        columns, names = [np.tile(moves, 2), np.tile(read, 2), np.repeat([0, 1], 10)], f"{names},segment"
+        columns, names = [np.tile(moves, 2), np.tile(read, 2), np.repeat([0, 1], 9)], f"{names},segment"
     foreign = table(tmp_path, names, *columns)
     assert answers(foreign) == [("--relative",), ("--column", "command=command (mm)")]
     rows = axis_rows(foreign, Wishes(relative=True))
-    assert [m["command"] for m in rows.moves] == [*PLACES[1:]] * (1 + homed)
+    assert [m["command"] for m in rows.moves] == [*places] * (1 + homed)
     stated = axis_rows(foreign, Wishes(columns={"command": "command (mm)"}))
     assert {m["command"] for m in stated.moves} == {10.0, -10.0}
 
