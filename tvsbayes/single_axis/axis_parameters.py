@@ -89,7 +89,9 @@ AXIS_QUANTITIES: Quantities[AxisQuantity] = Quantities(
     _key("drift_per_root_hour", "half-normal", 0.0005, 0.0, "drift of the zero per root hour"),
     _key("stop_sd", "log-normal", 0.0005, 1.5, "scatter of stops"),
     *AxisQuantity.many("stop_sd", CONTRAST_PARTS, unit="{unit}", label="scatter of stops, {0}"),
-    _key("home_sd", "log-normal", 0.0001, 2.0, "scatter of homings"),
+    # 95 % from 1.5e-7 T, an index pulse, to 3e-3 T, a motor that stalls at its stop. A narrower prior far from the data
+    # makes the promise after two or three homings too wide.
+    _key("home_sd", "log-normal", 0.00002, 2.5, "scatter of homings"),
     _key("reading_scale", "log-normal", None, 0.5, "scatter of readings / u", "1"),
     _key("creep", "normal", 0.0005, 0.0, "zero creeps while warming up"),
     _key("creep_minutes", "log-normal", None, 0.8, "time constant of creep, minutes", "min", median=20.0),
