@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import datetime
 import re
-from collections.abc import Sequence
-from itertools import accumulate, pairwise
+from collections import defaultdict, deque
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from decimal import Decimal
+from itertools import accumulate, pairwise, repeat
+from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,12 +23,9 @@ EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
 """Seconds per unit by the least number that counts this unit since 1970; smaller numbers are seconds."""
 TIME_MAX = 1e20
 """Largest number of a time: nanoseconds of 3000 years."""
-TIMES = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
-TIMES_REMEDY = "correct the cell, or write --column time_s="
-_CLOCK = re.compile(r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}(?:\.[0-9]{1,9})?(?: ?[AaPp][Mm])?|[0-9]{1,2}:[0-9]{2}")
-_DOTTED_DATE = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})(?:[ ,T]+|$)")
-"""Day, month and year: the only order written with dots."""
-_SLASHED_DATE = re.compile(r"([0-9]{4})/([0-9]{1,2})/([0-9]{1,2})(?:[ ,T]+|$)")
+STEPS_USUAL = 50
+"""Number of times before a step back that give the usual step."""
+_OF_DAY = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:\.[0-9]{1,9})?)(?: ?([AaPp])[Mm])?)?")
 _ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")
 _FORMS = ("", "%Y-%m-%dT%I:%M:%S %p", "%d-%b-%Y %H:%M:%S", "%b %d, %Y %H:%M:%S")
 """Of dates; "" is ISO 8601."""
@@ -32,8 +33,12 @@ _FORMS = ("", "%Y-%m-%dT%I:%M:%S %p", "%d-%b-%Y %H:%M:%S", "%b %d, %Y %H:%M:%S")
 
 def date_time(text: str) -> datetime.datetime | None:
     """A date with or without a time; None for other texts. Without a zone it is UTC, not this computer's."""
-    dotted = _DOTTED_DATE.sub(lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}T", text.strip(), count=1)
-    text = _SLASHED_DATE.sub(r"\1-\2-\3T", dotted, count=1).rstrip("T")
+    text = text.strip()
+    day, *rest = re.split("[ ,T]+", text, maxsplit=1)
+    # Day, month and year is the only order written with dots.
+    parts = day.split("/") if "/" in day else day.split(".")[::-1]
+    if len(parts) == 3 and len(parts[0]) == 4:
+        text = "T".join(filter(None, ["{}-{:0>2}-{:0>2}".format(*parts), *rest]))
     for form in _FORMS:
         try:
             at = datetime.datetime.strptime(text, form) if form else datetime.datetime.fromisoformat(text)
@@ -45,14 +50,50 @@ def date_time(text: str) -> datetime.datetime | None:
 
 def time_of_day(text: str) -> float | None:
     """Seconds since midnight of "9:05:12.25", "9:05" or "9:05:12 PM"; None for other texts."""
-    if not _CLOCK.fullmatch(text):
+    if (match := _OF_DAY.fullmatch(text)) is None:
         return None
-    hours, minutes, *rest = text.rstrip("AaPpMm ").split(":")
-    hour, half = int(hours), text[-2:].lower()
-    if half in ("am", "pm"):
-        hour = hour % 12 + 12 * (half == "pm")
-    seconds = float(rest[0]) if rest else 0.0
-    return hour * 3600.0 + int(minutes) * 60.0 + seconds if hour < 24 and int(minutes) < 60 and seconds < 61 else None
+    hour, minute, second = int(match[1]), int(match[2]), float(match[3] or 0.0)
+    hour = hour % 12 + 12 * (match[4] in "Pp") if match[4] else hour
+    return hour * 3600.0 + minute * 60.0 + second if hour < 24 and minute < 60 and second < 61 else None
+
+
+def _written(cells: Iterable[str]) -> Iterator[float | None]:
+    """Seconds of dates and times of day, else None; a time of day is of the day of the row before, or the next."""
+    before = 0.0
+    for cell in cells:
+        of_day, at = time_of_day(cell), date_time(cell)
+        if of_day is not None:
+            of_day += DAY_S * (before // DAY_S)
+            of_day += DAY_S * (of_day < before - DAY_S / 2)
+        time_s = of_day if at is None else at.timestamp()
+        before = before if time_s is None else time_s
+        yield time_s
+
+
+def is_clock(cells: Sequence[str]) -> bool:
+    """Whether all filled cells are dates or times of day."""
+    filled = [cell for cell in cells if cell]
+    return bool(filled) and None not in _written(filled)
+
+
+def stamp_of(cell: str) -> datetime.datetime | None:
+    """The date and time of a cell, with a zone where it states one; None without a date."""
+    at = None if NUMBER.fullmatch(cell) else date_time(cell)
+    return at if at is None or _ZONE.search(cell.strip()) else at.replace(tzinfo=None)
+
+
+# --- order -----------------------------------------------------------------------------------------------------------
+class SetBack(NamedTuple):
+    """A clock that was set back: the row, by how much, and what is added from there."""
+
+    row: int
+    back_s: float
+    added_s: float
+
+    def text(self, line: int) -> str:
+        """What is said of it."""
+        why = ", as at the end of summer time" * (self.added_s == SUMMER_TIME_S)
+        return f"the clock steps back by {self.back_s:.6g} s in line {line}{why}: {self.added_s:.6g} s added from there"
 
 
 def over_midnight(clocks_s: Sequence[float]) -> list[float]:
@@ -61,20 +102,30 @@ def over_midnight(clocks_s: Sequence[float]) -> list[float]:
     return [clock_s + DAY_S * day for clock_s, day in zip(clocks_s, days, strict=True)]
 
 
-def is_clock(cells: Sequence[str]) -> bool:
-    """Whether all filled cells are dates or times of day."""
-    filled = [cell for cell in cells if cell]
-    return bool(filled) and all(time_of_day(cell) is not None or date_time(cell) is not None for cell in filled)
+def forward(times_s: Iterable[float], series: Iterable[Hashable]) -> tuple[list[float], list[SetBack]]:
+    """Times that do not decrease in any series of a log: one clock, set forward again by what it lost.
 
-
-def stamp_of(cell: str) -> datetime.datetime | None:
-    """The date and time of a cell, with a zone where it states one; None without a date."""
-    at = None if NUMBER.fullmatch(cell) or time_of_day(cell) is not None else date_time(cell)
-    return at if at is None or _ZONE.search(cell.strip()) else at.replace(tzinfo=None)
+    That is an hour at the end of summer time, else the step and the usual time between two rows of its series.
+    """
+    past_s = defaultdict[Hashable, deque[float]](lambda: deque(maxlen=STEPS_USUAL))
+    forward_s, backs, moved = list[float](), list[SetBack](), 0.0
+    for row, (time_s, name) in enumerate(zip(times_s, series, strict=False)):
+        past = past_s[name]
+        if past and (back_s := past[-1] - time_s - moved) > 0:
+            steps_s = [b - a for a, b in pairwise(past) if b > a] or [0.0]
+            # Less than an hour by the time between the two rows, which is as between others.
+            is_summer = max(0.25 * SUMMER_TIME_S, SUMMER_TIME_S - 2 * max(steps_s)) <= back_s <= SUMMER_TIME_S
+            backs.append(SetBack(row, back_s, SUMMER_TIME_S if is_summer else back_s + median(steps_s)))
+            moved += backs[-1].added_s
+        past.append(time_s + moved)
+        forward_s.append(time_s + moved)
+    return forward_s, backs
 
 
 def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) -> list[float] | None:
     """Seconds of every row: numbers in the unit of the column's name or the given one, dates with times, times of day.
+
+    A clock set back from summer time, as one with a zone is not, is set forward again, once.
 
     Raises:
         Question: the times step back.
@@ -82,54 +133,29 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
     """
     if "time_s" not in cells:
         return None
-    texts, is_local = cells.text("time_s"), False
-    if all(NUMBER.fullmatch(cell) for cell in texts):
-        if (far := next((row for row, cell in enumerate(texts) if not abs(float(cell)) <= TIME_MAX), None)) is not None:
-            raise cells.refuse(far, "time_s", TIMES, TIMES_REMEDY)
-        unit = unit or name_of(cells.columns["time_s"]).unit
-        scale = unit.scale if unit is not None and unit.kind == "time" else 1.0
-        # Epochs in ns need more digits than a float has.
-        start = int(texts[0]) if texts and texts[0].isdigit() else float(texts[0] or 0.0)
-        epoch_scale = next((s for least, s in EPOCH_SCALES.items() if start >= least), None)
-        if unit is None and epoch_scale is not None:
-            seconds = [epoch_scale * ((int(cell) if cell.isdigit() else float(cell)) - start) for cell in texts]
-            assumed.append(f"time_s: counted in {epoch_scale:g} s since 1970, so seconds since the first row")
-        else:
-            seconds = [scale * float(cell) for cell in texts]
-    else:
-        seconds, is_local = _written_times(cells, texts), not any(map(_ZONE.search, texts))
+    texts, unit = cells.text("time_s"), unit or name_of(cells.columns["time_s"]).unit
+    is_number = all(map(NUMBER.fullmatch, texts))
+    written = [*map(float, texts)] if is_number else [*_written(texts)]
+    for row, time in enumerate(written):
+        if time is None or not abs(time) <= TIME_MAX:
+            allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
+            raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=")
+    times = np.array(written, dtype=float)
+    of_epoch = [scale for least, scale in EPOCH_SCALES.items() if times.max(initial=0.0) >= least]
+    if not is_number:
+        times_s = times - times[0]
         assumed.append("time_s: seconds since the first row")
-    return _in_order(cells, seconds, is_local, assumed)
-
-
-def _written_times(cells: FieldCells, texts: Sequence[str]) -> list[float]:
-    """Seconds since the first row of dates and times of day; these are of the day of the row before."""
-    seconds: list[float] = []
-    for row, cell in enumerate(texts):
-        of_day, at = time_of_day(cell), date_time(cell)
-        if of_day is not None:
-            day = DAY_S * (seconds[-1] // DAY_S if seconds else 0)
-            of_day += day + DAY_S * bool(seconds and day + of_day < seconds[-1] - DAY_S / 2)
-        elif at is None:
-            raise cells.refuse(row, "time_s", TIMES, TIMES_REMEDY)
-        seconds.append(at.timestamp() if at is not None else of_day or 0.0)
-    return [value - seconds[0] for value in seconds]
-
-
-def _in_order(cells: FieldCells, seconds: list[float], is_local: bool, assumed: list[str]) -> list[float]:
-    """Times that do not decrease; a clock set back from summer time is set forward again, once."""
-    moved = 0.0
-    for row in range(1, len(seconds)):
-        seconds[row] += moved
-        step = seconds[row] - seconds[row - 1]
-        if is_local and not moved and -SUMMER_TIME_S <= step < -0.25 * SUMMER_TIME_S:
-            moved, seconds[row] = SUMMER_TIME_S, seconds[row] + SUMMER_TIME_S
-            line = cells.table.lines[row]
-            assumed.append(
-                f"time_s: the clock steps back in line {line}, as at the end of summer time: an hour added from there"
-            )
-        elif step < 0:
-            raise cells.ask("clock-back", row, "time_s", back=-step)
+    elif unit is None and of_epoch:
+        # Epochs in ns need more digits than a float has.
+        times_s = [of_epoch[0] * float(Decimal(cell) - Decimal(texts[0])) for cell in texts]
+        assumed.append(f"time_s: counted in {of_epoch[0]:g} s since 1970, so seconds since the first row")
+    else:
+        times_s = times * (unit.scale if unit is not None and unit.kind == "time" else 1.0)
+    seconds, backs = forward(map(float, times_s), repeat("time_s"))
+    for back in backs:
+        if is_number or back.added_s != SUMMER_TIME_S or len(backs) > 1 or any(map(_ZONE.search, texts)):
+            raise cells.ask("clock-back", back.row, "time_s", back=back.back_s)
+        assumed.append(f"time_s: {back.text(cells.table.lines[back.row])}")
     return seconds
 
 
@@ -140,26 +166,20 @@ def relative_times(cells: Sequence[str], values: np.ndarray, unit: Unit | None) 
         return (unit.scale if unit and unit.kind == "time" else 1.0) * (values - values[0])
     if not is_clock(cells) or all(len(cell) <= 10 and time_of_day(cell) is None for cell in cells):
         return None
-    seconds = [
-        of_day if (of_day := time_of_day(c)) is not None else (at.timestamp() if (at := date_time(c)) else np.nan)
-        for c in cells
-    ]
-    return np.array(seconds) - seconds[0]
+    times_s = np.array([*_written(cells)], dtype=float)
+    return times_s - times_s[0]
 
 
 def equal_clocks(times: np.ndarray, others: np.ndarray) -> bool:
     """Whether two clocks agree but for their unit, to a second or a hundredth."""
     span, other_span = np.ptp(times), np.ptp(others)
-    scale = next(
-        (s for s in (1.0, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9) if span and abs(other_span / s / span - 1) < 0.01), 1.0
-    )
+    scales = (1.0, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9)
+    scale = next((s for s in scales if span and abs(other_span / s / span - 1) < 0.01), 1.0)
     return bool(np.all(np.abs(others / scale - times) <= 1.0 + 0.01 * span))
 
 
 def joined_clock(days: Sequence[str], hours: Sequence[str]) -> tuple[str, ...]:
     """A column of dates and one of times of day as one."""
-    midnights = [
-        at.replace(hour=0, minute=0, second=0, microsecond=0, tzinfo=None) for at in map(date_time, days) if at
-    ]
+    midnights = [datetime.datetime.combine(at, datetime.time()) for at in map(date_time, days) if at]
     steps = [datetime.timedelta(seconds=time_of_day(hour) or 0.0) for hour in hours]
     return tuple((a + b).isoformat(timespec="microseconds") for a, b in zip(midnights, steps, strict=True))

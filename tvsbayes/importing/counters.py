@@ -51,21 +51,19 @@ def moves_of_rows(
     numbers = cells.text("move") if "move" in cells else None
     homings, times_s = homings_of(cells, assumed), seconds_of(cells, assumed)
     temperatures = temperatures_of(cells, assumed)
-    approaches = [_approaches(cells, axis, approach[k]) for k, axis in enumerate(AXES)]
+    sides = list(zip(*map(_approaches, [cells] * len(AXES), AXES, approach), strict=True))
     moves: list[dict[str, Any]] = []
     move_of_row: list[int] = []
     at, segment = (0, 0), 0
-    for row, pair in enumerate(counters):
-        homed = homings[row]
+    for row, (pair, homed) in enumerate(zip(counters, homings, strict=True)):
         segment += homed
-        may_repeat = row > 0 and (numbers[row] == numbers[row - 1] if numbers else True) and not homed
-        repeats = may_repeat and (numbers is not None or pair == ((0, 0) if relative else at))
-        if not repeats:
-            at = (at[0] + pair[0], at[1] + pair[1]) if relative and row and not homed else pair
-            first = row == 0 or homed
-            sides = [column[row] if first else "" for column in approaches]
+        may_repeat = row > 0 and not homed and (numbers is None or numbers[row] == numbers[row - 1])
+        if not may_repeat or (numbers is None and pair != ((0, 0) if relative else at)):
+            begins = row == 0 or homed
+            at = (at[0] + pair[0], at[1] + pair[1]) if relative and not begins else pair
             time_s = float(len(moves)) if times_s is None else times_s[row]
-            values = (len(moves), segment, time_s, *at, *sides, temperatures[row])
+            side = sides[row] if begins else ("", "")
+            values = (len(moves), segment, time_s, *at, *side, temperatures[row])
             moves.append(dict(zip(FIELDS, values, strict=True)))
         elif not relative and pair != at:
             remedy = "a new move begins a new number; or leave the column out with --column move="
@@ -93,11 +91,9 @@ def whole_counters(cells: FieldCells) -> list[Pair]:
 
 
 def _approaches(cells: FieldCells, axis: str, default: str) -> list[str]:
-    """The approach side of an axis, for every row."""
     name = f"{axis}_approach"
     words = [word.lower() or default for word in cells.text(name)]
     for row, word in enumerate(words):
         if word not in SIDES[axis]:
-            remedy = "name the direction of the last move of the axis"
-            raise cells.refuse(row, name, ", ".join(SIDES[axis]), remedy)
+            raise cells.refuse(row, name, ", ".join(SIDES[axis]), "name the direction of the last move of the axis")
     return words
