@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
             began = time.process_time()
             result = fit_axis(campaign_of(logged, runs, file.name), tier="importance")
             summary = summarise_axis(result)
-            row = {"file": file.name, "run": logged.number, "mount": logged.mount, "frames": summary.readings}
+            row = {"file": file.name, "run": logged.number, "mount": logged.header["mount"], "frames": summary.readings}
             row |= {"span_s": float(result.rows.time_s[-1] - result.rows.time_s[0]), "problems": list(summary.problems)}
             row |= {"periods": [plain(one) for one in summary.periods], "cpu_s": time.process_time() - began}
             append_row(ROWS, row)

@@ -177,7 +177,7 @@ def test_a_track_log_of_maxim_gives_the_motion_of_its_mount():
     stated = {"pixel_arcsec": 2.0, "declination_deg": 20.0, "pulse_arcsec_per_s": pulse, "ra_axis": 1.0}
     times, found = motions(rows_of_run(run, [run], "track.log", stated))
     expected = np.array([maxim_wave_arcsec(t) for t in times])
-    assert (len(times), len(run.dropped_s), times[-1]) == (199, 1, 796.0)
+    assert (len(times), len(run.rows), times[-1]) == (199, 200, 796.0)
     assert np.abs(found - expected).max() < 0.5e-2 / MAXIM_PX_PER_ARCSEC + 1e-4
     reverse, _ = motions(rows_of_run(run, [run], "track.log", stated | {"pe_sign": -1.0}))[::-1]
     assert np.abs(reverse + expected).max() < 0.5e-2 / MAXIM_PX_PER_ARCSEC + 1e-4

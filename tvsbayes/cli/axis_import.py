@@ -193,9 +193,9 @@ def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_
     from tvsbayes.report.tables import TableView
 
     rows = run_rows(runs)
-    longest = max(rows, key=lambda row: row["minutes"])["run"]  # type: ignore[arg-type, return-value]
+    longest = max(rows, key=lambda row: row["minutes"])["run"]
     if yes:
-        longest_first = sorted(rows, key=lambda row: -row["minutes"])  # type: ignore[operator]
+        longest_first = sorted(rows, key=lambda row: -row["minutes"])
         raise asked("run", escaped(file.name), each=longest_first, count=len(runs))
     command = f"tvsbayes import {typed(file)} --axis --run {longest} --to {typed(to)} --yes"
     cells = [["" if value is None else escaped(str(value), 40) for value in row.values()] for row in rows]
@@ -215,9 +215,10 @@ def _run_of(runs: Sequence[GuideRun], file: Path, options: FileOptions) -> tuple
     run = runs[number - 1]
     rows = rows_of_run(run, runs, escaped(file.name), options.assume)
     (row,) = run_rows([run])
-    lines = [f"{escaped(file.name)}: guide log of {run.program}, run {number} of {len(runs)}, {escaped(run.mount)}"]
-    lines.append(f"begins {escaped(run.begins)}, {run.minutes:.1f} minutes")
-    document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.frames) + len(run.dropped_s)}
+    mount = escaped(row["mount"])
+    lines = [f"{escaped(file.name)}: guide log of {run.program}, run {number} of {len(runs)}, {mount}"]
+    lines.append(f"begins {escaped(run.begins)}, {row['minutes']:.1f} minutes")
+    document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.rows)}
     return rows, lines, document
 
 
