@@ -14,7 +14,8 @@ from support.calibration_files import FOREIGN, check_pair
 
 from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.errors import InputError
-from tvsbayes.importing.stereo import fitted_to_five, foreign_pair, kind_of, read_files
+from tvsbayes.importing.stereo import fitted_to_five, foreign_pair, kind_of
+from tvsbayes.importing.stereo_trees import read_files
 from tvsbayes.instrument.stereo_pair import Stereo
 
 SMALL = (640, 480)

@@ -15,7 +15,8 @@ from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Provenance, with_a
 from tvsbayes.errors import InputError, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX
-from tvsbayes.importing.stereo import foreign_pair, read_files
+from tvsbayes.importing.stereo import foreign_pair
+from tvsbayes.importing.stereo_trees import read_files
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import ASSUMED_REMEDY, Stereo, pair_doubts, parse_stereo, stereo_bytes
 

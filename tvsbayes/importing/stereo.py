@@ -1,7 +1,9 @@
 """Stereo calibrations of other programs, recognised by content: M and D of two cameras, x_right = R x_left + T.
 
-`stereo_trees` makes tables of a file, `stereo_programs` brings structures of programs to known names, `stereo_words`
-finds the meaning of each number; here numbers become a pair by the names of `stereo.json`, with assumptions in words.
+`stereo_trees` makes entries of a file, `stereo_programs` brings structures of programs to known names. Here every entry
+is looked up by its path in `data/words/stereo.toml`, and the numbers become a pair by the names of `stereo.json`, with
+assumptions in words. A name states a field and often a camera: `M1`, `K_left`, `cam0.intrinsics`, `Camera1.fx`. It fits
+a field by its count of numbers too: `P1` of 12 numbers is a projection, `p1` of one number a coefficient of a lens.
 R and T can follow from several entries: all must agree. Lengths of a pair are mm; Kalibr, ROS and EuRoC write metres,
 others the unit of the squares of their board.
 
@@ -14,19 +16,18 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
+from functools import cache, partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from tvsbayes.errors import escaped
-from tvsbayes.files.disk import read_bytes
+from tvsbayes.errors import InputError, closest, escaped, listed
 from tvsbayes.files.documents import Keys
-from tvsbayes.importing.stereo_programs import RATIONAL, adapted
-from tvsbayes.importing.stereo_trees import TREE_BYTES_MAX, read_trees
-from tvsbayes.importing.stereo_words import ROTATION_TOLERANCE, Entry, Fields, letters, refused, words
+from tvsbayes.importing.asking import refused
+from tvsbayes.importing.stereo_programs import FOCAL, RATIONAL, SIDES, Size, adapted, words
+from tvsbayes.importing.stereo_trees import ROTATION_TOLERANCE, Entry, entries_of, letters, rigid
 
 GRID = 25
 """Number of grid points along each side of the picture."""
@@ -36,6 +37,18 @@ WIDEST_TAN = 4.0
 """Tangent of the angle off the axis, 76 deg, beyond which five coefficients are not tried."""
 UNDISTORTION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 """Iterations, and the error of a distorted ray in px."""
+LEFT, RIGHT = r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1"
+UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+BASELINE_RANGE_MM = (20.0, 3000.0)
+"""Distance of the cameras of one bench; outside this range the user must state the unit."""
+RMS_PX_MAX, VIEWS_MAX = 20.0, 100_000
+KEY_FIELDS = ("M1", "D1", "M2", "D2", "R", "T")
+"""Fields that `--key` can name."""
+NAMES_LISTED, FOCAL_MIN = 12, 1e-9
+TURN_NOTED_DEG = 0.5
+"""Angle below which a rotation and its transpose are hardly different."""
+SHAPE_SHARE_MAX = 0.005
+"""Largest relative difference of the aspect ratios of two picture sizes: rounding to whole pixels."""
 
 
 class FittedLens(NamedTuple):
@@ -52,57 +65,39 @@ def kind_of(model: str) -> str | None:
     return next((kind for kind, names in words()["lens"].items() if name in names.split()), None if name else "five")
 
 
-def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], kind: str) -> FittedLens:
+def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: Size, kind: str) -> FittedLens:
     """Fit five coefficients to another model in a picture of this size, px.
 
     `distortion` holds OpenCV's 8, 12 or 14 coefficients, the 4 of its fisheye model, or the 5 of the inverse one.
     """
     pixels: np.ndarray = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 2)
     target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
-    rays: np.ndarray = target
-    reprojected = pixels
+    again, points = pixels, pixels[:, None]
     if kind == "inverse":
-        rays = projected(target, np.eye(3), distortion)
+        rays = _projected(target, np.eye(3), distortion)
     elif kind == "fisheye":
-        four = distortion.reshape(4, 1)
-        rays = cv2.fisheye.undistortPoints(pixels[:, None], matrix, four).reshape(-1, 2)
-        reprojected = cv2.fisheye.distortPoints(rays[:, None], matrix, four).reshape(-1, 2)
+        rays = cv2.fisheye.undistortPoints(points, matrix, distortion.reshape(4, 1)).reshape(-1, 2)
+        again = cv2.fisheye.distortPoints(rays[:, None], matrix, distortion.reshape(4, 1)).reshape(-1, 2)
     else:
         if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4: undistortPoints takes no criteria in Python
-            points = cv2.undistortPointsIter(pixels[:, None], matrix, distortion, None, None, UNDISTORTION)
+            rays = cv2.undistortPointsIter(points, matrix, distortion, None, None, UNDISTORTION).reshape(-1, 2)
         else:
-            points = cv2.undistortPoints(pixels[:, None], matrix, distortion, criteria=UNDISTORTION)
-        rays = points.reshape(-1, 2)
-        reprojected = projected(rays, matrix, distortion)
+            rays = cv2.undistortPoints(points, matrix, distortion, criteria=UNDISTORTION).reshape(-1, 2)
+        again = _projected(rays, matrix, distortion)
     valid = np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) < WIDEST_TAN)
-    valid[valid] &= np.abs(reprojected[valid] - pixels[valid]).max(axis=1) < ERROR_MAX_PX
+    valid[valid] &= np.abs(again[valid] - pixels[valid]).max(axis=1) < ERROR_MAX_PX
     if not valid.all():
         return FittedLens(np.zeros(5), np.inf, np.inf)
-    columns = [(projected(rays, np.eye(3), unit) - rays).ravel() for unit in np.eye(5)]
+    columns = [(_projected(rays, np.eye(3), unit) - rays).ravel() for unit in np.eye(5)]
     five = np.linalg.lstsq(np.stack(columns, axis=1), (target - rays).ravel())[0]
-    errors_px = np.linalg.norm(projected(rays, matrix, five) - pixels, axis=1)
+    errors_px = np.linalg.norm(_projected(rays, matrix, five) - pixels, axis=1)
     return FittedLens(five, float(errors_px.max()), float(np.sqrt(np.mean(errors_px**2))))
 
 
-def projected(rays: np.ndarray, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+def _projected(rays: np.ndarray, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Pixels (n, 2) of rays (n, 2) by any of OpenCV's pinhole models."""
     points = np.column_stack([rays, np.ones(len(rays))])
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
-
-
-CAMERAS = ("left", "right")
-UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-BASELINE_RANGE_MM = (20.0, 3000.0)
-"""Distance of the cameras of one bench; outside this range the user must state the unit."""
-RMS_PX_MAX, VIEWS_MAX = 20.0, 100_000
-KEY_FIELDS = ("M1", "D1", "M2", "D2", "R", "T")
-"""Fields that `--key` can name."""
-FILES_MAX, ARRAY_FILES_MAX = 3, 40
-FOCAL_MIN = 1e-9
-TURN_NOTED_DEG = 0.5
-"""Angle below which a rotation and its transpose are hardly different."""
-SHAPE_SHARE_MAX = 0.005
-"""Largest relative difference of the aspect ratios of two picture sizes: rounding to whole pixels."""
 
 
 @dataclass(frozen=True)
@@ -127,33 +122,194 @@ class ForeignPair:
     places: dict[str, str]
 
 
-def read_files(paths: Sequence[Path]) -> list[Keys]:
-    """The tables in files of a calibration; a folder stands for its arrays (.npy, else .txt), as do several such files.
+@cache
+def _fields() -> dict[str, Any]:
+    """Counts of numbers that a field can have, and its names."""
+    return {**words()["camera"], **words()["pair"], **words()["made"]}
 
-    Raises:
-        InputError: a file is unreadable, unknown or damaged, or a folder without arrays.
-    """
-    files: list[Path] = []
-    for path in map(Path, paths):
-        inner = [path]
-        if path.is_dir():
-            inner = sorted(path.glob("*.npy")) or sorted(path.glob("*.txt"))
-            if not 0 < len(inner) <= ARRAY_FILES_MAX:
-                raise refused("folder", escaped(str(path), 200), count=len(inner), most=ARRAY_FILES_MAX)
-        files += inner
-    trees = [tree for path in files for tree in read_trees(read_bytes(path, TREE_BYTES_MAX), escaped(path.name))]
-    if len(trees) > 1:
-        alone = [tree for tree in trees if set(tree.values) == {Path(tree.file).stem}]
-        arrays = {name: value for tree in alone for name, value in tree.values.items()}
-        trees = [tree for tree in trees if tree not in alone]
-        trees += [Keys(arrays, escaped(files[0].parent.name or "the arrays"), "")] if arrays else []
-    if len(trees) > FILES_MAX:
-        raise refused("files", trees[0].file, count=len(trees))
-    return trees
+
+@cache
+def _known_names() -> dict[str, list[tuple[str, str]]]:
+    """Meanings by name: a field, and the side that the name states for it, "" where it states none."""
+    found: dict[str, dict[tuple[str, str], None]] = {}
+    for field, stated in _fields().items():
+        for name, mark in product(stated["names"].split(), words()["marks"]["camera"]):
+            found.setdefault(f"{mark}{name}", {})[field, ""] = None
+            for side in (*words()["sides"], "0", "1", "2") if field in words()["camera"] else ():
+                for order in ((mark, side, name), (side, mark, name), (name, mark, side), (mark, name, side)):
+                    found.setdefault("".join(order), {})[field, side] = None
+    return {name: list(meant) for name, meant in found.items()}
+
+
+def _meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str]]:
+    """Possible meanings of an entry, by the longest part of its path that is a known name; for its count of numbers."""
+    parts = (*entry.tables[-1].path, entry.key)
+    for count in range(min(4, len(parts)), 0, -1) if not set(words()["marks"]["ignored"]) & set(parts) else ():
+        known = _known_names().get(letters("".join(parts[-count:])), ())
+        matches = [match for match in known if of_any_count or entry.numbers.size in _fields()[match[0]]["counts"]]
+        if matches:
+            # A name without a side may be in the table of one camera.
+            around = next((side for part in reversed(parts[:-count]) if (side := _side(part))), "")
+            return [(field, side or (around if field in words()["camera"] else "")) for field, side in matches]
+    return []
+
+
+def _side(part: str) -> str:
+    """The camera in the name of a table, "" if none."""
+    name = letters(part)
+    for mark in ("cameraparameters", "camera", "cam", "sensor"):
+        name = name.replace(mark, "", 1)
+    return name if name in (*words()["sides"], "0", "1", "2") else ""
+
+
+class _Pose(NamedTuple):
+    """A pose of the right camera (4, 4), in the file's unit; the entries of R and T, and the program they show."""
+
+    matrix: np.ndarray
+    turn: Entry
+    shift: Entry
+    source: str = ""
+    plain: bool = False
+    """Whether the name of R leaves its direction open."""
+
+    def deviation(self, rotation: np.ndarray, translation: np.ndarray) -> float:
+        """Deviation of another pose, whose unit may differ."""
+        directions = [t / np.linalg.norm(t) for t in (translation, self.matrix[:3, 3]) if t.any()]
+        distance = float(np.abs(directions[0] - directions[1]).max()) if len(directions) == 2 else 0.0
+        return max(float(np.abs(self.matrix[:3, :3] - rotation).max()), distance)
+
+
+class _Fields:
+    """Entries of all files by field; those of cameras by field and number (0 left, 1 right)."""
+
+    def __init__(self, files: Sequence[Keys], stated: Mapping[str, str]):
+        """Sort the entries by name, and by `stated`: field, such as M1, to the path of its entry."""
+        self.files, self.stated = files, set(stated)
+        self.entries = [entry for keys in files for entry in entries_of((keys,))]
+        self.pair: dict[str, Entry] = {}
+        self.cameras: tuple[dict[str, Entry], dict[str, Entry]] = ({}, {})
+        self.twice: dict[str, tuple[Entry, Entry]] = {}
+        self.by_columns: Entry | None = None
+        """A camera matrix that the file stores by columns."""
+        self.notes: list[str] = []
+        readings = [(entry, meaning) for entry in self.entries for meaning in _meanings(entry)]
+        # Entries without a side come last: they fill the gaps of a camera.
+        readings.sort(key=lambda reading: not reading[1][1])
+        digits = {side for _, (_, side) in readings if side.isdigit()}
+        order = words()["sides"] | ({"0": 0, "1": 1} if "0" in digits or not digits else {"1": 0, "2": 1})
+        # Files of one camera each have entries without a side: the first file is the left one, unless names state it.
+        without = [entry.tables[0] for entry, (field, side) in readings if field in ("M", "fx") and not side]
+        ones = [keys for keys in files if keys in without]
+        self.by_file = len(ones) == 2
+        names = [keys.file.lower() for keys in ones]
+        if self.by_file and re.search(RIGHT, names[0]) and re.search(LEFT, names[1]) and not re.search(LEFT, names[0]):
+            ones.reverse()
+        for entry, (field, side) in readings:
+            alone = self.by_file and entry.tables[0] in ones
+            if field in words()["made"]:
+                if not any(map(_side, entry.tables[-1].path)):
+                    self.pair.setdefault(field, entry)
+            elif field in words()["pair"]:
+                if not (alone and field == "R"):
+                    self._add(self.pair, field, field, entry)
+            elif side or alone:
+                number = order.get(side) if side else ones.index(entry.tables[0])
+                if number is not None:
+                    self._add(self.cameras[number], field, f"{field}{number + 1}", entry)
+            elif field in ("size", "width", "height"):
+                for camera in self.cameras:
+                    camera.setdefault(field, entry)
+        for field, name in stated.items():
+            entry = self._stated_entry(field, name)
+            self.twice.pop(field, None)
+            if field in ("R", "T"):
+                self.pair[field] = entry
+                self.pair.pop("pose", None)
+            else:
+                self.cameras[int(field[-1]) - 1][field[:-1]] = entry
+        self._complete()
+
+    def _add(self, table: dict[str, Entry], field: str, name: str, entry: Entry) -> None:
+        previous = table.get(field)
+        if previous is None or (previous.numbers.size == 3 and entry.numbers.size == 9):
+            # The matrix of a rotation replaces its vector.
+            table[field] = entry
+        elif previous.numbers.size == entry.numbers.size and not np.array_equal(previous.numbers, entry.numbers):
+            self.twice[name] = previous, entry
+
+    def _stated_entry(self, field: str, name: str) -> Entry:
+        """The entry that the user named; transposed for NAME.T."""
+        hits = [entry for entry in self.entries if name in (entry.path, entry.key)]
+        if not hits and field == "R" and name.endswith(".T"):
+            entry = self._stated_entry(field, name.removesuffix(".T"))
+            turned = entry.numbers.reshape(3, 3).T.ravel() if entry.numbers.size == 9 else -entry.numbers
+            return entry._replace(numbers=turned)
+        if len(hits) != 1 or hits[0].numbers.size not in _fields()[field.rstrip("12")]["counts"]:
+            paths = [entry.path for entry in self.entries]
+            found = f"{len(hits)} entries of that name" if len(hits) != 1 else f"{hits[0].numbers.size} numbers"
+            known = listed([escaped(path, 40) for path in paths], NAMES_LISTED)
+            remedy = closest(name[:80], paths) if paths else "name a file that holds numbers"
+            said: dict[str, Any] = {"field": field, "name": escaped(name, 60), "found": found}
+            raise refused("stereo-stated-key", self.files[0].file, **said, paths=known, remedy=remedy)
+        return hits[0]
+
+    def _complete(self) -> None:
+        """Refuse what is stated twice; find the sides of two files by their projections, and fields of another name."""
+        for name, (first, second) in self.twice.items():
+            remedy = f"say which: --key {name}={second.path}" if name in KEY_FIELDS else "remove one of them"
+            raise first.refuse("twice", remedy=remedy, place=second.place)
+        if self.by_file and all("P" in camera for camera in self.cameras):
+            shifts = [np.abs(camera["P"].numbers[[3, 7]]).max() for camera in self.cameras]
+            if shifts[1] == 0 and shifts[0] > 0:
+                # Two files of one camera each, named in reverse order: only the left projection has no shift.
+                self.cameras = self.cameras[::-1]
+        left, right = self.cameras
+        if "baseline" in self.pair and "fx" in left and not {"M", "fx", "P"} & set(right):
+            # The right camera of a rectified pair equals the left one.
+            right.update({key: entry for key, entry in left.items() if key in FOCAL})
+        for field, camera_field in (("R", "rectification"), ("T", "camera_T")):
+            # An entry for one camera only belongs to the pair; rectifications and poses of cameras come in twos.
+            if field not in self.pair and (camera_field in left) != (camera_field in right) and "P" not in left:
+                self.pair[field] = left.get(camera_field) or right[camera_field]
+
+    def missing(self, *lacking: str) -> InputError:
+        """The refusal of files that lack fields; it lists the fields that exist."""
+        sideless = {f: [e.path for e in self.entries if (f, "") in _meanings(e)] for f in ("M", "D", "fx")}
+        file = ", ".join(keys.file for keys in self.files)
+        if len(self.files) == 1 and len(sideless["M"]) > 1 and "M1" in lacking:
+            stated = [f"--key {field}{k}={name}" for field in "MD" for k, name in enumerate(sideless[field][:2], 1)]
+            return refused("stereo-sides", file, names=listed(sideless["M"], NAMES_LISTED), options=" ".join(stated))
+        if len(self.files) == 1 and (sideless["M"] or sideless["fx"]):
+            return refused("stereo-one-camera", file)
+        unknown = [entry for entry in self.entries if entry.numbers.size != 1 and not _meanings(entry)]
+        bare = {field.rstrip("12") for field in lacking}
+        for entry in unknown:
+            if names := {field for field, _ in _meanings(entry, of_any_count=True)} & bare:
+                counts = ", ".join(map(str, _fields()[min(names)]["counts"]))
+                remedy = "write k1 k2 p1 p2 k3, 0 for those that the lens lacks" if "D" in names else "correct it"
+                found = f"{entry.numbers.size} numbers" if entry.numbers.size else "no list of finite numbers"
+                return entry.refuse("count", counts=counts, remedy=remedy, found=found)
+        paths = [escaped(entry.path, 40) for entry in unknown if entry.numbers.size]
+        remedy = "a pair needs M D of both cameras and R T between them: name the other file too"
+        remedy = f"name what holds it: --key {lacking[0]}=NAME" if paths else remedy
+        others = listed(paths, NAMES_LISTED) if paths else "no other numbers"
+        return refused("stereo-missing", file, lacking=" ".join(lacking), others=others, remedy=remedy)
+
+    def model(self, side: int) -> str:
+        """The name of a camera's lens model in the tables around its numbers, lower case; "" if none."""
+        lens = next((self.cameras[side][field] for field in ("D", "M", "fx") if field in self.cameras[side]), None)
+        tables = self.files if lens is None else lens.tables[::-1]
+        for key, value in (item for keys in tables for item in keys.values.items()):
+            name = letters(key)
+            if isinstance(value, str) and name.endswith(tuple(words()["marks"]["model"])):
+                any_pinhole = letters(value) in ("pinhole", "perspective")
+                if not (any_pinhole and name.endswith(("cameramodel", "cameratype"))):
+                    return value.strip().lower()
+        return ""
 
 
 def foreign_pair(
-    files: Sequence[Keys], size: tuple[int, int] | None, unit_mm: float | None, keys: Mapping[str, str]
+    files: Sequence[Keys], size: Size | None, unit_mm: float | None, keys: Mapping[str, str]
 ) -> ForeignPair:
     """The pair in the tables of another program; options as of `cameras.imported_calibration.read_calibration`.
 
@@ -161,351 +317,240 @@ def foreign_pair(
         InputError: unknown, contradictory, or of lenses that five coefficients do not describe.
     """
     programs = [adapted(tree, size) for tree in files]
-    tables = [tree if program is None else program.keys for program, tree in zip(programs, files, strict=True)]
-    reader = _Reader(Fields(tables, keys), size, unit_mm)
-    for program in programs:
-        if program is not None:
-            reader.source, reader.unit = program.source, program.unit
-            reader.notes += [f"{program.keys.file}: {note}" for note in program.notes]
-    values = reader.pair()
-    source = reader.source or "opencv"
-    return ForeignPair(values, source, reader.made(source), reader.notes, reader.warnings, reader.places)
+    fields = _Fields([tree for tree, *_ in programs], keys)
+    fields.notes += [f"{tree.file}: {note}" for tree, _, _, notes in programs for note in notes]
+    source, unit = next(((source, unit) for _, source, unit, _ in programs if source), ("", None))
+    for side in (0, 1):
+        if kind_of(model := fields.model(side)) is None:
+            file = ", ".join(tree.file for tree in files)
+            raise refused("stereo-model", file, model=escaped(model, 40), side=SIDES[side])
+    as_stated, of_matrices = zip(*(_matrix(fields, side) for side in (0, 1)), strict=True)
+    named = {
+        letters(table[f].key) for table in (fields.pair, *fields.cameras) for f in ("radial", "pose") if f in table
+    }
+    # By the names of MATLAB's stereoParameters.
+    matlab = bool(named & {"radialdistortion", "a"}) or "R_transposed" in fields.pair or fields.by_columns is not None
+    (width, height), right_size = _sizes(fields, as_stated, size, matlab)
+    matrices = as_stated
+    if matlab:
+        source, matrices = "matlab", [matrix - np.outer([1, 1, 0], [0, 0, 1]) for matrix in as_stated]
+        fields.notes.append("MATLAB counts pixels from 1: 1 px is taken off cx and cy of both cameras")
+    sizes = (width, height), right_size or (width, height)
+    lenses, of_lenses = zip(*(_distortion(fields, k, matrices[k], sizes[k], source) for k in (0, 1)), strict=True)
+    scale = np.array(sizes[0]) / sizes[1]
+    M2 = matrices[1] * np.array([[scale[0]] * 2 + [1.0]] * 2 + [[1.0] * 3])
+    # The integer is at the centre of a pixel, so pictures begin at -1/2.
+    M2[:2, 2] = (matrices[1][:2, 2] + 0.5) * scale - 0.5
+    pose, warnings = _checked_pose(fields, as_stated, unit is None)
+    source, shift = source or pose.source, pose.matrix[:3, 3]
+    T = shift * _unit(fields, pose.shift.place, float(np.linalg.norm(shift)), unit_mm, unit, source)
+    values = {"image_width": width, "image_height": height, "right_image_size": right_size, "M1": matrices[0]}
+    values |= {"D1": lenses[0], "M2": M2, "D2": lenses[1], "R": pose.matrix[:3, :3], "T": T}
+    entries = zip(("M1", "M2", "D1", "D2", "R", "T"), (*of_matrices, *of_lenses, pose.turn, pose.shift), strict=True)
+    places = {name: entry.place for name, entry in entries if entry is not None}
+    source = source or "opencv"
+    return ForeignPair(values, source, _made(fields, source), fields.notes, warnings, places)
 
 
-class _Pose(NamedTuple):
-    """R (3, 3) and T (3,) of x_right = R x_left + T in the file's unit, their entries, and the program they show."""
+def _made(fields: _Fields, source: str) -> dict[str, Any]:
+    """How the calibration was made, as its files state it."""
+    stated = (float(fields.pair[name].numbers[0]) if name in fields.pair else 0.0 for name in words()["made"])
+    rms, views, columns, rows = stated
+    return {
+        "rms_px": rms if 0 < rms <= RMS_PX_MAX else None,
+        "views": int(views) if 3 <= views <= VIEWS_MAX else None,
+        "board": (int(columns), int(rows)) if 3 <= columns <= 100 and 3 <= rows <= 100 else None,
+        "fixed_intrinsics": words()["programs"]["fixed_intrinsics"].get(source),
+    }
 
-    rotation: np.ndarray
-    translation: np.ndarray
-    turn: Entry
-    shift: Entry
-    source: str = ""
-    plain: bool = False
-    """Whether the name of R leaves its direction open."""
+
+def _matrix(fields: _Fields, side: int) -> tuple[np.ndarray, Entry]:
+    """The camera matrix and its entry: of nine numbers, four, two pairs, single numbers, or a projection."""
+    camera, others = fields.cameras[side], [{"M", "fx"} & set(camera) for camera in fields.cameras]
+    forms = [form for form in (("M",), ("focal", "centre"), FOCAL) if set(form) <= set(camera)]
+    if not forms and "P" in camera and not any(others):
+        forms = [("P",)]
+        fields.notes.append(f"{camera['P'].place} alone: the rectified {SIDES[side]} camera, without distortion")
+    if not forms:
+        raise fields.missing(*([f"M{k + 1}" for k in (0, 1) if not others[k]] or [f"M{side + 1}"]))
+    entry = camera[forms[0][0]]
+    numbers = np.concatenate([camera[name].numbers for name in forms[0]])
+    if numbers.size == 4:
+        numbers = np.array([numbers[0], 0, numbers[2], 0, numbers[1], numbers[3], 0, 0, 1.0])
+    matrix = numbers.reshape(3, -1)[:, :3]
+    if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, :2].all():
+        matrix, fields.by_columns = matrix.T, entry
+    skewed = abs(matrix[0, 1]) > 1e-9 * abs(matrix[0, 0]) or matrix[1, 0] != 0
+    if not (min(matrix[0, 0], matrix[1, 1]) > FOCAL_MIN and np.allclose(matrix[2], [0, 0, 1])) or skewed:
+        raise entry.refuse("matrix-pattern")
+    return np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1.0]]), entry
 
 
-class _Reader:
-    """Builds a pair from the entries by field."""
-
-    def __init__(self, fields: Fields, size: tuple[int, int] | None, unit_mm: float | None):
-        self.fields, self.stated_size, self.unit_mm = fields, size, unit_mm
-        self.source = ""
-        self.unit: str | None = None
-        """As the format of a program states it."""
-        self.notes: list[str] = []
-        self.warnings: list[str] = []
-        self.places: dict[str, str] = {}
-        self.right_size: tuple[int, int] | None = None
-        self.matrices: list[np.ndarray] = []
-        """Of both cameras, as the file states them."""
-        self.transposed: Entry | None = None
-        """A camera matrix that the file stores by columns."""
-
-    def pair(self) -> dict[str, Any]:
-        """The pair by the names of `stereo.json`."""
-        for name, (first, second) in self.fields.twice.items():
-            remedy = f"say which: --key {name}={second.path}" if name in KEY_FIELDS else "remove one of them"
-            raise first.refuse("twice", remedy=remedy, place=second.place)
-        left, right = cameras = self.fields.cameras
-        if self.fields.by_file and all("P" in camera for camera in cameras):
-            shifts = [np.abs(camera["P"].numbers[[3, 7]]).max() for camera in cameras]
-            if shifts[1] == 0 and shifts[0] > 0:
-                # Two files of one camera each, named in reverse order: only the left projection has no shift.
-                self.fields.cameras = left, right = right, left
-        if "baseline" in self.fields.pair and "fx" in left and not {"M", "fx", "P"} & set(right):
-            # The right camera of a rectified pair equals the left one.
-            right.update({key: entry for key, entry in left.items() if key in ("fx", "fy", "cx", "cy")})
-        for side in (0, 1):
-            if kind_of(model := self.fields.model(side)) is None:
-                files = ", ".join(keys.file for keys in self.fields.files)
-                raise refused("model", files, model=escaped(model, 40), side=CAMERAS[side])
-        matrices = self.matrices = [self._matrix(side) for side in (0, 1)]
-        size = self._size(matrices)
-        if self._from_matlab():
-            self.source = "matlab"
-            matrices = [matrix - np.outer([1, 1, 0], [0, 0, 1]) for matrix in matrices]
-            self.notes.append("MATLAB counts pixels from 1: 1 px is taken off cx and cy of both cameras")
-        sizes = size, self.right_size or size
-        D1, D2 = (self._distortion(side, matrices[side], sizes[side]) for side in (0, 1))
-        scale = np.array(size) / sizes[1]
-        M2 = matrices[1] * np.array([[scale[0]] * 2 + [1.0]] * 2 + [[1.0] * 3])
-        # The integer is at the centre of a pixel, so pictures begin at -1/2.
-        M2[:2, 2] = (matrices[1][:2, 2] + 0.5) * scale - 0.5
-        pose = self._pose()
-        T = pose.translation * self._unit(float(np.linalg.norm(pose.translation)))
-        values = {"image_width": size[0], "image_height": size[1], "right_image_size": self.right_size}
-        return values | {"M1": matrices[0], "D1": D1, "M2": M2, "D2": D2, "R": pose.rotation, "T": T}
-
-    def made(self, source: str) -> dict[str, Any]:
-        """How the calibration was made, as its files state it."""
-        stated = {name: entry.numbers[0] for name, entry in self.fields.pair.items() if name in words()["made"]}
-        rms, views, columns, rows = (float(stated.get(name, 0.0)) for name in words()["made"])
-        return {
-            "rms_px": rms if 0 < rms <= RMS_PX_MAX else None,
-            "views": int(views) if 3 <= views <= VIEWS_MAX else None,
-            "board": (int(columns), int(rows)) if 3 <= columns <= 100 and 3 <= rows <= 100 else None,
-            "fixed_intrinsics": words()["programs"]["fixed_intrinsics"].get(source),
-        }
-
-    def _from_matlab(self) -> bool:
-        """Whether the fields are those of MATLAB's stereoParameters."""
-        pair = self.fields.pair
-        radial = any(_has_key(camera.get("radial"), "radialdistortion") for camera in self.fields.cameras)
-        return radial or "R_transposed" in pair or self.transposed is not None or _has_key(pair.get("pose"), "a")
-
-    def _matrix(self, side: int) -> np.ndarray:
-        """The camera matrix: from nine numbers, from four, from two pairs, from single numbers or from a projection."""
-        camera, name = self.fields.cameras[side], f"M{side + 1}"
-        parts = [camera.get(key) for key in ("fx", "fy", "cx", "cy")]
-        if "focal" in camera and "centre" in camera:
-            parts = [camera["focal"], camera["centre"]]
-        entry = camera.get("M")
-        if entry is not None and entry.numbers.size == 9:
-            matrix = entry.numbers.reshape(3, 3)
-            if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, :2].all():
-                matrix, self.transposed = matrix.T, entry
-        elif entry is not None or all(part is not None for part in parts):
-            entries = [part for part in (parts if entry is None else [entry]) if part is not None]
-            fx, fy, cx, cy = np.concatenate([part.numbers for part in entries])
-            matrix, entry = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), entries[0]
-        elif "P" in camera and not any({"M", "fx"} & set(part) for part in self.fields.cameras):
-            entry = camera["P"]
-            matrix = entry.numbers.reshape(3, 4)[:, :3]
-            self.notes.append(f"{entry.place} alone: the rectified {CAMERAS[side]} camera, without distortion")
-        else:
-            lacking = [f"M{k + 1}" for k in (0, 1) if not {"M", "fx"} & set(self.fields.cameras[k])]
-            raise self.fields.missing(lacking or [name])
-        self.places[name] = entry.place
-        skewed = abs(matrix[0, 1]) > 1e-9 * abs(matrix[0, 0]) or matrix[1, 0] != 0
-        if not (min(matrix[0, 0], matrix[1, 1]) > FOCAL_MIN and np.allclose(matrix[2], [0, 0, 1])) or skewed:
-            raise entry.refuse("matrix-pattern")
-        return np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1.0]])
-
-    def _distortion(self, side: int, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """The coefficients k1 k2 p1 p2 k3; fitted where the file has another model."""
-        camera, model = self.fields.cameras[side], self.fields.model(side)
-        kind = kind_of(model) or "five"
-        values, entry = _coefficients(camera, kind)
-        if entry is None:
-            if {"M", "fx"} & set(camera) and model != "rectified":
-                raise self.fields.missing([f"D{side + 1}"])
-            return np.zeros(5)
-        self.places[f"D{side + 1}"] = entry.place
-        if kind == "fisheye" and not values[4:].any():
-            values = values[:4]
-        if not values.any() and kind != "fisheye":
-            return np.zeros(5)
-        if kind == "five" and values.size == 4 and not model:
-            said = "four coefficients without the name of a model, taken as k1 k2 p1 p2"
-            remedy = "of cv2.fisheye they are others: then add distortion_model: equidistant"
-            self.notes.append(f"{entry.place}: {said}; {remedy}")
-        if kind in ("five", "rational") and not values[5:].any():
-            return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
-        count = {"fisheye": 4, "inverse": 5}.get(kind, values.size)
-        if values.size != count:
-            raise entry.refuse("coefficients", found=values.size, kind=kind, count=count)
-        fitted = fitted_to_five(matrix, values, size, "rational" if kind == "five" else kind)
-        lens = {"fisheye": "a fisheye lens", "inverse": "a lens described from pixels to rays"}
-        said = lens.get(kind, f"a lens of {values.size} coefficients") + (f" of {self.source}" if self.source else "")
-        if not fitted.error_px <= ERROR_MAX_PX:
-            miss = f"up to {fitted.error_px:.2g} px, {fitted.rms_px:.2g} px rms"
-            miss = miss if math.isfinite(fitted.error_px) else "an undetermined amount"
-            convert = words()["programs"]["convert"].get(self.source, "")
-            raise entry.refuse("lens", lens=said, miss=miss, most=ERROR_MAX_PX, convert=convert)
-        self.notes.append(f"{entry.place}: {said}, fitted to five coefficients within {fitted.error_px:.2g} px")
-        return fitted.distortion
-
-    def _size(self, matrices: Sequence[np.ndarray]) -> tuple[int, int]:
-        """The size of the left camera's pictures; stores the size of the right camera's where it differs."""
-        sizes: list[tuple[tuple[int, int], Entry]] = []
-        for matrix, camera in zip(matrices, self.fields.cameras, strict=True):
-            if "size" not in camera and not {"width", "height"} <= set(camera):
-                continue
-            entry = camera.get("size") or camera["width"]
-            pixels = entry.numbers if "size" in camera else np.append(entry.numbers, camera["height"].numbers)
-            if not all(n == int(n) and 1 <= n <= 65_535 for n in pixels):
-                raise entry.refuse("pixels", found=escaped(str(pixels.tolist()), 60))
-            width, height = int(pixels[0]), int(pixels[1])
-            by_rows = _offset_share(matrix, (height, width)) < _offset_share(matrix, (width, height))
-            if "size" in camera and (by_rows or self._from_matlab()) and width != height:
-                width, height = height, width
-                self.notes += [f"{entry.place} is taken as rows, columns: {width} x {height} px"] * (not sizes)
-            sizes.append(((width, height), entry))
-        if len({size for size, _ in sizes}) > 1:
-            (left, entry), (right, _) = sizes
-            found = f"left and right have two sizes: {left[0]} x {left[1]} and {right[0]} x {right[1]}"
-            if abs(left[0] * right[1] / (left[1] * right[0]) - 1.0) > SHAPE_SHARE_MAX:
-                raise entry.refuse("proportion", found=found)
-            self.right_size = right
-            self.notes.append(f"{found}: the right camera's numbers are those of its pictures scaled to the left one's")
-        for size, entry in sizes[:1]:
-            if self.stated_size not in (None, size):
-                raise entry.refuse("stated-size", found=f"{size[0]} x {size[1]}")
-            return size
-        if self.stated_size is not None:
-            return self.stated_size
-        first = self.fields.files[0]
+def _sizes(
+    fields: _Fields, matrices: Sequence[np.ndarray], stated: Size | None, matlab: bool
+) -> tuple[Size, Size | None]:
+    """The size of the left camera's pictures, and that of the right one's where it differs."""
+    sizes: list[tuple[Size, Entry]] = []
+    for matrix, camera in zip(matrices, fields.cameras, strict=True):
+        form = ("size",) if "size" in camera else ("width", "height")
+        if not set(form) <= set(camera):
+            continue
+        entry, pixels = camera[form[0]], np.concatenate([camera[name].numbers for name in form])
+        if not all(n == int(n) and 1 <= n <= 65_535 for n in pixels):
+            raise entry.refuse("pixels", found=escaped(str(pixels.tolist()), 60))
+        width, height = map(int, pixels)
+        # Offset of the principal point from the middle of the pictures, as a share of their size.
+        share, share_by_rows = (
+            np.abs((matrix[:2, 2] - np.subtract(size, 1) / 2) / size).max()
+            for size in ((width, height), (height, width))
+        )
+        by_rows = matlab or share_by_rows < share
+        if form == ("size",) and by_rows and width != height:
+            width, height = height, width
+            fields.notes += [f"{entry.place} is taken as rows, columns: {width} x {height} px"] * (not sizes)
+        sizes.append(((width, height), entry))
+    if not sizes:
+        if stated is not None:
+            return stated, None
+        first = fields.files[0]
         where = f", or name {first.values['size_in']}, which has it" if "size_in" in first else ""
-        raise refused("no-size", first.file, where=where)
-
-    def _pose(self) -> _Pose:
-        """R and T of x_right = R x_left + T, T in the file's unit: the first pose, checked against all others."""
-        poses, cameras = list(self._poses()), self.fields.cameras
-        if not poses:
-            if self.fields.by_file or "M" in cameras[0] or "fx" in cameras[0]:
-                raise self.fields.missing([name for name in ("R", "T") if name not in self.fields.pair] or ["R", "T"])
-            raise self.fields.missing(["M1", "M2", "R", "T"])
-        first, *others = poses
-        self.places |= {"R": first.turn.place, "T": first.shift.place}
-        self.source = self.source or first.source
-        checks: list[Callable[[np.ndarray, np.ndarray], float]] = [partial(_pose_deviation, other) for other in others]
-        if all("rectification" in c for c in cameras) and not any("P" in c for c in cameras):
-            left_part, right_part = (c["rectification"].rotation() for c in cameras)
-            if not any(first.turn is c["rectification"] for c in cameras):
-                checks.append(lambda r, t: float(np.abs(right_part.T @ left_part - r).max()))
-        for name, (left_part, right_part) in {"E": (np.eye(3), np.eye(3)), "F": self.matrices}.items():
-            if name in self.fields.pair:
-                essential = right_part.T @ self.fields.pair[name].numbers.reshape(3, 3) @ left_part
-                checks.append(partial(_essential_deviation, essential))
-        for deviation in checks:
-            if not deviation(first.rotation, first.translation) <= ROTATION_TOLERANCE:
-                turned = deviation(first.rotation.T, first.translation) <= ROTATION_TOLERANCE
-                raise first.turn.refuse("transposed" if turned else "other-pose", path=first.turn.path)
-        if not checks and first.plain and "R" not in self.fields.stated:
-            self._check_direction(first)
-        return first
-
-    def _poses(self) -> Iterator[_Pose]:
-        """All poses of the right camera in the files."""
-        pair, (left, right) = self.fields.pair, self.fields.cameras
-        for field, camera_field in (("R", "rectification"), ("T", "camera_T")):
-            # An entry for one camera only belongs to the pair; rectifications and poses of cameras come in twos.
-            if field not in pair and (camera_field in left) != (camera_field in right) and "P" not in left:
-                pair[field] = left.get(camera_field) or right[camera_field]
-        if "baseline" in pair and right.get("fx") is left.get("fx") and "fx" in left:
-            shift = np.array([-pair["baseline"].numbers[0], 0.0, 0.0])
-            yield _Pose(np.eye(3), shift, pair["baseline"], pair["baseline"], "orb-slam")
-        turn = pair.get("R") or pair.get("R_transposed")
-        if turn is not None and "T" in pair:
-            rotation, source = turn.rotation(), ""
-            by_columns = turn.numbers.size == 9 and turn.shape == (9,) and _has_key(left.get("cx"), "ppx")
-            if "R" not in pair or by_columns:
-                rotation, source = rotation.T, "matlab" if "R" not in pair else "realsense"
-                if by_columns:
-                    self.notes.append(f"{turn.place}: nine numbers, taken column by column as librealsense has them")
-            yield _Pose(rotation, pair["T"].numbers, turn, pair["T"], source, plain=not source and self.unit is None)
-        for field in ("pose", "pose_backwards"):
-            if (entry := pair.get(field)) is not None:
-                known = words()["programs"]["pose_keys"]
-                pose = entry.pose() if field == "pose" else np.linalg.inv(entry.pose())
-                yield _of(pose, entry, next((source for source, keys in known.items() if entry.key in keys), ""))
-        for field, source in (("from_body", "kalibr"), ("to_body", "euroc")):
-            if field in left and field in right:
-                t_left, t_right = (camera[field].pose() for camera in (left, right))
-                pose = t_right @ np.linalg.inv(t_left) if field == "from_body" else np.linalg.inv(t_right) @ t_left
-                yield _of(pose, right[field], source)
-        turns = [turn for c in (left, right) if (turn := c.get("camera_R", c.get("rectification"))) is not None]
-        if all("camera_T" in camera for camera in (left, right)) and len(turns) == 2:
-            r_left, r_right = (turn.rotation() for turn in turns)
-            shift = right["camera_T"].numbers - r_right @ r_left.T @ left["camera_T"].numbers
-            yield _Pose(r_right @ r_left.T, shift, turns[1], right["camera_T"])
-        if "P" in left and "P" in right and not ("R" in pair and "T" in pair and "rectification" not in left):
-            yield self._from_projections()
-
-    def _from_projections(self) -> _Pose:
-        """The rectified right camera sees x' = x + (P03 / P00, P13 / P11, 0): R = R2^T R1, T = R2^T times the shift."""
-        left, right = self.fields.cameras
-        left_p, right_p = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
-        if np.any(left_p[:2, 3] != 0) or not np.any(right_p[:2, 3]) or not (right_p[0, 0] > 0 and right_p[1, 1] > 0):
-            raise right["P"].refuse("projection")
-        turns = [c["rectification"].rotation() if "rectification" in c else np.eye(3) for c in (left, right)]
-        if "M" not in left and "fx" not in left:
-            # The files contain the rectified pair itself.
-            turns = [np.eye(3), np.eye(3)]
-        shift = np.array([right_p[0, 3] / right_p[0, 0], right_p[1, 3] / right_p[1, 1], 0.0])
-        source = "ros" if self.fields.by_file else ""
-        return _Pose(turns[1].T @ turns[0], turns[1].T @ shift, right["P"], right["P"], source)
-
-    def _check_direction(self, pose: _Pose) -> None:
-        """Note the meaning of R and of its transpose, where nothing else in the file determines it."""
-        path = pose.turn.path
-        if self.transposed is not None:
-            raise pose.turn.refuse("maybe-transposed", place=self.transposed.place, path=path)
-        if math.degrees(float(np.linalg.norm(cv2.Rodrigues(pose.rotation)[0]))) < TURN_NOTED_DEG:
-            return
-        stated_deg, transposed_deg = (_toe_in_deg(r, pose.translation) for r in (pose.rotation, pose.rotation.T))
-        stated, turned = (
-            f"{'converge' if deg >= 0 else 'diverge'} by {abs(deg):.1f} deg" for deg in (stated_deg, transposed_deg)
-        )
-        text = (
-            f"{pose.turn.place} is taken from left to right, x_right = R x_left + T, and nothing else in the file says "
-            f"so: the optical axes {stated}; transposed they {turned}: --key R={path}.T; `check` of a campaign with "
-            "spots says which"
-        )
-        if stated_deg < -TURN_NOTED_DEG < TURN_NOTED_DEG < transposed_deg:
-            self.warnings.append(f"is R transposed? {text}")
-        else:
-            self.notes.append(text)
-
-    def _unit(self, length: float) -> float:
-        """Millimetres per unit of the file: as stated, or by the format; an implausible one must be stated."""
-        if not 0 < length < math.inf:
-            raise refused("no-baseline", self.places["T"])
-        if self.unit_mm is not None:
-            return self.unit_mm
-        stated = self.unit or ("m" if self.source in words()["programs"]["metres"] else "")
-        unit = stated.strip("?") or "mm"
-        low, high = BASELINE_RANGE_MM
-        if stated == "?" or not low <= length * UNITS_MM[unit] <= high:
-            inside = {name: length * mm for name, mm in UNITS_MM.items() if low <= length * mm <= high}
-            options = [f"--import-unit {name} ({mm:.4g} mm)" for name, mm in inside.items()]
-            options += [] if stated == "?" else [f"--import-unit {unit} if it is so"]
-            options += ["--import-unit 25 where it counts squares of 25 mm"] * (length < low or not options)
-            said = {"unit": unit, "low": low, "high": high, "options": ", or ".join(options)}
-            if stated == "?":
-                raise refused("no-unit", self.places["T"], length=length, **said)
-            raise refused("unit", self.places["T"], length=length * UNITS_MM[unit], **said)
-        if not stated:
-            self.notes.append("T is taken in mm: the file does not state a unit")
-        return UNITS_MM[unit]
-
-
-def _of(pose: np.ndarray, entry: Entry, source: str) -> _Pose:
-    return _Pose(pose[:3, :3], pose[:3, 3], entry, entry, source)
+        raise refused("stereo-no-size", first.file, where=where)
+    (left, entry), (right, _) = sizes[0], sizes[-1]
+    if left != right:
+        found = f"left and right have two sizes: {left[0]} x {left[1]} and {right[0]} x {right[1]}"
+        if abs(left[0] * right[1] / (left[1] * right[0]) - 1.0) > SHAPE_SHARE_MAX:
+            raise entry.refuse("proportion", found=found)
+        fields.notes.append(f"{found}: the right camera's numbers are those of its pictures scaled to the left one's")
+    if stated not in (None, left):
+        raise entry.refuse("stated-size", found=f"{left[0]} x {left[1]}")
+    return left, right if right != left else None
 
 
 def _coefficients(camera: Mapping[str, Entry], kind: str) -> tuple[np.ndarray, Entry | None]:
     """Coefficients in OpenCV's order and their entry: one entry, MATLAB's two, or single numbers; None where none."""
     if "D" in camera:
         return camera["D"].numbers, camera["D"]
-
-    def single(names: Sequence[str]) -> np.ndarray:
-        entries = [camera.get(f"coefficient_{name}") for name in names]
-        return np.array([0.0 if entry is None else float(entry.numbers[0]) for entry in entries])
-
-    if "radial" in camera:
-        radial = camera["radial"].numbers
-        tangential = camera["tangential"].numbers if "tangential" in camera else single(("p1", "p2"))
-        return np.array([*radial[:2], *tangential, *radial[2:]]), camera["radial"]
-    names = ("k1", "k2", "k3", "k4") if kind == "fisheye" else RATIONAL[:5]
-    entries = (camera.get(f"coefficient_{name}") for name in names)
-    return single(names), next((entry for entry in entries if entry is not None), None)
+    order = ("k1", "k2", "k3", "k4") if kind == "fisheye" and "radial" not in camera else RATIONAL[:5]
+    fields = {"radial": ("k1", "k2", "k3"), "tangential": ("p1", "p2")} | {
+        f"coefficient_{name}": (name,) for name in order
+    }
+    stated: dict[str, float] = {}
+    for field in (field for field in fields if field in camera):
+        stated = dict(zip(fields[field], camera[field].numbers, strict=False)) | stated
+    # What is called tangential alone lacks its other half.
+    first = next((camera[field] for field in fields if field in camera and field != "tangential"), None)
+    return np.array([stated.get(name, 0.0) for name in order]), first
 
 
-def _offset_share(matrix: np.ndarray, size: tuple[int, int]) -> float:
-    """Offset of a principal point from the middle of the pictures, as a share of their size."""
-    return max(abs(c - (n - 1) / 2) / n for c, n in zip(matrix[:2, 2], size, strict=True))
+def _distortion(
+    fields: _Fields, side: int, matrix: np.ndarray, size: Size, source: str
+) -> tuple[np.ndarray, Entry | None]:
+    """The coefficients k1 k2 p1 p2 k3, and their entry; fitted where the file has another model."""
+    camera, model = fields.cameras[side], fields.model(side)
+    kind = kind_of(model) or "five"
+    values, entry = _coefficients(camera, kind)
+    if entry is None:
+        if {"M", "fx"} & set(camera) and model != "rectified":
+            raise fields.missing(f"D{side + 1}")
+        return np.zeros(5), None
+    if kind == "fisheye" and not values[4:].any():
+        values = values[:4]
+    if not values.any() and kind != "fisheye":
+        return np.zeros(5), entry
+    if kind == "five" and values.size == 4 and not model:
+        said = "four coefficients without the name of a model, taken as k1 k2 p1 p2"
+        remedy = "of cv2.fisheye they are others: then add distortion_model: equidistant"
+        fields.notes.append(f"{entry.place}: {said}; {remedy}")
+    if kind in ("five", "rational") and not values[5:].any():
+        return np.append(values[:5], np.zeros(max(0, 5 - values.size))), entry
+    count = {"fisheye": 4, "inverse": 5}.get(kind, values.size)
+    if values.size != count:
+        raise entry.refuse("coefficients", found=values.size, kind=kind, count=count)
+    fitted = fitted_to_five(matrix, values, size, kind)
+    lens = {"fisheye": "a fisheye lens", "inverse": "a lens described from pixels to rays"}
+    said = lens.get(kind, f"a lens of {values.size} coefficients") + (f" of {source}" if source else "")
+    if not fitted.error_px <= ERROR_MAX_PX:
+        miss = f"up to {fitted.error_px:.2g} px, {fitted.rms_px:.2g} px rms"
+        miss = miss if math.isfinite(fitted.error_px) else "an undetermined amount"
+        convert = words()["programs"]["convert"].get(source, "")
+        raise entry.refuse("lens", lens=said, miss=miss, most=ERROR_MAX_PX, convert=convert)
+    fields.notes.append(f"{entry.place}: {said}, fitted to five coefficients within {fitted.error_px:.2g} px")
+    return fitted.distortion, entry
 
 
-def _has_key(entry: Entry | None, word: str) -> bool:
-    return entry is not None and letters(entry.key) == word
+def _poses(fields: _Fields, unit_open: bool) -> Iterator[_Pose]:
+    """All poses of the right camera in the files."""
+    pair, (left, right) = fields.pair, fields.cameras
+    if "baseline" in pair and right.get("fx") is left.get("fx") and "fx" in left:
+        shift = np.array([-pair["baseline"].numbers[0], 0.0, 0.0])
+        yield _Pose(rigid(np.eye(3), shift), pair["baseline"], pair["baseline"], "orb-slam")
+    turn = pair.get("R") or pair.get("R_transposed")
+    if turn is not None and "T" in pair:
+        by_columns = turn.shape == (9,) and "cx" in left and letters(left["cx"].key) == "ppx"
+        source = "matlab" if "R" not in pair else "realsense" if by_columns else ""
+        rotation = turn.rotation().T if source else turn.rotation()
+        if by_columns:
+            fields.notes.append(f"{turn.place}: nine numbers, taken column by column as librealsense has them")
+        plain = not source and unit_open
+        yield _Pose(rigid(rotation, pair["T"].numbers), turn, pair["T"], source, plain)
+    for field in ("pose", "pose_backwards"):
+        if (entry := pair.get(field)) is not None:
+            known = words()["programs"]["pose_keys"]
+            source = next((source for source, keys in known.items() if entry.key in keys), "")
+            pose = entry.pose() if field == "pose" else np.linalg.inv(entry.pose())
+            yield _Pose(pose, entry, entry, source)
+    for field, source in (("from_body", "kalibr"), ("to_body", "euroc")):
+        if field in left and field in right:
+            of_left, of_right = left[field].pose(), right[field].pose()
+            pose = of_right @ np.linalg.inv(of_left) if field == "from_body" else np.linalg.inv(of_right) @ of_left
+            yield _Pose(pose, right[field], right[field], source)
+    turns = [turn for camera in (left, right) if (turn := camera.get("camera_R", camera.get("rectification")))]
+    if all("camera_T" in camera for camera in (left, right)) and len(turns) == 2:
+        of_left, of_right = (
+            rigid(t.rotation(), c["camera_T"].numbers) for t, c in zip(turns, fields.cameras, strict=True)
+        )
+        yield _Pose(of_right @ np.linalg.inv(of_left), turns[1], right["camera_T"])
+    if "P" in left and "P" in right and not ("R" in pair and "T" in pair and "rectification" not in left):
+        yield _pose_of_projections(fields)
 
 
-def _pose_deviation(other: _Pose, rotation: np.ndarray, translation: np.ndarray) -> float:
-    """Deviation of a pose from another one, whose unit may differ."""
-    directions = [t / np.linalg.norm(t) for t in (translation, other.translation) if t.any()]
-    distance = float(np.abs(directions[0] - directions[1]).max()) if len(directions) == 2 else 0.0
-    return max(float(np.abs(other.rotation - rotation).max()), distance)
+def _pose_of_projections(fields: _Fields) -> _Pose:
+    """The rectified right camera sees x' = x + (P03 / P00, P13 / P11, 0): R = R2^T R1, T = R2^T times the shift."""
+    left, right = fields.cameras
+    left_p, right_p = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
+    if np.any(left_p[:2, 3] != 0) or not np.any(right_p[:2, 3]) or not (right_p[0, 0] > 0 and right_p[1, 1] > 0):
+        raise right["P"].refuse("projection")
+    turns = [c["rectification"].rotation() if "rectification" in c else np.eye(3) for c in (left, right)]
+    if "M" not in left and "fx" not in left:
+        # The files contain the rectified pair itself.
+        turns = [np.eye(3), np.eye(3)]
+    shift = np.array([right_p[0, 3] / right_p[0, 0], right_p[1, 3] / right_p[1, 1], 0.0])
+    matrix = rigid(turns[1].T @ turns[0], turns[1].T @ shift)
+    return _Pose(matrix, right["P"], right["P"], "ros" if fields.by_file else "")
+
+
+def _checked_pose(fields: _Fields, matrices: Sequence[np.ndarray], unit_open: bool) -> tuple[_Pose, list[str]]:
+    """The first pose of the right camera, checked against all others and E and F; with doubts of its direction."""
+    poses, cameras, pair = list(_poses(fields, unit_open)), fields.cameras, fields.pair
+    if not poses:
+        raise fields.missing(*[name for name in ("R", "T") if name not in pair] or ["R", "T"])
+    first, *others = poses
+    if all("rectification" in c for c in cameras) and not any(
+        "P" in c or first.turn is c["rectification"] for c in cameras
+    ):
+        left_part, right_part = (c["rectification"].rotation() for c in cameras)
+        others.append(first._replace(matrix=rigid(right_part.T @ left_part, np.zeros(3))))
+    checks: list[Callable[[np.ndarray, np.ndarray], float]] = [other.deviation for other in others]
+    for name, (of_left, of_right) in {"E": (np.eye(3), np.eye(3)), "F": matrices}.items():
+        if name in pair:
+            checks.append(partial(_essential_deviation, of_right.T @ pair[name].numbers.reshape(3, 3) @ of_left))
+    rotation, translation = first.matrix[:3, :3], first.matrix[:3, 3]
+    for deviation in checks:
+        if not deviation(rotation, translation) <= ROTATION_TOLERANCE:
+            turned = deviation(rotation.T, translation) <= ROTATION_TOLERANCE
+            raise first.turn.refuse("transposed" if turned else "other-pose", path=first.turn.path)
+    is_open = not checks and first.plain and "R" not in fields.stated
+    return first, _doubted_direction(fields, first) if is_open else []
 
 
 def _essential_deviation(essential: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> float:
@@ -517,8 +562,50 @@ def _essential_deviation(essential: np.ndarray, rotation: np.ndarray, translatio
     return float(min(np.abs(stated - expected).max(), np.abs(stated + expected).max()))
 
 
-def _toe_in_deg(rotation: np.ndarray, translation: np.ndarray) -> float:
-    """Angle between the optical axes in the plane of the baseline, deg; negative where they diverge."""
-    to_right, to_left = -rotation.T @ translation, translation
-    sines = [direction[2] / np.linalg.norm(direction) for direction in (to_right, to_left)]
-    return math.degrees(sum(map(math.asin, np.clip(sines, -1.0, 1.0))))
+def _doubted_direction(fields: _Fields, pose: _Pose) -> list[str]:
+    """Warnings of the meaning of R where nothing else in the file determines it; a note of it and of its transpose."""
+    path, rotation, translation = pose.turn.path, pose.matrix[:3, :3], pose.matrix[:3, 3]
+    if fields.by_columns is not None:
+        raise pose.turn.refuse("maybe-transposed", place=fields.by_columns.place, path=path)
+    if math.degrees(float(np.linalg.norm(cv2.Rodrigues(rotation)[0]))) < TURN_NOTED_DEG:
+        return []
+
+    def toe_in_deg(rotation: np.ndarray) -> float:
+        """Angle between the optical axes in the plane of the baseline, deg; negative where they diverge."""
+        sines = [direction[2] / np.linalg.norm(direction) for direction in (-rotation.T @ translation, translation)]
+        return math.degrees(sum(map(math.asin, np.clip(sines, -1.0, 1.0))))
+
+    angles_deg = toe_in_deg(rotation), toe_in_deg(rotation.T)
+    stated, turned = (f"{'converge' if deg >= 0 else 'diverge'} by {abs(deg):.1f} deg" for deg in angles_deg)
+    text = (
+        f"{pose.turn.place} is taken from left to right, x_right = R x_left + T, and nothing else in the file says "
+        f"so: the optical axes {stated}; transposed they {turned}: --key R={path}.T; `check` of a campaign with "
+        "spots says which"
+    )
+    if angles_deg[0] < -TURN_NOTED_DEG < TURN_NOTED_DEG < angles_deg[1]:
+        return [f"is R transposed? {text}"]
+    fields.notes.append(text)
+    return []
+
+
+def _unit(
+    fields: _Fields, place: str, length: float, unit_mm: float | None, of_format: str | None, source: str
+) -> float:
+    """Millimetres per unit of the file: as stated, or by the format; an implausible one must be stated."""
+    if not 0 < length < math.inf:
+        raise refused("stereo-no-baseline", place)
+    if unit_mm is not None:
+        return unit_mm
+    stated = of_format or ("m" if source in words()["programs"]["metres"] else "")
+    unit = stated.strip("?") or "mm"
+    low, high = BASELINE_RANGE_MM
+    if stated == "?" or not low <= length * UNITS_MM[unit] <= high:
+        inside = {name: length * mm for name, mm in UNITS_MM.items() if low <= length * mm <= high}
+        options = [f"--import-unit {name} ({mm:.4g} mm)" for name, mm in inside.items()]
+        options += [] if stated == "?" else [f"--import-unit {unit} if it is so"]
+        options += ["--import-unit 25 where it counts squares of 25 mm"] * (length < low or not options)
+        row, length = ("stereo-no-unit", length) if stated == "?" else ("stereo-unit", length * UNITS_MM[unit])
+        raise refused(row, place, length=length, unit=unit, low=low, high=high, options=", or ".join(options))
+    if not stated:
+        fields.notes.append("T is taken in mm: the file does not state a unit")
+    return UNITS_MM[unit]

@@ -15,34 +15,40 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable, Iterable
-from pathlib import PurePath
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
+import cv2
 import numpy as np
+import yaml
 
 from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.files.disk import array_of, arrays_of
+from tvsbayes.files.disk import array_of, arrays_of, read_bytes
 from tvsbayes.files.documents import Keys, parse_json, parse_toml
-from tvsbayes.importing.stereo_programs import printed_trees
+from tvsbayes.importing.asking import filled, refused
+from tvsbayes.importing.stereo_programs import printed_trees, words
 from tvsbayes.importing.text import text_of
 
-PACKED = struct.error, zlib.error
-TREE_BYTES_MAX = 4 * 1024 * 1024
-ENTRIES_MAX, PRINTED_CHARS_MAX = 200_000, 1_000_000
-DEPTH_MAX = 12
-LIMITS_TEXT, TRIM_REMEDY = f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
-_FORMATS_TEXT = (
+TREE_BYTES_MAX, PRINTED_CHARS_MAX = 4 * 1024 * 1024, 1_000_000
+ENTRIES_MAX, DEPTH_MAX, NUMBER_MAX = 200_000, 12, 1e12
+FILES_MAX, ARRAY_FILES_MAX = 3, 40
+ROTATION_TOLERANCE = 1e-3
+"""Largest deviation of R from a rotation, for files of few digits; the nearest rotation is used."""
+MAT_SECONDS_MAX = 60.0
+_FORMATS = (
     "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .npy, .mat of MATLAB up to version 7, a ZED's "
     "SN*.conf, what rs-enumerate-devices -c prints"
 )
-REWRITE_REMEDY = "write it as its own program does"
-_TEXT_REMEDY = "name a calibration file; from Python save the matrices by numpy.savez, not as pickles or pictures"
-MAT_SECONDS_MAX = 60.0
-_DAMAGE = ArithmeticError, AttributeError, LookupError, MemoryError, OSError, TypeError, ValueError, *PACKED
+_NO_TEXT_REMEDY = "name a calibration file; from Python save the matrices by numpy.savez, not as pickles or pictures"
+_LIMITS = f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, MemoryError, OSError, TypeError, ValueError, struct.error)
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
 """MAT-file 5: length of the header, and type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
+_YAML_TAGS = "map opencv-matrix opencv-nd-matrix seq python/tuple str int float bool null timestamp merge value".split()
 
 
 def read_trees(data: bytes, file: str) -> list[Keys]:
@@ -54,58 +60,94 @@ def read_trees(data: bytes, file: str) -> list[Keys]:
     if len(data) > TREE_BYTES_MAX:
         found, allowed = f"{len(data)} bytes", f"at most {TREE_BYTES_MAX} bytes"
         raise refusal("size", file=file, found=found, allowed=allowed, remedy="remove what is not needed")
-    for magic, reader in _BINARY.items():
-        if data.startswith(magic):
-            try:
-                values = reader(data)
-            except _DAMAGE as error:
-                found = str(error) if isinstance(error, ValueError) else "a damaged file"
-                raise container_error(file, None, found, "write it again with its program") from error
-            values = values if isinstance(values, dict) else {PurePath(file).stem: values}
-            return [Keys(_plain(values, file), file, "")]
-    text = text_of(data, file, _FORMATS_TEXT, _TEXT_REMEDY).text
+    stem = PurePath(file).stem
+    for read in (reader for magic, reader in _BINARY.items() if data.startswith(magic)):
+        try:
+            values = read(data)
+        except (*_DAMAGE, zlib.error) as error:
+            found = str(error) if isinstance(error, ValueError) else "a damaged file"
+            raise _refused(file, None, found, "write it again with its program") from error
+        return [Keys(_plain(values if isinstance(values, dict) else {stem: values}, file), file, "")]
+    text = text_of(data, file, _FORMATS, _NO_TEXT_REMEDY).text
     try:
         printed = printed_trees(text) if len(text) <= PRINTED_CHARS_MAX else []
     except (ValueError, ArithmeticError) as error:
         found, *remedy = map(str, error.args)
-        raise container_error(file, None, found, *remedy or ["take the file as the program wrote it"]) from error
+        raise _refused(file, None, found, *remedy or ["take the file as the program wrote it"]) from error
     if printed:
         return [Keys(_plain(values, file), file, text) for values in printed]
     if (rows := _rows(text)) is not None:
-        return [Keys(_plain({PurePath(file).stem: rows}, file), file, text)]
+        return [Keys(_plain({stem: rows}, file), file, text)]
     if text.lstrip().startswith("<"):
         return [Keys(_plain(_xml(text, file), file), file, "")]
     if re.match(r"\s*\{\s*[\"}]", text):
         if text.count(",") > ENTRIES_MAX:
-            raise container_error(file, None, LIMITS_TEXT, TRIM_REMEDY)
+            raise _refused(file, None, *_LIMITS)
         return [parse_json(text.encode(), file)]
     if re.match(r"(?:\s|#.*\n)*+(\[[\w.\"-]+\]\s*(#.*)?$|[\w.-]+\s*=)", text, re.MULTILINE):
         return [parse_toml(text.encode(), file)]
-    return [Keys(_plain(document, file), file, text) for document in _yaml(text, file)]
+    return [Keys(document, file, text) for document in _yaml(text, file)]
 
 
-def container_error(file: str, line: int | None, found: str, remedy: str = REWRITE_REMEDY) -> InputError:
-    """The refusal of a container."""
-    return refusal("container", file=file, line=line, found=escaped(found, 120), allowed=_FORMATS_TEXT, remedy=remedy)
+def read_files(paths: Sequence[Path]) -> list[Keys]:
+    """The tables in files of a calibration; a folder stands for its arrays (.npy, else .txt), as do several such files.
+
+    Raises:
+        InputError: a file is unreadable, unknown or damaged, or a folder without arrays.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        inner = [path]
+        if path.is_dir():
+            inner = sorted(path.glob("*.npy")) or sorted(path.glob("*.txt"))
+            if not 0 < len(inner) <= ARRAY_FILES_MAX:
+                raise refused("stereo-folder", escaped(str(path), 200), count=len(inner), most=ARRAY_FILES_MAX)
+        files += inner
+    trees = [tree for path in files for tree in read_trees(read_bytes(path, TREE_BYTES_MAX), escaped(path.name))]
+    if len(trees) > 1:
+        arrays = [tree for tree in trees if set(tree.values) == {Path(tree.file).stem}]
+        values = {name: value for tree in arrays for name, value in tree.values.items()}
+        trees = [tree for tree in trees if tree not in arrays]
+        trees += [Keys(values, escaped(files[0].parent.name or "the arrays"), "")] if arrays else []
+    if len(trees) > FILES_MAX:
+        raise refused("stereo-files", trees[0].file, count=len(trees))
+    return trees
+
+
+def _refused(file: str, line: int | None, found: str, remedy: str = "write it as its own program does") -> InputError:
+    return refusal("container", file=file, line=line, found=escaped(found, 120), allowed=_FORMATS, remedy=remedy)
+
+
+def number(word: str) -> int | float | None:
+    """A finite number in a text, else None."""
+    if not NUMBER.fullmatch(word) or not math.isfinite(float(word)):
+        return None
+    return int(word) if re.fullmatch(r"[+-]?[0-9]{1,15}", word) else float(word)
 
 
 def _plain(value: Any, file: str) -> Any:
-    """Reduce a value to tables, lists, numbers and text, within the limits."""
+    """Reduce values of Python and NumPy, elements of XML and nodes of YAML to tables, lists, numbers and text.
+
+    Raises:
+        InputError: above the limits, aliases of YAML expanded.
+    """
     count = 0
 
     def plain(value: Any, depth: int) -> Any:
         nonlocal count
         count += 1
-        if count > ENTRIES_MAX or depth > DEPTH_MAX:
-            raise container_error(file, None, LIMITS_TEXT, TRIM_REMEDY)
+        if count > ENTRIES_MAX or depth > DEPTH_MAX or (isinstance(value, np.ndarray) and value.size > ENTRIES_MAX):
+            raise _refused(file, None, *_LIMITS)
+        if isinstance(value, np.ndarray | np.generic):
+            value = value.tolist()
+        elif isinstance(value, ElementTree.Element):
+            value = _content(value)
+        elif isinstance(value, yaml.Node):
+            value = _constructed(value, file)
         if isinstance(value, dict):
             return {str(key): plain(item, depth + 1) for key, item in value.items()}
         if isinstance(value, list | tuple):
             return [plain(item, depth + 1) for item in value]
-        if isinstance(value, np.ndarray | np.generic):
-            if value.size > ENTRIES_MAX:
-                raise container_error(file, None, f"an array of {value.size} numbers", TRIM_REMEDY)
-            return plain(value.tolist(), depth)
         if isinstance(value, float) and not math.isfinite(value):
             return None
         return value if isinstance(value, int | float | str | bool) else None
@@ -131,7 +173,7 @@ def _mat(data: bytes) -> dict[str, Any]:
     offset, unpacked = _MAT_HEADER_BYTES, 0
     order = "<" if data[126:128] == b"IM" else ">"
     while offset + 8 <= len(data):
-        kind, size = struct.unpack(f"{order}II", data[offset : offset + 8])
+        kind, size = struct.unpack_from(f"{order}II", data, offset)
         if kind == _MAT_COMPRESSED:
             packed = data[offset + 8 : offset + 8 + size]
             unpacked += len(zlib.decompressobj().decompress(packed, TREE_BYTES_MAX + 1))
@@ -143,8 +185,7 @@ def _mat(data: bytes) -> dict[str, Any]:
         result = subprocess.run(command, input=data, capture_output=True, timeout=MAT_SECONDS_MAX, check=True)
     except subprocess.SubprocessError as error:
         raise ValueError("a damaged file, or variables that are no plain matrices and structures") from error
-    variables = json.loads(result.stdout)
-    return variables if isinstance(variables, dict) else {}
+    return dict(json.loads(result.stdout))
 
 
 def _hdf5(data: bytes) -> dict[str, Any]:
@@ -170,38 +211,34 @@ def _rows(text: str) -> list[Any] | None:
     return None if not numbers or any(None in row for row in numbers) else numbers
 
 
-def _xml(text: str, file: str) -> dict[str, Any]:
-    """Elements by name with their attributes; several of one name as a list; words that are numbers as numbers."""
-    from xml.etree import ElementTree
-
+def _xml(text: str, file: str) -> ElementTree.Element | dict[str, Any]:
+    """The root of a document without document type and entities; a table of it where it has no children."""
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
-        raise container_error(file, None, "a document type or entity")
+        raise _refused(file, None, "a document type or entity")
     if text.count("<") > ENTRIES_MAX:
-        raise container_error(file, None, LIMITS_TEXT, TRIM_REMEDY)
+        raise _refused(file, None, *_LIMITS)
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        line = getattr(error, "position", (None,))[0]
-        raise container_error(file, line, str(error)) from error
+        raise _refused(file, getattr(error, "position", (None,))[0], str(error)) from error
+    for tags in ([child.tag for child in element] for element in root.iter() if root.tag == "opencv_storage"):
+        if twice := [tag for tag, times in Counter(tags).items() if times > 1 and tags != ["_"] * times]:
+            raise _refused(file, None, f"{shown(twice[0])} twice", "remove one of them")
+    return root if isinstance(_content(root), dict) else {root.tag: root}
 
-    def value(element: Any, depth: int) -> Any:
-        if depth > DEPTH_MAX:
-            raise container_error(file, None, f"elements nested deeper than {DEPTH_MAX}")
-        stated = {key: _word(text) for key, text in element.attrib.items() if key != "type_id"}
-        if len(element) or stated:
-            if len(element) and all(child.tag == "_" for child in element):
-                return [value(child, depth + 1) for child in element]
-            found: dict[str, list[Any]] = {}
-            for child in element:
-                found.setdefault(child.tag, []).append(value(child, depth + 1))
-            if root.tag == "opencv_storage" and (twice := [tag for tag, items in found.items() if len(items) > 1]):
-                raise container_error(file, None, f"{shown(twice[0])} twice", "remove one of them")
-            inner = {tag: items[0] if len(items) == 1 else items for tag, items in found.items()}
-            return stated | inner | ({} if len(element) else {"value": _word(element.text or "")})
-        return _word(element.text or "", listed=element.tag == "data")
 
-    content = value(root, 0)
-    return content if isinstance(content, dict) else {root.tag: content}
+def _content(element: ElementTree.Element) -> Any:
+    """Attributes and children by name, several of one name as a list; words that are numbers as numbers."""
+    if len(element) and all(child.tag == "_" for child in element):
+        return list(element)
+    stated = {key: _word(text) for key, text in element.attrib.items() if key != "type_id"}
+    if not len(element):
+        value = _word(element.text or "", listed=element.tag == "data")
+        return {**stated, "value": value} if stated else value
+    children: dict[str, list[ElementTree.Element]] = {}
+    for child in element:
+        children.setdefault(child.tag, []).append(child)
+    return stated | {tag: items if len(items) > 1 else items[0] for tag, items in children.items()}
 
 
 def _word(text: str, listed: bool = False) -> Any:
@@ -212,75 +249,158 @@ def _word(text: str, listed: bool = False) -> Any:
     return numbers if len(numbers) > 1 or listed else numbers[0]
 
 
-def number(word: str) -> int | float | None:
-    """A finite number in a text, else None."""
-    if not NUMBER.fullmatch(word) or not math.isfinite(float(word)):
-        return None
-    return int(word) if re.fullmatch(r"[+-]?[0-9]{1,15}", word) else float(word)
-
-
 def _yaml(text: str, file: str) -> list[dict[str, Any]]:
-    """The documents of YAML, by PyYAML's safe loader, which does not know the tags of OpenCV.
-
-    Repeated messages of one camera, which differ only in their headers, are left out.
-    """
-    import yaml
-
-    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-        """Refuses duplicate keys; reads numbers as OpenCV, ROS and Kalibr write them (`1.`, `2e-05`)."""
-
-    def mapping(loader: Any, node: Any) -> dict[str, Any]:
-        keys = [str(key.value) for key, _ in node.value]
-        for k, key in enumerate(keys):
-            if key in keys[:k]:
-                line = node.value[k][0].start_mark.line + 1
-                raise container_error(file, line, f"{shown(key)} twice", "remove one of them")
-        return {key: loader.construct_object(part, deep=True) for key, (_, part) in zip(keys, node.value, strict=True)}
-
-    def scalar(loader: Any, node: Any) -> Any:
-        found = None if node.style in ("'", '"', "|", ">") else number(node.value)
-        return node.value if found is None else found
-
-    sequence, tag = yaml.SafeLoader.construct_yaml_seq, "tag:yaml.org,2002:"
-    Loader.yaml_constructors = {None: yaml.SafeLoader.construct_undefined}
-    for kinds, constructor in (
-        ("map opencv-matrix opencv-nd-matrix", mapping),
-        ("str int float bool null timestamp merge value", scalar),
-        ("seq python/tuple", sequence),
-    ):
-        Loader.yaml_constructors |= {f"{tag}{kind}": constructor for kind in kinds.split()}
+    """The tables in documents of YAML; those that differ only in their headers, as repeated messages, count once."""
     # OpenCV's header is not a YAML directive; what mrcal packs of its corners is no YAML.
     body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
     body = re.sub(r"'optimization_inputs':\s*b'[^']*',?", lambda match: "\n" * match.group().count("\n"), body)
-    try:
-        _check_limits(yaml.parse(body, Loader=Loader), file)
-        documents = list(yaml.load_all(body, Loader=Loader))
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        problem = getattr(error, "problem", None) or str(error)
-        remedy = "save lists, M.tolist(), or the matrices by numpy.savez" if "python/" in problem else REWRITE_REMEDY
-        raise container_error(file, None if mark is None else mark.line + 1, str(problem), remedy) from error
-    except (RecursionError, ValueError) as error:
-        raise container_error(file, None, "YAML that is nested too deeply") from error
-    distinct: list[dict[str, Any]] = []
-    for document in documents:
-        # Separators of ROS' dumps start empty documents.
-        if document and not isinstance(document, dict):
-            raise container_error(file, 1, shown(document), "name a calibration file")
-        plain = {key: value for key, value in (document or {}).items() if key != "header"}
-        if plain and plain not in distinct:
-            distinct.append(plain)
-    if not distinct:
-        raise container_error(file, 1, "nothing", "name a calibration file")
-    return distinct
-
-
-def _check_limits(events: Iterable[Any], file: str) -> None:
-    """Check depth and number of entries before any object is built; `_plain` counts expanded aliases."""
+    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     depth = count = 0
-    for event in events:
-        name, line = type(event).__name__, event.start_mark.line + 1
-        count += 1
-        depth += name.endswith("StartEvent") - name.endswith("EndEvent")
-        if depth > DEPTH_MAX or count > ENTRIES_MAX:
-            raise container_error(file, line, LIMITS_TEXT, TRIM_REMEDY)
+    try:
+        # Before any object is built.
+        for event in yaml.parse(body, loader):
+            count += 1
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEPTH_MAX or count > ENTRIES_MAX:
+                raise _refused(file, event.start_mark.line + 1, *_LIMITS)
+        documents = [_plain(node, file) for node in yaml.compose_all(body, loader)]
+    except (yaml.YAMLError, ValueError) as error:
+        mark, problem = (getattr(error, name, None) for name in ("problem_mark", "problem"))
+        raise _refused(file, None if mark is None else mark.line + 1, str(problem or error)) from error
+    tables: list[dict[str, Any]] = []
+    # Separators of ROS' dumps start empty documents.
+    for document in filter(None, documents):
+        if not isinstance(document, dict):
+            raise _refused(file, 1, shown(document), "name a calibration file")
+        table = {key: value for key, value in document.items() if key != "header"}
+        if table and table not in tables:
+            tables.append(table)
+    if not tables:
+        raise _refused(file, 1, "nothing", "name a calibration file")
+    return tables
+
+
+def _constructed(node: yaml.Node, file: str) -> Any:
+    """One level of YAML without duplicate keys, numbers as OpenCV, ROS and Kalibr write them (`1.`, `2e-05`)."""
+    line, tag = node.start_mark.line + 1, node.tag.removeprefix("tag:yaml.org,2002:")
+    if tag not in _YAML_TAGS:
+        remedy = "save lists, M.tolist(), or the matrices by numpy.savez" if "python/" in tag else "remove the tag"
+        raise _refused(file, line, f"the tag {shown(tag)}", remedy)
+    if isinstance(node, yaml.ScalarNode):
+        value = None if node.style in ("'", '"', "|", ">") else number(node.value)
+        return node.value if value is None else value
+    if not isinstance(node, yaml.MappingNode):
+        return node.value
+    table: dict[str, yaml.Node] = {}
+    for key, item in node.value:
+        if str(key.value) in table:
+            raise _refused(file, key.start_mark.line + 1, f"{shown(str(key.value))} twice", "remove one of them")
+        table[str(key.value)] = item
+    return table
+
+
+def rigid(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """A homogeneous transformation (4, 4)."""
+    return np.vstack([np.column_stack([rotation, shift]), [0, 0, 0, 1.0]])
+
+
+class Entry(NamedTuple):
+    """Numbers of a file, flat and by shape: the tables around them from the top of the file, and their name there."""
+
+    tables: tuple[Keys, ...]
+    key: str
+    numbers: np.ndarray
+    shape: tuple[int, ...]
+
+    @property
+    def path(self) -> str:
+        """Dotted path, as users name it."""
+        return ".".join((*self.tables[-1].path, self.key))
+
+    @property
+    def place(self) -> str:
+        """Key and file, in words."""
+        return f"{escaped(self.path, 80)} of {self.tables[0].file}"
+
+    def refuse(self, what: str, **values: Any) -> InputError:
+        """The refusal of these numbers."""
+        text = filled(f"stereo-{what}", values)
+        return self.tables[-1].refuse(self.key, text["code"], text["allowed"], text["remedy"], text["found"])
+
+    def rotation(self, numbers: np.ndarray | None = None) -> np.ndarray:
+        """The rotation (3, 3): nearest to a matrix of nine numbers, or from Rodrigues' three."""
+        numbers = self.numbers if numbers is None else numbers
+        if numbers.size == 3:
+            if np.linalg.norm(numbers) > math.pi:
+                raise self.refuse("degrees", found=escaped(str(numbers.tolist()), 60))
+            return cv2.Rodrigues(numbers)[0]
+        matrix = numbers.reshape(3, 3)
+        deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
+        if not deviation <= ROTATION_TOLERANCE:
+            raise self.refuse("no-rotation", found=deviation, tolerance=ROTATION_TOLERANCE)
+        u, _, vt = np.linalg.svd(matrix)
+        return u @ vt
+
+    def pose(self) -> np.ndarray:
+        """The homogeneous transformation (4, 4) of 12 or 16 numbers."""
+        rows = self.numbers[:12].reshape(3, 4)
+        return rigid(self.rotation(rows[:, :3]), rows[:, 3])
+
+
+def letters(name: str) -> str:
+    """A name as it is looked up."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """Finite numbers, in their shape, of a number, nested lists or OpenCV's or ROS' rows, cols, data; else None."""
+    if isinstance(value, dict):
+        rows, columns, data = (value.get(name, value.get(name.title())) for name in ("rows", "cols", "data"))
+        numbers = _numbers(data)
+        if numbers is not None and "sizes" in value:
+            return numbers.ravel()
+        if (
+            numbers is not None
+            and isinstance(rows, int)
+            and isinstance(columns, int)
+            and rows * columns == numbers.size
+        ):
+            # In an untrusted file both may be negative.
+            return numbers.reshape(abs(rows), abs(columns))
+        if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
+            # BoofCV states the rotation of a pose in the same table as its shift.
+            shift, turn = _numbers([value[axis] for axis in "xyz"]), _numbers(value.get("rotation"))
+            if shift is None or turn is None or turn.size != 9:
+                return shift
+            return np.column_stack([turn.reshape(3, 3), shift])
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float | list):
+        return None
+    try:
+        numbers = np.array(value, dtype=float)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return numbers if numbers.size and (np.abs(numbers) <= NUMBER_MAX).all() else None
+
+
+def entries_of(tables: tuple[Keys, ...]) -> Iterator[Entry]:
+    """All entries with numbers, in the order of the file; lists that are no numbers as empty ones."""
+    keys = tables[-1]
+    for key, value in keys.values.items():
+        numbers = _numbers(value)
+        nothing = Entry(tables, key, np.empty(0), (0,))
+        if numbers is not None:
+            yield Entry(tables, key, numbers.ravel(), numbers.shape)
+        elif isinstance(value, dict):
+            if {"rows", "cols", "data"} <= {name.lower() for name in value}:
+                raise nothing.refuse("not-finite")
+            yield from entries_of((*tables, keys.table(key)))
+        elif isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+            for number, item in enumerate(value):
+                yield from entries_of((*tables, Keys(item, keys.file, keys.text, (*keys.path, key, str(number)))))
+        elif isinstance(value, list):
+            yield nothing
+        elif isinstance(value, str) and any(
+            letters(key) in words()["camera"][side]["names"].split() for side in ("width", "height")
+        ):
+            raise nothing.refuse("pixel-text", found=shown(value))
