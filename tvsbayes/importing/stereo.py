@@ -5,9 +5,8 @@ is looked up by its path in `data/words/stereo.toml`, and the numbers become a p
 assumptions in words. A name states a field and often a camera: `M1`, `K_left`, `cam0.intrinsics`, `Camera1.fx`. It fits
 a field by its count of numbers too: `P1` of 12 numbers is a projection, `p1` of one number a coefficient of a lens.
 R and T can follow from several entries: all must agree. Lengths of a pair are mm; Kalibr, ROS and EuRoC write metres,
-others the unit of the squares of their board.
-
-Other lenses are fitted to k1 k2 p1 p2 k3 by linear least squares over a grid of pixels, the camera matrix unchanged.
+others the unit of the squares of their board. Other lenses are fitted to k1 k2 p1 p2 k3 by linear least squares over a
+grid of pixels, the camera matrix unchanged.
 """
 
 from __future__ import annotations
@@ -123,16 +122,10 @@ class ForeignPair:
 
 
 @cache
-def _fields() -> dict[str, Any]:
-    """Counts of numbers that a field can have, and its names."""
-    return {**words()["camera"], **words()["pair"], **words()["made"]}
-
-
-@cache
 def _known_names() -> dict[str, list[tuple[str, str]]]:
     """Meanings by name: a field, and the side that the name states for it, "" where it states none."""
     found: dict[str, dict[tuple[str, str], None]] = {}
-    for field, stated in _fields().items():
+    for field, stated in words()["fields"].items():
         for name, mark in product(stated["names"].split(), words()["marks"]["camera"]):
             found.setdefault(f"{mark}{name}", {})[field, ""] = None
             for side in (*words()["sides"], "0", "1", "2") if field in words()["camera"] else ():
@@ -146,7 +139,9 @@ def _meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, st
     parts = (*entry.tables[-1].path, entry.key)
     for count in range(min(4, len(parts)), 0, -1) if not set(words()["marks"]["ignored"]) & set(parts) else ():
         known = _known_names().get(letters("".join(parts[-count:])), ())
-        matches = [match for match in known if of_any_count or entry.numbers.size in _fields()[match[0]]["counts"]]
+        matches = [
+            match for match in known if of_any_count or entry.numbers.size in words()["fields"][match[0]]["counts"]
+        ]
         if matches:
             # A name without a side may be in the table of one camera.
             around = next((side for part in reversed(parts[:-count]) if (side := _side(part))), "")
@@ -244,13 +239,13 @@ class _Fields:
             entry = self._stated_entry(field, name.removesuffix(".T"))
             turned = entry.numbers.reshape(3, 3).T.ravel() if entry.numbers.size == 9 else -entry.numbers
             return entry._replace(numbers=turned)
-        if len(hits) != 1 or hits[0].numbers.size not in _fields()[field.rstrip("12")]["counts"]:
+        if len(hits) != 1 or hits[0].numbers.size not in words()["fields"][field.rstrip("12")]["counts"]:
             paths = [entry.path for entry in self.entries]
             found = f"{len(hits)} entries of that name" if len(hits) != 1 else f"{hits[0].numbers.size} numbers"
+            said = f"{field}={escaped(name, 60)}: {found}"
             known = listed([escaped(path, 40) for path in paths], NAMES_LISTED)
             remedy = closest(name[:80], paths) if paths else "name a file that holds numbers"
-            said: dict[str, Any] = {"field": field, "name": escaped(name, 60), "found": found}
-            raise refused("stereo-stated-key", self.files[0].file, **said, paths=known, remedy=remedy)
+            raise refused("stereo-stated-key", self.files[0].file, said=said, paths=known, remedy=remedy)
         return hits[0]
 
     def _complete(self) -> None:
@@ -285,7 +280,7 @@ class _Fields:
         bare = {field.rstrip("12") for field in lacking}
         for entry in unknown:
             if names := {field for field, _ in _meanings(entry, of_any_count=True)} & bare:
-                counts = ", ".join(map(str, _fields()[min(names)]["counts"]))
+                counts = ", ".join(map(str, words()["fields"][min(names)]["counts"]))
                 remedy = "write k1 k2 p1 p2 k3, 0 for those that the lens lacks" if "D" in names else "correct it"
                 found = f"{entry.numbers.size} numbers" if entry.numbers.size else "no list of finite numbers"
                 return entry.refuse("count", counts=counts, remedy=remedy, found=found)
@@ -342,20 +337,18 @@ def foreign_pair(
     # The integer is at the centre of a pixel, so pictures begin at -1/2.
     M2[:2, 2] = (matrices[1][:2, 2] + 0.5) * scale - 0.5
     pose, warnings = _checked_pose(fields, as_stated, unit is None)
-    source, shift = source or pose.source, pose.matrix[:3, 3]
-    T = shift * _unit(fields, pose.shift.place, float(np.linalg.norm(shift)), unit_mm, unit, source)
+    source = source or pose.source or "opencv"
+    T = pose.matrix[:3, 3] * _unit(fields, pose, unit_mm, unit, source)
     values = {"image_width": width, "image_height": height, "right_image_size": right_size, "M1": matrices[0]}
     values |= {"D1": lenses[0], "M2": M2, "D2": lenses[1], "R": pose.matrix[:3, :3], "T": T}
     entries = zip(("M1", "M2", "D1", "D2", "R", "T"), (*of_matrices, *of_lenses, pose.turn, pose.shift), strict=True)
     places = {name: entry.place for name, entry in entries if entry is not None}
-    source = source or "opencv"
-    return ForeignPair(values, source, _made(fields, source), fields.notes, warnings, places)
+    return ForeignPair(values, source, _made(fields.pair, source), fields.notes, warnings, places)
 
 
-def _made(fields: _Fields, source: str) -> dict[str, Any]:
+def _made(pair: Mapping[str, Entry], source: str) -> dict[str, Any]:
     """How the calibration was made, as its files state it."""
-    stated = (float(fields.pair[name].numbers[0]) if name in fields.pair else 0.0 for name in words()["made"])
-    rms, views, columns, rows = stated
+    rms, views, columns, rows = (float(pair[name].numbers[0]) if name in pair else 0.0 for name in words()["made"])
     return {
         "rms_px": rms if 0 < rms <= RMS_PX_MAX else None,
         "views": int(views) if 3 <= views <= VIEWS_MAX else None,
@@ -400,11 +393,8 @@ def _sizes(
             raise entry.refuse("pixels", found=escaped(str(pixels.tolist()), 60))
         width, height = map(int, pixels)
         # Offset of the principal point from the middle of the pictures, as a share of their size.
-        share, share_by_rows = (
-            np.abs((matrix[:2, 2] - np.subtract(size, 1) / 2) / size).max()
-            for size in ((width, height), (height, width))
-        )
-        by_rows = matlab or share_by_rows < share
+        shares = [np.abs((matrix[:2, 2] + 0.5) / n - 0.5).max() for n in ((width, height), (height, width))]
+        by_rows = matlab or shares[1] < shares[0]
         if form == ("size",) and by_rows and width != height:
             width, height = height, width
             fields.notes += [f"{entry.place} is taken as rows, columns: {width} x {height} px"] * (not sizes)
@@ -431,14 +421,13 @@ def _coefficients(camera: Mapping[str, Entry], kind: str) -> tuple[np.ndarray, E
     if "D" in camera:
         return camera["D"].numbers, camera["D"]
     order = ("k1", "k2", "k3", "k4") if kind == "fisheye" and "radial" not in camera else RATIONAL[:5]
-    fields = {"radial": ("k1", "k2", "k3"), "tangential": ("p1", "p2")} | {
-        f"coefficient_{name}": (name,) for name in order
-    }
+    parts: dict[str, tuple[str, ...]] = {f"coefficient_{name}": (name,) for name in order}
+    parts |= {"radial": ("k1", "k2", "k3"), "tangential": ("p1", "p2")}
     stated: dict[str, float] = {}
-    for field in (field for field in fields if field in camera):
-        stated = dict(zip(fields[field], camera[field].numbers, strict=False)) | stated
+    for field in (field for field in parts if field in camera):
+        stated |= zip(parts[field], camera[field].numbers, strict=False)
     # What is called tangential alone lacks its other half.
-    first = next((camera[field] for field in fields if field in camera and field != "tangential"), None)
+    first = next((camera[field] for field in parts if field in camera and field != "tangential"), None)
     return np.array([stated.get(name, 0.0) for name in order]), first
 
 
@@ -505,11 +494,10 @@ def _poses(fields: _Fields, unit_open: bool) -> Iterator[_Pose]:
             pose = of_right @ np.linalg.inv(of_left) if field == "from_body" else np.linalg.inv(of_right) @ of_left
             yield _Pose(pose, right[field], right[field], source)
     turns = [turn for camera in (left, right) if (turn := camera.get("camera_R", camera.get("rectification")))]
-    if all("camera_T" in camera for camera in (left, right)) and len(turns) == 2:
-        of_left, of_right = (
-            rigid(t.rotation(), c["camera_T"].numbers) for t, c in zip(turns, fields.cameras, strict=True)
-        )
-        yield _Pose(of_right @ np.linalg.inv(of_left), turns[1], right["camera_T"])
+    shifts = [camera["camera_T"] for camera in (left, right) if "camera_T" in camera]
+    if len(turns) == len(shifts) == 2:
+        poses = [rigid(turn.rotation(), shift.numbers) for turn, shift in zip(turns, shifts, strict=True)]
+        yield _Pose(poses[1] @ np.linalg.inv(poses[0]), turns[1], shifts[1])
     if "P" in left and "P" in right and not ("R" in pair and "T" in pair and "rectification" not in left):
         yield _pose_of_projections(fields)
 
@@ -535,10 +523,10 @@ def _checked_pose(fields: _Fields, matrices: Sequence[np.ndarray], unit_open: bo
     if not poses:
         raise fields.missing(*[name for name in ("R", "T") if name not in pair] or ["R", "T"])
     first, *others = poses
-    if all("rectification" in c for c in cameras) and not any(
-        "P" in c or first.turn is c["rectification"] for c in cameras
-    ):
-        left_part, right_part = (c["rectification"].rotation() for c in cameras)
+    rectifications = [camera["rectification"] for camera in cameras if "rectification" in camera]
+    others_state_it = any("P" in camera for camera in cameras) or any(first.turn is entry for entry in rectifications)
+    if len(rectifications) == 2 and not others_state_it:
+        left_part, right_part = (entry.rotation() for entry in rectifications)
         others.append(first._replace(matrix=rigid(right_part.T @ left_part, np.zeros(3))))
     checks: list[Callable[[np.ndarray, np.ndarray], float]] = [other.deviation for other in others]
     for name, (of_left, of_right) in {"E": (np.eye(3), np.eye(3)), "F": matrices}.items():
@@ -549,8 +537,9 @@ def _checked_pose(fields: _Fields, matrices: Sequence[np.ndarray], unit_open: bo
         if not deviation(rotation, translation) <= ROTATION_TOLERANCE:
             turned = deviation(rotation.T, translation) <= ROTATION_TOLERANCE
             raise first.turn.refuse("transposed" if turned else "other-pose", path=first.turn.path)
-    is_open = not checks and first.plain and "R" not in fields.stated
-    return first, _doubted_direction(fields, first) if is_open else []
+    if checks or not first.plain or "R" in fields.stated:
+        return first, []
+    return first, _doubted_direction(fields, first)
 
 
 def _essential_deviation(essential: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> float:
@@ -588,10 +577,9 @@ def _doubted_direction(fields: _Fields, pose: _Pose) -> list[str]:
     return []
 
 
-def _unit(
-    fields: _Fields, place: str, length: float, unit_mm: float | None, of_format: str | None, source: str
-) -> float:
+def _unit(fields: _Fields, pose: _Pose, unit_mm: float | None, of_format: str | None, source: str) -> float:
     """Millimetres per unit of the file: as stated, or by the format; an implausible one must be stated."""
+    place, length = pose.shift.place, float(np.linalg.norm(pose.matrix[:3, 3]))
     if not 0 < length < math.inf:
         raise refused("stereo-no-baseline", place)
     if unit_mm is not None:

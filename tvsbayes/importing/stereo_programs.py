@@ -39,8 +39,9 @@ _DAMAGE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 @cache
 def words() -> dict[str, Any]:
-    """The names of fields, sides, lenses and programs."""
-    return tomllib.loads((shipped_data() / "words" / "stereo.toml").read_text(encoding="utf-8"))
+    """The names of sides, lenses and programs; `fields`: names of all fields and the counts of their numbers."""
+    tables = tomllib.loads((shipped_data() / "words" / "stereo.toml").read_text(encoding="utf-8"))
+    return tables | {"fields": {**tables["camera"], **tables["pair"], **tables["made"]}}
 
 
 def printed_trees(text: str) -> list[Values]:

@@ -69,6 +69,8 @@ def read_trees(data: bytes, file: str) -> list[Keys]:
             raise _refused(file, None, found, "write it again with its program") from error
         return [Keys(_plain(values if isinstance(values, dict) else {stem: values}, file), file, "")]
     text = text_of(data, file, _FORMATS, _NO_TEXT_REMEDY).text
+    if sum(map(text.count, ",\n[{<")) > ENTRIES_MAX:
+        raise _refused(file, None, *_LIMITS)
     try:
         printed = printed_trees(text) if len(text) <= PRINTED_CHARS_MAX else []
     except (ValueError, ArithmeticError) as error:
@@ -81,8 +83,6 @@ def read_trees(data: bytes, file: str) -> list[Keys]:
     if text.lstrip().startswith("<"):
         return [Keys(_plain(_xml(text, file), file), file, "")]
     if re.match(r"\s*\{\s*[\"}]", text):
-        if text.count(",") > ENTRIES_MAX:
-            raise _refused(file, None, *_LIMITS)
         return [parse_json(text.encode(), file)]
     if re.match(r"(?:\s|#.*\n)*+(\[[\w.\"-]+\]\s*(#.*)?$|[\w.-]+\s*=)", text, re.MULTILINE):
         return [parse_toml(text.encode(), file)]
@@ -126,11 +126,7 @@ def number(word: str) -> int | float | None:
 
 
 def _plain(value: Any, file: str) -> Any:
-    """Reduce values of Python and NumPy, elements of XML and nodes of YAML to tables, lists, numbers and text.
-
-    Raises:
-        InputError: above the limits, aliases of YAML expanded.
-    """
+    """Values of NumPy, elements of XML and nodes of YAML as tables, lists, numbers and text, within the limits."""
     count = 0
 
     def plain(value: Any, depth: int) -> Any:
@@ -204,7 +200,7 @@ _BINARY: dict[bytes, Callable[[bytes], Any]] = {
 
 def _rows(text: str) -> list[Any] | None:
     """Rows of numbers, as `numpy.savetxt` writes them; None for any other text, and beyond the limits."""
-    if not re.fullmatch(r"(?:[0-9eE+\-.,\s]++|#[^\n]*+)++", text) or sum(map(text.count, ", \n")) > ENTRIES_MAX:
+    if not re.fullmatch(r"(?:[0-9eE+\-.,\s]++|#[^\n]*+)++", text) or text.count(" ") > ENTRIES_MAX:
         return None
     rows = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
     numbers = [[number(word) for word in row] for row in rows if row]
@@ -215,8 +211,6 @@ def _xml(text: str, file: str) -> ElementTree.Element | dict[str, Any]:
     """The root of a document without document type and entities; a table of it where it has no children."""
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
         raise _refused(file, None, "a document type or entity")
-    if text.count("<") > ENTRIES_MAX:
-        raise _refused(file, None, *_LIMITS)
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
@@ -255,13 +249,12 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
     body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
     body = re.sub(r"'optimization_inputs':\s*b'[^']*',?", lambda match: "\n" * match.group().count("\n"), body)
     loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    depth = count = 0
+    depth = 0
     try:
-        # Before any object is built.
+        # The composer is recursive: depth is limited before it.
         for event in yaml.parse(body, loader):
-            count += 1
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEPTH_MAX or count > ENTRIES_MAX:
+            if depth > DEPTH_MAX:
                 raise _refused(file, event.start_mark.line + 1, *_LIMITS)
         documents = [_plain(node, file) for node in yaml.compose_all(body, loader)]
     except (yaml.YAMLError, ValueError) as error:
@@ -359,14 +352,9 @@ def _numbers(value: Any) -> np.ndarray | None:
         numbers = _numbers(data)
         if numbers is not None and "sizes" in value:
             return numbers.ravel()
-        if (
-            numbers is not None
-            and isinstance(rows, int)
-            and isinstance(columns, int)
-            and rows * columns == numbers.size
-        ):
+        if numbers is not None and isinstance(rows, int) and isinstance(columns, int):
             # In an untrusted file both may be negative.
-            return numbers.reshape(abs(rows), abs(columns))
+            return numbers.reshape(abs(rows), abs(columns)) if rows * columns == numbers.size else None
         if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
             # BoofCV states the rotation of a pose in the same table as its shift.
             shift, turn = _numbers([value[axis] for axis in "xyz"]), _numbers(value.get("rotation"))
@@ -400,7 +388,7 @@ def entries_of(tables: tuple[Keys, ...]) -> Iterator[Entry]:
                 yield from entries_of((*tables, Keys(item, keys.file, keys.text, (*keys.path, key, str(number)))))
         elif isinstance(value, list):
             yield nothing
-        elif isinstance(value, str) and any(
-            letters(key) in words()["camera"][side]["names"].split() for side in ("width", "height")
-        ):
-            raise nothing.refuse("pixel-text", found=shown(value))
+        elif isinstance(value, str):
+            width, height = (words()["fields"][field]["names"].split() for field in ("width", "height"))
+            if letters(key) in (*width, *height):
+                raise nothing.refuse("pixel-text", found=shown(value))
