@@ -144,7 +144,8 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
     of_epoch = [scale for least, scale in EPOCH_SCALES.items() if times.max(initial=0.0) >= least]
     if not is_number:
         times_s = times - times[0]
-        assumed.append("time_s: seconds since the first row")
+        of_minutes = "hours and minutes, so " * all(len(cell) <= 5 for cell in texts)
+        assumed.append(f"time_s: {of_minutes}seconds since the first row")
     elif unit is None and of_epoch:
         # Epochs in ns need more digits than a float has.
         times_s = [of_epoch[0] * float(Decimal(cell) - Decimal(texts[0])) for cell in texts]

@@ -30,8 +30,8 @@ from tvsbayes.importing.words import place_of
 
 SIDEREAL_ARCSEC_PER_S = 1296000.0 / 86164.0905
 """A turn in a sidereal day (Explanatory Supplement to the Astronomical Almanac, 3rd edition, table 15.3)."""
-PULSE_MAX = 1.2
-"""Largest rate of a pulse, sidereal rates: guide speeds of mounts are at most one."""
+PULSE_MIN, PULSE_MAX = 0.05, 1.2
+"""Least and largest rate of a pulse, sidereal rates: guide speeds of mounts are from a tenth to one."""
 RATES_AGREE, RATES_EQUAL = 0.25, 0.05
 """Largest relative differences: of two statements of the rate of a pulse, and of rates between which none decides."""
 TIME_MAX_S, RAW_MAX_PX, PULSE_MAX_MS, PIXEL_MAX_ARCSEC = 1e6, 1e5, 1e6, 1e4
@@ -66,7 +66,8 @@ _COLUMNS = {
 _NUMBER = r"(-?\d{1,9}(?:\.\d+)?)"
 _HEADER = {
     "pixel_arcsec": re.compile(rf"^Pixel scale = {_NUMBER} arc-sec/px"),
-    "x_rate": re.compile(rf"\bxRate = {_NUMBER}"),
+    # Adaptive optics have a line and an xRate of their own.
+    "x_rate": re.compile(rf"^Mount = .*\bxRate = {_NUMBER}"),
     "at_equator": re.compile(rf"^Norm rates RA = {_NUMBER}"),
     "guide_speed": re.compile(rf"\bRA Guide Speed = {_NUMBER} a-s/s"),
     "calibration_deg": re.compile(rf"\bCal Dec = {_NUMBER}"),
@@ -186,7 +187,9 @@ def _read(run: GuideRun, lines: Iterable[tuple[int, str]], axis: str, file: str)
                 run.counts["saturated"] += cells.get("ErrorCode") == "1"
                 is_new = False
             except (KeyError, TypeError, ValueError, csv.Error, StopIteration):
+                # Its pulse is unknown.
                 run.counts["damaged row"] += 1
+                is_new = True
         else:
             stated = {name: match[1] for name, pattern in _HEADER.items() if (match := pattern.search(line))}
             found = {name: t if name in ("mount", "pier") else float(t) for name, t in stated.items()} | found
@@ -265,9 +268,10 @@ def _common_rate(runs: Sequence[GuideRun]) -> float:
 
 def _logged_pulse(run: GuideRun, runs: Sequence[GuideRun], known: Mapping[str, Any], file: str) -> tuple[float, str]:
     """Rate of the axis during a pulse, arcsec/s, and its source: the hypothesis that other statements support."""
-    rates, header, most = _hypotheses(run, known), run.header, PULSE_MAX * SIDEREAL_ARCSEC_PER_S
+    rates, header = _hypotheses(run, known), run.header
+    least, most = PULSE_MIN * SIDEREAL_ARCSEC_PER_S, PULSE_MAX * SIDEREAL_ARCSEC_PER_S
+    answers = [Candidate("with your number", ("--assume", "pulse_arcsec_per_s=NUMBER"))]
     if not rates:
-        answers = [Candidate("with your number", ("--assume", "pulse_arcsec_per_s=NUMBER"))]
         raise asked("missing-value", file, line=run.line, answers=answers, run=run.number, values="xRate")
     cosine = math.cos(math.radians(known["declination_deg"]))
     stated = {
@@ -281,11 +285,14 @@ def _logged_pulse(run: GuideRun, runs: Sequence[GuideRun], known: Mapping[str, A
     near = min(rates, key=lambda name: abs(math.log(rates[name] / first)))
     pulse = rates[near]
     undecided = not evidence and max(rates.values()) / min(rates.values()) - 1 > RATES_EQUAL
-    if undecided or pulse > most or any(abs(rate / pulse - 1) > RATES_AGREE for rate in evidence.values()):
+    against = any(abs(rate / pulse - 1) > RATES_AGREE for rate in evidence.values())
+    if undecided or against or not least <= pulse <= most:
         says = {**rates, **evidence}
         text = ", ".join(f"{rate:.4g} arcsec/s ({name})" for name, rate in says.items())
         said: dict[str, Any] = {"run": run.number, "rates": text, "agree": RATES_AGREE, "most": PULSE_MAX}
-        raise asked("pulse-rates", file, line=run.line, each=[item for item in says.items() if item[1] <= most], **said)
+        possible = [item for item in says.items() if least <= item[1] <= most]
+        answers = [] if possible else answers
+        raise asked("pulse-rates", file, line=run.line, each=possible, answers=answers, least=PULSE_MIN, **said)
     text = "".join(f"; {name}: {rate:.4g}, {100 * (rate / pulse - 1):+.0f} %" for name, rate in evidence.items())
     return pulse, f"pulses turn the axis by {pulse:.4g} arcsec/s: {near}{text}; --assume pulse_arcsec_per_s="
 
@@ -309,7 +316,7 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
     pulse, text = known.get("pulse_arcsec_per_s", 0.0), "no corrections: the star's way is the axis' own"
     if "pulse_arcsec_per_s" in stated:
         text = f"pulses turn the axis by {pulse:g} arcsec/s, as stated"
-    elif not is_maxim:
+    elif any(row.pulse_ms for row in run.rows):
         pulse, text = _logged_pulse(run, runs, known, file)
     scale = f"declination {known['declination_deg']:g} deg: distances on the sky over {cosine:.4f}"
     assumed = [
@@ -351,6 +358,9 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
 
 def _check_known(run: GuideRun, known: Mapping[str, Any], file: str) -> None:
     """Ask for numbers that nobody states, and refuse those of which no angle comes."""
+    others = {name: n for name, n in run.counts.items() if name.startswith("rows of") and n >= len(run.frames)}
+    if others:
+        raise refused("other-device", file, line=run.line, rows=list(others), frames=len(run.frames))
     needed = {"pixel_arcsec": "the pixel scale", "declination_deg": "the declination"}
     if run.program == "MaxIm":
         needed |= {"pulse_arcsec_per_s": "the rate of a pulse"} if any(row.pulse_ms for row in run.rows) else {}
@@ -455,15 +465,19 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
     """
     known, worm = columns_of(table), _WORM.search(text)
     errors = [name for name, column in known.items() if _is_error(column)]
-    times = [name for name, column in known.items() if column.name.has("time") and column.numeric]
+    clocks = {name for name, column in known.items() if column.name.unit and column.name.unit.kind == "time"}
+    times = [n for n, column in known.items() if column.numeric and (n in clocks or column.name.has("time"))]
     if worm and not errors and len(known) == 3:
         times, _, errors = ([name] for name in known)
     if len(errors) != 1 or len(times) != 1:
         raise refused("periodic-error", table.file, line=table.first_line, times=len(times), errors=len(errors))
     time, error = known[times[0]], known[errors[0]]
-    scale_s = time.name.unit.scale if time.name.unit and time.name.unit.kind == "time" else 1.0
+    for column, kind in ((time, "time"), (error, "angle")):
+        if column.name.unknown or (column.name.unit and column.name.unit.kind != kind):
+            raise refused("error-unit", table.file, line=table.first_line, name=column.name.text, kind=kind)
     unit = error.name.unit
-    scale = 3600.0 * unit.scale * unit.per_number if unit and unit.kind == "angle" else 1.0
+    scale_s = time.name.unit.scale if time.name.unit else 1.0
+    scale = 3600.0 * unit.scale * unit.per_number if unit else 1.0
     pairs = [
         (scale_s * float(t), scale * float(e))
         for t, e in zip(time.cells, error.cells, strict=True)

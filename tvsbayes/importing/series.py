@@ -267,11 +267,16 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
 
 def _messages(data: bytes, file: str) -> Iterator[dict[str, Any]]:
     """JSON objects of a log, compressed or not, each ended by the byte 3 or by a line end."""
-    if data.startswith(b"\x1f\x8b"):
+    packed, data = (data, b"") if data.startswith(b"\x1f\x8b") else (b"", data)
+    while packed and len(data) <= INFLATED_BYTES_MAX:
         try:
-            data = zlib.decompressobj(31).decompress(data, INFLATED_BYTES_MAX)
+            part = zlib.decompressobj(31)
+            data += part.decompress(packed, INFLATED_BYTES_MAX + 1 - len(data))
         except zlib.error as error:
             raise refused("gzip", file) from error
+        packed = part.unused_data
+    if len(data) > INFLATED_BYTES_MAX:
+        raise refused("gzip-size", file, most=INFLATED_BYTES_MAX // 2**20)
     for match in re.finditer(rb"[^\x03\n]+", data):
         if len(match[0]) > MESSAGE_BYTES_MAX:
             raise refused("klipper-size", file, most=MESSAGE_BYTES_MAX)
