@@ -9,7 +9,15 @@ import pytest
 from importing.samples import MAXIM_PX_PER_ARCSEC, MAXIM_PX_PER_S, maxim_log, maxim_wave_arcsec
 
 from tvsbayes.errors import InputError, Question
-from tvsbayes.importing.guide import SIDEREAL_ARCSEC_PER_S, is_guide_log, read_runs, rows_of_run, run_rows
+from tvsbayes.importing.guide import (
+    SIDEREAL_ARCSEC_PER_S,
+    is_guide_log,
+    periodic_error_rows,
+    read_runs,
+    rows_of_run,
+    run_rows,
+)
+from tvsbayes.importing.table import table_of
 
 PIXEL, DECLINATION, CALIBRATED, RATE_PX = 2.0, 40.0, 10.0, 3.0
 AXIS_RATE = RATE_PX * PIXEL / math.cos(math.radians(CALIBRATED))
@@ -147,6 +155,7 @@ def test_several_runs_calibrations_and_empty_logs():
         ("Pixel scale = 2.0", "Pixel scale = ?", "does not state the pixel scale", "--assume pixel_arcsec=NUMBER"),
         (", xRate = 3.0", "", "does not state xRate", "--assume pulse_arcsec_per_s=NUMBER"),
         ("Dec = 40.0 deg", "Dec = 89.3 deg", "a declination of 89.3 deg", "nearer to the equator"),
+        ("xRate = 3.0", "xRate = 0.003", "0.05 to 1.2 x sidereal", "--assume pulse_arcsec_per_s=6.1"),
     ],
 )
 def test_values_missing_in_the_log_are_asked_for(old, new, message, remedy):
@@ -155,6 +164,50 @@ def test_values_missing_in_the_log_are_asked_for(old, new, message, remedy):
         rows_of_run(run, [], "log.txt", {})
     said = refused.value
     assert remedy in (said.asked_by(()) if isinstance(said, Question) else said).remedy
+
+
+def test_a_run_without_pulses_needs_no_rate():
+    """The guiding assistant watches a mount that nobody corrects; it may not even be calibrated."""
+    log = "\n".join(
+        [
+            *HEADER.format(norm="").replace(f"xAngle = 1.0, xRate = {RATE_PX}", "not calibrated").splitlines(),
+            *(
+                f'{k},{3 * k},"Mount",0,0,{motion_of(3 * k) * COSINE / PIXEL:.4f},0,0,0,0,,0,,,,900,30,0'
+                for k in range(1, 99)
+            ),
+        ]
+    )
+    (run,) = read_runs(log, "log.txt")
+    times, motion = motions(rows_of_run(run, [], "log.txt", {}))
+    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
+
+
+def test_adaptive_optics_have_a_rate_of_their_own_and_hide_the_axis():
+    optics = "AO = Some AO, connected, guiding enabled, xAngle = 1.0, xRate = 152.1, yAngle = 2.0, yRate = 150.0\n"
+    (run,) = read_runs(night().replace("Mount = Some", f"{optics}Mount = Some"), "log.txt")
+    times, motion = motions(rows_of_run(run, [], "log.txt", {}))
+    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
+    moved = "\n".join(line.replace("Mount", "AO") if k % 3 else line for k, line in enumerate(night().splitlines()))
+    (run,) = read_runs(moved.replace("AO = Some", "Mount = Some"), "log.txt")
+    with pytest.raises(InputError, match="rows of AO beside 100 frames of the mount"):
+        rows_of_run(run, [], "log.txt", {})
+
+
+@pytest.mark.parametrize(("head", "words"), [("Time (s),PE (px)", "PE"), ("Time (s),PE (zz)", "PE"), ("t (V),PE", "t")])
+def test_a_periodic_error_in_no_angle_is_refused(head, words):
+    names = head.split(",")
+    rows = {names[0]: [str(k) for k in range(9)], names[1]: [f"{k % 4}.5" for k in range(9)]}
+    table = table_of("pe.csv", "CSV", rows, range(1, 10))
+    with pytest.raises(InputError, match=rf"in column {words}"):
+        periodic_error_rows(table, "", {})
+
+
+def test_days_of_the_julian_calendar_are_days():
+    rows = {"MJD": [f"{60310 + k / 86400:.9f}" for k in range(9)], "PE": [f"{k % 4}.5" for k in range(9)]}
+    table = table_of("pe.csv", "CSV", rows, range(1, 10))
+    times = [reading["time_s"] for reading in periodic_error_rows(table, "", {}).readings]
+    # Days are written to 1e-9, 0.1 ms.
+    assert np.diff(times) == pytest.approx(np.ones(8), abs=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,28 @@ def test_a_clock_that_steps_back_goes_on(back_s, added_s):
     assert f"the clock steps back by {back_s:g} s in line 61" in table.kind and f"{added_s:g} s added" in table.kind
 
 
+def test_a_value_on_the_way_is_no_reading_at_the_command():
+    """A motor record logs its readback while it moves, and once more where it stops."""
+    lines = []
+    for k, command in enumerate([0, 1, 2, 3, 2, 1, 0, 1, 2]):
+        lines.append(line("m1.VAL", 10 * k, command))
+        lines += [line("m1.RBV", 10 * k + 0.5, command - 0.4), line("m1.RBV", 10 * k + 2, command)]
+    table = epics_table("\n".join([*lines, line("m1.VAL", 90, 5)]), "log", {})
+    commands, values = ([*map(float, table.columns[name])] for name in ("m1.VAL", "m1.RBV"))
+    assert commands == values
+    assert len(table) == 9 and "9 readings under way left out" in table.kind
+
+
+def test_all_parts_of_a_packed_log_are_read():
+    """Files of gzip that are joined are one; one that unpacks to more than the limit is refused, not cut."""
+    messages = [json.dumps(message).encode() + b"\x03" for message in klipper()]
+    whole = klipper_table(b"".join(messages), "log")
+    parts = klipper_table(b"".join(map(gzip.compress, messages)), "log")
+    assert parts.columns == whole.columns
+    with pytest.raises(InputError, match="at most 64 MiB when unpacked"):
+        klipper_table(gzip.compress(b"\n" * (65 * 2**20), 1), "log")
+
+
 def test_messages_that_would_expand_are_small():
     """Four messages of 20 million steps: the counter at an angle's time is computed, no step is stored."""
     bomb = {"first_clock": 0, "last_clock": 2 * 10**7 - 1, "first_step_time": 0.0, "last_step_time": 20.0}

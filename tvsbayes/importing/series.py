@@ -21,6 +21,7 @@ import numpy as np
 from tvsbayes.errors import Candidate, InputError, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import asked, refused
+from tvsbayes.importing.axis import MOVING_SHARE, ROWS_MIN
 from tvsbayes.importing.clock import date_time, forward
 from tvsbayes.importing.columns import line_through
 from tvsbayes.importing.table import ForeignTable, table_of
@@ -121,7 +122,12 @@ def epics_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable
         commands, moving = held, np.zeros(1)
     notes += [f"command {escaped(command)}, reading {escaped(value)}"]
     notes += [f"{int(moving.sum())} commands interpolated in time, {int((~inside).sum())} readings outside left out"]
-    return _joined(file, notes, read, commands, (command, value))
+    counts, rests = np.unique(before, return_counts=True)[1], np.ones(len(held), dtype=bool)
+    if not moving.any() and np.median(counts) < ROWS_MIN and np.mean(counts > 1) >= MOVING_SHARE:
+        # A value that is logged at its change, and soon after another one, is of an axis under way.
+        rests[:-1] = (np.diff(read.times_s) > INTERVAL_MAX_S) | (np.diff(before) > 0)
+        notes += [f"{int((~rests).sum())} readings under way left out"] * (not rests.all())
+    return _joined(file, notes, Series(read.times_s[rests], read.values[rests]), commands[rests], (command, value))
 
 
 def _scatter(commands: np.ndarray, values: np.ndarray) -> float:
