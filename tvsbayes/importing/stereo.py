@@ -25,8 +25,8 @@ import numpy as np
 from tvsbayes.errors import InputError, closest, escaped, listed
 from tvsbayes.files.documents import Keys
 from tvsbayes.importing.asking import refused
-from tvsbayes.importing.stereo_programs import FOCAL, RATIONAL, SIDES, Size, adapted, words
-from tvsbayes.importing.stereo_trees import ROTATION_TOLERANCE, Entry, entries_of, letters, rigid
+from tvsbayes.importing.stereo_programs import FOCAL, RATIONAL, SIDES, Size, adapted, rigid, words
+from tvsbayes.importing.stereo_trees import ROTATION_TOLERANCE, Entry, entries_of, letters
 
 GRID = 25
 """Number of grid points along each side of the picture."""

@@ -74,16 +74,15 @@ def _numbers(text: str) -> list[float]:
     return [float(word) for word in re.split(r"[\s,;\[\]]+", text) if NUMBER.fullmatch(word)]
 
 
-def _homogeneous(turn: Any, shift: Any) -> np.ndarray:
+def rigid(turn: Any, shift: Any) -> np.ndarray:
     """Transformation (4, 4) of Rodrigues' vector, a matrix, or a quaternion x y z w, and a shift."""
-    turn, pose = np.array(turn, float), np.eye(4)
+    turn = np.array(turn, float)
     if turn.size == 4:
         x, y, z, w = turn / np.linalg.norm(turn)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-    pose[:3, :3] = cv2.Rodrigues(turn)[0] if turn.size == 3 else turn.reshape(3, 3)
-    pose[:3, 3] = np.array(shift, float).ravel()
-    return pose
+    turn = cv2.Rodrigues(turn)[0] if turn.size == 3 else turn.reshape(3, 3)
+    return np.vstack([np.column_stack([turn, np.array(shift, float)]), [0, 0, 0, 1.0]])
 
 
 def _chosen(sizes: Iterable[Size], size: Size | None, file: str) -> Size:
@@ -114,7 +113,7 @@ def _kalibr_text(text: str) -> list[Values]:
         if f"cam{before}" in values and int(before) == int(after) + 1 and len(quaternion) == 4 and any(quaternion):
             # JPL's quaternion of Kalibr turns the other way than Hamilton's: that of the inverse rotation.
             inverse = [*(-part for part in quaternion[:3]), quaternion[3]]
-            values[f"cam{before}"]["T_cn_cnm1"] = _homogeneous(inverse, _numbers(shift)).tolist()
+            values[f"cam{before}"]["T_cn_cnm1"] = rigid(inverse, _numbers(shift)).tolist()
     if errors_px := _numbers(" ".join(re.findall(r"reprojection error: .*\+-(.*)", text))):
         values["rms_px"] = float(np.sqrt(np.sum(np.square(errors_px)) * 2 / len(errors_px)))
     return [values]
@@ -189,17 +188,11 @@ def _realsense(document: Values, file: str, size: Size | None, notes: list[str])
     found = [(f"camera {number}", *fields) for number, fields in enumerate(re.findall(_OBJECT, text), start=1)]
     for *name_and_size, rest in _STREAM.findall(text):
         lines = dict(re.findall(r"(\w+):([^\n]*)", rest))
-        found.append(
-            (*name_and_size, *(lines.get(key, "") for key in ("PPX", "PPY", "Fx", "Fy", "Distortion", "Coeffs")))
-        )
+        found.append((*name_and_size, *(lines.get(key, "") for key in "PPX PPY Fx Fy Distortion Coeffs".split())))
     for name, width, height, ppx, ppy, fx, fy, model, coefficients in found:
-        stream = {
-            "K": _numbers(f"{fx} {fy} {ppx} {ppy}"),
-            "D": _numbers(coefficients),
-            "distortion_model": model.strip(),
-        }
         size_px = int(width), int(height)
-        streams.setdefault(name, {})[size_px] = {**stream, "width": size_px[0], "height": size_px[1]}
+        stream: Values = {"K": _numbers(f"{fx} {fy} {ppx} {ppy}"), "D": _numbers(coefficients), "model": model.strip()}
+        streams.setdefault(name, {})[size_px] = stream | dict(zip(("width", "height"), size_px, strict=True))
     pair = STEREO_STREAMS if set(STEREO_STREAMS) <= set(streams) else tuple(streams)
     poses = [(turn, shift, False) for *ends, turn, shift in _POSE.findall(text) if tuple(ends) == pair]
     poses += [(turn, shift, True) for turn, shift in re.findall(_POSE_OBJECT, text)]
@@ -232,7 +225,7 @@ def _depthai(document: Values, file: str, size: Size | None, notes: list[str]) -
             if extrinsics["toCameraSocket"] not in cameras:
                 return socket, pose
             shift = [extrinsics["translation"][axis] for axis in "xyz"]
-            pose = _homogeneous(np.reshape(extrinsics["rotationMatrix"], 9), shift) @ pose
+            pose = rigid(extrinsics["rotationMatrix"], shift) @ pose
             socket = extrinsics["toCameraSocket"]
         raise broken
 
@@ -255,7 +248,7 @@ def _mrcal(document: Values, file: str, size: Size | None, notes: list[str]) -> 
     if not re.fullmatch(r"LENSMODEL_(PINHOLE|OPENCV(4|5|8|12))", model):
         raise refused("stereo-mrcal", file, model=escaped(model, 60))
     values = {"K": numbers[:4], "D": numbers[4:] or [0.0] * 4, "distortion_model": model.removeprefix("LENSMODEL_")}
-    pose = _homogeneous(document["extrinsics"][:3], document["extrinsics"][3:])
+    pose = rigid(document["extrinsics"][:3], document["extrinsics"][3:])
     return {**values, "size": document["imagersize"], "T_cam_body": pose.tolist()}
 
 
@@ -269,7 +262,7 @@ def _basalt(document: Values, file: str, size: Size | None, notes: list[str]) ->
         order = ("k1", "k2", "k3", "k4") if model == "kb4" else RATIONAL
         values[side] = {"K": [inner[key] for key in FOCAL], "camera_model": model, "size": pixels}
         values[side]["D"] = [inner[key] for key in order if key in inner] or [0.0] * 4
-        values[side]["T_body_cam"] = _homogeneous(turn, shift).tolist()
+        values[side]["T_body_cam"] = rigid(turn, shift).tolist()
     notes += [FIRST_TWO.format(len(content["intrinsics"]))] * (len(content["intrinsics"]) > 2)
     return values
 
@@ -288,7 +281,7 @@ def _calibio(document: Values, file: str, size: Size | None, notes: list[str]) -
         values[side] |= data["CameraModelCRT"]["CameraModelBase"]["imageSize"]
         values[side]["D"] = [stated.get(key, 0.0) for key in RATIONAL]
         turn, shift = [pose["rotation"][f"r{axis}"] for axis in "xyz"], [pose["translation"][axis] for axis in "xyz"]
-        values[side]["T_cam_body"] = _homogeneous(turn, shift).tolist()
+        values[side]["T_cam_body"] = rigid(turn, shift).tolist()
     notes += [FIRST_TWO.format(len(cameras))] * (len(cameras) > 2)
     return values
 

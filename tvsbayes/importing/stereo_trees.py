@@ -30,7 +30,7 @@ from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import array_of, arrays_of, read_bytes
 from tvsbayes.files.documents import Keys, parse_json, parse_toml
 from tvsbayes.importing.asking import filled, refused
-from tvsbayes.importing.stereo_programs import printed_trees, words
+from tvsbayes.importing.stereo_programs import printed_trees, rigid, words
 from tvsbayes.importing.text import text_of
 
 TREE_BYTES_MAX, PRINTED_CHARS_MAX = 4 * 1024 * 1024, 1_000_000
@@ -290,11 +290,6 @@ def _constructed(node: yaml.Node, file: str) -> Any:
             raise _refused(file, key.start_mark.line + 1, f"{shown(str(key.value))} twice", "remove one of them")
         table[str(key.value)] = item
     return table
-
-
-def rigid(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """A homogeneous transformation (4, 4)."""
-    return np.vstack([np.column_stack([rotation, shift]), [0, 0, 0, 1.0]])
 
 
 class Entry(NamedTuple):

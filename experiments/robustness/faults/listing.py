@@ -47,7 +47,7 @@ FAULTS = (
     # Heads: their URDF, and what is watched of them.
     Fault("the azimuth zero of a URDF has the wrong sign", "urdf.head_joints", Reads("azimuth", "-value"),
           "test_terms_of_joints_are_those_of_the_chain"),
-    Fault("a quaternion of a calibration turns the other way", "stereo_programs._homogeneous", Reads("w", "-value"),
+    Fault("a quaternion of a calibration turns the other way", "stereo_programs.rigid", Reads("w", "-value"),
           "test_the_same_pair_in_the_files_of_every_program"),
     Fault("a correction is applied to a model that has it", "HeadModel.urdf", Never("before"),
           "test_an_estimated_head_is_what_another_parser_reads"),
