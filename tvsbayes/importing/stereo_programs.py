@@ -171,7 +171,7 @@ def _zed(document: Values, file: str, size: Size | None, notes: list[str]) -> Va
 _STREAM = re.compile(
     r'Intrinsic of "([^"\n]+)" / ([0-9]{1,6})x([0-9]{1,6})(.*?)(?=Intrinsic of "|Extrinsic from "|\Z)', re.DOTALL
 )
-_POSE = re.compile(r'Extrinsic from "([^"\n]+)"\s+To\s+"([^"\n]+)"\s*:(.*?)Translation Vector:\s*([^\n]*)', re.DOTALL)
+_POSE = re.compile(r'Extrinsic from "([^"\n]+)"\s+To\s+"([^"\n]+)"\s*:([^"]*?)Translation Vector:\s*([^\n]*)')
 _OBJECT = (
     r"\[\s*([0-9]{1,6})x([0-9]{1,6})\s+p\[(\S+)\s+([^\]\s]+)\]\s+f\[(\S+)\s+([^\]\s]+)\]\s+"
     r"([A-Za-z][\w ]*?)\s*\[([^\]]*)\]\s*\]"
@@ -187,7 +187,7 @@ def _realsense(document: Values, file: str, size: Size | None, notes: list[str])
     text, streams = document["printed realsense"], dict[str, dict[Size, Values]]()
     found = [(f"camera {number}", *fields) for number, fields in enumerate(re.findall(_OBJECT, text), start=1)]
     for *name_and_size, rest in _STREAM.findall(text):
-        lines = dict(re.findall(r"(\w+):([^\n]*)", rest))
+        lines = dict(reversed(re.findall(r"(\w+):([^\n]*)", rest)))
         found.append((*name_and_size, *(lines.get(key, "") for key in "PPX PPY Fx Fy Distortion Coeffs".split())))
     for name, width, height, ppx, ppy, fx, fy, model, coefficients in found:
         size_px = int(width), int(height)
@@ -260,7 +260,7 @@ def _basalt(document: Values, file: str, size: Size | None, notes: list[str]) ->
         turn, shift = ([pose[key] for key in names] for names in (("qx", "qy", "qz", "qw"), ("px", "py", "pz")))
         inner, model = lens["intrinsics"], str(lens["camera_type"])
         order = ("k1", "k2", "k3", "k4") if model == "kb4" else RATIONAL
-        values[side] = {"K": [inner[key] for key in FOCAL], "camera_model": model, "size": pixels}
+        values[side] = {key: inner[key] for key in FOCAL} | {"camera_model": model, "size": pixels}
         values[side]["D"] = [inner[key] for key in order if key in inner] or [0.0] * 4
         values[side]["T_body_cam"] = rigid(turn, shift).tolist()
     notes += [FIRST_TWO.format(len(content["intrinsics"]))] * (len(content["intrinsics"]) > 2)
