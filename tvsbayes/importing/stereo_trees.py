@@ -323,7 +323,9 @@ class Entry(NamedTuple):
                 raise self.refuse("degrees", found=escaped(str(numbers.tolist()), 60))
             return cv2.Rodrigues(numbers)[0]
         matrix = numbers.reshape(3, 3)
-        deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
+        deviation = max(
+            np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.cross(matrix[0], matrix[1]) @ matrix[2] - 1.0)
+        )
         if not deviation <= ROTATION_TOLERANCE:
             raise self.refuse("no-rotation", found=deviation, tolerance=ROTATION_TOLERANCE)
         u, _, vt = np.linalg.svd(matrix)
