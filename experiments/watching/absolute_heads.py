@@ -32,7 +32,7 @@ from tvsbayes.errors import TvsError
 from tvsbayes.studies.executors import SINGLE_THREADED
 
 KINDS = tuple((encoder, sides) for encoder in ("output", "motor") for sides in ("recorded", "unrecorded"))
-SEED, NEXT_STARS = 7311, 40
+SEED, NEXT_STARS, NEXT_NIGHTS = 7311, 40, 20
 FIRST_NIGHT = datetime.datetime(2026, 3, 1, 20, 0)
 NIGHTS_APART = datetime.timedelta(hours=24)
 U_DEG = 0.0005
@@ -88,19 +88,34 @@ def turn(axis: int, angle_deg: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, Night, int]:
-    """Both nights of a head, and the number of stars of the first."""
+@dataclass(frozen=True)
+class Head:
+    """What a drawn head is: scales by axis, deg and hours, and the stars of its first night."""
+
+    stars: int
+    drift: tuple[float, ...]
+    stop_sd: tuple[float, ...]
+    error: tuple[float, ...]
+    length: tuple[float, ...]
+    half_play: tuple[float, ...]
+
+
+def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, list[Night], Head]:
+    """The first night of a head, and `NEXT_NIGHTS` that may come a day later, each drawn anew after the first."""
     encoder, recorded = kind
     rng = np.random.default_rng([SEED, KINDS.index(kind), seed])
     first, of_motor = int(rng.integers(40, 101)), encoder == "motor"
-    count = first + NEXT_STARS
-    night = np.arange(count) >= first
+    count = first + NEXT_NIGHTS * NEXT_STARS
     encoder_deg = np.stack([rng.uniform(*PAN_DEG, count), rng.uniform(*TILT_DEG, count)], axis=1)
-    hours = np.cumsum(rng.uniform(0.02, 0.04, count)) + np.where(night, 24.0 - 0.03 * first, 0.0)
+    # Each next night begins a day after the first began.
+    begun = np.r_[0, np.arange(first, count, NEXT_STARS)]
+    night = np.searchsorted(begun, np.arange(count), side="right") - 1
+    hours = np.cumsum(rng.uniform(0.02, 0.04, count))
+    hours += np.where(night > 0, 24.0, 0.0) - hours[begun][night]
     ratio = 1 + (0.005 if of_motor else 1e-3) * rng.standard_normal(2)
     half = np.abs(rng.standard_normal(2)) * (0.15 if of_motor else 0.0)
     begins = (0, first // 2) if rng.uniform() < 0.5 else (0,)
-    output, sides = np.empty((count, 2)), rng.choice([-1, 1], 2)
+    output, sides, scales = np.empty((count, 2)), rng.choice([-1, 1], 2), []
     for axis in range(2):
         q = ratio[axis] * encoder_deg[:, axis]
         sd, length = 0.02 * abs(rng.standard_normal()), 8.0 * np.exp(0.5 * rng.standard_normal())
@@ -110,13 +125,16 @@ def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, Night, int]:
         for k in range(count):
             play = max(half[axis] + varied[k] / 2, 0.0)
             # A shaft that somebody turned by hand comes from either side.
-            side = sides[axis] if k in begins or k == first else None
+            side = sides[axis] if k in begins or k in begun else None
             at = q[k] - play * side if side else float(np.clip(at, q[k] - play, q[k] + play))
             output[k, axis] = at
-        stops = np.exp(0.5 * rng.standard_normal()) * 0.002 * rng.standard_normal(count)
-        steps = np.sqrt(np.diff(hours, prepend=0.0)) * rng.standard_normal(count)
-        walk = 0.002 * abs(rng.standard_normal()) * np.cumsum(steps)
-        output[:, axis] += error + stops + walk
+        stop_sd, drift = np.exp(0.5 * rng.standard_normal()) * 0.002, 0.002 * abs(rng.standard_normal())
+        pause = np.where(np.arange(count) == begun[night], hours - hours[first - 1], np.diff(hours, prepend=0.0))
+        walk = np.cumsum(np.sqrt(np.r_[0.0, pause[1:]]) * rng.standard_normal(count))
+        # Every next night walks on from the end of the first.
+        walk += np.where(night > 0, walk[first - 1] - walk[begun - 1][night], 0.0)
+        output[:, axis] += error + stop_sd * rng.standard_normal(count) + drift * walk
+        scales.append((drift, stop_sd, sd, length, half[axis]))
     zero, lean = rng.normal(0, 0.3, 2), rng.normal(0, 0.1, 2)
     square, beam = rng.normal(0, 0.1, 2)
     pointing = turn(0, lean[0]) @ turn(1, lean[1]) @ turn(2, output[:, 0] + zero[0])
@@ -127,9 +145,11 @@ def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, Night, int]:
     seen += off / np.stack([np.cos(np.radians(seen[:, 1])), np.ones(count)], axis=1)
     words = (("right", "left")[int(sides[0] > 0)], ("down", "up")[int(sides[1] > 0)])
     named = words if recorded == "recorded" else None
-    parts = (slice(None, first), begins), (slice(first, None), (0,))
-    both = [Night(encoder_deg[p], seen[p], hours[p] - hours[p][0], b, named) for p, b in parts]
-    return both[0], both[1], first
+    nights = []
+    for k, at in enumerate(begun):
+        p = slice(at, first if k == 0 else at + NEXT_STARS)
+        nights.append(Night(encoder_deg[p], seen[p], hours[p] - hours[at], (0,) if k else begins, named))
+    return nights[0], nights[1:], Head(first, *map(tuple, zip(*scales, strict=True)))
 
 
 def tvsbayes(cwd: Path, *words: str) -> tuple[float, subprocess.CompletedProcess]:

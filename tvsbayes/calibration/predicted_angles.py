@@ -16,7 +16,7 @@ import numpy as np
 from tvsbayes.calibration.frames import P_INPUTS
 from tvsbayes.calibration.optics import Values, beam_components, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.calibration.states import ZERO_NAMES, uses_of, zero_shifts
+from tvsbayes.calibration.states import HOUR_S, ZERO_NAMES, homings_of, uses_of, zero_shifts
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.axes import AXES, SIDES, Axis
 from tvsbayes.instrument.campaign import Campaign, ordered_spots, pixels_of
@@ -35,6 +35,7 @@ class PredictedAngles:
     Attributes:
         state: state of the calibration.
         use: use as in the campaign.
+        homings: number of homings that were seen.
         other: counters of the other axis, one for all readings or one for each (r,).
 
     Raises:
@@ -57,6 +58,10 @@ class PredictedAngles:
         self._zeros = dict(zip(ZERO_NAMES, calibration.zeros[rows].T, strict=True))
         self._poses, self._pose = calibration.extrinsics[rows], calibration.extrinsics.mean(axis=0, keepdims=True)
         self._range_mm = _range_mm(campaign, self._poses[:, 3:].mean(axis=0))
+        self.homings = homings_of(campaign)[axis]
+        # An absolute zero walks from the first move on, and a use goes on from the last.
+        times_s = [move.time_s for move in campaign.moves if axis in campaign.rig.absolute]
+        self._walked_hours = (times_s[-1] - times_s[0]) / HOUR_S if times_s else 0.0
         self._home_sd_deg = (axis not in campaign.rig.absolute) * self._zeros[f"home_sd_deg.{axis}"]
 
     def expected(self, command: np.ndarray, side: np.ndarray, state: State | None = None) -> PredictedReadings:
@@ -101,7 +106,8 @@ class PredictedAngles:
 
     def scatter(self, side: np.ndarray, use: State, u: np.ndarray | float) -> dict[str, np.ndarray]:
         """Compute what does not repeat, by cause, of angles after one homing, each at a stop of its own."""
-        hours, once = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side)), np.eye(len(side))
+        hours = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side)) + self._walked_hours
+        once = np.eye(len(side))
         low, high = (self._noise[f"stop_sd_deg.{name}"][:, None] ** 2 for name in SIDES[self.axis])
         stops = np.where(np.asarray(side) > 0, high, low)
         walk = self._zeros[f"drift_deg_per_root_hour.{self.axis}"][:, None, None] ** 2

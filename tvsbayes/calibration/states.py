@@ -109,6 +109,13 @@ def states_of(campaign: Campaign) -> dict[Axis, State]:
     return {axis: state._replace(travel=0.0) for axis, state in means.items()}
 
 
+def homings_of(campaign: Campaign) -> dict[Axis, int]:
+    """Count the homings whose zeros were seen, by axis; 0 of an absolute encoder."""
+    segment = {move.move: move.segment for move in campaign.moves}
+    seen = len({segment[spot.move] for spot in ordered_spots(campaign)})
+    return {axis: 0 if axis in campaign.rig.absolute else seen for axis in AXES}
+
+
 def uses_of(campaign: Campaign) -> dict[Axis, Use]:
     """Compute the use of each axis as in a campaign: its longest time and travel after a homing, its temperatures."""
     first, states = _timeline(campaign)

@@ -24,6 +24,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_reading
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedAxis
+from tvsbayes.statistics.predicted_readings import frees_shift
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 SCATTERS, HOME_SDS = 4.0, 5.0
@@ -102,7 +103,7 @@ def _changes(machine: PredictedAxis, fresh: AxisRows) -> tuple[StatedChange, ...
     changes = [single_change("ratio", "per_command", _rounded(100.0 * size / fit.rows.travel), "%")]
     if fresh.both_sides:
         changes.append(single_change("play", "backlash", _rounded(size), machine.unit))
-    if fit.campaign.absolute or len(np.unique(fit.rows.zero)) > 1:
+    if not frees_shift(machine.homings):
         home = HOME_SDS * float(np.sqrt(np.mean(machine.scales["home_sd"] ** 2)))
         changes.append(single_change("zero", "offset", _rounded(max(size, home)), machine.unit))
     return tuple(changes)

@@ -19,10 +19,9 @@ from tvsbayes.calibration.calibration_file import calibration_of_arrays
 from tvsbayes.calibration.optics import beam_components, output_deg
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.calibration.predicted_angles import PredictedAngles
-from tvsbayes.calibration.states import states_at
+from tvsbayes.calibration.states import homings_of, states_at
 from tvsbayes.comparison.departures import LOOKS_MIN
 from tvsbayes.comparison.watched_looks import WatchedLooks
-from tvsbayes.compensation.aimed_promise import homings_of
 from tvsbayes.compensation.promise import bound_of, refuse_answer
 from tvsbayes.compensation.verification import (
     IDENTIFIED,
@@ -50,7 +49,7 @@ from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, ShiftFree, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
 from tvsbayes.results.store import stored_fit
-from tvsbayes.statistics.predicted_readings import PredictedReadings, less_means
+from tvsbayes.statistics.predicted_readings import PredictedReadings, frees_shift, less_means
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
@@ -275,7 +274,8 @@ def verify_looks(
     aim = np.zeros(len(error))
     travel = float(np.max(np.ptp(aimed.ratios * aimed.steps, axis=0)))
     # Axes whose scatter of homings was not read: one shift common to all of each does not count.
-    free = [homings_of(fit.campaign)[axis] == 1 for axis in AXES]
+    homings = homings_of(fit.campaign)
+    free = [frees_shift(homings[axis]) for axis in AXES]
     groups = np.tile(np.diag(free), len(aimed.steps))
     shift = travel**2 * (groups.T.astype(float) @ groups)
     judgement = judged(Trial(at, error, aim, _other(aimed), travel, shift, angles.noise), seed)

@@ -12,12 +12,13 @@ from tvsbayes.calibration.calibration_file import calibration_json, content_sha2
 from tvsbayes.calibration.optics import output_deg
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.calibration.predicted_angles import PredictedAngles
-from tvsbayes.calibration.states import uses_of
+from tvsbayes.calibration.states import homings_of, uses_of
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.promise import TRIED_STOPS, promised_sides, tried_use
 from tvsbayes.instrument.axes import AXES, SIDES, Axis
-from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.results.compensation_record import AimedPromise, SidePromise
+from tvsbayes.statistics.predicted_readings import frees_shift
 
 NODES = 257
 """Counters of an axis at which the calibration's own are computed; linear between them, to a few per cent of a step."""
@@ -59,7 +60,7 @@ def aimed_correction(calibration: Calibration, campaign: Campaign, axis: Axis, *
 
 
 def _axis_promise(
-    calibration: Calibration, campaign: Campaign, axis: Axis, by_ratio: bool, shift: bool, seed: int
+    calibration: Calibration, campaign: Campaign, axis: Axis, by_ratio: bool, seed: int
 ) -> dict[str, SidePromise]:
     """Compute the promise of an axis by side; none where it never moved."""
     own = AXES.index(axis)
@@ -72,15 +73,8 @@ def _axis_promise(
     machine = PredictedAngles(calibration, campaign, axis, other)
     between = float(correction.command[0]), float(correction.command[-1])
     _, tried = tried_use(machine, correction, between, nominal_line(campaign, axis), 0.0, seed)
-    promise = promised_sides(tried, shift, False)
+    promise = promised_sides(tried, frees_shift(machine.homings), False)
     return {name: promise[way] for name, way in zip(SIDES[axis], ("backward", "forward"), strict=True)}
-
-
-def homings_of(campaign: Campaign) -> dict[str, int]:
-    """Count the homings whose zeros were seen, by axis; 0 of an encoder that keeps its zero, which no shift frees."""
-    segment = {move.move: move.segment for move in campaign.moves}
-    seen = len({segment[spot.move] for spot in ordered_spots(campaign)})
-    return {axis: 0 if axis in campaign.rig.absolute else seen for axis in AXES}
 
 
 def aimed_promise(
@@ -98,10 +92,10 @@ def aimed_promise(
     Raises:
         NothingToEstimate: the calibration has no draws of the shifts of its zeros.
     """
-    homings, uses = homings_of(campaign), uses_of(campaign)
+    uses = uses_of(campaign)
     promise: dict[str, SidePromise] = {}
     for axis in AXES:
-        promise |= _axis_promise(calibration, campaign, axis, target == "urdf", homings[axis] == 1, seed)
+        promise |= _axis_promise(calibration, campaign, axis, target == "urdf", seed)
     low, high = uses["pan"].kelvin
     return AimedPromise(
         target=target,
@@ -112,7 +106,7 @@ def aimed_promise(
         reversal_steps=dict(calibration.overshoot_steps),
         hours=uses["pan"].hours,
         travel_steps={axis: use.travel for axis, use in uses.items()},
-        homings=homings,
+        homings=homings_of(campaign),
         promise=promise,
         unsaid=unsaid,
         state={axis: state._asdict() for axis, state in calibration.states.items()},

@@ -67,7 +67,8 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
         lines.append(f"within {number(made.travel_command, 6)} commands, off the drive's own line, but for one shift")
     else:
         lines += [
-            f"within {made.hours:.3g} h and {number(made.travel_command, 4)} commands of travel since homing",
+            f"within {made.hours:.3g} h and {number(made.travel_command, 4)} commands of travel "
+            f"{'since homing' if made.homings else 'after the campaign'}",
             f"arrive with at least {number(made.reversal_command, 4)} commands of travel on a side",
         ]
     return lines + [plainly(text) for text in made.unsaid]

@@ -2,9 +2,8 @@
 
 The table is of one state, the campaign's mean, for all positions and both sides. The promise is the 95 % quantile of
 single readings over the posterior and over use: time since homing, travel and temperature as in the campaign, the
-limits of the format and rounding by the controller included. Where no second homing was read, or an encoder keeps the
-zero, it is of errors less one common shift, since nothing but a prior tells how homings scatter. Commands in the
-campaign's counts, all else in its unit. No JAX.
+limits of the format and rounding by the controller included. Where one homing was read, it is of errors less one common
+shift (`statistics.predicted_readings.frees_shift`). Commands in the campaign's counts, all else in its unit. No JAX.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.predicted_stops import PredictedAxis
 from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
-from tvsbayes.statistics.predicted_readings import PredictedMachine, PredictedReadings
+from tvsbayes.statistics.predicted_readings import PredictedMachine, PredictedReadings, frees_shift
 from tvsbayes.statistics.streams import Stream, random_stream
 
 NODES_FEW, NODES_MANY = 13, 41
@@ -375,8 +374,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")
     nominal = _nominal(campaign, fitted, wish)
     low, high = float(rows.positions[0]), float(rows.positions[-1])
-    homings = len(np.unique(rows.zero))
-    shift = form.zero_free or homings == 1
+    shift = form.zero_free or frees_shift(machine.homings)
     with Job({"table": 1.0, "promise": 2.0}, progress) as job:
         job.begin("table")
         by_phase = form.holds == "table" and wish.period is not None
@@ -409,7 +407,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         reversal_command=run_up,
         hours=use.hours,
         travel_command=use.travel,
-        homings=homings,
+        homings=machine.homings,
         table=table,
         settings=shaped.settings,
         promise=promise,

@@ -146,8 +146,8 @@ def aimed_text(result: AimedPromise) -> str:
         "",
         promise_table(result),
         "",
-        f"the promise holds between these counters, within {two_digits(result.hours)} h and {travel} of travel since "
-        f"homing{_kelvin(result)}",
+        f"the promise holds between these counters, within {two_digits(result.hours)} h and {travel} of travel "
+        f"{_since(any(result.homings.values()))}{_kelvin(result)}",
         f"arrive with at least {run_up} of travel on a side",
         f"largest remaining error: {(HELPS | AIMED_HELPS)[_largest(result)]}",
         *_homing_remarks(result),
@@ -178,6 +178,10 @@ def _largest(result: Compensation | AimedPromise) -> str:
     return max(counted, key=lambda cause: max(promise.causes.get(cause, 0.0) for promise in result.sides.values()))
 
 
+def _since(homed: bool) -> str:
+    return "since homing" if homed else "after the campaign, from whose first move on the absolute zero walks"
+
+
 def _kelvin(result: Compensation | AimedPromise) -> str:
     low, high = result.kelvin or (0.0, 0.0)
     return f", at temperatures as read, over {two_digits(high - low)} K" if result.kelvin else ""
@@ -192,9 +196,7 @@ def _homing_remarks(result: Compensation | AimedPromise) -> list[str]:
         for side, promise in result.sides.items()
         if promise.error95_with_homing is not None
     ]
-    remark = (
-        "one homing was read, or none: the promise is of errors but for one shift common to all, as within one homing"
-    )
+    remark = "one homing was read: the promise is of errors but for one shift common to all, as within one homing"
     where = "home_sd_deg in [rig.prior]" if isinstance(result, AimedPromise) else "home_sd in [axis]"
     prior = f"with the next homing's error, which its prior alone determines, {where}, 95 % are at most: "
     return [f"{remark}; {prior}{', '.join(homed)} {escaped(result.unit)}"]
@@ -213,7 +215,7 @@ def _validity(result: Compensation) -> list[str]:
         ]
     return [
         f"the promise holds between these commands, within {two_digits(result.hours)} h and "
-        f"{result.travel_command:.4g} commands of travel since homing{_kelvin(result)}",
+        f"{result.travel_command:.4g} commands of travel {_since(bool(result.homings))}{_kelvin(result)}",
         f"arrive with at least {result.reversal_command:.4g} commands of travel on a side",
     ]
 

@@ -15,7 +15,6 @@ from msgspec import Meta, field, structs
 from tvsbayes.display import Shown, View
 from tvsbayes.results.records import (
     Count,
-    FromOne,
     HasFolder,
     NotNegative,
     Positive,
@@ -24,6 +23,7 @@ from tvsbayes.results.records import (
     read_record,
     stored_document,
 )
+from tvsbayes.statistics.predicted_readings import frees_shift
 
 COMPENSATION_FORMAT = "tvsbayes-compensation/1"
 AIMED_FORMAT = "tvsbayes-aimed-promise/1"
@@ -68,7 +68,7 @@ class SidePromise(Record, frozen=True, omit_defaults=True):
 
     Attributes:
         error95: 95 % of errors are at most this size, either sign; after removing one common shift where one homing
-            was read, or none, or the format leaves the zero open.
+            was read, or the format leaves the zero open.
         rms: root mean square of the same errors.
         without95: `error95` without compensation.
         causes: error that each cause alone would leave, 95 %.
@@ -102,8 +102,8 @@ class Compensation(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         resolution: least command that the controller carries out; 0 where it is fine.
         reversal_command: travel, in commands, after which an arrival is on one side whatever came before.
         hours, travel_command: limits since homing for which the promise holds: the campaign's longest segment.
-        homings: number in the campaign, 1 of an encoder that keeps its zero: the promise is then of errors less one
-            common shift, since the prior alone determines the scatter of homings.
+        homings: number whose zeros the campaign read; with 1 the promise is of errors less one common shift, since the
+            prior alone determines the scatter of homings; with 0, of an encoder that keeps its zero, of all.
         table: rows by increasing command.
         settings: numbers of formats that hold no table, by name.
         promise: promised errors, by side.
@@ -126,7 +126,7 @@ class Compensation(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
     reversal_command: NotNegative
     hours: NotNegative
     travel_command: NotNegative
-    homings: FromOne
+    homings: Count
     table: Annotated[tuple[TableRow, ...], Meta(min_length=2)]
     settings: dict[str, float]
     promise: Sides
@@ -170,7 +170,7 @@ class Compensation(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
     @property
     def shift_matters(self) -> bool:
         """Whether nothing but a prior tells how homings scatter: the promise is of errors less one common shift."""
-        return self.homings == 1 and not self.in_motion and not self.zero_free
+        return frees_shift(self.homings) and not self.in_motion and not self.zero_free
 
     @property
     def shift_free(self) -> bool:
@@ -236,7 +236,7 @@ class AimedPromise(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
     @property
     def free_axes(self) -> tuple[str, ...]:
         """Axes whose promise is of errors less one shift common to all, since nothing but a prior tells their zero."""
-        return tuple(axis for axis, count in self.homings.items() if count == 1)
+        return tuple(axis for axis, count in self.homings.items() if frees_shift(count))
 
     def shown(self) -> View:
         """Show the promise."""
@@ -283,7 +283,7 @@ class Verification(Shown, Record, frozen=True, kw_only=True, omit_defaults=True)
         before: errors of the same stops without the table, as predicted from the campaign.
         after: errors of the fresh readings.
         promised95: 95 % of errors of these stops are at most this size, by the promise; this, `before`, `after` and `p`
-            are of errors less one shift common to all where one homing was read, or none.
+            are of errors less one shift common to all where one homing was read.
         readings: number used; for a scanner looks, each of which shows both axes.
         millimetres: the same for points; only for a scanner.
         shift_free: `after` and `promised95` again, the name of 0.3; None where the scatter of homings was read.

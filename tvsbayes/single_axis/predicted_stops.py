@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.instrument.conditions import kelvin_at
+from tvsbayes.instrument.conditions import kelvin_at, pause_s
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import BACKLASH, CONTRAST, FLOOR, OFFSET, SLOPE, AxisModel, LinearPosterior
@@ -96,6 +96,17 @@ class PredictedAxis:
         linear, play = model.linear(self.w), model.line_terms(backlash=1.0)[None]
         self._backlash = linear.drawn(play, random_stream(seed, AxisStream.PREDICTED_STOPS, 1))[:, 0]
 
+    @property
+    def homings(self) -> int:
+        """Number of homings that were read."""
+        return 0 if self.fit.campaign.absolute else len(np.unique(self.fit.rows.zero))
+
+    @property
+    def _walked_hours(self) -> float:
+        """Time that the zero of an absolute encoder walks until the campaign ends, from which a use goes on."""
+        moves = self.fit.campaign.moves
+        return (moves[-1].time_s - moves[0].time_s) / HOUR_S if self.fit.campaign.absolute else 0.0
+
     @cached_property
     def state(self) -> State:
         """Mean state of the rows."""
@@ -138,13 +149,14 @@ class PredictedAxis:
 
     def scatter(self, side: np.ndarray, use: State, u: np.ndarray | float) -> dict[str, np.ndarray]:
         """Compute what does not repeat, by cause, of readings after one homing, each at a stop of its own."""
-        hours = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side))
+        hours = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side)) + self._walked_hours
         return self._scattered(np.zeros(len(side)), hours, np.arange(len(side)), side, np.asarray(u) ** 2)
 
     def read(self, campaign: AxisCampaign) -> PredictedReadings:
         """Predict the readings of another campaign of this axis, after homings of its own, at its own states.
 
-        Its commands are those that the mechanics got; the values of its readings are not used.
+        The zero of an absolute encoder walks on until then, by `created` of both. Its commands are those that the
+        mechanics got; the values of its readings are not used.
         """
         rows = replace(rows_of(campaign), line=self.fit.rows.line)
         play = play_places(rows, self._backlash)
@@ -156,6 +168,9 @@ class PredictedAxis:
             # Somewhere in the range that was read.
             unknown = float(np.ptp(self.fit.rows.kelvin)) ** 2 / 12
         hours = _since_homing(rows)
+        if self.fit.campaign.absolute:
+            pause = pause_s(self.fit.campaign.header, campaign.header, self.fit.campaign.moves[-1].time_s)
+            hours = hours + self._walked_hours + pause / HOUR_S
         shared, own = self._shared_errors(campaign, rows)
         state = State(hours, rows.path, rows.warm_s / HOUR_S, kelvin)
         repeated = self._readings(rows.command, play, state, shared)

@@ -9,6 +9,8 @@ predicted_stops` for an axis); who uses it knows no instrument. The contract:
   Without a state it is that of the campaign's mean (`state`), one for all commands and both sides: the state of tables
   and figures. The zero is the mean of the campaign's homings.
 - `use` is the distribution of states over which a promise holds.
+- `homings` is the number of homings whose zeros the campaign read; 0 of an absolute encoder, whose zero walks on from
+  the first move. With 1 nothing but a prior tells how homings scatter: `frees_shift`.
 - `shifts` is what a change of state adds, by cause, in `expected` as well; `scatter` is what does not repeat, by cause.
   A single reading is `expected` at its state plus all of `scatter`.
 - All have the same draws in the same order: sums of their means and covariances are by draw, `pooled` after the sum.
@@ -123,6 +125,11 @@ def log_mean(logs: Sequence[float] | np.ndarray) -> float:
     return float(np.logaddexp.reduce(logs) - np.log(len(logs)))
 
 
+def frees_shift(homings: int) -> bool:
+    """Whether the errors of an axis count less one shift common to all: its zero was read after one homing alone."""
+    return homings == 1
+
+
 class PredictedMachine(Protocol):
     """Readings of one axis, predicted from a fit: see the module for the contract."""
 
@@ -137,6 +144,10 @@ class PredictedMachine(Protocol):
     @property
     def use(self) -> Use:
         """Use as in the campaign: its longest time and travel after a homing, its range of temperatures."""
+
+    @property
+    def homings(self) -> int:
+        """Number of homings whose zeros were read; 0 of an absolute encoder."""
 
     def expected(self, command: np.ndarray, side: np.ndarray, state: State | None = None) -> PredictedReadings:
         """Predict the repeatable part at commands (r,), play taken up by arriving on a side (r,): 1 rising, -1 falling.
