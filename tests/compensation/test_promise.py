@@ -7,15 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from msgspec import structs
-from support.compensated import driven, results, table, to_and_fro, true_axis
+from support.compensated import absolute_results, driven, results, table, to_and_fro, true_axis
 
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensate, compensation_of
 from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.report.compensation_text import compensation_text
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_record import AxisResults, summarise_axis
+from tvsbayes.single_axis.predicted_stops import PredictedAxis
+from tvsbayes.statistics.predicted_readings import State
 
 
 def errors_after(result, seed: int) -> np.ndarray:
@@ -120,6 +123,24 @@ def test_python_makes_the_file_in_one_call(monkeypatch):
     monkeypatch.setattr("tvsbayes.compensation.promise.results_for", fitted_before)
     result = compensate(replace(results().fit.campaign, header={"serial": "A 7"}), "linuxcnc")
     assert result.machine == "A 7" and "machine: A 7" in result.text and result.text.startswith("-20.0")
+
+
+def test_an_absolute_encoder_promises_of_all_errors():
+    """No homing sets its zero: no shift is free. It walks from the first move on, and a use follows the last."""
+    homed, fit = results().fit, absolute_results().fit
+    made = compensation_of(absolute_results(), Wish("csv"))
+    assert made.homings == 0 and not made.shift_free and not made.shift_matters
+    for promise in made.promise.values():
+        assert promise.error95 == promise.error95_with_homing > promise.shift_free95 and promise.causes["homing"] == 0
+    text = compensation_text(made)
+    assert "but for one shift" not in text and "since homing" not in text and "homing was read" not in text
+    side, once = np.array([1, -1]), State(0.0, 0.0, 0.0, 0.0)
+    hours = fit.campaign.moves[-1].time_s / 3600.0
+    walked = PredictedAxis(fit)
+    drift = walked.scatter(side, once, 0.0)["drift"][:, 0, 0]
+    np.testing.assert_allclose(drift, walked.scales["drift_per_root_hour"] ** 2 * hours)
+    assert not PredictedAxis(homed).scatter(side, once, 0.0)["drift"].any()
+    assert PredictedAxis(homed).homings == 3 == table().homings
 
 
 def growing_screw(seed: int = 1) -> AxisCampaign:

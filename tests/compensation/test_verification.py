@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import datetime
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from msgspec import structs
-from support.compensated import driven, fresh, results, table, to_and_fro, true_axis
+from support.compensated import absolute_results, driven, fresh, results, table, to_and_fro, true_axis
 
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
@@ -25,6 +26,7 @@ from tvsbayes.results.compensation_record import (
     TWICE,
     WRONG_SIGN,
 )
+from tvsbayes.single_axis.predicted_stops import PredictedAxis
 
 
 @pytest.mark.parametrize(
@@ -76,6 +78,20 @@ def test_with_one_homing_errors_are_less_one_shift():
     page = compensation_section(once, check)
     assert "as within one homing" in page.items[-1]
     assert "one homing" not in " ".join(compensation_section(table(), None).items)
+
+
+def test_an_absolute_zero_walks_on_between_the_folders():
+    """Nothing is taken off; a day later the zero may lie where the drift of a day takes it."""
+    fit, new = absolute_results().fit, replace(fresh(3), absolute=True)
+    made = compensation_of(absolute_results(), Wish("csv"))
+    begun = datetime.datetime(2026, 3, 1, 12, 0)
+    dated = replace(fit.campaign, header={"created": begun})
+    fit = replace(fit, campaign=dated)
+    later = [replace(new, header={"created": begun + datetime.timedelta(hours=hours)}) for hours in (1.0, 1.0 + 24.0)]
+    checks = [verify_readings(fit, made, each) for each in later]
+    assert all(check.shift_free is None and check.after_with_homing is None for check in checks)
+    drift = float(np.mean(PredictedAxis(fit).scales["drift_per_root_hour"] ** 2))
+    assert checks[1].promised95 ** 2 - checks[0].promised95 ** 2 > 24.0 * drift
 
 
 def test_another_axis_is_none_of_the_worlds():

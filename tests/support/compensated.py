@@ -69,6 +69,17 @@ def results(ratio: float = 1.002) -> AxisResults:
 
 
 @cache
+def absolute_results() -> AxisResults:
+    """Nine positions from both sides, with an absolute encoder that is switched off half way."""
+    campaign = driven(true_axis(), *to_and_fro(np.linspace(-20, 20, 9)), seed=1)
+    half = len(campaign.moves) // 2
+    moves = [
+        replace(m, segment=int(m.move >= half), approach="backward" * (m.move in (0, half))) for m in campaign.moves
+    ]
+    return results_for(replace(campaign, moves=tuple(moves), absolute=True, stated={}))
+
+
+@cache
 def table(target: str = "csv", **wish) -> Compensation:
     """Of that fit."""
     return compensation_of(results(), Wish(target, **wish))

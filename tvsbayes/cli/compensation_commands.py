@@ -22,7 +22,7 @@ from tvsbayes.cli.app import (
     keep,
     report_line,
 )
-from tvsbayes.cli.kept_promise import promise_document, promise_of
+from tvsbayes.cli.kept_promise import finish_promised, promise_of, write_kept
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
@@ -121,21 +121,16 @@ def compensate(
         compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
     origin = plain(provenance(axis_hashes(data), seed, results.fit_id))
     document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **origin}
-    files: dict[str, str] = {}
-    if out is not None:
-        write_atomically(out, file_text(compensation, data).encode())
-        files[to] = str(out)
-        if second is not None and (yaml_text := file_beside(compensation, data)) is not None:
-            write_atomically(second, yaml_text.encode())
-            files["yaml"] = str(second)
-        record_path = output_place(campaign, "results") / "compensation.json"
-        held = record_path.read_bytes() if before is not None else b""
-        if keep(document, record_path):
-            files["compensation"] = str(record_path)
-            _name_other_promises(compensation, before, replaced, record_path.parent, held)
+    content = file_text(compensation, data)
+    contents = {to: (out, content), "yaml": (second, file_beside(compensation, data) or "")}
+    record_path = output_place(campaign, "results") / "compensation.json"
+    held = record_path.read_bytes() if out is not None and before is not None else b""
+    files = write_kept(campaign, document, contents)
+    if "compensation" in files:
+        _name_other_promises(compensation, before, replaced, record_path.parent, held)
     text = compensation_text(compensation, list(files.values()))
     if out is None:
-        text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(compensation, data)}".rstrip("\n")
+        text += f"\nnothing written: give -o FILE; it would hold:\n\n{content}".rstrip("\n")
     else:
         next_step = compensation.shown_by if compensation.in_motion else command_line("verify", campaign, "FRESH")
         text += f"\nnext: apply it, then {next_step}"
@@ -170,28 +165,19 @@ def export_calibration(
     data = read_campaign(campaign)
     with waiting() as progress:
         results = StoredOrFitted(data, report_line, progress)
-        calibration = results.calibration
-    origin = Origin.of(data)
-    promise = promise_of(results, kind, seed) if kind == "header" else None
-    stored = calibration_json(calibration, origin)
-    words = "" if promise is None else aimed_words(promise)
-    text = calibration_header(calibration, origin, words) if kind == "header" else json.dumps(stored, indent=1)
-    document: dict[str, Any] = {"header": text} if kind == "header" else dict(stored)
-    if promised and promise is not None:
-        document |= promise_document(promise, results, seed)
+        calibration, origin = results.calibration, Origin.of(data)
+    promise, kept = promise_of(results, kind, seed) if kind == "header" else (None, {})
+    document: dict[str, Any] = calibration_json(calibration, origin)
+    text = json.dumps(document, indent=1)
+    if kind == "header":
+        text = calibration_header(calibration, origin, "" if promise is None else aimed_words(promise))
+        document = {"header": text}
+    kept = kept if promised else {}
     if out is None:
-        finish(document, text.rstrip("\n"), as_json)
+        finish({**document, **kept}, text.rstrip("\n"), as_json)
         return
-    write_atomically(out, f"{text.rstrip()}\n".encode())
-    files, said = {kind: str(out)}, f"written: {escaped(str(out), 200)}"
-    if promised and promise is not None:
-        document.pop("header")
-        said = f"{aimed_text(promise)}\n{said}\nnext: aim with it, then {command_line('verify', campaign, 'FRESH')}"
-        place = output_place(campaign, "results") / "compensation.json"
-        files |= {"compensation": str(place)} if keep(document, place) else {}
-        finish({**document, "files": files}, said, as_json)
-        return
-    finish({"files": files}, said, as_json)
+    said = aimed_text(promise) if promise is not None and promised else ""
+    finish_promised(campaign, kept, {}, said, {kind: (out, f"{text.rstrip()}\n")}, as_json)
 
 
 def _check_choice(option: str, given: str, allowed: tuple[str, ...]) -> None:

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tvsbayes.cli.app import check_output, command_line, finish, keep, report_line, write_files
+from tvsbayes.cli.app import check_output, finish, report_line, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
-from tvsbayes.cli.kept_promise import promise_document, promise_of
+from tvsbayes.cli.kept_promise import finish_promised, promise_of
 from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.display import concise
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_kind import templates
-from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically, write_folder
+from tvsbayes.files.disk import make_folder, read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
@@ -293,52 +293,40 @@ def compensate(folder: Path, out: Path | None, force: bool, seed: int, as_json: 
         message = f"-o {escaped(str(out), 200)} would replace the model that this head is corrected from"
         raise InputError("occupied", message, remedy="name another file, or add --force")
     data = read_campaign(folder)
-    calibration, origin = accepted_calibration(data), Origin.of(data)
-    kind = data.rig.mechanism
-    terms = {f"backlash_deg.{axis}" for axis in AXES} | {f"degrees_per_step.{axis}" for axis in AXES}
+    results, origin = StoredOrFitted(data, report_line), Origin.of(data)
+    calibration, kind = accepted_calibration(data, results.stored), data.rig.mechanism
+    terms = {f"{block}.{axis}" for axis in AXES for block in ("backlash_deg", "degrees_per_step")}
     terms |= {term.name for term in kind.terms.values() if term.name in kind.documented}
     used = [k for k, name in enumerate(calibration.names) if name in terms and calibration.covariance[k, k] > 0]
     stated = data.header.get("urdf")
-    urdf: dict[str, Any] = stated if isinstance(stated, dict) else {}
-    origin_text = (
-        f"made by tvsbayes {origin.tvsbayes}, {origin.exported}, of {escaped(origin.campaign)}; applied to nothing yet"
-    )
+    made = f"made by tvsbayes {origin.tvsbayes}, {origin.exported}, of {escaped(origin.campaign)}"
+    made += "; applied to nothing yet"
     model = HeadModel(
         names=tuple(calibration.names[k] for k in used),
         values=calibration.mean[used],
         covariance=calibration.covariance[np.ix_(used, used)],
-        origin=origin_text,
+        origin=made,
         data_sha256=hashlib.sha256("".join(input_hashes(data).values()).encode()).hexdigest(),
-        steps_per_turn=urdf.get("steps_per_turn"),
+        steps_per_turn=stated.get("steps_per_turn") if isinstance(stated, dict) else None,
     )
     head = _joints_of(folder)
-    text, document = model.urdf(head), model.document(head)
+    document = model.document(head)
     lines = [f"{name} {concise(v, u)}" for name, v, u in zip(model.names, model.values, document["u"], strict=True)]
     lines += [
         f"{axis}: {joint['steps_per_rad']:.9g} counters per radian of joint {escaped(joint['name'])}"
         for axis, joint in document["joints"].items()
     ]
     lines += [f"not in the file: {words}" for words in document["unsaid"]]
-    results = StoredOrFitted(data, report_line)
-    promise = promise_of(results, "urdf", seed, UNSAID)
-    promised = {} if promise is None else promise_document(promise, results, seed)
+    promise, kept = promise_of(results, "urdf", seed, UNSAID)
     if promise is not None:
         lines.append(aimed_text(promise))
-        document["promise"] = promised["promise"]
-    files: dict[str, str] = {}
-    if out is None or yaml_path is None:
+        document["promise"] = kept["promise"]
+    if out is None:
         described = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
         lines.append(f"nothing written: give -o FILE; it would hold {described}, and FILE.yaml their covariance")
-    else:
-        write_atomically(out, text)
-        write_atomically(yaml_path, f"# {origin_text}\n{yaml.safe_dump(document, sort_keys=False)}".encode())
-        files = {"urdf": str(out), "yaml": str(yaml_path)}
-        place = output_place(folder, "results") / "compensation.json"
-        if promised and keep(promised, place):
-            files["compensation"] = str(place)
-        lines.append(f"written: {', '.join(files.values())}")
-        lines.append(f"next: load it in place of the old model, then {command_line('verify', folder, 'FRESH')}")
-    finish({**promised, **document, "target": "urdf", "files": files}, "\n".join(lines), as_json)
+    beside = f"# {made}\n{yaml.safe_dump(document, sort_keys=False)}"
+    contents = {"urdf": (out, model.urdf(head)), "yaml": (yaml_path, beside)}
+    finish_promised(folder, kept, {**document, "target": "urdf"}, "\n".join(lines), contents, as_json)
 
 
 def classic(folder: Path, as_json: bool) -> None:

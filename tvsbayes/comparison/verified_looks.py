@@ -22,16 +22,18 @@ from tvsbayes.calibration.predicted_angles import PredictedAngles
 from tvsbayes.calibration.states import homings_of, states_at
 from tvsbayes.comparison.departures import LOOKS_MIN
 from tvsbayes.comparison.watched_looks import WatchedLooks
-from tvsbayes.compensation.promise import bound_of, refuse_answer
+from tvsbayes.compensation.promise import refuse_answer
 from tvsbayes.compensation.verification import (
     IDENTIFIED,
     SEPARATE,
+    Judged,
     Trial,
     VerifyStop,
     discriminating_visits,
     judged,
     other_axis,
     size_of,
+    verification_of,
 )
 from tvsbayes.errors import InputError, NothingToEstimate, Reason
 from tvsbayes.estimators.campaign_arrays import in_sight
@@ -46,9 +48,9 @@ from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.model.parameter_space import physical_at
-from tvsbayes.results.compensation_record import Millimetres, ShiftFree, Verification
+from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
-from tvsbayes.results.store import stored_fit
+from tvsbayes.results.store import FitFiles, stored_fit
 from tvsbayes.statistics.predicted_readings import PredictedReadings, frees_shift, less_means
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
@@ -72,14 +74,18 @@ SURER = (
 """Remedies that make a rough answer an accepted one."""
 
 
-def accepted_calibration(campaign: Campaign) -> Calibration:
+def accepted_calibration(campaign: Campaign, stored: FitFiles | Reason | None = None) -> Calibration:
     """Return the calibration in force: that of `results/`, for these data, by an accepted fit.
+
+    Args:
+        campaign: the campaign.
+        stored: its stored fit, if it was read before.
 
     Raises:
         InputError: there is none for these data, or it is damaged.
         NotConverged: the fit is not accepted.
     """
-    stored = stored_fit(campaign, input_hashes(campaign))
+    stored = stored_fit(campaign, input_hashes(campaign)) if stored is None else stored
     calibration = None if isinstance(stored, Reason) else calibration_of_arrays(stored.arrays)
     if isinstance(stored, Reason) or calibration is None:
         raise InputError(
@@ -208,20 +214,19 @@ def _other(aimed: AimedLooks) -> np.ndarray:
     return covariance
 
 
-def _millimetres(
-    aimed: AimedLooks, promised: PredictedReadings, before: np.ndarray, after: np.ndarray, distance_mm: float, seed: int
-) -> Millimetres:
+def _millimetres(aimed: AimedLooks, trial: Trial, judgement: Judged, distance_mm: float, seed: int) -> Millimetres:
     """Compute errors of points at a distance, and the promised bound of 95 % of them, from those of mirror angles."""
-    slopes = aimed.slopes_mm(distance_mm)
+    slopes, kept = aimed.slopes_mm(distance_mm), less_means(trial.free)
 
     def lengths(angles: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.einsum("mxa,...ma->...mx", slopes, angles.reshape(*angles.shape[:-1], -1, 2)), axis=-1)
 
+    promised = judgement.promised.less(trial.free)
     drawn = lengths(promised.drawn(PROMISED_DRAWS, random_stream(seed, Stream.PROMISED_LENGTHS)))
     return Millimetres(
         distance_mm=distance_mm,
-        before=size_of(lengths(before)),
-        after=size_of(lengths(after)),
+        before=size_of(lengths(kept @ judgement.without.pooled().mean)),
+        after=size_of(lengths(kept @ trial.value)),
         promised95=float(np.quantile(drawn, 0.95)),
     )
 
@@ -276,26 +281,15 @@ def verify_looks(
     # Axes whose scatter of homings was not read: one shift common to all of each does not count.
     homings = homings_of(fit.campaign)
     free = [frees_shift(homings[axis]) for axis in AXES]
-    groups = np.tile(np.diag(free), len(aimed.steps))
-    shift = travel**2 * (groups.T.astype(float) @ groups)
-    judgement = judged(Trial(at, error, aim, _other(aimed), travel, shift, angles.noise), seed)
-    kept = less_means(groups)
-    before, after, promised = kept @ judgement.without.pooled().mean, kept @ error, judgement.promised.less(groups)
-    every = np.arange(len(aim))
-    first = size_of(after), bound_of(promised, aim, every)
-    return Verification(
-        verdict=judgement.verdict,
-        p=judgement.p,
-        worlds=judgement.worlds,
-        before=size_of(before),
-        after=first[0],
-        promised95=first[1],
-        readings=len(aimed.steps),
+    trial = Trial(at, error, aim, _other(aimed), travel, np.tile(np.diag(free), len(aimed.steps)), angles.noise)
+    judgement = judged(trial, seed)
+    return verification_of(
+        trial,
+        judgement,
+        len(aimed.steps),
+        homing=any(free),
         # Directions have no lengths.
-        millimetres=_millimetres(aimed, promised, before, after, distance_mm, seed) if looks.has_images else None,
-        shift_free=ShiftFree(*first) if any(free) else None,
-        after_with_homing=size_of(error) if any(free) else None,
-        promised95_with_homing=bound_of(judgement.promised, aim, every) if any(free) else None,
+        millimetres=_millimetres(aimed, trial, judgement, distance_mm, seed) if looks.has_images else None,
         unit="deg",
         needed=None if judgement.needed is None else -(-judgement.needed // 2),
         looks=True,

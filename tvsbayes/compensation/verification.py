@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,7 +46,7 @@ from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedAxis, longest_use
-from tvsbayes.statistics.predicted_readings import PredictedReadings, State, log_mean
+from tvsbayes.statistics.predicted_readings import PredictedReadings, State, less_means, log_mean
 from tvsbayes.statistics.streams import Stream, random_stream
 
 SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003
@@ -92,11 +92,6 @@ def other_axis(command: np.ndarray, side: np.ndarray) -> np.ndarray:
     return shape + 0.25 * np.eye(len(span))
 
 
-def _shift(made: Compensation, travel: float, count: int) -> np.ndarray:
-    """Compute the covariance of one shift common to all readings, where the promise is of errors without it."""
-    return (travel**2 if made.shift_free else 0.0) * np.ones((count, count))
-
-
 @dataclass(frozen=True)
 class Trial:
     """Fresh readings and their predictions by each hypothesis, of one axis or of both of a scanner.
@@ -106,7 +101,7 @@ class Trial:
         value, aim: readings, and aimed readings, shape (r,).
         other: relative covariance (r, r) of another machine's deviations.
         travel: range of the readings.
-        shift: covariance (r, r) of one shift that the format does not determine.
+        free: masks (g, r) of readings whose errors count but for one shift common to them; disjoint, g may be 0.
         noise: variances of the noise drawn at each visit, shape (r,).
     """
 
@@ -115,8 +110,13 @@ class Trial:
     aim: np.ndarray
     other: np.ndarray
     travel: float
-    shift: np.ndarray
+    free: np.ndarray
     noise: np.ndarray
+
+    @property
+    def shift(self) -> np.ndarray:
+        """Covariance (r, r) of the free shifts, which may be as large as the travel."""
+        return self.travel**2 * (self.free.T.astype(float) @ self.free)
 
 
 @dataclass(frozen=True)
@@ -176,10 +176,28 @@ def _p_value(promised: PredictedReadings, value: np.ndarray, shift: np.ndarray, 
     return float((1 + np.sum(squares(drawn) >= squares(value)[0])) / (REPLICATES + 1))
 
 
-def size_of(error: np.ndarray, shift: bool = False) -> ErrorSize:
-    """Compute the size of errors (r,), without their mean where a shift is free."""
-    left = error - error.mean() if shift else error
-    return ErrorSize(float(np.sqrt(np.mean(left**2))), float(np.max(np.abs(left))))
+def size_of(error: np.ndarray) -> ErrorSize:
+    """Compute the size of errors (r,)."""
+    return ErrorSize(float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))))
+
+
+def verification_of(trial: Trial, judgement: Judged, readings: int, *, homing: bool, **said: Any) -> Verification:
+    """State a result: errors and their bound less the free shifts; where those are of a `homing` with them as well."""
+    kept, error, every = less_means(trial.free), trial.value - trial.aim, np.arange(len(trial.aim))
+    first = size_of(kept @ error), bound_of(judgement.promised.less(trial.free), kept @ trial.aim, every)
+    return Verification(
+        verdict=judgement.verdict,
+        p=judgement.p,
+        worlds=judgement.worlds,
+        before=size_of(kept @ (judgement.without.pooled().mean - trial.aim)),
+        after=first[0],
+        promised95=first[1],
+        readings=readings,
+        shift_free=ShiftFree(*first) if homing else None,
+        after_with_homing=size_of(error) if homing else None,
+        promised95_with_homing=bound_of(judgement.promised, trial.aim, every) if homing else None,
+        **said,
+    )
 
 
 def _verdict(worlds: dict[str, float], p: float) -> Verdict:
@@ -260,28 +278,12 @@ def verify_readings(
             aim=aim,
             other=other_axis(fresh.command, fresh.side),
             travel=fit.rows.travel,
-            shift=_shift(made, fit.rows.travel, len(fresh.value)),
+            free=np.ones((int(made.shift_free), len(aim)), dtype=bool),
             noise=machine.noise(fresh.side, fresh.variance),
         )
         judgement = judged(trial, seed)
-    stops, error, before = np.arange(len(aim)), fresh.value - aim, judgement.without.pooled().mean - aim
-    free = made.shift_free
-    after, promised95 = size_of(error, free), bound_of(judgement.promised, aim, stops, free)
-    return Verification(
-        verdict=judgement.verdict,
-        p=judgement.p,
-        worlds=judgement.worlds,
-        before=size_of(before, free),
-        after=after,
-        promised95=promised95,
-        readings=len(fresh.value),
-        unit=campaign.unit,
-        needed=judgement.needed,
-        remarks=_remarks(made, fresh, campaign),
-        shift_free=ShiftFree(after, promised95) if made.shift_matters else None,
-        after_with_homing=size_of(error) if made.shift_matters else None,
-        promised95_with_homing=bound_of(judgement.promised, aim, stops) if made.shift_matters else None,
-    )
+    said = {"unit": campaign.unit, "needed": judgement.needed, "remarks": _remarks(made, fresh, campaign)}
+    return verification_of(trial, judgement, len(fresh.value), homing=made.shift_matters, **said)
 
 
 AGAIN = "run `tvsbayes compensate` on this folder, and apply what it writes"
@@ -496,7 +498,7 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
 
     promised = at(1.0, 1.0)
     mean, covariance = promised.pooled()
-    shift = _shift(made, fit.rows.travel, len(mean))
+    shift = fit.rows.travel**2 * float(made.shift_free)
     noise = np.minimum(machine.noise(side, variance), 0.999 * np.diag(covariance))
     off = [at(0.0, 0.0).pooled().mean - mean]
     play = at(1.0, 0.0).pooled().mean - mean
