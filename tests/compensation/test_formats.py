@@ -13,7 +13,7 @@ from msgspec import structs
 from support.compensated import results, table
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS, Origin, Wish
+from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS, Origin, Wish, is_table_of
 from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.errors import InputError
 from tvsbayes.files.own_outputs import require_own
@@ -51,6 +51,18 @@ def test_every_file_is_known_as_ours(target, tmp_path):
     (tmp_path / "table").write_text(text.replace("tvsbayes", "somebody"))
     with pytest.raises(InputError, match="would be replaced"):
         require_own(tmp_path / "table", "compensation")
+
+
+@pytest.mark.parametrize("target", FORMATS)
+def test_a_file_without_id_is_known_by_the_digest_of_what_it_holds(target):
+    """As those of 0.3.0, whatever their remarks say; not one of other data or of another table."""
+    made, text = table(target, **WISHES.get(target, {})), written(target)
+    old = "\n".join(line for line in text.splitlines() if "its promise is in results/" not in line)
+    assert is_table_of(old, made, ORIGIN.data_sha256)
+    shifted = [structs.replace(r, command=r.command + 1, forward=r.forward + 1) for r in made.table]
+    settings = {name: 1.01 * value for name, value in made.settings.items()}
+    other = structs.replace(made, table=tuple(shifted), settings=settings)
+    assert not is_table_of(old, other, ORIGIN.data_sha256) and not is_table_of("", made, ORIGIN.data_sha256)
 
 
 def test_csv_holds_the_readings_expected():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from dataclasses import replace
 from functools import cache
 
@@ -125,9 +127,26 @@ def test_the_file_says_its_period_and_is_known_again():
     assert [float(cell) for cell in first.split(",")[1:3]] == pytest.approx(
         [table().table[0].add_forward, table().table[0].add_backward]
     )
-    assert "# period: 600 commands" in text and is_table_of(text, table())
-    assert not is_table_of(text, structs.replace(table(), offset=table().offset + 1))
+    assert "# period: 600 commands" in text and is_table_of(text, table(), "")
+    assert not is_table_of(text, structs.replace(table(), offset=table().offset + 1), "")
     assert "by phase" in compensation_text(table())
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_a_header_by_phase_adds_the_same_in_every_turn(tmp_path):
+    made = compensation_of(results(), Wish("header", period=TURN))
+    (tmp_path / "axis.h").write_text(file_text(made, results().fit.campaign))
+    at = [-1800.0, -700.5, -0.001, 0.0, 300.0, 599.9, 600.0, 1234.0]
+    calls = "".join(f'printf("%.9f %.9f\\n", axis_sent({c}, 1), axis_sent({c}, -1));' for c in at)
+    (tmp_path / "try.c").write_text(f'#include <stdio.h>\n#include "axis.h"\nint main(void) {{ {calls} return 0; }}\n')
+    subprocess.run(["cc", "-std=c99", "-Wall", "-Werror", "-o", "try", "try.c"], cwd=tmp_path, check=True)
+    out = subprocess.run([tmp_path / "try"], capture_output=True, text=True, check=True).stdout
+    cells = np.array([[float(cell) for cell in line.split()] for line in out.splitlines()])
+    for column, side in enumerate((1, -1)):
+        # Nine decimals printed; the table of the file has nine digits.
+        expected = Correction.of(made).sent(np.array(at), np.full(len(at), side))
+        np.testing.assert_allclose(cells[:, column], expected, atol=2e-8)
+    assert made.promise == table().promise and any("by phase" in text for text in made.unsaid)
 
 
 @pytest.mark.parametrize(("period", "message"), [(300.0, "eight positions"), (2000.0, "whole period")])

@@ -67,7 +67,7 @@ def compensate(
     letter: Annotated[str, typer.Option("--letter", help="Axis in settings of grbl: X, Y, Z, A, B or C.")] = "X",
     period: Annotated[
         float | None,
-        typer.Option("--period", help="Of a table by phase, pec or csv, in commands (pec: strongest wave)."),
+        typer.Option("--period", help="Of a table by phase: pec, csv or header, in commands (pec: strongest wave)."),
     ] = None,
     force: Force = False,
     seed: Seed = 0,

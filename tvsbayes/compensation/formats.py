@@ -6,6 +6,7 @@ of the promise. Numbers have a decimal point in any locale.
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -137,7 +138,11 @@ def _header(made: Compensation, origin: Origin) -> str:
     for name, field in (("command", "command"), ("forward", "add_forward"), ("backward", "add_backward")):
         values = ", ".join(_c_double(getattr(row, field)) for row in made.table)
         arrays.append(f"static const double axis_{name}[AXIS_ROWS] = {{{values}}};")
-    return HEADER.replace("@SAID@", said).replace("@ROWS@", str(len(made.table))).replace("@ARRAYS@", "\n".join(arrays))
+    text = HEADER
+    if period := made.settings.get("period_command"):
+        by_phase = PHASE_IN_C.replace("@PERIOD@", _c_double(period))
+        text = text.replace("axis_sent", "axis_of_one_turn").replace("\n#endif\n", by_phase)
+    return text.replace("@SAID@", said).replace("@ROWS@", str(len(made.table))).replace("@ARRAYS@", "\n".join(arrays))
 
 
 def _c_double(value: float) -> str:
@@ -164,6 +169,20 @@ static double axis_sent(double command, int side)
     while (command > axis_command[k + 1]) k++;
     return command + add[k] + (add[k + 1] - add[k]) * (command - axis_command[k])
                               / (axis_command[k + 1] - axis_command[k]);
+}
+
+#endif
+"""
+PHASE_IN_C = """
+static const double axis_period = @PERIOD@;
+
+/* The same for a command of any turn: what is added repeats with the period, in commands. */
+static double axis_sent(double command, int side)
+{
+    double turns = (double)(long long)((command - axis_command[0]) / axis_period);
+    double at = command - turns * axis_period;
+    if (at < axis_command[0]) at += axis_period;
+    return command - at + axis_of_one_turn(at, side);
 }
 
 #endif
@@ -242,12 +261,16 @@ _REMARKS = re.compile(r"(?s)<!--.*?-->|/\*.*?\*/|^[ \t]*[#;][^\n]*$", re.MULTILI
 _TABLE_ID = re.compile(r"\btable ([0-9a-f]{16}): its promise")
 
 
-def is_table_of(text: str, made: Compensation) -> bool:
-    """Whether a file holds a table: by its id, in one of 0.3.0, which has none, by all that it holds beside remarks."""
+def content_digest(text: str) -> str:
+    """SHA-256 of all that a file holds beside remarks and white space, by which one of 0.3.0, without id, is known."""
+    return hashlib.sha256(" ".join(_REMARKS.sub("", text).split()).encode()).hexdigest()
+
+
+def is_table_of(text: str, made: Compensation, data_sha256: str) -> bool:
+    """Whether a file holds a table made of data with this hash: by its id, or by the digest of what it holds."""
     if named := _TABLE_ID.search(text):
         return named[1] == made.table_id
-    written = FORMATS[made.target].write(made, Origin("", ""))
-    return bool(text.strip()) and _REMARKS.sub("", text).split() == _REMARKS.sub("", written).split()
+    return content_digest(text) == content_digest(FORMATS[made.target].write(made, Origin("", data_sha256)))
 
 
 @dataclass(frozen=True)
@@ -277,7 +300,7 @@ _NO_POSITION = "error by position remains: the format has no entry for it"
 FORMATS: Mapping[str, Format] = {
     "csv": Format("table", _csv, by_phase=True),
     "linuxcnc": Format("table", _linuxcnc),
-    "header": Format("table", _header),
+    "header": Format("table", _header, by_phase=True),
     # gnea/grbl, doc/markdown/settings.md: $100 to $102 are steps per mm; no setting compensates backlash.
     "grbl": Format(
         "ratio", _grbl, in_force="$100", unsaid=("grbl has no correction of play: all play remains", _NO_POSITION)
@@ -327,7 +350,7 @@ class Wish:
         resolution: least command that is carried out; 0 where it is fine.
         in_force: present value of the setting, for formats that change one.
         letter: letter of the axis in the settings of grbl: X, Y, Z, A, B or C.
-        period: period of a table by phase, in commands; None: of pec that of the strongest wave, of csv no such table.
+        period: period of a table by phase, in commands; None: of pec that of the strongest wave, else no such table.
     """
 
     target: str = "csv"

@@ -461,7 +461,7 @@ def _by_position_alone(
         return ()
     return (
         "the axis goes round: the table is by position, for the turns read alone; one by phase, both sides, is "
-        f"`--to csv --period N`, N the commands of a turn, about {number(turn, 4)}",
+        f"`--to csv --period N` (or header), N the commands of a turn, about {number(turn, 4)}",
     )
 
 
@@ -510,7 +510,8 @@ def compensate(
     return structs.replace(made, text=file_text(made, campaign))
 
 
-def _origin(campaign: AxisCampaign) -> Origin:
+def origin_of(campaign: AxisCampaign) -> Origin:
+    """Program, folder and data of a table's file."""
     digest = hashlib.sha256("".join(sorted(axis_hashes(campaign).values())).encode()).hexdigest()
     name = campaign.path.name if campaign.path else "a campaign"
     return Origin(f"tvsbayes {own_version()} of {name}", digest)
@@ -518,10 +519,10 @@ def _origin(campaign: AxisCampaign) -> Origin:
 
 def file_text(made: Compensation, campaign: AxisCampaign) -> str:
     """Return the content of the file."""
-    return FORMATS[made.target].write(made, _origin(campaign))
+    return FORMATS[made.target].write(made, origin_of(campaign))
 
 
 def file_beside(made: Compensation, campaign: AxisCampaign) -> str | None:
     """Return the content of the second file, YAML; None where the format has none."""
     beside = FORMATS[made.target].beside
-    return None if beside is None else beside(made, _origin(campaign))
+    return None if beside is None else beside(made, origin_of(campaign))

@@ -18,7 +18,7 @@ import numpy as np
 
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import is_table_of
-from tvsbayes.compensation.promise import bound_of, reading_u, refuse_answer
+from tvsbayes.compensation.promise import bound_of, origin_of, reading_u, refuse_answer
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX
@@ -311,10 +311,11 @@ def table_in(campaign: AxisCampaign, path: Path) -> Compensation | None:
         InputError: the file, or a promise in `results/`, cannot be read.
     """
     text, inputs = read_bytes(path, JSON_BYTES_MAX).decode(errors="replace"), axis_hashes(campaign)
+    data = origin_of(campaign).data_sha256
     folder = None if campaign.path is None else campaign.path / "results"
     for name in [] if folder is None else sorted(each.name for each in folder.glob("compensation*.json")):
         keys = stored_document(campaign, name, (COMPENSATION_FORMAT,), inputs)
-        if keys is not None and is_table_of(text, made := read_record(Compensation, keys, AGAIN)):
+        if keys is not None and is_table_of(text, made := read_record(Compensation, keys, AGAIN), data):
             return made
     return None
 
