@@ -167,7 +167,7 @@ def export_calibration(
         results = StoredOrFitted(data, report_line, progress)
         calibration, origin = results.calibration, Origin.of(data)
     promise, kept = promise_of(results, kind, seed) if kind == "header" else (None, {})
-    document: dict[str, Any] = calibration_json(calibration, origin)
+    document: dict[str, Any] = dict(calibration_json(calibration, origin))
     text = json.dumps(document, indent=1)
     if kind == "header":
         text = calibration_header(calibration, origin, "" if promise is None else aimed_words(promise))

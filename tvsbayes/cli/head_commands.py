@@ -16,7 +16,7 @@ import numpy as np
 
 from tvsbayes.cli.app import check_output, finish, report_line, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
-from tvsbayes.cli.kept_promise import finish_promised, promise_of
+from tvsbayes.cli.kept_promise import Contents, finish_promised, promise_of
 from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.display import concise
 from tvsbayes.errors import InputError, escaped, refusal, typed
@@ -325,7 +325,7 @@ def compensate(folder: Path, out: Path | None, force: bool, seed: int, as_json: 
         described = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
         lines.append(f"nothing written: give -o FILE; it would hold {described}, and FILE.yaml their covariance")
     beside = f"# {made}\n{yaml.safe_dump(document, sort_keys=False)}"
-    contents = {"urdf": (out, model.urdf(head)), "yaml": (yaml_path, beside)}
+    contents: Contents = {"urdf": (out, model.urdf(head)), "yaml": (yaml_path, beside)}
     finish_promised(folder, kept, {**document, "target": "urdf"}, "\n".join(lines), contents, as_json)
 
 

@@ -34,7 +34,8 @@ def promise_of(
     if not isinstance(stored, Reason) and answer_of(stored.keys) == "accepted":
         try:
             promise = aimed_promise(results.calibration, results.campaign, target, unsaid, seed=seed)
-            origin = plain(provenance(inputs_of(results.campaign), seed, stored.keys.values.get("fit_id")))
+            fit = stored.keys.values.get("fit_id")
+            origin = plain(provenance(inputs_of(results.campaign), seed, None if fit is None else str(fit)))
             return promise, {"format": AIMED_FORMAT, **promise.as_json(), **origin}
         except NothingToEstimate as error:
             why = str(error)
