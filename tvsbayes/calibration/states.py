@@ -109,7 +109,7 @@ def states_of(campaign: Campaign) -> dict[Axis, State]:
     return {axis: state._replace(travel=0.0) for axis, state in means.items()}
 
 
-def homings_of(campaign: Campaign) -> dict[Axis, int]:
+def homings_of(campaign: Campaign) -> dict[str, int]:
     """Count the homings whose zeros were seen, by axis; 0 of an absolute encoder."""
     segment = {move.move: move.segment for move in campaign.moves}
     seen = len({segment[spot.move] for spot in ordered_spots(campaign)})

@@ -106,7 +106,7 @@ def aimed_promise(
         reversal_steps=dict(calibration.overshoot_steps),
         hours=uses["pan"].hours,
         travel_steps={axis: use.travel for axis, use in uses.items()},
-        homings=dict(homings_of(campaign)),
+        homings=homings_of(campaign),
         promise=promise,
         unsaid=unsaid,
         state={axis: state._asdict() for axis, state in calibration.states.items()},
