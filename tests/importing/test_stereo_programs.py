@@ -62,6 +62,21 @@ BROKEN = {
         SMALL,
         "no pose between",
     ),
+    "a pose without its shift, before another pose": (
+        lambda: edited(PRINTED, "Translation Vector: -0.1186", "Vector: -0.1186"),
+        SMALL,
+        "no pose between",
+    ),
+    "half of MATLAB's coefficients": (
+        lambda: (FOREIGN / "matlab_json/c.json").read_text().replace("RadialDistortion", "Radial"),
+        None,
+        "no D1 under",
+    ),
+    "a focal length of Basalt that is none": (
+        lambda: edited("basalt/calibration.json", '"fy": 811.9', '"fy": true'),
+        None,
+        "no M1 under",
+    ),
     "BoofCV without a shift": (lambda: edited("boofcv/stereo.yaml", "  z:", "  depth:"), None, "no T under"),
     "BoofCV's other lens": (
         lambda: edited("boofcv/stereo.yaml", "pinhole_radial_tangential", "universal_omni"),

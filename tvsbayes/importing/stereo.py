@@ -508,10 +508,9 @@ def _pose_of_projections(fields: _Fields) -> _Pose:
     left_p, right_p = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
     if np.any(left_p[:2, 3] != 0) or not np.any(right_p[:2, 3]) or not (right_p[0, 0] > 0 and right_p[1, 1] > 0):
         raise right["P"].refuse("projection")
-    turns = [c["rectification"].rotation() if "rectification" in c else np.eye(3) for c in (left, right)]
-    if "M" not in left and "fx" not in left:
-        # The files contain the rectified pair itself.
-        turns = [np.eye(3), np.eye(3)]
+    # Without matrices the files contain the rectified pair itself.
+    raw = "M" in left or "fx" in left
+    turns = [c["rectification"].rotation() if raw and "rectification" in c else np.eye(3) for c in (left, right)]
     shift = np.array([right_p[0, 3] / right_p[0, 0], right_p[1, 3] / right_p[1, 1], 0.0])
     matrix = rigid(turns[1].T @ turns[0], turns[1].T @ shift)
     return _Pose(matrix, right["P"], right["P"], "ros" if fields.by_file else "")
@@ -544,10 +543,9 @@ def _checked_pose(fields: _Fields, matrices: Sequence[np.ndarray], unit_open: bo
 
 def _essential_deviation(essential: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> float:
     """Deviation of [T]x R from an essential matrix of any length and sign."""
-    x, y, z = translation
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    product_of_columns = np.cross(translation, rotation, axisb=0, axisc=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        stated, expected = (e / np.linalg.norm(e) for e in (essential, cross @ rotation))
+        stated, expected = (e / np.linalg.norm(e) for e in (essential, product_of_columns))
     return float(min(np.abs(stated - expected).max(), np.abs(stated + expected).max()))
 
 

@@ -139,11 +139,8 @@ def _zed(document: Values, file: str, size: Size | None, notes: list[str]) -> Va
     parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=(";", "#"))
     parser.read_string(document["printed zed"])
     sections = {name.lower(): dict(section) for name, section in parser.items()}
-    names = {
-        (width, height): name
-        for name, (width, height) in words()["zed"].items()
-        if all(f"{side}_cam_{name}" in sections for side in SIDES)
-    }
+    complete = [name for name in words()["zed"] if {f"left_cam_{name}", f"right_cam_{name}"} <= set(sections)]
+    names = {(width, height): name for name, (width, height) in words()["zed"].items() if name in complete}
     width, height = _chosen(names, size, file)
     name = names[width, height]
 
@@ -216,28 +213,26 @@ def _depthai(document: Values, file: str, size: Size | None, notes: list[str]) -
         # CAM_B and CAM_C are used where the rectification was never stored.
         sockets = [1, 2]
     broken = refused("stereo-chain", file, sockets=listed([str(s) for s in cameras], 8) if cameras else "none")
-
-    def chained(socket: int) -> tuple[int, np.ndarray]:
-        """The last socket of a camera's chain, and the transformation (4, 4) to it."""
-        pose = np.eye(4)
-        for _ in cameras if socket in cameras else ():
-            extrinsics = cameras[socket]["extrinsics"]
+    if not set(sockets) <= set(cameras):
+        raise broken
+    values, ends = Values(), set[int]()
+    for side, socket in zip(SIDES, sockets, strict=True):
+        camera, end, pose = cameras[socket], socket, np.eye(4)
+        for _ in cameras:
+            extrinsics = cameras[end]["extrinsics"]
             if extrinsics["toCameraSocket"] not in cameras:
-                return socket, pose
+                break
             shift = [extrinsics["translation"][axis] for axis in "xyz"]
-            pose = rigid(extrinsics["rotationMatrix"], shift) @ pose
-            socket = extrinsics["toCameraSocket"]
-        raise broken
-
-    ends, poses = zip(*map(chained, sockets), strict=True)
-    if ends[0] != ends[1]:
-        raise broken
-    values: Values = {}
-    for side, socket, pose in zip(SIDES, sockets, poses, strict=True):
-        camera, kind = cameras[socket], cameras[socket].get("cameraType", 0)
+            pose, end = rigid(extrinsics["rotationMatrix"], shift) @ pose, extrinsics["toCameraSocket"]
+        else:
+            raise broken
+        ends.add(end)
+        kind = camera.get("cameraType", 0)
         values[side] = {key: camera.get(key) for key in ("intrinsicMatrix", "distortionCoeff", "width", "height")}
         values[side]["camera_model"] = DEPTHAI_MODELS.get(kind, f"cameraType {escaped(str(kind), 20)}")
         values[side]["T_body_cam"] = pose.tolist()
+    if len(ends) > 1:
+        raise broken
     notes.append(f"sockets {sockets[0]} (left) and {sockets[1]} (right)")
     return values
 
