@@ -165,6 +165,17 @@ def test_a_value_on_the_way_is_no_reading_at_the_command():
     assert len(table) == 9 and "9 readings under way left out" in table.kind
 
 
+def test_a_series_in_two_entries_of_an_archive_is_one():
+    def entry(name: str, first: int) -> dict:
+        data = [
+            {"secs": 1_700_000_000 + 5 * k, "val": float(k), "nanos": 0, "severity": 0} for k in range(first, first + 9)
+        ]
+        return {"meta": {"name": name}, "data": data}
+
+    text = json.dumps([entry(name, first) for first in (0, 9) for name in ("m1.VAL", "m1.RBV")])
+    assert len(epics_table(text, "log", {})) == 18
+
+
 def test_all_parts_of_a_packed_log_are_read():
     """Files of gzip that are joined are one; one that unpacks to more than the limit is refused, not cut."""
     messages = [json.dumps(message).encode() + b"\x03" for message in klipper()]

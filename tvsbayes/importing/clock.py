@@ -21,11 +21,13 @@ DAY_S = 86400.0
 SUMMER_TIME_S = 3600.0
 EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
 """Seconds per unit by the least number that counts this unit since 1970; smaller numbers are seconds."""
+SHEET_DAYS = (36526.0, 55153.0)
+"""Days of the years 2000 to 2050 as spreadsheets count them."""
 TIME_MAX = 1e20
 """Largest number of a time: nanoseconds of 3000 years."""
 STEPS_USUAL = 50
 """Number of times before a step back that give the usual step."""
-_OF_DAY = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:\.[0-9]{1,9})?)(?: ?([AaPp])[Mm])?)?")
+_OF_DAY = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:[.,][0-9]{1,9})?)(?: ?([AaPp])[Mm])?)?")
 _ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")
 _FORMS = ("", "%Y-%m-%dT%I:%M:%S %p", "%d-%b-%Y %H:%M:%S", "%b %d, %Y %H:%M:%S")
 """Of dates; "" is ISO 8601."""
@@ -52,7 +54,7 @@ def time_of_day(text: str) -> float | None:
     """Seconds since midnight of "9:05:12.25", "9:05" or "9:05:12 PM"; None for other texts."""
     if (match := _OF_DAY.fullmatch(text)) is None:
         return None
-    hour, minute, second = int(match[1]), int(match[2]), float(match[3] or 0.0)
+    hour, minute, second = int(match[1]), int(match[2]), float((match[3] or "0").replace(",", "."))
     hour = hour % 12 + 12 * (match[4] in "Pp") if match[4] else hour
     return hour * 3600.0 + minute * 60.0 + second if hour < 24 and minute < 60 and second < 61 else None
 
@@ -134,8 +136,9 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
     if "time_s" not in cells:
         return None
     texts, unit = cells.text("time_s"), unit or name_of(cells.columns["time_s"]).unit
-    is_number = all(map(NUMBER.fullmatch, texts))
-    written = [*map(float, texts)] if is_number else [*_written(texts)]
+    numbers = [float(cell) if NUMBER.fullmatch(cell) else None for cell in texts]
+    is_number = 2 * numbers.count(None) <= len(texts)
+    written = numbers if is_number else [*_written(texts)]
     for row, time in enumerate(written):
         if time is None or not abs(time) <= TIME_MAX:
             allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
@@ -152,6 +155,10 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
         assumed.append(f"time_s: counted in {of_epoch[0]:g} s since 1970, so seconds since the first row")
     else:
         times_s = times * (unit.scale if unit is not None and unit.kind == "time" else 1.0)
+        if unit is None and len(times) and SHEET_DAYS[0] <= times.min() and times.max() <= SHEET_DAYS[1]:
+            assumed.append(
+                "time_s: in s, though spreadsheets count days by such numbers; a column of days is named Time (d)"
+            )
     seconds, backs = forward(map(float, times_s), repeat("time_s"))
     for back in backs:
         if is_number or back.added_s != SUMMER_TIME_S or len(backs) > 1 or any(map(_ZONE.search, texts)):

@@ -65,18 +65,18 @@ _COLUMNS = {
 """Columns that a log needs, by the beginning of the line that names them."""
 _NUMBER = r"(-?\d{1,9}(?:\.\d+)?)"
 _HEADER = {
-    "pixel_arcsec": re.compile(rf"^Pixel scale = {_NUMBER} arc-sec/px"),
+    "calibrated_speed": rf"Calibration guide speeds: RA = {_NUMBER} a-s/s",
+    "pixel_arcsec": rf"^Pixel scale = {_NUMBER} arc-sec/px",
     # Adaptive optics have a line and an xRate of their own.
-    "x_rate": re.compile(rf"^Mount = .*\bxRate = {_NUMBER}"),
-    "at_equator": re.compile(rf"^Norm rates RA = {_NUMBER}"),
-    "guide_speed": re.compile(rf"\bRA Guide Speed = {_NUMBER} a-s/s"),
-    "calibration_deg": re.compile(rf"\bCal Dec = {_NUMBER}"),
-    "declination_deg": re.compile(rf"^(?:RA = [^,]*, *)?Dec = {_NUMBER} deg"),
-    "pulse_max_ms": re.compile(rf"\bMax RA duration = {_NUMBER}"),
-    "mount": re.compile(r"^Mount = ([^,]*)"),
-    "pier": re.compile(r"\bPier side = (\w+)"),
+    "x_rate": rf"^Mount = .*\bxRate = {_NUMBER}",
+    "at_equator": rf"^Norm rates RA = {_NUMBER}",
+    "guide_speed": rf"\bRA Guide Speed = {_NUMBER} a-s/s",
+    "calibration_deg": rf"\bCal Dec = {_NUMBER}",
+    "declination_deg": rf"^(?:RA = [^,\n]*, *)?Dec = {_NUMBER} deg",
+    "pulse_max_ms": rf"\bMax RA duration = {_NUMBER}",
+    "mount": r"^Mount = ([^,\n]*)",
+    "pier": r"\bPier side = (\w+)",
 }
-_CALIBRATED = re.compile(rf"Calibration guide speeds: RA = {_NUMBER} a-s/s")
 _EVENT = re.compile(
     r"Settling (?P<settling>started|complete|failed)|(?P<dither>DITHER by)|(?P<lock>SET LOCK POSITION|LOCK SHIFT)"
     r"|(?P<pause>received RESUME|Resumed)|(?P<change>Guiding parameter change.* RA )"
@@ -107,7 +107,6 @@ class GuideRun:
         header: what the log states by the names of `_HEADER`: numbers, the driver of the mount, the side of the pier.
         counts: numbers of events by name.
         rows: frames in time order; with `settling` they are left out, from `is_new` on the zero is another.
-        ended: whether the log contains the end of the run.
     """
 
     number: int
@@ -117,7 +116,6 @@ class GuideRun:
     header: dict[str, Any]
     counts: Counter[str]
     rows: list[GuideFrame] = field(default_factory=list)
-    ended: bool = False
 
     @property
     def frames(self) -> list[GuideFrame]:
@@ -140,17 +138,20 @@ def read_runs(text: str, file: str, ra_axis: float | None = None) -> list[GuideR
     mount = {"mount": "a mount of MaxIm" if program == "MaxIm" else "unknown", "pier": "unknown"}
     lines = list(enumerate(map(str.strip, text.splitlines()), start=1))
     starts = [k for k, (_, line) in enumerate(lines) if _BEGINS.search(line)]
-    runs, steps, speeds = list[GuideRun](), 0, dict[str, float]()
+    runs, steps, speed = list[GuideRun](), 0, dict[str, Any]()
     for start, end in pairwise([*starts, len(lines)]):
         (number, begins), part = lines[start], lines[start + 1 : end]
+        named = next((k for k, (_, line) in enumerate(part) if line.startswith(tuple(_COLUMNS))), len(part))
+        text = "\n".join(line for _, line in part[:named])
+        found = {name: match[1] for name, form in _HEADER.items() if (match := re.search(form, text, re.MULTILINE))}
+        header = {name: word if name in ("mount", "pier") else float(word) for name, word in found.items()}
         if begins.startswith("Calibration"):
             steps += sum(line.startswith(("West,", "East,", "North,", "South,", "Backlash,")) for _, line in part)
-            found = [float(match[1]) for _, line in part if (match := _CALIBRATED.search(line))]
-            speeds |= {"calibrated_speed": found[-1]} if found else {}
+            speed = {"calibrated_speed": header["calibrated_speed"]} if "calibrated_speed" in header else speed
             continue
-        counts, steps = Counter({"calibration step": steps}), 0
+        counts, steps = Counter({"calibration step": steps, "end": program == "MaxIm"}), 0
         begins = _BEGINS.split(begins)[-1].strip()
-        run = GuideRun(len(runs) + 1, number, begins, program, {**mount, **speeds}, counts)
+        run = GuideRun(len(runs) + 1, number, begins, program, {**mount, **speed, **header}, counts)
         _read(run, part, "Y" if ra_axis == 2 else "X", file)
         runs += [run] if run.frames else []
     if not runs:
@@ -159,13 +160,13 @@ def read_runs(text: str, file: str, ra_axis: float | None = None) -> list[GuideR
 
 
 def _read(run: GuideRun, lines: Iterable[tuple[int, str]], axis: str, file: str) -> None:
-    """Read header and rows of a run; a damaged row, or one of another device, is only counted."""
-    run.ended, settling, is_new, found = run.program == "MaxIm", False, False, dict[str, Any]()
+    """Read the rows of a run; a damaged row, or one of another device, is only counted."""
+    settling = is_new = False
     columns: Sequence[str] = _COLUMNS["UT Time,"] if run.program == "MaxIm" else ()
     for number, line in lines:
         needed = next((needed for head, needed in _COLUMNS.items() if line.startswith(head)), None)
         if line.startswith("Guiding Ends"):
-            run.ended = True
+            run.counts["end"] += 1
             break
         if needed is not None:
             columns = [name.strip() for name in line.split(",")]
@@ -190,10 +191,6 @@ def _read(run: GuideRun, lines: Iterable[tuple[int, str]], axis: str, file: str)
                 # Its pulse is unknown.
                 run.counts["damaged row"] += 1
                 is_new = True
-        else:
-            stated = {name: match[1] for name, pattern in _HEADER.items() if (match := pattern.search(line))}
-            found = {name: t if name in ("mount", "pier") else float(t) for name, t in stated.items()} | found
-    run.header |= found
 
 
 def _row(run: GuideRun, cells: Mapping[str, str], axis: str) -> tuple[float, float | None, float]:
@@ -332,20 +329,15 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
         which, where = "Y" if stated.get("ra_axis") == 2 else "X", "lags" if sign > 0 else "is ahead"
         assumed[-2:] = ["a correction acts after its frame: motion = offset - corrections of the frames before"]
         assumed.append(f"sign: where {which} grows the axis {where}; --assume pe_sign={-sign:g} says the other")
-    moves: list[dict[str, Any]] = []
-    rows: list[_Row] = []
-    pulses, is_new = 0.0, True
+    points, pulses, is_new = list[tuple[float, float | None, str, bool]](), 0.0, True
     for row in run.rows:
         is_read, is_new = row.raw_px is not None and not row.settling, is_new or row.is_new
-        if is_read and is_new:
-            moves.append(_drive_move(len(moves), row.time_s, drive))
-            pulses, is_new = 0.0, False
-        value = drive * row.time_s - sign * ((row.raw_px or 0.0) * known["pixel_arcsec"] / cosine + pulses)
+        pulses = 0.0 if is_read and is_new else pulses
+        error = -sign * ((row.raw_px or 0.0) * known["pixel_arcsec"] / cosine + pulses) if is_read else None
         status = "ok" if is_read else "dropped" if row.raw_px is None else "settling"
-        # Frames before the first stretch belong to no move.
-        rows += [(row.time_s, len(moves) - 1, value if is_read else None, status)] if moves else []
-        pulses += row.pulse_ms / 1000.0 * pulse
-    used = sum(status == "ok" for *_, status in rows)
+        points.append((row.time_s, error, status, is_read and is_new))
+        pulses, is_new = pulses + row.pulse_ms / 1000.0 * pulse, is_new and not is_read
+    used = sum(error is not None for _, error, _, _ in points)
     if used < 3:
         raise refused("few-frames", file, line=run.line, count=used)
     header: dict[str, Any] = {"name": f"{file}, run {run.number}", "instrument": run.header["mount"][:200]}
@@ -353,7 +345,8 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
         header["created"] = datetime.datetime.fromisoformat(run.begins)
     except ValueError:
         header["notes"] = f"begins {run.begins[:100]}"
-    return _drive_rows(drive, moves, rows, assumed, _notes(run, used, len(moves)), header)
+    notes = _notes(run, used, sum(begins for *_, begins in points))
+    return _drive_rows(drive, points, assumed, notes, header)
 
 
 def _check_known(run: GuideRun, known: Mapping[str, Any], file: str) -> None:
@@ -402,7 +395,7 @@ def _notes(run: GuideRun, used: int, stretches: int) -> tuple[str, ...]:
     remarks = {
         f"frames: {used} used of {len(run.rows)} ({', '.join(out)} left out); {own} ({', '.join(breaks)})": True,
         f"pier side {run.header['pier']}": True,
-        "the log does not say that the run ended: it may be cut off": not run.ended,
+        "the log does not say that the run ended: it may be cut off": not counts["end"],
         f"{long_pulses} pulses last longer than the {step_s:.2g} s between frames and act in part later": long_pulses,
         f"{at_limit} pulses at their limit of {limit_ms:g} ms": at_limit,
         f"{_several(counts['saturated'], 'frame')} with a saturated star, used": counts["saturated"],
@@ -411,33 +404,31 @@ def _notes(run: GuideRun, used: int, stretches: int) -> tuple[str, ...]:
     return tuple(remark for remark, is_so in remarks.items() if is_so)
 
 
-_Row = tuple[float, int, float | None, str]
-"""Time, move, value and status of a reading."""
-
-
 def _drive_rows(
     rate: float,
-    moves: list[dict[str, Any]],
-    rows: Sequence[_Row],
+    points: Sequence[tuple[float, float | None, str, bool]],
     assumed: Sequence[str],
     notes: tuple[str, ...],
     header: Mapping[str, object],
     axis: Mapping[str, Any] | None = None,
 ) -> AxisRows:
-    """Readings of a drive at a constant rate; an unknown period is from a minute to a third of the run, s, if any."""
-    readings = [
-        {"reading": k, "move": m, "value": None if v is None else round(v, 4), "u": 0.0, "status": status, "time_s": t}
-        for k, (t, m, v, status) in enumerate(rows)
-    ]
-    span_s = rows[-1][0] - rows[0][0]
+    """An axis whose drive turns at a constant rate, by times, errors, statuses, and whether a stretch begins.
+
+    Points before the first stretch belong to no move. An unknown period is from a minute to a third of the run, if any.
+    """
+    moves, readings = list[dict[str, Any]](), list[dict[str, Any]]()
+    for time_s, error, status, begins in points:
+        if begins:
+            at = {"move": len(moves), "segment": len(moves), "time_s": time_s}
+            moves.append({**at, "command": round(rate * time_s, 6), "approach": "forward"})
+        if moves:
+            value = None if error is None else round(rate * time_s + error, 4)
+            reading = {"reading": len(readings), "move": len(moves) - 1, "value": value, "u": 0.0}
+            readings.append({**reading, "status": status, "time_s": time_s})
+    span_s = readings[-1]["time_s"] - readings[0]["time_s"]
     between = {"periods_in": "seconds", "period_between": [60.0, round(span_s / 3.0, 0)]} if span_s > 360.0 else {}
     entries = {**PRIORS, **(between if axis is None else axis)}
     return AxisRows(moves, readings, "arcsec", tuple(assumed), notes, {"rate": rate, **header}, entries)
-
-
-def _drive_move(number: int, time_s: float, rate: float) -> dict[str, Any]:
-    at = {"move": number, "segment": number, "time_s": time_s}
-    return {**at, "command": round(rate * time_s, 6), "approach": "forward"}
 
 
 # --- tables of time and periodic error -------------------------------------------------------------------------------
@@ -471,16 +462,15 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
         times, _, errors = ([name] for name in known)
     if len(errors) != 1 or len(times) != 1:
         raise refused("periodic-error", table.file, line=table.first_line, times=len(times), errors=len(errors))
-    time, error = known[times[0]], known[errors[0]]
-    for column, kind in ((time, "time"), (error, "angle")):
+    clock, read = known[times[0]], known[errors[0]]
+    for column, kind in ((clock, "time"), (read, "angle")):
         if column.name.unknown or (column.name.unit and column.name.unit.kind != kind):
             raise refused("error-unit", table.file, line=table.first_line, name=column.name.text, kind=kind)
-    unit = error.name.unit
-    scale_s = time.name.unit.scale if time.name.unit else 1.0
+    unit, scale_s = read.name.unit, clock.name.unit.scale if clock.name.unit else 1.0
     scale = 3600.0 * unit.scale * unit.per_number if unit else 1.0
     pairs = [
         (scale_s * float(t), scale * float(e))
-        for t, e in zip(time.cells, error.cells, strict=True)
+        for t, e in zip(clock.cells, read.cells, strict=True)
         if NUMBER.fullmatch(t) and NUMBER.fullmatch(e)
     ]
     if len(pairs) < 3 or any(b[0] < a[0] for a, b in pairwise(pairs)):
@@ -496,5 +486,5 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
     ]
     axis = {"periods_in": "seconds", "periods": [float(worm[1])]} if worm else None
     notes, header = (f"{len(pairs)} of {len(table)} rows are numbers",), {"name": table.file[:200]}
-    rows: list[_Row] = [(t, 0, rate * t + sign * e, "ok") for t, e in pairs]
-    return _drive_rows(rate, [_drive_move(0, pairs[0][0], rate)], rows, assumed, notes, header, axis)
+    points = [(time_s, sign * error, "ok", k == 0) for k, (time_s, error) in enumerate(pairs)]
+    return _drive_rows(rate, points, assumed, notes, header, axis)

@@ -6,7 +6,6 @@ ANGLE_CALIBRATE saves. Sizes are limited by what the messages hold, not by what 
 
 from __future__ import annotations
 
-import configparser
 import json
 import math
 import re
@@ -46,6 +45,8 @@ _CAMONITOR = re.compile(
     r"(?P<name>(?=\S*[A-Za-z])\S+)\s+(?:\(\S+\)\s*)?(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?)\s+"
     r"(?P<value>\S+)(?:\s+(?P<rest>\S.*))?"
 )
+_TABLE = r"^calibrate\s*[=:](.*(?:\n[ \t].*)*)"
+"""In the section of a sensor."""
 _CONCEPTS = (("value", "logged-reading"), ("value", "logged-readback"), ("command", "logged-command"))
 """Words of a series by what it is, the surest first."""
 
@@ -158,7 +159,7 @@ def _monitored(text: str) -> tuple[dict[str, Series], list[str]]:
 
 def _archived(text: str, file: str) -> tuple[dict[str, Series], list[str]]:
     """Series of the archiver appliance (its "Customizing data retrieval"), with their units in brackets."""
-    series, left_out = dict[str, Series](), 0
+    series, left_out = defaultdict[str, list[tuple[float, float]]](list), 0
     try:
         content = json.loads(text)
         for entry in content:
@@ -168,11 +169,11 @@ def _archived(text: str, file: str) -> tuple[dict[str, Series], list[str]]:
             usable = [r for r in usable if math.isfinite(r["val"])]
             left_out += len(data) - len(usable)
             rows = ((float(r["secs"]) + 1e-9 * float(r.get("nanos", 0)), float(r["val"])) for r in usable)
-            series[f"{name} ({unit})" if unit else name] = _series(rows)
+            series[f"{name} ({unit})" if unit else name].extend(rows)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise refused("archive", file, error=escaped(str(error), 60)) from error
     notes = [f"EPICS archiver, {len(content)} series, {left_out} values that are invalid or no numbers left out"]
-    return {name: values for name, values in series.items() if len(values.times_s)}, notes
+    return {name: _series(rows) for name, rows in series.items() if rows}, notes
 
 
 def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> tuple[str, str]:
@@ -220,17 +221,13 @@ def is_klipper(data: bytes) -> bool:
 
 def _saved_angles(data: bytes) -> tuple[str, list[str]] | None:
     """The sensor and the table that SAVE_CONFIG wrote below "#*#" into a configuration; None if there is none."""
-    if b"[angle" not in data:
-        return None
-    lines = [line.removeprefix("#*#").removeprefix(" ") for line in data.decode(errors="replace").splitlines()]
-    parser = configparser.ConfigParser(interpolation=None, allow_no_value=True, strict=False)
-    try:
-        parser.read_string("\n".join(["[top]", *lines]))
-    except configparser.Error:
-        return None
-    tables = {name: parser[name].get("calibrate") or "" for name in parser.sections() if name.startswith("angle ")}
-    name = max(tables, key=lambda section: len(tables[section]), default="")
-    return (name.removeprefix("angle "), NUMBER.findall(tables[name])) if tables else None
+    lines = data.decode(errors="replace").splitlines() if b"[angle" in data else []
+    text = "\n".join(line.removeprefix("#*#").removeprefix(" ") for line in lines)
+    sections = re.findall(r"^\[angle ([^\]\n]+)\].*((?:\n(?!\[).*)*)", text, re.MULTILINE)
+    tables = [(name, re.findall(_TABLE, body, re.MULTILINE)) for name, body in sections]
+    numbers = [(name, NUMBER.findall(" ".join(table))) for name, table in tables]
+    is_configuration = b"#*#" in data or b"sensor_type" in data or any(table for _, table in tables)
+    return max(numbers, key=lambda sensor: len(sensor[1])) if numbers and is_configuration else None
 
 
 def klipper_table(data: bytes, file: str) -> ForeignTable:
