@@ -154,6 +154,7 @@ def test_several_runs_calibrations_and_empty_logs():
         ("Dec = 40.0 deg", "Dec = Unknown", "does not state the declination", "--assume declination_deg=NUMBER"),
         ("Pixel scale = 2.0", "Pixel scale = ?", "does not state the pixel scale", "--assume pixel_arcsec=NUMBER"),
         (", xRate = 3.0", "", "does not state xRate", "--assume pulse_arcsec_per_s=NUMBER"),
+        ("xRate = 3.0", "xRate = 3,0", "does not state xRate", "--assume pulse_arcsec_per_s=NUMBER"),
         ("Dec = 40.0 deg", "Dec = 89.3 deg", "a declination of 89.3 deg", "nearer to the equator"),
         ("xRate = 3.0", "xRate = 0.003", "0.05 to 1.2 x sidereal", "--assume pulse_arcsec_per_s=6.1"),
     ],

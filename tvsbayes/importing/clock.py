@@ -181,8 +181,7 @@ def relative_times(cells: Sequence[str], values: np.ndarray, unit: Unit | None) 
 def equal_clocks(times: np.ndarray, others: np.ndarray) -> bool:
     """Whether two clocks agree but for their unit, to a second or a hundredth."""
     span, other_span = np.ptp(times), np.ptp(others)
-    scales = (1.0, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9)
-    scale = next((s for s in scales if span and abs(other_span / s / span - 1) < 0.01), 1.0)
+    scale = 1000.0 ** np.round(np.log10(other_span / span) / 3) if min(span, other_span) > 0 else 1.0
     return bool(np.all(np.abs(others / scale - times) <= 1.0 + 0.01 * span))
 
 

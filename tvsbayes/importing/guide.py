@@ -45,7 +45,8 @@ ASSUMED = (
     "a pulse acts after its frame: motion = raw distance + W - E pulses of the frames before",
     "sign: a star ahead of the mount, which W pulses answer, is an axis that lags: angle = drive - motion",
 )
-_DRIVE = ("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
+DRIVEN = {"drive_arcsec_per_s": SIDEREAL_ARCSEC_PER_S, "pe_sign": 1.0}
+"""What is assumed of a drive."""
 ASSUMPTIONS = {
     "declination_deg": "declination of the star",
     "pulse_arcsec_per_s": "what a pulse turns the axis by, arcsec/s",
@@ -63,7 +64,8 @@ _COLUMNS = {
     "UT Time,": ("UT Time", "Star X", "Star Y", "OffsetX", "OffsetY", "Corr X", "Corr Y"),
 }
 """Columns that a log needs, by the beginning of the line that names them."""
-_NUMBER = r"(-?\d{1,9}(?:\.\d+)?)"
+_NUMBER = r"(-?\d{1,9}(?:\.\d+)?)(?!,?\d)"
+"""A decimal comma makes it no number: the whole part alone would be another."""
 _HEADER = {
     "calibrated_speed": rf"Calibration guide speeds: RA = {_NUMBER} a-s/s",
     "pixel_arcsec": rf"^Pixel scale = {_NUMBER} arc-sec/px",
@@ -307,9 +309,9 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
     Raises:
         InputError: a number that neither `stated` nor the log contains, or fewer than three usable frames.
     """
-    known, is_maxim = {**run.header, **stated}, run.program == "MaxIm"
+    known, is_maxim = {**DRIVEN, **run.header, **stated}, run.program == "MaxIm"
     _check_known(run, known, file)
-    cosine, drive = math.cos(math.radians(known["declination_deg"])), stated.get(*_DRIVE)
+    cosine, drive = math.cos(math.radians(known["declination_deg"])), known["drive_arcsec_per_s"]
     pulse, text = known.get("pulse_arcsec_per_s", 0.0), "no corrections: the star's way is the axis' own"
     if "pulse_arcsec_per_s" in stated:
         text = f"pulses turn the axis by {pulse:g} arcsec/s, as stated"
@@ -325,7 +327,7 @@ def rows_of_run(run: GuideRun, runs: Sequence[GuideRun], file: str, stated: Mapp
     ]
     sign = 1.0
     if is_maxim:
-        sign = math.copysign(1.0, stated.get("pe_sign", 1.0))
+        sign = math.copysign(1.0, known["pe_sign"])
         which, where = "Y" if stated.get("ra_axis") == 2 else "X", "lags" if sign > 0 else "is ahead"
         assumed[-2:] = ["a correction acts after its frame: motion = offset - corrections of the frames before"]
         assumed.append(f"sign: where {which} grows the axis {where}; --assume pe_sign={-sign:g} says the other")
@@ -475,7 +477,8 @@ def periodic_error_rows(table: ForeignTable, text: str, stated: Mapping[str, flo
     ]
     if len(pairs) < 3 or any(b[0] < a[0] for a, b in pairwise(pairs)):
         raise refused("few-errors", table.file, count=len(pairs))
-    sign, rate = math.copysign(1.0, stated.get("pe_sign", 1.0)), stated.get(*_DRIVE)
+    driven = {**DRIVEN, **stated}
+    sign, rate = math.copysign(1.0, driven["pe_sign"]), driven["drive_arcsec_per_s"]
     columns = f"times in column {escaped(times[0])}, periodic error in column {escaped(errors[0])}"
     assumed = [
         f"{columns}, {unit.name if unit else 'arcsec'}",
