@@ -89,7 +89,7 @@ def test_one_clock_of_several_series_goes_on_by_what_it_lost():
     found, (back,) = forward(times, "abc" * 3)
     assert found == [0.0, 1.0, 1.0, 10.0, 11.0, 11.0, 20.0, 21.0, 21.0]
     assert (back.row, back.back_s, back.added_s) == (6, 5.0, 15.0)
-    assert over_midnight([86399.0, 1.0, 0.0, 2.0]) == [86399.0, 86401.0, 86400.0, 86402.0]
+    assert over_midnight([86399.0, 1.0, 0.0, 2.0]) == [86399.0, 86401.0, 86400.0, 86402.0] and over_midnight([]) == []
 
 
 @pytest.mark.parametrize("cell", ["tomorrow", "9" * 400, "nan"])

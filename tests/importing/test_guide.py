@@ -215,6 +215,7 @@ def test_days_of_the_julian_calendar_are_days():
     ("log", "message"),
     [
         ("PHD2 version 2\n", "no run with frames"),
+        ("Track Log Started at UT", "no run with frames"),
         (night(9).replace("RADuration", "Duration"), "no column RADuration"),
         (night(2), "2 frames"),
     ],
@@ -237,5 +238,8 @@ def test_a_track_log_of_maxim_gives_the_motion_of_its_mount():
     assert np.abs(reverse + expected).max() < 0.5e-2 / MAXIM_PX_PER_ARCSEC + 1e-4
     with pytest.raises(Question, match="correct more than the offsets"):
         rows_of_run(run, [run], "track.log", stated | {"pulse_arcsec_per_s": 2.5 * pulse})
+    names, first, *others = maxim_log().split("\n", 2)
+    (cut,) = read_runs("\n".join([names, first, others[0].replace("23:50:00", "23:5", 1)]), "track.log", 1)
+    assert (len(cut.rows), cut.counts["damaged row"]) == (199, 1)
     (across,) = read_runs(maxim_log(), "track.log", 2)
     assert {frame.raw_px for frame in across.frames} == {0.1}

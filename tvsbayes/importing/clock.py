@@ -101,7 +101,7 @@ class SetBack(NamedTuple):
 def over_midnight(clocks_s: Sequence[float]) -> list[float]:
     """Times of day in order: a step back by more than half a day is midnight."""
     days = accumulate((b < a - DAY_S / 2 for a, b in pairwise(clocks_s)), initial=0)
-    return [clock_s + DAY_S * day for clock_s, day in zip(clocks_s, days, strict=True)]
+    return [clock_s + DAY_S * day for clock_s, day in zip(clocks_s, days, strict=False)]
 
 
 def forward(times_s: Iterable[float], series: Iterable[Hashable]) -> tuple[list[float], list[SetBack]]:

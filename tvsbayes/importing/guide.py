@@ -56,9 +56,9 @@ ASSUMPTIONS = {
     "ra_axis": "1 where X of a guide camera is right ascension, 2 where Y",
 }
 """Values that `--assume` may state, with their meaning."""
-MAXIM = "Track Log Started at UT "
+MAXIM = "Track Log Started at UT"
 """First line of a run of MaxIm DL, whose track log has offsets in px and corrections in s (its help, "Track Log")."""
-_BEGINS = re.compile(rf"^Guiding Begins at |^Calibration Begins at|{MAXIM}")
+_BEGINS = re.compile(rf"^Guiding Begins at\b|^Calibration Begins at\b|{MAXIM}")
 _COLUMNS = {
     "Frame,": ("Time", "RARawDistance", "RADuration", "RADirection"),
     "UT Time,": ("UT Time", "Star X", "Star Y", "OffsetX", "OffsetY", "Corr X", "Corr Y"),
@@ -189,7 +189,7 @@ def _read(run: GuideRun, lines: Iterable[tuple[int, str]], axis: str, file: str)
                 run.rows.append(GuideFrame(*_row(run, cells, axis), settling, is_new))
                 run.counts["saturated"] += cells.get("ErrorCode") == "1"
                 is_new = False
-            except (KeyError, TypeError, ValueError, csv.Error, StopIteration):
+            except (KeyError, ValueError, csv.Error, StopIteration):
                 # Its pulse is unknown.
                 run.counts["damaged row"] += 1
                 is_new = True
@@ -199,7 +199,8 @@ def _row(run: GuideRun, cells: Mapping[str, str], axis: str) -> tuple[float, flo
     """Time, raw distance and pulse of a row; any error of reading means that it is damaged."""
     last_s, raw_px, pulse_ms = run.rows[-1].time_s if run.rows else 0.0, None, 0.0
     if run.program == "MaxIm":
-        of_day: Any = time_of_day(cells["UT Time"])
+        if (of_day := time_of_day(cells["UT Time"])) is None:
+            raise ValueError("no time of day")
         # The time of this clock next to the row before: a small step back is none over midnight.
         after_s = of_day - run.header.setdefault("begun_s", of_day) - last_s
         time_s = last_s + (after_s + DAY_S / 2) % DAY_S - DAY_S / 2
