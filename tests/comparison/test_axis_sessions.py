@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 from support.axes import drawn, runs
 
-from tvsbayes.comparison.axis_sessions import compare_axes, refuse_other_axis, shared_positions, watch_axis
+from tvsbayes.comparison.axis_sessions import (
+    compare_axes,
+    plan_watch_axis,
+    refuse_other_axis,
+    shared_positions,
+    watch_axis,
+)
 from tvsbayes.comparison.departures import FALSE_ALARM_RATE, LOOKS_MIN
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.report.command_text import changes_text
-from tvsbayes.report.watch_text import HELPS, REMEDIES, watch_text
+from tvsbayes.report.watch_text import HELPS, REMEDIES, watch_plan_text, watch_text
 from tvsbayes.results.watch_record import MOVED, OK
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis
@@ -75,6 +81,25 @@ def test_what_moved_is_named_with_its_size(known, what, size, change):
 def test_every_change_has_its_help_and_remedy(known):
     for change in watch_axis(known, session(1, 52)).changes:
         assert change.what in HELPS and change.what in REMEDIES
+
+
+def test_a_plan_watches_with_the_power_that_it_states(known):
+    """The fewest stops for each change; a session at its stops has these powers."""
+    plan, stops = plan_watch_axis(known)
+    assert plan.met and plan.looks == len(stops.stops) and plan.minutes <= plan.minutes_allowed
+    assert [change.what for change in plan.changes] == ["ratio", "play", "zero"]
+    assert all(change.looks_needed <= plan.looks for change in plan.changes)
+    path = [command for arrival in stops.arrivals for command in (arrival.via, arrival.command) if command is not None]
+    moves = tuple(AxisMove(k, 0, 60.0 * k, c, "" if k else "backward") for k, c in enumerate(path))
+    read = [k for k in range(len(path)) if path[k] in {c for c, _ in stops.stops}]
+    looks = AxisCampaign("deg", moves, tuple(Reading(n, k, 0.01 * path[k], U) for n, k in enumerate(read)), {})
+    watched = {change.what: change.power for change in watch_axis(known, looks).changes}
+    for change in plan.changes:
+        assert change.power == pytest.approx(watched[change.what], abs=0.15) and change.power >= 0.8
+    few, shorter = plan_watch_axis(known, minutes=0.6 * plan.minutes)
+    assert few.looks < plan.looks and few.looks == len(shorter.stops) and not few.met
+    text = watch_plan_text(plan, "stops")
+    assert f"{plan.looks} stops after 1 homing," in text and "look" not in text
 
 
 def test_the_zero_of_a_campaign_with_one_homing_is_not_watched():

@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, refuse_options, report_line
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, refuse_mixed, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watched import WATCHING, finish_watch
 from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
@@ -71,12 +72,14 @@ def plan_watch(
     from tvsbayes.instrument.rig import read_rig
 
     campaign = given or path
-    if campaign is None or instrument_of(campaign) is INSTRUMENTS["axis"]:
-        raise InputError(
-            "usage",
-            "--watch needs the campaign of a scanner or a head",
-            remedy="write tvsbayes plan CAMPAIGN --watch -o looks.csv",
-        )
+    if campaign is None:
+        remedy = "write tvsbayes plan CAMPAIGN --watch -o looks.csv"
+        raise InputError("usage", "--watch needs a campaign", remedy=remedy)
+    if instrument_of(campaign) is INSTRUMENTS["axis"]:
+        options: dict[str, object] = {"rig": path if given else None}
+        refuse_options("for a scanner or a head", "an axis is planned from its folder alone", **options)
+        _plan_axis_watch(campaign, minutes, out, seed, as_json)
+        return
     known, rig = read_campaign(campaign), None if given is None or path is None else read_rig(path)
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 8.0}, progress) as job:
@@ -93,3 +96,27 @@ def plan_watch(
         looks = structs.replace(looks, plan=str(out))
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish(looks.as_json(), text, as_json)
+
+
+def _plan_axis_watch(folder: Path, minutes: float | None, out: Path | None, seed: int, as_json: bool) -> None:
+    """`plan AXIS --watch`: the fewest stops by which `watch` notices a change of ratio, play or zero."""
+    from msgspec import structs
+
+    from tvsbayes.comparison.axis_sessions import plan_watch_axis
+    from tvsbayes.compensation.promise import refuse_answer
+    from tvsbayes.report.watch_text import watch_plan_text
+    from tvsbayes.single_axis.axis_campaign import read_axis
+    from tvsbayes.single_axis.axis_record import results_for
+
+    known = read_axis(folder)
+    with waiting() as progress, Job({FITTING: 1.0, PLANNING: 1.0}, progress) as job:
+        results = results_for(known, progress=job.part(FITTING), seed=seed, notify=report_line)
+        refuse_answer(results.summary.answer)
+        job.begin(PLANNING)
+        plan, stops = plan_watch_axis(results.fit, minutes=minutes, seed=seed)
+    text = watch_plan_text(plan, "stops")
+    if out is not None:
+        write_atomically(out, stops.plan_bytes())
+        plan = structs.replace(plan, plan=str(out))
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    finish(plan.as_json(), text, as_json)

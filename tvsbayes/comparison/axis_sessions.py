@@ -6,25 +6,39 @@ force are verified instead. Units of the folder. No JAX.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tvsbayes.comparison.changes import compared, days_between
 from tvsbayes.comparison.departures import (
+    FALSE_ALARM_RATE,
     LOOKS_MIN,
+    POWER_MIN,
     Departure,
     DrawnDepartures,
     StatedChange,
+    null_distribution,
+    powers,
     single_change,
     tested,
 )
+from tvsbayes.compensation.promise import reading_u, run_up_of, table_commands
+from tvsbayes.compensation.verification import (
+    VerifyPlan,
+    discriminating_visits,
+    planned_stops,
+    reachable_stops,
+    spread_stops,
+)
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.results.comparison_record import Comparison
-from tvsbayes.results.watch_record import Watch
+from tvsbayes.results.watch_record import PlannedChange, Watch, WatchPlan
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_readings
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
+from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedAxis
-from tvsbayes.statistics.predicted_readings import frees_shift
+from tvsbayes.statistics.predicted_readings import State, frees_shift
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 SCATTERS, HOME_SDS = 4.0, 5.0
@@ -32,6 +46,8 @@ SCATTERS, HOME_SDS = 4.0, 5.0
 of homings, which have the same effect."""
 POSITIONS_MAX = 100
 """Largest number of positions of a comparison."""
+STOPS_MAX, HOUR_MINUTES = 96, 60.0
+"""Largest number of stops of a plan for `watch`."""
 
 
 def refuse_other_axis(known: AxisCampaign, new: AxisCampaign) -> None:
@@ -96,17 +112,28 @@ def compare_axes(first: AxisFit, second: AxisFit) -> Comparison:
     )
 
 
-def _changes(machine: PredictedAxis, fresh: AxisRows) -> tuple[StatedChange, ...]:
-    """Changes that are tested: ratio, play, and the zero where its scatter is known."""
+def _changes(
+    machine: PredictedAxis, command: np.ndarray, side: np.ndarray, variance: np.ndarray
+) -> tuple[tuple[StatedChange, ...], np.ndarray]:
+    """Changes that are tested by stops (r,), and their readings by a unit of each, (r, q).
+
+    They are ratio, play, and the zero where its scatter is known.
+    """
     fit = machine.fit
-    size = SCATTERS * float(np.sqrt(np.mean(machine.noise(fresh.side, fresh.variance))))
+    size = SCATTERS * float(np.sqrt(np.mean(machine.noise(side, variance))))
     changes = [single_change("ratio", "per_command", _rounded(100.0 * size / fit.rows.travel), "%")]
-    if fresh.both_sides:
+    if len(np.unique(np.sign(side[side != 0]))) == 2:
         changes.append(single_change("play", "backlash", _rounded(size), machine.unit))
     if not frees_shift(machine.homings):
         home = HOME_SDS * float(np.sqrt(np.mean(machine.scales["home_sd"] ** 2)))
         changes.append(single_change("zero", "offset", _rounded(max(size, home)), machine.unit))
-    return tuple(changes)
+    # The play lags on the side of arrival.
+    columns = {
+        "per_command": 0.01 * fit.rows.line.slope * command,
+        "backlash": -0.5 * np.sign(fit.rows.line.slope) * side,
+        "offset": np.ones(len(command)),
+    }
+    return tuple(changes), np.column_stack([columns[change.names[0]] for change in changes])
 
 
 def _rounded(size: float) -> float:
@@ -133,14 +160,8 @@ def watch_axis(fit: AxisFit, campaign: AxisCampaign, *, seed: int = 0) -> Watch:
             "too-few-looks", message, file="readings.csv", remedy="read more stops, from both sides"
         )
     machine = PredictedAxis(fit, seed)
-    stops, changes = machine.read(campaign), _changes(machine, fresh)
-    # Reading by a unit of each change; the play lags on the side of arrival.
-    columns = {
-        "per_command": 0.01 * fit.rows.line.slope * fresh.command,
-        "backlash": -0.5 * np.sign(fit.rows.line.slope) * fresh.side,
-        "offset": np.ones(len(fresh.value)),
-    }
-    shifts = np.column_stack([columns[change.names[0]] for change in changes])
+    stops = machine.read(campaign)
+    changes, shifts = _changes(machine, fresh.command, fresh.side, fresh.variance)
 
     def departure(mean: np.ndarray, covariance: np.ndarray) -> Departure:
         off = fresh.value - mean
@@ -151,3 +172,74 @@ def watch_axis(fit: AxisFit, campaign: AxisCampaign, *, seed: int = 0) -> Watch:
     drawn = tuple(departure(*each) for each in zip(stops.mean, stops.covariance, strict=True))
     centre = departure(*stops.pooled())
     return tested(DrawnDepartures(centre, drawn, np.full(len(drawn), 1 / len(drawn))), len(fresh.value), True, seed)
+
+
+def plan_watch_axis(fit: AxisFit, *, minutes: float | None = None, seed: int = 0) -> tuple[WatchPlan, VerifyPlan]:
+    """Plan the fewest stops after one homing by which `watch` notices each change, by greedy choice.
+
+    Args:
+        fit: converged fit of the axis.
+        minutes: longest duration; None for that of the campaign's longest run after a homing.
+        seed: seed of all draws.
+
+    Returns:
+        The plan with the power for each change, and its stops.
+
+    Raises:
+        NothingToEstimate: no run-up fits into the commands that are allowed, or the readings are of a drive.
+    """
+    from scipy.special import ndtri
+
+    machine = PredictedAxis(fit, seed)
+    run_up = run_up_of(machine, fit.rows.positions, fit.rows.line.slope)
+    command, side = reachable_stops(fit, table_commands(fit.rows), run_up)
+    variance, state = np.full(len(command), reading_u(fit.campaign) ** 2), machine.state
+    use = State(np.linspace(0.0, machine.use.hours, len(command)), state.travel, state.warm_hours, state.kelvin)
+    scatter = sum(machine.scatter(side, use, np.sqrt(variance)).values())
+    covariance = machine.expected(command, side, use).plus(scatter).pooled().covariance
+    noise = np.minimum(machine.noise(side, variance), 0.999 * np.diag(covariance))
+    changes, shifts = _changes(machine, command, side, variance)
+    common, first = covariance - np.diag(noise), spread_stops(command)
+    first |= first.sum() < LOOKS_MIN
+    allowed = HOUR_MINUTES * machine.use.hours if minutes is None else minutes
+    move_minutes = float(np.median(np.diff([move.time_s for move in fit.campaign.moves]))) * HOUR_MINUTES / HOUR_S
+
+    def planned(which: Sequence[int], most: int) -> tuple[VerifyPlan, np.ndarray, float]:
+        off = [changes[k].size * shifts[:, k] for k in which]
+        # Of single tests at equal shares of the false alarms.
+        wanted = float(ndtri(1 - 0.5 * FALSE_ALARM_RATE / len(changes)) + ndtri(POWER_MIN)) ** 2
+        chosen = discriminating_visits(off, common, noise, first, wanted, most)
+        plan = VerifyPlan(planned_stops(command, side, chosen.visits), run_up, chosen.reached >= wanted, chosen.reached)
+        return plan, chosen.visits, move_minutes * plan.moves
+
+    every, most = range(len(changes)), STOPS_MAX
+    plan, visits, taken = planned(every, most)
+    while taken > allowed and len(plan.stops) > max(int(first.sum()), LOOKS_MIN):
+        plan, visits, taken = planned(every, len(plan.stops) - 1)
+    used = np.flatnonzero(visits)
+    scattered = common[np.ix_(used, used)] + np.diag(noise[used] / visits[used])
+    information = shifts[used].T @ np.linalg.solve(scattered, shifts[used])
+    departure = Departure(0.0, len(used), np.zeros(len(changes)), information, changes)
+    able = powers(departure, null_distribution(departure, seed).limit, seed)
+    needs = [planned([k], most) for k in every]
+    return (
+        WatchPlan(
+            looks=len(plan.stops),
+            homings=1,
+            minutes=taken,
+            minutes_allowed=allowed,
+            power_wanted=POWER_MIN,
+            false_alarm_rate=FALSE_ALARM_RATE,
+            met=min(able) >= POWER_MIN and taken <= allowed,
+            changes=tuple(
+                PlannedChange(
+                    *(change.what, change.size, change.unit, power),
+                    *((len(need.stops), 1, lasts) if need.enough else (None, None, None)),
+                    None,
+                )
+                for change, power, (need, _, lasts) in zip(changes, able, needs, strict=True)
+            ),
+            steps=(),
+        ),
+        plan,
+    )

@@ -62,7 +62,7 @@ def _expected(machine: PredictedMachine, commands: np.ndarray, both_sides: bool)
     return _Expected(commands, mean.reshape(2, -1), np.diag(covariance).reshape(2, -1), both_sides)
 
 
-def _run_up(machine: PredictedMachine, commands: np.ndarray, fitted: float, resolution: float) -> float:
+def run_up_of(machine: PredictedMachine, commands: np.ndarray, fitted: float, resolution: float = 0.0) -> float:
     """Compute the travel, commands, after which an arrival is on one side: the play's upper end, and a margin.
 
     The margin is a step of the controller where one is known, else the scatter of stops.
@@ -388,7 +388,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         aimed = (_offset(at, nominal) if form.holds == "table" and not by_phase else None, nominal)
         offset, tried = tried_use(machine, shaped.correction, (low, high), aimed, reading_u(campaign), seed)
         promise = promised_sides(tried, shift, form.zero_free)
-        run_up = _run_up(machine, rows.positions, fitted, wish.resolution)
+        run_up = run_up_of(machine, rows.positions, fitted, wish.resolution)
     added = tried.added_variance(shift)
     by_side = np.array([added[tried.side == side].mean() for _, side in SIDES])
     table = _table(replace(at, variance=at.variance + by_side[:, None]), shaped.correction)

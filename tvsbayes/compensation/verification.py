@@ -403,8 +403,9 @@ class VerifyPlan:
     enough: bool
     distance: float
 
-    def plan_bytes(self) -> bytes:
-        """Return `plan.csv`: step, command, direction, read (1 or 0)."""
+    @property
+    def arrivals(self) -> list[AxisStop]:
+        """The stops with the commands visited before, where a run-up needs one."""
         at, planned = math.nan, []
         for command, side in self.stops:
             # The first stop gets a run-up, wherever the axis is.
@@ -412,7 +413,16 @@ class VerifyPlan:
             via = None if arrives else command - side * self.run_up
             planned.append(AxisStop(via, command, DIRECTIONS[side]))
             at = command
-        return stops_csv(planned)
+        return planned
+
+    @property
+    def moves(self) -> int:
+        """Number of moves that it takes."""
+        return sum(1 + (stop.via is not None) for stop in self.arrivals)
+
+    def plan_bytes(self) -> bytes:
+        """Return `plan.csv`: step, command, direction, read (1 or 0)."""
+        return stops_csv(self.arrivals)
 
 
 def _separation(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:
@@ -431,7 +441,12 @@ class DiscriminatingVisits:
 
 
 def discriminating_visits(
-    off: Sequence[np.ndarray], common: np.ndarray, noise: np.ndarray, first: np.ndarray
+    off: Sequence[np.ndarray],
+    common: np.ndarray,
+    noise: np.ndarray,
+    first: np.ndarray,
+    wanted: float = IDENTIFIED,
+    most: int = PLANNED_MAX,
 ) -> DiscriminatingVisits:
     """Choose the fewest visits that discriminate the hypotheses, by greedy choice.
 
@@ -440,10 +455,12 @@ def discriminating_visits(
         common: covariance (m, m) of errors common to all visits.
         noise: variances of the noise drawn at each visit, shape (m,).
         first: mask of candidates that are always visited; all where it holds none.
+        wanted: squared distance of the nearest one that is enough.
+        most: largest number of visits.
     """
     visits = first.astype(float) if first.any() else np.ones(len(first))
     reached = _separation(off, common, noise, visits)
-    while reached < IDENTIFIED and visits.sum() < PLANNED_MAX:
+    while reached < wanted and visits.sum() < most:
         each = [_separation(off, common, noise, visits + row) for row in np.eye(len(visits))]
         best = int(np.argmax(each))
         visits[best] += 1
@@ -470,15 +487,13 @@ def refuse_drive(made: Compensation) -> None:
     )
 
 
-def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:
-    """Plan the fewest stops that discriminate the hypotheses, by greedy choice among the table's commands.
+def reachable_stops(fit: AxisFit, nodes: np.ndarray, run_up: float) -> tuple[np.ndarray, np.ndarray]:
+    """Choose commands and sides (m,) of stops that a plan may have, those of the rising side first.
 
     Raises:
-        NothingToEstimate: the table corrects nothing, or no run-up fits into the commands that are allowed.
+        NothingToEstimate: no run-up fits into the commands that are allowed.
     """
-    applied = Correction.of(made)
-    run_up, (low, high) = made.reversal_command, fit.campaign.range_allowed
-    nodes = np.array([row.command for row in made.table])
+    low, high = fit.campaign.range_allowed
     nodes = nodes[(nodes >= low) & (nodes <= high) & ((nodes - run_up >= low) | (nodes + run_up <= high))]
     # Commands whose both sides can be reached, if there are enough.
     inside = nodes[(nodes - run_up >= low) & (nodes + run_up <= high)]
@@ -489,6 +504,31 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         raise NothingToEstimate("limits", message, file="campaign.toml", remedy=remedy)
     nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), CANDIDATES)).round().astype(int)]
     command, side = np.r_[nodes, nodes[::-1]], np.repeat([1, -1], len(nodes))
+    starts = command - side * run_up
+    reached = (starts >= low) & (starts <= high)
+    return command[reached], side[reached]
+
+
+def spread_stops(command: np.ndarray) -> np.ndarray:
+    """Mask of stops over the whole range, which come first: a fault in a part of it shows only there."""
+    nodes = np.unique(command)
+    return np.isin(command, nodes[np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)])
+
+
+def planned_stops(command: np.ndarray, side: np.ndarray, visits: np.ndarray) -> tuple[VerifyStop, ...]:
+    """List each stop as often as it is visited."""
+    order = np.repeat(np.arange(len(command)), visits.astype(int))
+    return tuple(VerifyStop(float(command[k]), int(side[k])) for k in order)
+
+
+def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:
+    """Plan the fewest stops that discriminate the hypotheses, by greedy choice among the table's commands.
+
+    Raises:
+        NothingToEstimate: the table corrects nothing, or no run-up fits into the commands that are allowed.
+    """
+    applied, run_up = Correction.of(made), made.reversal_command
+    command, side = reachable_stops(fit, np.array([row.command for row in made.table]), run_up)
     machine, variance = PredictedAxis(fit, seed), np.full(len(command), reading_u(fit.campaign) ** 2)
     state = machine.state
     use = State(np.linspace(0.0, made.hours, len(command)), state.travel, state.warm_hours, state.kelvin)
@@ -497,8 +537,7 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
     def at(common: float, play: float) -> PredictedReadings:
         return machine.expected(applied.sent(command, side, common, play), side, use).plus(scatter)
 
-    promised = at(1.0, 1.0)
-    mean, covariance = promised.pooled()
+    mean, covariance = at(1.0, 1.0).pooled()
     shift = fit.rows.travel**2 * float(made.shift_free)
     noise = np.minimum(machine.noise(side, variance), 0.999 * np.diag(covariance))
     off = [at(0.0, 0.0).pooled().mean - mean]
@@ -507,14 +546,6 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         off.append(play)
     if not np.any(off[0]):
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
-    # Stops over the whole range first: a fault in a part of the table shows only there.
-    spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
-    starts = command - side * run_up
-    reach = np.flatnonzero((starts >= low) & (starts <= high))
-    common = (covariance - np.diag(noise) + shift)[np.ix_(reach, reach)]
-    first = np.isin(command[reach], nodes[spread])
-    chosen = discriminating_visits([o[reach] for o in off], common, noise[reach], first)
-    reached = chosen.reached
-    order = [k for k, visits in zip(reach.tolist(), chosen.visits, strict=True) for _ in range(int(visits))]
-    stops = tuple(VerifyStop(float(command[k]), int(side[k])) for k in order)
+    chosen = discriminating_visits(off, covariance - np.diag(noise) + shift, noise, spread_stops(command))
+    stops, reached = planned_stops(command, side, chosen.visits), chosen.reached
     return VerifyPlan(stops, run_up, reached >= IDENTIFIED, float(np.sqrt(reached)))

@@ -90,19 +90,23 @@ def watch_text(watch: Watch, power_min: float, looks: str = "looks") -> str:
 def _need(change: PlannedChange) -> str:
     if change.looks_needed is None:
         return "none do"
-    return f"{change.looks_needed} after {change.homings_needed} homings, {change.minutes_needed:.0f} min"
+    return f"{change.looks_needed} after {_homings(change.homings_needed or 1)}, {change.minutes_needed:.0f} min"
 
 
-def watch_plan_text(plan: WatchPlan) -> str:
-    """A plan for watching a calibration, as text."""
-    rows = [[c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", _need(c)] for c in plan.changes]
+def _homings(count: int) -> str:
+    return f"{count} homing{'s' * (count != 1)}"
+
+
+def watch_plan_text(plan: WatchPlan, looks: str = "looks") -> str:
+    """A plan for watching a calibration, as text; `looks` is what it takes."""
+    rows = [[c.what, f"{c.size:g} {escaped(c.unit)}", f"{100 * c.power:.0f} %", _need(c)] for c in plan.changes]
     power = f"{100 * plan.power_wanted:.0f} %"
     summary = (
-        f"{plan.looks} looks after {plan.homings} homings, {plan.minutes:.1f} of {plan.minutes_allowed:g} minutes; "
+        f"{plan.looks} {looks} after {_homings(plan.homings)}, {plan.minutes:.1f} of {plan.minutes_allowed:g} minutes; "
         f"false alarms {100 * plan.false_alarm_rate:g} %"
     )
     table = TableView(
-        "What `watch` will notice", ["change", "of", "noticed by this plan", f"looks for {power} of it alone"], rows
+        "What `watch` will notice", ["change", "of", "noticed by this plan", f"{looks} for {power} of it alone"], rows
     )
     lines = [summary, *([scatter_of_prior(plan.home_sd_by_prior)] if plan.home_sd_by_prior else [])]
     for c in plan.changes:
@@ -110,7 +114,8 @@ def watch_plan_text(plan: WatchPlan) -> str:
             continue
         text = f"{c.size:g} {c.unit} of {c.what} is noticed in {100 * c.power:.0f} % of the cases"
         if c.looks_needed is not None:
-            need = f"{c.looks_needed} looks after {c.homings_needed} homings ({c.minutes_needed:.0f} minutes) suffice"
+            need = f"{c.looks_needed} {looks} after {_homings(c.homings_needed or 1)} ({c.minutes_needed:.0f} minutes)"
+            need += " suffice"
             if c.looks_needed > LOOKS_MAX:
                 need += f", more than the {LOOKS_MAX} that are planned at most"
             lines.append(f"{text}: {need}; {HELPS[c.what]}")
@@ -119,5 +124,7 @@ def watch_plan_text(plan: WatchPlan) -> str:
             if c.looks_to_add is not None:
                 remedy = f": add about {c.looks_to_add} looks to it like those of this plan, homed as often (others, "
                 remedy += "after one homing, are less informative), and take as many at every watch"
-            lines.append(f"{text}, and no number of looks improves that: the campaign determines it too poorly{remedy}")
+            lines.append(
+                f"{text}, and no number of {looks} improves that: the campaign determines it too poorly{remedy}"
+            )
     return terminal(*lines, "", table)
