@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cycles import up_and_down
 from support.imagined_stops import STOPS, stops_of
 from support.known_calibration import known_calibration
 
@@ -16,6 +15,7 @@ from tvsbayes.calibration.optics import beam_deg_per_step
 from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.metrology.iso230 import figures_of
 from tvsbayes.metrology.positioning_table import INDIRECT, positioning
+from tvsbayes.metrology.simulated_cycles import simulated_runs
 from tvsbayes.results.metrology_tables import FIGURES
 from tvsbayes.results.records import plain
 
@@ -50,7 +50,7 @@ def test_the_predicted_interval_holds_a_test_on_the_true_rig():
     interval = table.predicted["reversal_deg"].interval95
     fresh = inputs.copy()
     fresh[:, INPUT_NAMES.index("backlash_deg.pan")] = np.abs(rng.normal(0.3, 0.05, rigs))
-    up, down = up_and_down(replace(base, inputs=fresh), "pan", (0, 50, 100, 150), 0.06, tests=rigs, seed=9)
+    up, down = simulated_runs(replace(base, inputs=fresh), "pan", (0, 50, 100, 150), 0.06, tests=rigs, seed=9)
     values = figures_of(up, down).reversal_deg
     held = np.count_nonzero((values >= interval[0]) & (values <= interval[1]))
     # Binomial(300, 0.95) at 1e-4 either side, widened by the interval's own error of 0.4 % in probability.

@@ -8,17 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from support.bent_rig import BENT, WOBBLE
-from support.cycles import up_and_down
 from support.known_calibration import known_calibration
 
-from tvsbayes.metrology.simulated_cycles import target_steps
+from tvsbayes.metrology.simulated_cycles import simulated_runs, target_steps
 from tvsbayes.twin.physics import harmonics_deg, mirror_chain, transmission
 
 
 def test_unequal_ratios_carry_every_run_on():
     """K up = k + c/2, k down = k - c/2 (formulation 3.1): a cycle over travel L gains c L; by hand, step for step."""
     c, targets, runs = 1e-4, (0, 100, 200), 3
-    up, down = up_and_down(
+    up, down = simulated_runs(
         known_calibration(), "pan", targets, 0.06, runs=runs, tests=1, contrast_deg_per_step=np.full(50, c)
     )
     q = 0.06 * targets[0]
@@ -43,7 +42,7 @@ def test_a_run_on_a_bent_rig_is_the_twins(period_deg):
     )
     targets, beyond = (-60, 20, 90, 160, 250), 40
     for axis, name in enumerate(("pan", "tilt")):
-        up, down = up_and_down(one, name, targets, 0.06, runs=2, tests=1)
+        up, down = simulated_runs(one, name, targets, 0.06, runs=2, tests=1)
         path = [-60 - beyond, *(2 * [*targets, 250 + beyond, *targets[::-1], -60 - beyond])]
         first = np.arange(len(path)) == 0
         # The other axis: its counters' middle, in mid-play.
@@ -69,7 +68,7 @@ def test_a_run_on_a_bent_rig_is_the_twins(period_deg):
 
 def test_stop_errors_scatter_runs_by_side():
     sds = {"stop_sd_deg.left": 0.2, "stop_sd_deg.right": 0.05}
-    up, down = up_and_down(known_calibration(**sds), "pan", (0, 50, 100, 200), 0.06, runs=5, tests=500)
+    up, down = simulated_runs(known_calibration(**sds), "pan", (0, 50, 100, 200), 0.06, runs=5, tests=500)
     count = up.size
     # 1e-4 bounds of the standard deviation of `count` normal numbers; the chain is 1:1.
     for values, sd in ((up, 0.2), (down, 0.05)):

@@ -49,7 +49,6 @@ INDEPENDENCE = (
 
 
 def _finite(dof: float) -> float | None:
-    """Replace infinity by None, as JSON has none."""
     return dof if math.isfinite(dof) else None
 
 
@@ -63,41 +62,33 @@ def budget_table(
     probability: float = PROBABILITY,
     notes: Sequence[str] = (),
 ) -> BudgetTable:
-    """Assemble a budget.
+    """Assemble a budget of a result: largest inputs first, small ones together, correlations as what is left of u.
 
     Args:
         quantity: name of the result.
         unit: its unit.
         estimate: its value.
-        u: its combined standard uncertainty, correlations included: the remainder of the rows is the correlation row.
+        u: its combined standard uncertainty, correlations included.
         sources: input quantities.
         probability: coverage probability of U.
         notes: notes before the default one.
 
-    Returns:
-        The table.
-
     Raises:
         ValueError: u is not positive, or a number is not finite.
     """
-    contributions = [s.sensitivity * s.u for s in sources]
-    if not (u > 0 and math.isfinite(u) and all(map(math.isfinite, (estimate, *contributions)))):
+    parts = sorted(((s, s.sensitivity * s.u) for s in sources), key=lambda part: -(part[1] ** 2))
+    if not (u > 0 and math.isfinite(u) and all(map(math.isfinite, (estimate, *(c for _, c in parts))))):
         raise ValueError(f"{quantity}: a budget needs finite contributions and a positive uncertainty, not {u}")
-    shares = [(c / u) ** 2 for c in contributions]
-    rows, small = [], []
-    for source, contribution, share in sorted(zip(sources, contributions, shares, strict=True), key=lambda x: -x[2]):
-        if share < SMALL_SHARE:
-            small.append((source, contribution, share))
-        else:
-            fields = vars(source) | {"dof": _finite(source.dof)}
-            rows.append(BudgetRow(**fields, contribution=contribution, share=share))
-    if small:
-        kinds = sorted({kind for source, _, _ in small for kind in source.kind.split(", ")})
-        several = (f"{len(small)} further inputs, each below {100 * SMALL_SHARE:g} %", "", None, None, ", ".join(kinds))
-        together = math.sqrt(sum(c**2 for _, c, _ in small))
-        rows.append(BudgetRow(*several, "", None, None, together, sum(share for _, _, share in small)))
-    rows.append(BudgetRow(CORRELATIONS, "", None, None, "", "", None, None, None, 1 - sum(shares)))
-    dof = effective_dof(u, contributions, [s.dof for s in sources])
+    large = [(s, c) for s, c in parts if (c / u) ** 2 >= SMALL_SHARE]
+    rows = [BudgetRow(**vars(s) | {"dof": _finite(s.dof)}, contribution=c, share=(c / u) ** 2) for s, c in large]
+    if small := parts[len(large) :]:
+        kinds = ", ".join(sorted({kind for s, _ in small for kind in s.kind.split(", ")}))
+        together, name = math.hypot(*(c for _, c in small)), f"{len(small)} further inputs, each below"
+        several = (f"{name} {100 * SMALL_SHARE:g} %", "", None, None, kinds, "", None, None)
+        rows.append(BudgetRow(*several, together, (together / u) ** 2))
+    rest = 1 - sum((c / u) ** 2 for _, c in parts)
+    rows.append(BudgetRow(CORRELATIONS, "", None, None, "", "", None, None, None, rest))
+    dof = effective_dof(u, [c for _, c in parts], [s.dof for s, _ in parts])
     k = coverage_factor(dof, probability)
     remarks = (*notes, INDEPENDENCE)
     return BudgetTable(quantity, unit, estimate, tuple(rows), u, _finite(dof), k, probability, k * u, remarks)

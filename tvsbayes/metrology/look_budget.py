@@ -1,6 +1,6 @@
 """Uncertainty budget of one located point: by cause, and by parameter with correlations.
 
-Frame T, mm; law of propagation of uncertainty (GUM 5.1, 5.2).
+Frame T, mm; law of propagation of uncertainty (GUM 5.1, 5.2, 7.2.7).
 """
 
 from __future__ import annotations
@@ -22,17 +22,16 @@ STOP_HERE, APERTURE_HERE, PLAY_HERE = "stop error here", "aperture noise here", 
 
 @dataclass(frozen=True)
 class Budget:
-    """Parts of the variance of one point, by the law of propagation.
+    """Parts of the variance of one point.
 
     Attributes:
-        causes: pixel noise, stop errors of the campaign, stereo calibration, focal scale, every prior, transmission
-            error and play variation, and the noises of this look.
-        share: shares of the total variance (sum over x, y, z), shape (causes,); sum 1.
-        variance_mm2: variance by cause and coordinate, shape (causes, 3).
+        causes: those of the calibration, then the noises of this look.
+        share: of the total variance (sum over x, y, z), shape (causes,); sum 1.
+        variance_mm2: by cause and coordinate, shape (causes, 3).
         parameters: names of the calibration's `look_inputs` and of this look's noises.
         contribution_mm: sensitivity times standard uncertainty, shape (parameters, 3).
-        correlation: correlation of the parameters, needed to add up contributions, shape (parameters, parameters).
-        covariance_mm2: covariance of the point, shape (3, 3).
+        correlation: of the parameters, needed to add up contributions, shape (parameters, parameters).
+        covariance_mm2: of the point, shape (3, 3).
         steps: counters (pan, tilt) of the look.
     """
 
@@ -47,16 +46,11 @@ class Budget:
 
     def as_json(self) -> dict[str, object]:
         """Return causes with share and u, and parameters with signed contributions and correlations."""
-        u = np.sqrt(self.variance_mm2)
+        causes = zip(self.causes, self.share.tolist(), np.sqrt(self.variance_mm2).tolist(), strict=True)
+        parameters = zip(self.parameters, self.contribution_mm.tolist(), strict=True)
         return {
-            "causes": [
-                {"cause": name, "share": float(share), "u_mm": row.tolist()}
-                for name, share, row in zip(self.causes, self.share, u, strict=True)
-            ],
-            "parameters": [
-                {"name": name, "contribution_mm": row.tolist()}
-                for name, row in zip(self.parameters, self.contribution_mm, strict=True)
-            ],
+            "causes": [{"cause": name, "share": share, "u_mm": u} for name, share, u in causes],
+            "parameters": [{"name": name, "contribution_mm": row} for name, row in parameters],
             "correlation": self.correlation.tolist(),
         }
 
@@ -68,32 +62,22 @@ def budget(
     aperture_deg: float,
     approach: tuple[str, str] = HOME_APPROACH,
 ) -> Budget:
-    """Compute the uncertainty budget of one point (GUM 7.2.7), by cause, and by parameter with correlations.
-
-    Args:
-        calibration: calibration with causes, as a fit stores them.
-        pan_steps: absolute counter.
-        tilt_steps: absolute counter.
-        aperture_deg: reading B.
-        approach: last move of (pan, tilt): left or right, up or down, or unknown.
+    """Compute the uncertainty budget of one look: counters, reading B of the aperture, last move of (pan, tilt).
 
     Raises:
-        ValueError: the calibration has no causes.
+        ValueError: the calibration has no causes, as of an older fit.
         InputError: there is no such approach, or beam and line of sight do not meet.
     """
     if not calibration.causes:
         raise ValueError("this calibration has no causes of uncertainty: fit the campaign again")
+    steps, count = (float(pan_steps), float(tilt_steps)), len(calibration.look_inputs)
     jacobian = calibration.derivatives(pan_steps, tilt_steps, aperture_deg, approach)
-    steps = float(pan_steps), float(tilt_steps)
     covariance, parts = calibration.look_covariance(steps), calibration.cause_covariance
     if calibration.gears.size:
         parts = calibration.gears.look_covariance(parts, steps)
-    count = len(calibration.look_inputs)
-    calibrated, at_look = jacobian[:, :count], jacobian[:, count:]
-    by_cause = [np.einsum("ij,jk,ik->i", calibrated, c, calibrated) for c in parts]
-    noise_variance = at_look**2 * np.diag(covariance)[count:]
-    by_cause += [noise_variance[:, kind].sum(axis=1) for kind in (STOPS, PLACES)] + [noise_variance[:, APERTURE]]
-    variance = np.array(by_cause)
+    calibrated, noise = jacobian[:, :count], jacobian[:, count:] ** 2 * np.diag(covariance)[count:]
+    here = [noise[:, kind].sum(axis=1) for kind in (STOPS, PLACES)] + [noise[:, APERTURE]]
+    variance = np.array([*(np.einsum("ij,jk,ik->i", calibrated, part, calibrated) for part in parts), *here])
     u = np.sqrt(np.diag(covariance))
     # Constants have correlation 0.
     safe = np.where(u > 0, u, 1.0)
@@ -114,33 +98,18 @@ _KINDS = {"stop": ("A", "normal"), "place": ("B", "uniform"), "aperture": ("B", 
 
 
 def coordinate_budget(budget: Budget, calibration: Calibration, xyz_mm: Sequence[float], component: str) -> BudgetTable:
-    """Build the budget of x, y or z of one located point, by parameter of the calibration and noise of the look.
-
-    Args:
-        budget: budget of the look.
-        calibration: its calibration.
-        xyz_mm: the point, frame T, mm.
-        component: "x", "y" or "z".
-
-    Raises:
-        ValueError: another component.
-    """
+    """Build the budget of "x", "y" or "z" of a located point by parameter of the calibration and noise of the look."""
     if component not in ("x", "y", "z"):
         raise ValueError(f"component {component!r}; allowed: x, y, z")
-    index = "xyz".index(component)
-    u = math.sqrt(float(budget.covariance_mm2[index, index]))
+    index, estimates = "xyz".index(component), calibration.estimates_at(budget.steps)
     sd = np.sqrt(np.diag(calibration.look_covariance(budget.steps))).tolist()
-    estimates = calibration.estimates_at(budget.steps)
     sources = []
     for name, width, moved in zip(budget.parameters, sd, budget.contribution_mm[:, index].tolist(), strict=True):
-        if width == 0:
-            continue
-        if name in UNIT_NOISES:
-            kind, shape = _KINDS[name.split()[0]]
-            sources.append(Source(name, "1", 0.0, width, kind, shape, math.inf, moved / width))
-        else:
-            sources.append(
-                Source(name, unit_of(name), estimates[name], width, "A, B", "normal", math.inf, moved / width)
-            )
+        if width:
+            fitted = name not in UNIT_NOISES
+            unit, value = (unit_of(name), estimates[name]) if fitted else ("1", 0.0)
+            kind = ("A, B", "normal") if fitted else _KINDS[name.split()[0]]
+            sources.append(Source(name, unit, value, width, *kind, math.inf, moved / width))
+    u = math.sqrt(float(budget.covariance_mm2[index, index]))
     notes = ("by parameter; parameters fitted together are correlated (GUM 5.2.2)",)
     return budget_table(f"{component} of the point", "mm", float(xyz_mm[index]), u, sources, notes=notes)

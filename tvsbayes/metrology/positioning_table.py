@@ -20,12 +20,11 @@ from tvsbayes.metrology.simulated_cycles import (
     RUNS,
     SIMULATED_TESTS,
     TARGETS_MIN,
-    Runs,
     simulated_runs,
     target_steps,
     targets_wanted,
 )
-from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, Predicted
+from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, Positioning, Predicted
 
 INDIRECT = (
     "ISO 230-2-style and indirect: angles of the beam are inferred from spots in two cameras through the fitted model; "
@@ -76,8 +75,9 @@ class StopReadings:
 def _with_own_stops(table: AxisPositioning, readings: StopReadings, wanted: int) -> AxisPositioning:
     """Add the figures of the campaign's stops, or why there are none; `wanted` is ISO's number of targets."""
     u = float(np.sqrt(np.mean(readings.u_deg**2))) if len(readings.u_deg) else None
-    left_out, few = readings.play_left_out, []
-    unplayed = [f"plug-in: {left_out} stops left out whose play was not taken up for certain"] if left_out else []
+    notes, left_out = [], readings.play_left_out
+    if left_out:
+        notes = [f"plug-in: {left_out} stops left out whose play was not taken up for certain"]
     runs = {
         int(n): [np.flatnonzero((readings.steps == n) & (readings.side == s)) for s in (1, -1)]
         for n in np.unique(readings.steps)
@@ -89,22 +89,19 @@ def _with_own_stops(table: AxisPositioning, readings: StopReadings, wanted: int)
             f"{counters} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
             f"are needed, ISO 230-2 asks for {wanted} with {RUNS} runs"
         )
-        return structs.replace(table, missing=reason, reading_u_deg=u, notes=tuple(unplayed))
+        return structs.replace(table, missing=reason, reading_u_deg=u, notes=tuple(notes))
     other = readings.reference_pose_deg[1 - AXES.index(readings.axis)]
     angle = beam_angle_deg(readings.values, readings.axis, readings.mirror_deg, other)
     deviation = angle - table.deg_per_step * readings.steps
-    longest = max(len(rows) for pair in usable.values() for rows in pair)
-    by_side = np.full((2, len(usable), longest), np.nan)
+    counts = tuple((len(up), len(down)) for up, down in usable.values())
+    by_side = np.full((2, len(usable), max(map(max, counts))), np.nan)
     for k, pair in enumerate(usable.values()):
         for side, rows in enumerate(pair):
             by_side[side, k, : len(rows)] = deviation[rows]
-    counts = tuple((len(a), len(b)) for a, b in usable.values())
     fewest = min(map(min, counts))
     if len(usable) < wanted or fewest < RUNS:
-        few.append(
-            f"plug-in: {len(usable)} targets, at least {fewest} runs per side; ISO 230-2 asks for {wanted} targets and "
-            f"{RUNS} runs"
-        )
+        made = f"plug-in: {len(usable)} targets, at least {fewest} runs per side"
+        notes.insert(0, f"{made}; ISO 230-2 asks for {wanted} targets and {RUNS} runs")
     return structs.replace(
         table,
         plug_in=figures_of(*by_side),
@@ -112,27 +109,23 @@ def _with_own_stops(table: AxisPositioning, readings: StopReadings, wanted: int)
         plug_in_runs=counts,
         reading_u_deg=u,
         missing=None,
-        notes=(OWN_STOPS, *few, *unplayed),
+        notes=(OWN_STOPS, *notes),
     )
 
 
-def _predicted(runs: Runs) -> dict[str, Predicted]:
+def _predicted(figures: Positioning) -> dict[str, Predicted]:
     """Compute median and interval of every figure over simulated tests."""
-    figures = figures_of(runs.up_deg, runs.down_deg)
-    predicted = {}
-    for name in FIGURES:
-        low, middle, high = np.quantile(getattr(figures, name), [0.025, 0.5, 0.975])
-        predicted[name] = Predicted(float(middle), (float(low), float(high)))
-    return predicted
+    quantiles = {name: np.quantile(getattr(figures, name), [0.025, 0.5, 0.975]).tolist() for name in FIGURES}
+    return {name: Predicted(middle, (low, high)) for name, (low, middle, high) in quantiles.items()}
 
 
 def _middle_deg_per_step(calibration: Calibration, axis: str) -> float:
     """Compute the beam's mean ratio of both directions at the middle of the counters, in mid-play."""
-    middle_pan, middle_tilt = calibration.range_steps.mean(axis=1).tolist()
-    estimates = calibration.estimates_at((middle_pan, middle_tilt))
+    counters = calibration.range_steps.mean(axis=1).tolist()
+    estimates = calibration.estimates_at((counters[0], counters[1]))
     pan, tilt = (
         float(output_deg(estimates, a, n, 0.0, calibration.period_deg.get(a)))
-        for a, n in zip(AXES, (middle_pan, middle_tilt), strict=True)
+        for a, n in zip(AXES, counters, strict=True)
     )
     return beam_deg_per_step(estimates, axis, (pan, tilt))
 
@@ -159,9 +152,6 @@ def positioning(
         tests: number of simulated tests.
         contrast_deg_per_step: draws of the ratio contrast, as in `simulated_runs`.
 
-    Returns:
-        The table, with notes on effects that it does not cover.
-
     Raises:
         ValueError: the calibration has no draws.
     """
@@ -174,8 +164,7 @@ def positioning(
     if chosen:
         contrast = contrast_deg_per_step
         cycles = simulated_runs(calibration, axis, chosen, ratio, tests=tests, contrast_deg_per_step=contrast)
-        predicted, made = _predicted(cycles), SIMULATED.format(tests, RUNS, calibration.estimator)
-    wanted = targets_wanted((high - low) * ratio)
+        predicted, made = _predicted(figures_of(*cycles)), SIMULATED.format(tests, RUNS, calibration.estimator)
     table = AxisPositioning(
         axis=axis,
         deg_per_step=ratio,
@@ -191,6 +180,6 @@ def positioning(
         notes=(),
     )
     if readings is not None:
-        table = _with_own_stops(table, readings, wanted)
+        table = _with_own_stops(table, readings, targets_wanted((high - low) * ratio))
     notes = (INDIRECT, *table.notes, made, DEFINITIONS, *(f"not covered: {text}" for text in NOT_COVERED))
     return structs.replace(table, notes=notes)
