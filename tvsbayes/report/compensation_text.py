@@ -71,6 +71,11 @@ DRIVE_HELPS = {
     "drift": "the walk of the zero; guide",
 }
 """The same for a drive at constant rate, where they differ."""
+ABSOLUTE_HELPS = {
+    "drift": "the walk of the zero, which no homing sets and a short campaign hardly shows, so that it rests on the prior: "
+    "read again on another day into the same folder, or state the drift",
+}
+"""The same for absolute encoders, where they differ."""
 
 
 def promise_table(result: Compensation | AimedPromise) -> TableView:
@@ -118,7 +123,7 @@ def _promise_text(verification: Verification) -> str:
 
 def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
     """A compensation as text."""
-    unit, (low, high), largest = escaped(result.unit), result.range_command, _largest(result)
+    unit, (low, high) = escaped(result.unit), result.range_command
     shift = ", but for one shift common to all" if result.zero_free else ""
     lines: list[Part] = [
         f"compensation for {result.target}: {len(result.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
@@ -127,7 +132,7 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
         promise_table(result),
         "",
         *_validity(result),
-        f"largest remaining error: {DRIVE_HELPS.get(largest, HELPS[largest]) if result.in_motion else HELPS[largest]}",
+        f"largest remaining error: {_help(result)}",
         *(f"the format: {text}" for text in result.unsaid),
     ]
     lines += _homing_remarks(result)
@@ -149,7 +154,7 @@ def aimed_text(result: AimedPromise) -> str:
         f"the promise holds between these counters, within {two_digits(result.hours)} h and {travel} of travel "
         f"{_since(any(result.homings.values()))}{_kelvin(result)}",
         f"arrive with at least {run_up} of travel on a side",
-        f"largest remaining error: {(HELPS | AIMED_HELPS)[_largest(result)]}",
+        f"largest remaining error: {_help(result)}",
         *_homing_remarks(result),
     )
 
@@ -172,10 +177,13 @@ def _of_axes(result: Compensation | AimedPromise) -> str:
     return f" of {' and of '.join(result.free_axes)}" if isinstance(result, AimedPromise) else ""
 
 
-def _largest(result: Compensation | AimedPromise) -> str:
-    """The largest cause of the remaining error."""
+def _help(result: Compensation | AimedPromise) -> str:
+    """The largest cause of the remaining error, with its remedy."""
     counted = [cause for cause in CAUSES if cause != "homing" or not _shift_free(result)]
-    return max(counted, key=lambda cause: max(promise.causes.get(cause, 0.0) for promise in result.sides.values()))
+    largest = max(counted, key=lambda cause: max(left.causes.get(cause, 0.0) for left in result.sides.values()))
+    own = AIMED_HELPS if isinstance(result, AimedPromise) else DRIVE_HELPS if result.in_motion else {}
+    homed = any(result.homings.values()) if isinstance(result, AimedPromise) else result.homings
+    return (HELPS | own | ({} if homed else ABSOLUTE_HELPS))[largest]
 
 
 def _since(homed: bool) -> str:
