@@ -72,7 +72,7 @@ DRIVE_HELPS = {
 }
 """The same for a drive at constant rate, where they differ."""
 ABSOLUTE_HELPS = {
-    "drift": "the walk of the zero, which no homing sets and a short campaign hardly shows, so that the prior tells it: "
+    "drift": "the walk of the zero, which no homing sets and a short campaign hardly shows, so that it is the prior's: "
     "read again on another day into the same folder, or state the drift",
 }
 """The same for absolute encoders, where they differ."""
