@@ -174,6 +174,15 @@ def watch_axis(fit: AxisFit, campaign: AxisCampaign, *, seed: int = 0) -> Watch:
     return tested(DrawnDepartures(centre, drawn, np.full(len(drawn), 1 / len(drawn))), len(fresh.value), True, seed)
 
 
+def _powers_of(
+    changes: tuple[StatedChange, ...], shifts: np.ndarray, common: np.ndarray, repeated: np.ndarray, seed: int
+) -> list[float]:
+    """Power of the test of each change by stops (r,): readings by a unit of each (r, q), covariance, variances."""
+    information = shifts.T @ np.linalg.solve(common + np.diag(repeated), shifts)
+    departure = Departure(0.0, len(shifts), np.zeros(len(changes)), information, changes)
+    return powers(departure, null_distribution(departure, seed).limit, seed)
+
+
 def plan_watch_axis(fit: AxisFit, *, minutes: float | None = None, seed: int = 0) -> tuple[WatchPlan, VerifyPlan]:
     """Plan the fewest stops after one homing by which `watch` notices each change, by greedy choice.
 
@@ -203,43 +212,38 @@ def plan_watch_axis(fit: AxisFit, *, minutes: float | None = None, seed: int = 0
     first |= first.sum() < LOOKS_MIN
     allowed = HOUR_MINUTES * machine.use.hours if minutes is None else minutes
     move_minutes = float(np.median(np.diff([move.time_s for move in fit.campaign.moves]))) * HOUR_MINUTES / HOUR_S
+    # Of single tests at equal shares of the false alarms.
+    wanted = float(ndtri(1 - 0.5 * FALSE_ALARM_RATE / len(changes)) + ndtri(POWER_MIN)) ** 2
 
-    def planned(which: Sequence[int], most: int) -> tuple[VerifyPlan, np.ndarray, float]:
-        off = [changes[k].size * shifts[:, k] for k in which]
-        # Of single tests at equal shares of the false alarms.
-        wanted = float(ndtri(1 - 0.5 * FALSE_ALARM_RATE / len(changes)) + ndtri(POWER_MIN)) ** 2
-        chosen = discriminating_visits(off, common, noise, first, wanted, most)
+    def planned(which: Sequence[int], most: int = STOPS_MAX) -> tuple[VerifyPlan, np.ndarray, float]:
+        chosen = discriminating_visits(
+            [changes[k].size * shifts[:, k] for k in which], common, noise, first, wanted, most
+        )
         plan = VerifyPlan(planned_stops(command, side, chosen.visits), run_up, chosen.reached >= wanted, chosen.reached)
         return plan, chosen.visits, move_minutes * plan.moves
 
-    every, most = range(len(changes)), STOPS_MAX
-    plan, visits, taken = planned(every, most)
-    while taken > allowed and len(plan.stops) > max(int(first.sum()), LOOKS_MIN):
+    every = range(len(changes))
+    plan, visits, taken = planned(every)
+    while taken > allowed and len(plan.stops) > first.sum():
         plan, visits, taken = planned(every, len(plan.stops) - 1)
     used = np.flatnonzero(visits)
-    scattered = common[np.ix_(used, used)] + np.diag(noise[used] / visits[used])
-    information = shifts[used].T @ np.linalg.solve(scattered, shifts[used])
-    departure = Departure(0.0, len(used), np.zeros(len(changes)), information, changes)
-    able = powers(departure, null_distribution(departure, seed).limit, seed)
-    needs = [planned([k], most) for k in every]
-    return (
-        WatchPlan(
-            looks=len(plan.stops),
-            homings=1,
-            minutes=taken,
-            minutes_allowed=allowed,
-            power_wanted=POWER_MIN,
-            false_alarm_rate=FALSE_ALARM_RATE,
-            met=min(able) >= POWER_MIN and taken <= allowed,
-            changes=tuple(
-                PlannedChange(
-                    *(change.what, change.size, change.unit, power),
-                    *((len(need.stops), 1, lasts) if need.enough else (None, None, None)),
-                    None,
-                )
-                for change, power, (need, _, lasts) in zip(changes, able, needs, strict=True)
-            ),
-            steps=(),
-        ),
-        plan,
+    able = _powers_of(changes, shifts[used], common[np.ix_(used, used)], noise[used] / visits[used], seed)
+    needs = [
+        (len(alone.stops), lasts) if alone.enough else (None, None) for alone, _, lasts in map(planned, zip(every))
+    ]
+    seen = tuple(
+        PlannedChange(each.what, each.size, each.unit, power, count, 1 if count else None, lasts, None)
+        for each, power, (count, lasts) in zip(changes, able, needs, strict=True)
     )
+    looks = WatchPlan(
+        looks=len(plan.stops),
+        homings=1,
+        minutes=taken,
+        minutes_allowed=allowed,
+        power_wanted=POWER_MIN,
+        false_alarm_rate=FALSE_ALARM_RATE,
+        met=min(able) >= POWER_MIN and taken <= allowed,
+        changes=seen,
+        steps=(),
+    )
+    return looks, plan
