@@ -113,6 +113,13 @@ def test_later_readings_are_compared_and_watched(ask, say, folder, tmp_path):
     assert [change["what"] for change in document["changes"]] == ["ratio", "play"]
     assert document["verdict"] in (tmp_path / "nights.csv").read_text()
     assert "new stops against the calibration" in say("watch", folder, tmp_path / "later")[1]
+    code, document = ask("plan", folder, "--watch", "-o", tmp_path / "stops.csv")
+    assert code == 0 and document["plan"] == str(tmp_path / "stops.csv")
+    jsonschema.validate(document, shipped_schema("watch-plan-1"))
+    planned = (tmp_path / "stops.csv").read_text().splitlines()
+    assert sum(row.endswith(",1") for row in planned[1:]) == document["looks"] >= 4
+    code, document = ask("plan", folder, "--given", folder, "--watch")
+    assert code == 2 and assert_error(document, "usage")
     for command in ("compare", "watch"):
         code, document = ask(command, folder, folder)
         assert code == 2 and assert_error(document, "same-looks")

@@ -30,6 +30,7 @@ from tvsbayes.compensation.verification import (
     planned_stops,
     reachable_stops,
     spread_stops,
+    use_over,
 )
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.results.comparison_record import Comparison
@@ -38,7 +39,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_reading
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedAxis
-from tvsbayes.statistics.predicted_readings import State, frees_shift
+from tvsbayes.statistics.predicted_readings import frees_shift
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 SCATTERS, HOME_SDS = 4.0, 5.0
@@ -202,9 +203,8 @@ def plan_watch_axis(fit: AxisFit, *, minutes: float | None = None, seed: int = 0
     machine = PredictedAxis(fit, seed)
     run_up = run_up_of(machine, fit.rows.positions, fit.rows.line.slope)
     command, side = reachable_stops(fit, table_commands(fit.rows), run_up)
-    variance, state = np.full(len(command), reading_u(fit.campaign) ** 2), machine.state
-    use = State(np.linspace(0.0, machine.use.hours, len(command)), state.travel, state.warm_hours, state.kelvin)
-    scatter = sum(machine.scatter(side, use, np.sqrt(variance)).values())
+    variance = np.full(len(command), reading_u(fit.campaign) ** 2)
+    use, scatter = use_over(machine, machine.use.hours, side, variance)
     covariance = machine.expected(command, side, use).plus(scatter).pooled().covariance
     noise = np.minimum(machine.noise(side, variance), 0.999 * np.diag(covariance))
     changes, shifts = _changes(machine, command, side, variance)

@@ -509,6 +509,12 @@ def reachable_stops(fit: AxisFit, nodes: np.ndarray, run_up: float) -> tuple[np.
     return command[reached], side[reached]
 
 
+def use_over(machine: PredictedAxis, hours: float, side: np.ndarray, variance: np.ndarray) -> tuple[State, np.ndarray]:
+    """States of stops (r,) one after the other over the hours since a homing, and what does not repeat there."""
+    use = machine.state._replace(hours=np.linspace(0.0, hours, len(side)))
+    return use, np.asarray(sum(machine.scatter(side, use, np.sqrt(variance)).values()))
+
+
 def spread_stops(command: np.ndarray) -> np.ndarray:
     """Mask of stops over the whole range, which come first: a fault in a part of it shows only there."""
     nodes = np.unique(command)
@@ -530,9 +536,7 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
     applied, run_up = Correction.of(made), made.reversal_command
     command, side = reachable_stops(fit, np.array([row.command for row in made.table]), run_up)
     machine, variance = PredictedAxis(fit, seed), np.full(len(command), reading_u(fit.campaign) ** 2)
-    state = machine.state
-    use = State(np.linspace(0.0, made.hours, len(command)), state.travel, state.warm_hours, state.kelvin)
-    scatter = sum(machine.scatter(side, use, np.sqrt(variance)).values())
+    use, scatter = use_over(machine, made.hours, side, variance)
 
     def at(common: float, play: float) -> PredictedReadings:
         return machine.expected(applied.sent(command, side, common, play), side, use).plus(scatter)
