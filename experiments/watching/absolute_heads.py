@@ -6,7 +6,7 @@
 Head i of a kind is drawn with seed i by NumPy alone, nothing of the package in it: geometry, errors by position of its
 encoders (`output`) or gears (`motor`, with play that varies), scatter of stops, a zero that walks. 40 to 100 stars are
 found, each at its own angles, on a night of one power-up or of two; the approach of the first move is recorded or not.
-Heads are of three `USES`, by their seed: a zero that walks little, as far as the prior says, or little and seen on
+Heads are of three `USES`, in turn: a zero that walks little, as far as the prior says, or little and seen on
 another night of 40 stars as well. The next night is another campaign of 40 stars, drawn eight times after the same
 first one: the actual error is that of these. Tables go through `import --sightings --encoders`. CPU is in imports: the
 CPU time of `import jax, optimistix, scipy.stats` in a process of its own, measured beside every head.
@@ -92,11 +92,16 @@ def turn(axis: int, angle_deg: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def use_of(kind: tuple[str, str], seed: int) -> tuple[str, float, int]:
+    """The use of a head: each kind has all of them in turn."""
+    return USES[(seed + KINDS.index(kind)) % len(USES)]
+
+
 def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, list[Night], int]:
     """A head's campaign, `NEXT_NIGHTS` that may come a day later, each drawn anew, and the stars of the campaign."""
     encoder, recorded = kind
     rng = np.random.default_rng([SEED, KINDS.index(kind), seed])
-    _, walks, nights = USES[seed % len(USES)]
+    _, walks, nights = use_of(kind, seed)
     first, of_motor = int(rng.integers(40, 101)), encoder == "motor"
     known = first + (nights - 1) * NEXT_STARS
     count = known + NEXT_NIGHTS * NEXT_STARS
@@ -181,7 +186,7 @@ def one_head(task: tuple[str, str, int]) -> dict[str, object]:
     """One head: fitted by the command, then its next night, and the same with a zero that moved."""
     encoder, recorded, seed = task
     campaign, later, stars = drawn_nights((encoder, recorded), seed)
-    use, _, nights = USES[seed % len(USES)]
+    use, _, nights = use_of((encoder, recorded), seed)
     next_night = FIRST_NIGHT + nights * NIGHTS_APART
     row: dict[str, object] = {"encoder": encoder, "sides": recorded, "seed": seed, "use": use, "stars": stars}
     row["commit"] = commit()
