@@ -264,7 +264,7 @@ FAULTS = (
           Returns("self.limits or (min(m.command for m in self.moves), max(m.command for m in self.moves))"),
           "test_no_plan_goes_where_an_import_thought_that_the_axis_was"),
     Fault("the run-ups of a verification leave the limits", "verification.reachable_stops",
-          Local("reached", "np.ones(len(command), dtype=bool)"), "test_a_verification_stays_within_the_limits"),
+          Argument("run_up", "0.0 * value"), "test_a_verification_stays_within_the_limits"),
     Fault("an absolute zero stands still between two folders", "PredictedAxis.read", Local("pause", "0.0"),
           "test_an_absolute_zero_walks_on_between_the_folders"),
     Fault("the promise of an absolute axis forgets the walk in its campaign", "PredictedAxis._walked_hours",
