@@ -13,13 +13,13 @@ import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice, permutations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from tvsbayes.errors import Candidate, InputError, escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.asking import asked, refused
+from tvsbayes.importing.asking import ANSWERS_MAX, asked, refused
 from tvsbayes.importing.axis import MOVING_SHARE, ROWS_MIN
 from tvsbayes.importing.clock import date_time, forward
 from tvsbayes.importing.columns import line_through
@@ -37,8 +37,6 @@ ROWS_KEPT = 2000
 INFLATED_BYTES_MAX, MESSAGE_BYTES_MAX = 64 * 2**20, 2**20
 KLIPPER_TURN = 65536
 """Counts per turn of an angle sensor in Klipper (klippy/extras/angle.py, ANGLE_BITS)."""
-PAIRS_MAX = 20
-"""Largest number of pairs of series that are asked about."""
 INVALID = 3
 """Severity of a value that is none (EPICS, alarm.h)."""
 _CAMONITOR = re.compile(
@@ -51,32 +49,28 @@ _CONCEPTS = (("value", "logged-reading"), ("value", "logged-readback"), ("comman
 """Words of a series by what it is, the surest first."""
 
 
-class Series(NamedTuple):
-    """Values by ascending time, logged at changes, shapes (n,)."""
-
-    times_s: np.ndarray
-    values: np.ndarray
-
-
-def _series(rows: Iterable[Sequence[float]]) -> Series:
-    """Rows in time order; only the last of several at one time."""
-    times, values = np.array(sorted(rows, key=lambda row: row[0]), dtype=float).reshape(-1, 2).T
-    is_last = np.append(np.diff(times) > EQUAL_S, True)[: len(times)]
-    return Series(times[is_last], values[is_last])
+def _series(rows: Iterable[tuple[str, float, float]]) -> dict[str, np.ndarray]:
+    """Times and values by name, shape (2, n), in time order; only the last of several at one time."""
+    of_name = defaultdict[str, list[tuple[float, float]]](list)
+    for name, time_s, value in rows:
+        of_name[name].append((time_s, value))
+    series = {name: np.array(sorted(own, key=lambda row: row[0]), dtype=float).T for name, own in of_name.items()}
+    return {name: both[:, np.append(np.diff(both[0]) > EQUAL_S, True)] for name, both in series.items()}
 
 
 def _joined(
-    file: str, notes: Sequence[str], read: Series, commands: np.ndarray, names: tuple[str, str]
+    file: str, notes: Sequence[str], read: np.ndarray, commands: np.ndarray, names: tuple[str, str]
 ) -> ForeignTable:
     """Commands and readings at the same times as a table, every n-th of many."""
     step = -(-len(commands) // ROWS_KEPT)
+    times, values = read[:, ::step]
     columns = {
-        "time_s": [f"{t:.6f}" for t in read.times_s[::step] - read.times_s[0]],
+        "time_s": [f"{t:.6f}" for t in times - times[0]],
         names[0]: [repr(float(f"{c:.10g}")) for c in commands[::step]],
-        names[1]: [f"{v:.12g}" for v in read.values[::step]],
+        names[1]: [f"{v:.12g}" for v in values],
     }
     thinned = [f"every {step}th reading kept"] * (step > 1)
-    return table_of(file, "; ".join([*notes, *thinned]), columns, range(1, len(columns["time_s"]) + 1))
+    return table_of(file, "; ".join([*notes, *thinned]), columns, range(1, len(times) + 1))
 
 
 # --- EPICS -----------------------------------------------------------------------------------------------------------
@@ -105,30 +99,29 @@ def epics_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable
     """
     series, notes = _archived(text, file) if is_archive(text) else _monitored(text)
     command, value = _pair(series, file, stated)
-    log, read = series[command], series[value]
-    inside = (read.times_s >= log.times_s[0] - EQUAL_S) & (read.times_s <= log.times_s[-1] + EQUAL_S)
+    (log_s, logged), read = series[command], series[value]
+    inside = (read[0] >= log_s[0] - EQUAL_S) & (read[0] <= log_s[-1] + EQUAL_S)
     if not inside.any():
         raise refused("apart", file, command=command, value=value)
-    read = Series(read.times_s[inside], read.values[inside])
-    before = np.maximum(np.searchsorted(log.times_s, read.times_s + EQUAL_S, side="right") - 1, 0)
-    after = np.minimum(before + 1, len(log.times_s) - 1)
-    gap_s, since_s = log.times_s[after] - log.times_s[before], read.times_s - log.times_s[before]
-    usual_s = float(np.median(np.diff(log.times_s))) if len(log.times_s) > 1 else 0.0
+    times_s, values = read = read[:, inside]
+    before = np.maximum(np.searchsorted(log_s, times_s + EQUAL_S, side="right") - 1, 0)
+    after = np.minimum(before + 1, len(log_s) - 1)
+    gap_s, since_s, held = log_s[after] - log_s[before], times_s - log_s[before], logged[before]
+    usual_s = float(np.median(np.diff(log_s))) if len(log_s) > 1 else 0.0
     moving = (gap_s <= min(STANDSTILL_INTERVALS * usual_s, INTERVAL_MAX_S)) & (since_s > EQUAL_S)
-    held = log.values[before]
     share = np.divide(since_s, gap_s, out=np.zeros(len(held)), where=moving)
-    commands = held + share * (log.values[after] - held)
+    commands = held + share * (logged[after] - held)
     # A command that is logged once a move jumps; between two such rows no axis was halfway.
-    if _scatter(held, read.values) <= _scatter(commands, read.values):
+    if _scatter(held, values) <= _scatter(commands, values):
         commands, moving = held, np.zeros(1)
     notes += [f"command {escaped(command)}, reading {escaped(value)}"]
     notes += [f"{int(moving.sum())} commands interpolated in time, {int((~inside).sum())} readings outside left out"]
     counts, rests = np.unique(before, return_counts=True)[1], np.ones(len(held), dtype=bool)
     if not moving.any() and np.median(counts) < ROWS_MIN and np.mean(counts > 1) >= MOVING_SHARE:
         # A value that is logged at its change, and soon after another one, is of an axis under way.
-        rests[:-1] = (np.diff(read.times_s) > INTERVAL_MAX_S) | (np.diff(before) > 0)
+        rests[:-1] = (np.diff(times_s) > INTERVAL_MAX_S) | (np.diff(before) > 0)
         notes += [f"{int((~rests).sum())} readings under way left out"] * (not rests.all())
-    return _joined(file, notes, Series(read.times_s[rests], read.values[rests]), commands[rests], (command, value))
+    return _joined(file, notes, read[:, rests], commands[rests], (command, value))
 
 
 def _scatter(commands: np.ndarray, values: np.ndarray) -> float:
@@ -136,7 +129,7 @@ def _scatter(commands: np.ndarray, values: np.ndarray) -> float:
     return float(np.std(line_through(commands, values)[1])) if len(np.unique(commands)) > 1 else np.inf
 
 
-def _monitored(text: str) -> tuple[dict[str, Series], list[str]]:
+def _monitored(text: str) -> tuple[dict[str, np.ndarray], list[str]]:
     """Series of a camonitor log; a clock that steps back goes on."""
     rows, names, left_out = [], set[str](), 0
     for number, line in enumerate(text.splitlines(), start=1):
@@ -148,38 +141,34 @@ def _monitored(text: str) -> tuple[dict[str, Series], list[str]]:
                 rows.append((number, match["name"], at, value))
                 continue
         left_out += bool(line.strip())
-    times_s, backs = forward(((at - rows[0][2]).total_seconds() for _, _, at, _ in rows), (row[1] for row in rows))
-    values = defaultdict[str, list[tuple[float, float]]](list)
-    for time_s, (_, name, _, value) in zip(times_s, rows, strict=True):
-        values[name].append((time_s, value))
+    numbers, of, stamps, values = zip(*rows, strict=True) if rows else ((), (), (), ())
+    times_s, backs = forward(((at - stamps[0]).total_seconds() for at in stamps), of)
     notes = [f"EPICS camonitor, {len(names)} series, {left_out} lines without a number left out"]
-    notes += [back.text(rows[back.row][0]) for back in backs]
-    return {name: _series(of_name) for name, of_name in values.items()}, notes
+    return _series(zip(of, times_s, values, strict=True)), [*notes, *(back.text(numbers[back.row]) for back in backs)]
 
 
-def _archived(text: str, file: str) -> tuple[dict[str, Series], list[str]]:
+def _archived(text: str, file: str) -> tuple[dict[str, np.ndarray], list[str]]:
     """Series of the archiver appliance (its "Customizing data retrieval"), with their units in brackets."""
-    series, left_out = defaultdict[str, list[tuple[float, float]]](list), 0
+    rows, left_out = list[tuple[str, float, float]](), 0
     try:
         content = json.loads(text)
         for entry in content:
             meta, data = entry["meta"], entry["data"]
-            name, unit = str(meta["name"]), str(meta.get("EGU", ""))
+            name = str(meta["name"]) + (f" ({meta['EGU']})" if meta.get("EGU", "") else "")
             usable = [r for r in data if r.get("severity", 0) < INVALID and isinstance(r.get("val"), int | float)]
             usable = [r for r in usable if math.isfinite(r["val"])]
             left_out += len(data) - len(usable)
-            rows = ((float(r["secs"]) + 1e-9 * float(r.get("nanos", 0)), float(r["val"])) for r in usable)
-            series[f"{name} ({unit})" if unit else name].extend(rows)
+            rows += [(name, float(r["secs"]) + 1e-9 * float(r.get("nanos", 0)), float(r["val"])) for r in usable]
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise refused("archive", file, error=escaped(str(error), 60)) from error
     notes = [f"EPICS archiver, {len(content)} series, {left_out} values that are invalid or no numbers left out"]
-    return {name: _series(rows) for name, rows in series.items() if rows}, notes
+    return _series(rows), notes
 
 
-def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> tuple[str, str]:
+def _pair(series: Mapping[str, np.ndarray], file: str, stated: Mapping[str, str]) -> tuple[str, str]:
     """Names of the series of command and reading: as stated, else by words in their names."""
     changing = [name for name, (_, values) in series.items() if len(np.unique(values)) > 1]
-    listed = ", ".join(f"{escaped(name)} ({len(series[name].values)} values)" for name in changing) or "none"
+    listed = ", ".join(f"{escaped(name)} ({series[name].shape[1]} values)" for name in changing) or "none"
     by_name = {name: name for name in series} | {re.sub(r" \([^()]*\)$", "", name): name for name in series}
     names = {field: by_name.get(stated[field], stated[field]) for field in ("command", "value") if stated.get(field)}
     for field, name in names.items():
@@ -193,7 +182,7 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
             names[field] = matching[0]
     free = [name for name in changing if name not in names.values()]
     missing = [field for field in ("command", "value") if field not in names]
-    ways = islice(permutations(free, len(missing)), PAIRS_MAX)
+    ways = islice(permutations(free, len(missing)), ANSWERS_MAX)
     pairs = [{**names, **dict(zip(missing, chosen, strict=True))} for chosen in ways]
     if not pairs:
         raise refused("few-series", file, series=listed)
@@ -203,7 +192,7 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
         Candidate(
             f"command {escaped(pair['command'])}, reading {escaped(pair['value'])}",
             ("--column", f"command={pair['command']}", "--column", f"value={pair['value']}"),
-            {name: [f"{x:g}" for x in series[name].values[:3]] for name in pair.values()},
+            {name: [f"{x:g}" for x in series[name][1, :3]] for name in pair.values()},
         )
         for pair in pairs
     ]
@@ -257,15 +246,15 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     if sorted(name.partition(":")[0] for name in rows) != ["angle", "stepq"]:
         raise refused("klipper-series", file, series=list(rows) or "none")
     angles_at, queue = (np.concatenate(rows[name]) for name in sorted(rows))
-    read = _series(angles_at)
-    counters = _counters_at(queue, read.times_s)
+    read = _series(("", *row) for row in angles_at).get("", np.empty((2, 0)))
+    counters = _counters_at(queue, read[0])
     inside = np.isfinite(counters)
     if not inside.any():
         raise refused("klipper-apart", file)
     notes = [f"Klipper, {', '.join(map(escaped, rows))}"]
     notes.append(f"{int((~inside).sum())} angles before the first step left out")
-    read = Series(read.times_s[inside], read.values[inside] * 360.0 / KLIPPER_TURN)
-    return _joined(file, notes, read, counters[inside], ("steps", "angle (deg)"))
+    read[1] *= 360.0 / KLIPPER_TURN
+    return _joined(file, notes, read[:, inside], counters[inside], ("steps", "angle (deg)"))
 
 
 def _messages(data: bytes, file: str) -> Iterator[dict[str, Any]]:
