@@ -18,7 +18,7 @@ def test_coordinates_have_the_quantiles_of_their_priors():
     np.testing.assert_allclose(values["transmission_error"], 0.08 * np.array([0.67449, 2.27760]), rtol=1e-4)
     np.testing.assert_allclose(values["stop_sd.forward"], 0.02 * np.exp([0.0, 3.0]), rtol=1e-12)
     np.testing.assert_allclose(values["backlash"], [0.1, 0.5], rtol=1e-12)
-    np.testing.assert_allclose(values["home_sd"], 0.004, rtol=1e-12)
+    np.testing.assert_allclose(values["home_sd"], 0.0008, rtol=1e-12)
     assert coordinates.coordinate("stop_sd.forward", 0.02 * np.exp(3.0)) == pytest.approx(2.0)
 
 

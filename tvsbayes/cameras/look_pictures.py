@@ -35,7 +35,9 @@ Matching = Literal["number", "order"]
 LOOKS_MAX = 100_000
 SPARSE_MARGIN = 10
 """The numbers in names are times or a counter, not moves, where the largest exceeds twice their count plus this."""
-_NUMBER = re.compile(r"[0-9]{1,9}")
+_NUMBER = re.compile(r"[0-9]{1,18}")
+STAMP_NUMBERS = 5
+"""Least count of numbers in a name, as 2026-06-01_23-59-50, that are one time together."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,8 @@ def _number_position(views: Sequence[View], ids: Sequence[int] | None) -> int | 
     numbers = {position: {view.numbers[position] for view in views} for position in positions}
     fitting = [position for position in positions if known is None or numbers[position] <= known]
     best = max(fitting, key=lambda position: (len(numbers[position]), position), default=None)
+    if best is not None and len(positions) >= STAMP_NUMBERS and len(numbers[best]) < len(views) and known is None:
+        return None
     return best if best is not None and (len(numbers[best]) > 1 or len(views) == 1) else None
 
 
@@ -186,10 +190,12 @@ def pair_looks(
         stated, names = [view.numbers[slot] for view in views], [view.without_number(slot) for view in views]
         if matching is None and _are_experiments(views, slot, names):
             raise _question(views[0], stated[0])
-        ranks = {number: rank for rank, number in enumerate(sorted(set(stated)))}
+        # A day before a time of day counts too.
+        times = [tuple(view.numbers[: slot + 1]) for view in views]
         numbers = stated
-        if ids is None and max(stated) >= 2 * len(ranks) + SPARSE_MARGIN:
-            numbers, renumbered = [ranks[number] for number in stated], (min(stated), max(stated))
+        if ids is None and max(stated) >= 2 * len(set(stated)) + SPARSE_MARGIN:
+            ranks = {time: rank for rank, time in enumerate(sorted(set(times)))}
+            numbers, renumbered = [ranks[time] for time in times], (min(stated), max(stated))
     elif matching == "number" or (ids is not None and len(views) != len(ids)):
         raise _unmatched(views, ids or (), file)
     else:

@@ -19,15 +19,24 @@ import numpy as np
 
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.asking import asked
+from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
-from tvsbayes.importing.axis_units import Wishes, in_one_unit, is_expanded, shown_units, stated_unit, units_of
+from tvsbayes.importing.axis_units import Wishes, in_one_unit, is_expanded, rounded, shown_units, stated_unit, units_of
 from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of, temperatures_of
 from tvsbayes.importing.clock import seconds_of, stamp_of
-from tvsbayes.importing.columns import Understood, columns_of, line_through, table_document, table_lines
+from tvsbayes.importing.columns import (
+    Understood,
+    asked_of_dial,
+    columns_of,
+    fill_values,
+    restarts,
+    table_document,
+    table_lines,
+)
+from tvsbayes.importing.counters import are_moves, summed_up
 from tvsbayes.importing.runs import long_table
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import means, name_of, parse_unit, place_of, plain, words_of
+from tvsbayes.importing.words import Unit, means, name_of, parse_unit, place_of, plain, words_of
 from tvsbayes.statistics.wrapped import turn_jumps
 
 ROWS_MIN = 4
@@ -65,7 +74,9 @@ def at_rest(command: np.ndarray, value: np.ndarray, parts: Sequence[Sequence[str
         begins[1:] |= np.array([a != b for a, b in pairwise(cells)], bool)
     starts = np.flatnonzero(begins)
     blocks = [np.arange(a, b) for a, b in zip(starts, [*starts[1:], len(command)], strict=True)]
-    blocks = [block[np.isfinite(value[block])] for block in blocks]
+    passed = _passed(command, blocks)
+    rests[[row for block in passed for row in block]] = False
+    blocks = [block[np.isfinite(value[block])] for block in blocks if not any(block is ramp for ramp in passed)]
     if len(blocks) < 2 or np.median([len(block) for block in blocks]) < ROWS_MIN:
         return rests
     tails = [block[-max(3, round(TAIL_SHARE * len(block))) :] for block in blocks]
@@ -97,9 +108,26 @@ def at_rest(command: np.ndarray, value: np.ndarray, parts: Sequence[Sequence[str
         if len(block) >= ROWS_MIN and abs(value[block[-1]] - value[block[-2]]) > tolerance and off.mean() > 0.5:
             rests[block] = False
     under_way = np.mean([k not in elsewhere and not rests[block].all() for k, block in enumerate(blocks)][1:])
-    return rests if under_way >= MOVING_SHARE else np.ones(len(command), bool)
+    kept = np.ones(len(command), bool)
+    kept[[row for block in passed for row in block]] = False
+    return rests if under_way >= MOVING_SHARE else kept
 
 
+def _passed(command: np.ndarray, blocks: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Blocks of a command that the axis passed: short ones, on the way from one long stop to the next."""
+    long = [k for k, block in enumerate(blocks) if len(block) >= RAMP_ROWS]
+    short = [k for k in range(len(blocks)) if long and long[0] < k < long[-1] and len(blocks[k]) <= 2]
+    at = [float(command[block[0]]) for block in blocks]
+    for a, b in pairwise(long):
+        steps = np.diff(at[a : b + 1])
+        if b > a + 1 and not (np.all(steps > 0) or np.all(steps < 0)):
+            return []
+    whole = len(short) + len(long) == len(blocks) and 2 * sum(len(blocks[k]) for k in long) > len(command)
+    return [blocks[k] for k in short] if whole and len(short) >= len(long) >= 3 else []
+
+
+RAMP_ROWS = 6
+"""Least number of rows of a stop, between which commands are passed."""
 NUMBER_MAX = 1e12
 """Largest absolute command or reading."""
 TURN_TOLERANCE = 0.1
@@ -122,13 +150,14 @@ SCALES = ("length", "angle")
 """Kinds of units in which commands are target positions."""
 STATED_SHARE = 0.6
 """Least mean sign of the steps at which a single word stands for their direction."""
-MOVES_MIN, MOVES_SHARE = 4, 0.1
-"""Least number of readings, and largest part of their spread that the sum of the moves leaves, where commands are
-moves: play leaves less."""
 EXPANDED_IS_COMMON = (
     "u: an expanded uncertainty is one error that all readings share, as a certificate's is, not noise of each; "
     "campaign.toml says otherwise without u_is"
 )
+STALE_MIN = 4
+"""Least number of moves of an export of two series, whose rows repeat the last reading."""
+SEAM_GAPS = 3.0
+"""Least size of the part of a circle that commands leave out, in median distances of commands."""
 STATUS_SHARE = 0.5
 """Share of rows that a status of 0 and 1 may leave out without a question."""
 
@@ -176,10 +205,14 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     """
     table.require_rows()
     runs = long_table(table, wishes.columns, wishes.order)
-    known = axis_columns(runs.table, runs.stated, wishes.deviations)
+    settled = wishes.deviations is not None or wishes.relative or wishes.counts_per_turn is not None
+    known = axis_columns(runs.table, runs.stated, wishes.deviations, settled=settled)
     table, columns = runs.table, dict(known.columns)
     assumed = [*runs.remarks, *known.remarks]
-    table = _good_rows(table, columns, wishes, assumed)
+    if wishes.relative:
+        table = _summed(table, columns)
+        assumed.append("command: summed up, because --relative says that each is the length of its move")
+    table = _without_fills(_good_rows(table, columns, wishes, assumed), columns, wishes, assumed)
     table = _resting_rows(table, columns, wishes, assumed)
     cells, written = FieldCells(table, columns).with_plain(("command", "value", "u"), assumed)
     units = units_of(cells, written, wishes, assumed)
@@ -187,11 +220,20 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     read = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
     of_homings = list[str]()
     homings = homings_of(cells, of_homings)
-    if wishes.relative:
-        commands = summed_up(commands, homings)
-        assumed.append("command: summed up, because --relative says that each is the length of its move")
-    elif "command" not in wishes.columns and _are_moves(commands, read, homings):
-        raise table.ask("moves-or-positions", column=columns["command"])
+    if "value" not in wishes.columns and name_of(columns["value"]).has("increment"):
+        raise refused("moved-readings", table.file, line=table.first_line, name=columns["value"])
+    stale = _stale(commands, read)
+    if stale.any():
+        read = [None if old else value for value, old in zip(read, stale, strict=True)]
+        how = "as an export of two series does: moves alone"
+        assumed.append(f"value: {stale.sum()} rows repeat the reading before a move, {how}")
+    commands = _through_the_seam(cells, commands, units["command"], wishes, assumed)
+    if (
+        not wishes.relative
+        and "command" not in wishes.columns
+        and (are_moves(commands, read, homings) or name_of(columns["command"]).has("increment"))
+    ):
+        raise table.ask("moves-or-positions", column=columns["command"], field="command")
     given_u = [u or 0.0 for u in cells.numbers("u", 0.0, NUMBER_MAX, optional=True)]
     values, stated_u, unit = in_one_unit(cells, commands, read, given_u, units, wishes, assumed)
     times, statuses = seconds_of(cells, assumed, stated_unit(cells, "time_s", wishes)), cells.text("status")
@@ -229,27 +271,51 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     )
 
 
-def summed_up(moves: Sequence[float], homings: Sequence[bool]) -> list[float]:
-    """Positions after moves, from 0 at every homing."""
-    begun = np.cumsum(homings)
-    total, moved = np.cumsum(moves), np.asarray(moves, dtype=float)
-    before = (total - moved)[np.searchsorted(begun, begun)]
-    return [float(f"{x:.13g}") for x in total - before]
+def _summed(table: ForeignTable, columns: Mapping[str, str]) -> ForeignTable:
+    """The table with positions in place of moves, from 0 at every homing."""
+    cells, written = FieldCells(table, columns).with_plain(("command",), [])
+    moves = [move or 0.0 for move in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
+    positions = tuple(map(repr, summed_up(moves, homings_of(cells, []))))
+    unit = written["command"]
+    positions = tuple(f"{at} {unit.name}" for at in positions) if unit else positions
+    return replace(table, columns={**table.columns, columns["command"]: positions})
 
 
-def _are_moves(commands: Sequence[float], read: Sequence[float | None], homings: Sequence[bool]) -> bool:
-    """Whether the readings follow the sum of the commands, and not the commands."""
-    known = np.array([value is not None for value in read])
-    value = np.array([np.nan if v is None else v for v in read])[known]
-    if len(value) < MOVES_MIN or not np.ptp(value) > 0:
-        return False
+def _stale(commands: Sequence[float], read: Sequence[float | None]) -> np.ndarray:
+    """Rows that repeat the reading before, where all rows of a new command do: two series joined row by row."""
+    command = np.array(commands)
+    value = np.array([np.nan if v is None else v for v in read])
+    moved, same = np.diff(command) != 0, value[1:] == value[:-1]
+    stale = np.r_[False, moved & same]
+    staircase = moved.sum() >= STALE_MIN and np.all((same | np.isnan(value[:-1]))[moved]) and not same[~moved].all()
+    return stale if staircase else np.zeros(len(command), bool)
 
-    def unexplained(x: Sequence[float]) -> float:
-        of_read = np.asarray(x, dtype=float)[known]
-        return float(np.std(line_through(of_read, value)[1])) if np.ptp(of_read) > 0 else np.inf
 
-    of_sums, of_commands = map(unexplained, (summed_up(commands, homings), commands))
-    return of_sums < MOVES_SHARE * min(of_commands, float(np.std(value)))
+def _through_the_seam(
+    cells: FieldCells, commands: list[float], unit: Unit | None, wishes: Wishes, assumed: list[str]
+) -> list[float]:
+    """Commands of an angle that go on through a whole turn, where the user says so.
+
+    Raises:
+        Question: they jump across the seam, and the part of the circle that they leave out lies elsewhere.
+    """
+    turn = wishes.command_turn
+    if turn is None and unit is not None and unit.kind == "angle":
+        period = 360.0 / (unit.scale * unit.per_number)
+        places = np.unique(np.mod(commands, period))
+        gaps = np.diff(np.r_[places, places[0] + period])
+        jumps = np.flatnonzero(np.abs(np.diff(commands)) > 0.5 * period)
+        # Across the largest gap the commands never go, so a jump that is not across it goes the short way.
+        low, high = np.sort([commands[jumps[0]], commands[jumps[0] + 1]]) if len(jumps) else (0.0, 0.0)
+        gap = int(np.argmax(gaps))
+        inside = low < places[gap] + 0.5 * gaps[gap] < high or low < places[gap] + 0.5 * gaps[gap] - period < high
+        if len(jumps) and len(places) > 3 and gaps[gap] > SEAM_GAPS * np.median(gaps) and inside:
+            said = {"before": commands[jumps[0]], "after": commands[jumps[0] + 1], "period": period}
+            raise cells.table.ask("seam", unit=unit.name, **said)
+    if not turn:
+        return commands
+    assumed.append(f"command: whole turns of {turn:g} added, because --assume command_turn says so")
+    return [rounded(c) for c in np.unwrap(commands, period=turn)]
 
 
 # --- rows that count -------------------------------------------------------------------------------------------------
@@ -269,15 +335,33 @@ def _good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, ass
     if "status" in wishes.columns or not any(bad):
         return table
     codes = {float(cell) for cell in cells if NUMBER.fullmatch(cell)}
-    if all(bad):
+    if all(bad) and len(codes) < 2:
         assumed.append(f"status: column {escaped(name)} would leave out every reading, so it is none")
         del columns["status"]
         return table
     coded = all(NUMBER.fullmatch(cell) or not cell for cell in cells)
-    if coded and sum(bad) > STATUS_SHARE * len(cells):
+    if coded and (sum(bad) > STATUS_SHARE * len(cells) or all(bad)):
         known = columns_of(table)
         said = {"column": name, "bad": sum(bad), "rows": len(cells)}
         raise table.ask("status", each=sorted(codes), first={name: known[name].first}, **said)
+    return table
+
+
+def _without_fills(table: ForeignTable, columns: Mapping[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
+    """The table without numbers that stand for no reading; asks where some may."""
+    name = columns["value"]
+    command, value = (columns_of(table)[columns[field_]].values for field_ in ("command", "value"))
+    if wishes.no_reading is not None:
+        cells = tuple("" if v == wishes.no_reading else c for v, c in zip(value, table.columns[name], strict=True))
+        count = sum(v == wishes.no_reading for v in value)
+        assumed.append(f"value: {count} cells of {wishes.no_reading:g} are empty, because --assume no_reading says so")
+        return replace(table, columns={**table.columns, name: cells})
+    if "value" not in wishes.columns:
+        statuses = table.columns[columns["status"]] if "status" in columns else ()
+        good = [not cell.strip() or means(cell, "good") for cell in statuses]
+        for fill in fill_values(command, np.where(good, value, np.nan) if good else value):
+            rows = [table.lines[k] for k in np.flatnonzero(value == fill)]
+            raise table.ask("no-reading", fill=fill, column=name, rows=rows)
     return table
 
 
@@ -290,7 +374,8 @@ def _resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, 
     if "moving" in columns:
         name = columns.pop("moving")
         is_resting = place_of(words_of(name), "resting") is not None
-        says_yes = np.array([means(cell, "good") for cell in table.columns[name]])
+        is_speed = name_of(name).has("speed")
+        says_yes = known[name].values != 0 if is_speed else np.array([means(c, "good") for c in table.columns[name]])
         rests, how = says_yes == is_resting, f"column {escaped(name)}"
     else:
         sides = table.columns[columns["approach"]] if "approach" in columns else ()
@@ -485,6 +570,9 @@ def unwrapped(
         or (360.0 / of_angle.scale if of_angle and of_angle.kind == "angle" else None)
         or _counts_of(command, value)
     )
+    if turn is None and of_angle is not None and of_angle.kind == "length":
+        if len(size := restarts(command, value)):
+            raise asked_of_dial(size, of_angle)
     jumps = turn_jumps(command, value, turn) if turn is not None else {}
     # An outlier also jumps, and back, but not by whole turns.
     if turn is None or not jumps or any(abs(jump - round(jump)) > TURN_TOLERANCE for jump in jumps.values()):

@@ -13,8 +13,18 @@ import numpy as np
 from tvsbayes.errors import Candidate, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
+from tvsbayes.importing.cells import FieldCells, homings_of
 from tvsbayes.importing.clock import equal_clocks, relative_times
-from tvsbayes.importing.columns import Chooser, Column, Understood, factor_between, line_through
+from tvsbayes.importing.columns import (
+    Chooser,
+    Column,
+    Understood,
+    asked_of_dial,
+    factor_between,
+    line_through,
+    restarts,
+)
+from tvsbayes.importing.counters import are_moves
 from tvsbayes.importing.runs import counts_rows
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, place_of
@@ -30,6 +40,10 @@ STEADY_SHARE, STEP_TOLERANCE = 0.7, 0.2
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 """Readings in the unit of the commands are not positions if they span less than the first share of the commands' range
 and scatter by more than the second share of their own span about a line."""
+ROUND_RATIO = 1.3
+"""Least ratio of the numbers of different commands and readings at which they may be exchanged."""
+STOPPED_SHARE = 0.2
+"""Least share of rows of either kind in a column of speeds that says where the axis moves."""
 ROOM_DEGC = (10.0, 40.0)
 """Temperatures of a room."""
 MACHINES_MAX, MACHINE_ROWS = 8, 3
@@ -39,22 +53,31 @@ STRAY_ROWS, STRAY_R2 = 6, 0.5
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
 """Options that say what the readings are."""
 _MEANING = {DEVIATIONS: "actual less commanded position", POSITIONS: "positions"}
+ORDERED = {"repeats": "readings of each stop", "forward": "runs, all rising", "alternate": "runs, rising and falling"}
+"""Columns alike but for a number, by values of --runs."""
 NO_READING = "; or is a column actual less commanded position: --column value=NAME --deviations"
 
 
-def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: bool | None = None) -> Understood:
+def axis_columns(
+    table: ForeignTable, stated: Mapping[str, str], deviations: bool | None = None, *, settled: bool = False
+) -> Understood:
     """The columns of an axis' table by field.
 
     Args:
         table: a table with a row for each reading or move.
         stated: column by field, as the user states it; "" where the table has no such column.
         deviations: whether the readings are actual less commanded position; None where nobody says it.
+        settled: whether the user says how readings follow the commands.
 
     Raises:
         Question: two columns could be one field.
         InputError: a field or column that does not exist, or no column for a command or a reading.
     """
     chooser = Chooser.of(table, stated, FIELDS, _role)
+    if "command" not in stated and chooser.roles.get("command") and "command" in chooser.known:
+        # Beside a set point an output of the controller that never changes is none.
+        if not chooser.known["command"].numeric:
+            del chooser.taken["command"]
     numbers = chooser.of_role("command", "value", "position", "")
     _take_volts(chooser, numbers)
     if len(numbers) < 2:
@@ -63,8 +86,9 @@ def axis_columns(table: ForeignTable, stated: Mapping[str, str], deviations: boo
     _take_command(chooser)
     chooser.roles = {role: _of_device(chooser, names) for role, names in chooser.roles.items()}
     _take_value(chooser, deviations)
+    _ask_which_is_round(chooser)
     _take_others(chooser)
-    if deviations is None and not {"command", "value"} & stated.keys():
+    if not settled and not {"command", "value"} & stated.keys():
         _ask_whether_it_follows(chooser)
     _refuse_several(chooser)
     return chooser.understood()
@@ -90,14 +114,20 @@ def _role(column: Column) -> str:
     kind = unit.kind if unit else ""
     if name.has("temperature") or kind == "temperature":
         return "temperature_degC" if bool(np.isfinite(column.values).any()) else "aside"
+    if name.has("speed") and column.numeric and STOPPED_SHARE <= np.mean(column.values == 0) <= 1 - STOPPED_SHARE:
+        return "speed"
     if name.has("aside") or kind in ("other", "voltage"):
         return "aside"
     if kind == "time" or (name.has("time") and not kind):
         return "time_s"
-    if name.has("u", "expanded"):
+    if name.is_u:
         return "u"
+    if name.has("status", "excluded") and not kind and not column.numeric and not name.has("command", "value"):
+        return "status"
     if name.has("deviation"):
         return "deviation"
+    if name.has("excluded") and not kind:
+        return "aside"
     for role in ("moving", "resting", "status", "approach"):
         if name.has(role) and not kind and not (name.has("command", "value") and column.numeric):
             return role
@@ -113,10 +143,12 @@ def _role(column: Column) -> str:
         return "command" if value is None or (command is not None and (command < value or is_number)) else "value"
     if not name.has("command", "value", "position") and not kind and counts_rows(column.cells):
         return "index"
+    if name.has("increment") and column.numeric and not name.has("statistic"):
+        return "command"
     if not column.numeric and not (column.has_digits and name.has("command", "value", "position")):
         return "aside"
     if name.has("statistic") and not name.has("position"):
-        return "aside"
+        return "mean" if place_of(name.words, "mean") is not None else "aside"
     return "position" if name.has("position") or (unit is not None and not name.words) else ""
 
 
@@ -147,7 +179,11 @@ def _take_others(chooser: Chooser) -> None:
     temperatures = chooser.roles.get("temperature_degC", [])
     if len(temperatures) > 1 and chooser.is_open("temperature_degC"):
         remarks.append(f"temperature: none of {listed(temperatures)}; --column temperature_degC=NAME takes one")
-    for name, roles in (("temperature_degC", ("temperature_degC",)), ("moving", ("moving", "resting"))):
+    for name, roles in (
+        ("temperature_degC", ("temperature_degC",)),
+        ("moving", ("moving", "resting")),
+        ("moving", ("speed",)),
+    ):
         if len(names := chooser.of_role(*roles)) == 1:
             chooser.take(name, names)
     spreads = [name for name in chooser.of_role("u") if np.isfinite(known[name].values).any()]
@@ -172,6 +208,20 @@ def _take_others(chooser: Chooser) -> None:
     chooser.take("time_s", clocks, what="that could be the clock")
 
 
+def _ask_which_is_round(chooser: Chooser) -> None:
+    """Ask where a column that no word calls the command scatters, and the readings come again to the last digit."""
+    command, value = (chooser.known[chooser.taken[name]] for name in ("command", "value"))
+    if command.name.text in chooser.roles.get("command", ()) or {"command", "value"} & chooser.stated.keys():
+        return
+    c, v = _in_both(command, value)
+    if len(c) >= STRAY_ROWS and len(np.unique(c)) > ROUND_RATIO * len(np.unique(v)):
+        ours, others = escaped(value.name.text), escaped(command.name.text)
+        found = f"numbers in column {ours} that come again, and others in {others}"
+        pairs = ((command.name.text, value.name.text), (value.name.text, command.name.text))
+        answers = [chooser.answer({"command": a, "value": b}) for a, b in pairs]
+        raise chooser.ask(f"{found} that do not", answers)
+
+
 def _ask_whether_it_follows(chooser: Chooser) -> None:
     """Ask where the reading goes its own way: signs in another column, an encoder of another axis."""
     names = {name: chooser.taken[name] for name in ("command", "value")}
@@ -181,6 +231,12 @@ def _ask_whether_it_follows(chooser: Chooser) -> None:
         return
     if np.corrcoef(c, v)[0, 1] ** 2 < STRAY_R2:
         found = f"readings in column {escaped(names['value'])} that do not follow column {escaped(names['command'])}"
+        homed = homings_of(FieldCells(chooser.table, chooser.taken), [])
+        read = [None if np.isnan(v) else float(v) for v in value.values]
+        if np.isfinite(command.values).all() and are_moves(command.values.tolist(), read, homed):
+            raise chooser.table.ask("moves-or-positions", column=names["command"], field="command")
+        if len(jumps := restarts(c, v)):
+            raise asked_of_dial(jumps, value.unit)
         raise chooser.ask(found, [chooser.answer(names), chooser.answer(names, DEVIATIONS)])
 
 
@@ -255,11 +311,17 @@ def _take_value(chooser: Chooser, deviations: bool | None) -> None:
         return
     following = [name for name in others if follows(command, known[name])]
     own = [name for name in (*weak, *following) if not _repeats(command, known[name])]
-    pools = (strong, [n for n in weak if n in own], [n for n in following if n in own], weak, following)
+    means = [name for name in chooser.of_role("mean") if follows(command, known[name])]
+    pools = (strong, [n for n in weak if n in own], [n for n in following if n in own], weak, following, means)
     pool = next(filter(None, pools), [])
     if len(pool) > 1:
         found = f"{len(pool)} columns that could be the reading ({listed(pool)})"
-        raise chooser.ask(found, [chooser.answer({"value": name}) for name in pool])
+        counted = {tuple(word for word in known[name].name.words if not word.isdigit()) for name in pool}
+        first = {name: known[name].first for name in pool}
+        runs = [Candidate(meaning, ("--runs", order), first) for order, meaning in ORDERED.items()]
+        answers = [chooser.answer({"value": name}) for name in pool]
+        are_counted = len(counted) == 1 and all(known[name].name.numbers for name in pool)
+        raise chooser.ask(found, [*answers[:3], *runs] if are_counted else answers)
     if pool:
         (name,) = pool
         taken["value"] = name

@@ -38,6 +38,8 @@ class Wishes:
         coverage: coverage factor of the column of uncertainties.
         status_ok: number of a status that means a good row.
         relative: whether commands are the lengths of moves.
+        no_reading: number that stands for no reading.
+        command_turn: whole turn of commands that go on through it; 0: nowhere.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -48,6 +50,8 @@ class Wishes:
     coverage: float | None = None
     status_ok: float | None = None
     relative: bool = False
+    no_reading: float | None = None
+    command_turn: float | None = None
 
 
 def stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:

@@ -17,7 +17,7 @@ from typing import Any
 from tvsbayes.errors import InputError, Question, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, means, name_of, parse_unit, unit_named
+from tvsbayes.importing.words import HOUR_ANGLE, Unit, means, name_of, parse_unit, place_of, unit_named, words_of
 
 WORDS_SHOWN = 5
 """Largest number of status words in a message about excluded rows."""
@@ -59,7 +59,7 @@ def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
         plain = tuple("" if match is None else match["number"].replace(",", ".") for match in found)
         return PlainColumn(plain, unit, f"column {escaped(name)}: every cell is in {unit.name}")
     for value_of, of, words in (
-        (_degrees, unit_named("deg"), "degrees, minutes and seconds"),
+        (_degrees, *_of_sexagesimals(name, filled)),
         (_fraction, None, "fractions"),
     ):
         values = [value_of(cell) if cell else None for cell in cells]
@@ -67,6 +67,13 @@ def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
             plain = tuple("" if value is None else repr(value) for value in values)
             return PlainColumn(plain, of, f"column {escaped(name)}: {words}, read as decimal numbers")
     return PlainColumn(tuple(cells), None, "")
+
+
+def _of_sexagesimals(name: str, cells: Sequence[str]) -> tuple[Unit, str]:
+    """The unit of 10:20:30 and what it is called."""
+    if place_of(words_of(name), "hour-angle") is not None and not any({*cell} & {*"\u00b0d"} for cell in cells):
+        return HOUR_ANGLE, "hours, minutes and seconds"
+    return unit_named("deg"), "degrees, minutes and seconds"
 
 
 def _degrees(cell: str) -> float | None:

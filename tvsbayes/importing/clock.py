@@ -15,19 +15,20 @@ import numpy as np
 
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.cells import FieldCells
-from tvsbayes.importing.words import Unit, name_of
+from tvsbayes.importing.words import Unit, name_of, place_of
 
 DAY_S = 86400.0
 SUMMER_TIME_S = 3600.0
 EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
 """Seconds per unit by the least number that counts this unit since 1970; smaller numbers are seconds."""
-SHEET_DAYS = (36526.0, 55153.0)
-"""Days of the years 2000 to 2050 as spreadsheets count them."""
+SPREADSHEET_DAYS, SHORTEST_S = (36526.0, 73050.0), 0.02
+"""Days since 1900 from 2000 to 2100, and a time in seconds shorter than moves of a machine."""
 TIME_MAX = 1e20
 """Largest number of a time: nanoseconds of 3000 years."""
 STEPS_USUAL = 50
 """Number of times before a step back that give the usual step."""
 _OF_DAY = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:[.,][0-9]{1,9})?)(?: ?([AaPp])[Mm])?)?")
+_SHORT = re.compile(r"[0-9]{1,3}:[0-9]{2}")
 _ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")
 _FORMS = ("", "%Y-%m-%dT%I:%M:%S %p", "%d-%b-%Y %H:%M:%S", "%b %d, %Y %H:%M:%S")
 """Of dates; "" is ISO 8601."""
@@ -124,6 +125,13 @@ def forward(times_s: Iterable[float], series: Iterable[Hashable]) -> tuple[list[
     return forward_s, backs
 
 
+def _are_days(times: np.ndarray) -> bool:
+    """Whether numbers are days since 1900: of recent years, and in steps that no move takes in seconds."""
+    low, high = SPREADSHEET_DAYS
+    steps = np.abs(np.diff(times))
+    return len(steps) > 0 and bool(np.all((low <= times) & (times <= high))) and 0 < np.median(steps) < SHORTEST_S
+
+
 def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) -> list[float] | None:
     """Seconds of every row: numbers in the unit of the column's name or the given one, dates with times, times of day.
 
@@ -136,16 +144,26 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
     if "time_s" not in cells:
         return None
     texts, unit = cells.text("time_s"), unit or name_of(cells.columns["time_s"]).unit
+    words = name_of(cells.columns["time_s"]).words
+    is_elapsed = all(map(_SHORT.fullmatch, texts)) and place_of(words, "elapsed") is not None
+    if is_elapsed and unit is None:
+        raise cells.ask("elapsed", 0, "time_s")
     numbers = [float(cell) if NUMBER.fullmatch(cell) else None for cell in texts]
     is_number = 2 * numbers.count(None) <= len(texts)
     written = numbers if is_number else [*_written(texts)]
+    if is_elapsed and unit is not None:
+        written = [unit.scale * (float(a) + float(b) / 60) for a, b in (text.split(":") for text in texts)]
     for row, time in enumerate(written):
         if time is None or not abs(time) <= TIME_MAX:
             allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
             raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=")
     times = np.array(written, dtype=float)
+    is_day = is_number and unit is None and (place_of(words, "day-number") is not None or _are_days(times))
     of_epoch = [scale for least, scale in EPOCH_SCALES.items() if times.max(initial=0.0) >= least]
-    if not is_number:
+    if is_day:
+        times_s = DAY_S * (times - times[0])
+        assumed.append("time_s: days, as of a Julian date or a spreadsheet, so seconds since the first row")
+    elif not is_number:
         times_s = times - times[0]
         of_minutes = "hours and minutes, so " * all(len(cell) <= 5 for cell in texts)
         assumed.append(f"time_s: {of_minutes}seconds since the first row")
@@ -155,13 +173,10 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
         assumed.append(f"time_s: counted in {of_epoch[0]:g} s since 1970, so seconds since the first row")
     else:
         times_s = times * (unit.scale if unit is not None and unit.kind == "time" else 1.0)
-        if unit is None and len(times) and SHEET_DAYS[0] <= times.min() and times.max() <= SHEET_DAYS[1]:
-            assumed.append(
-                "time_s: in s, though spreadsheets count days by such numbers; a column of days is named Time (d)"
-            )
     seconds, backs = forward(map(float, times_s), repeat("time_s"))
     for back in backs:
-        if is_number or back.added_s != SUMMER_TIME_S or len(backs) > 1 or any(map(_ZONE.search, texts)):
+        is_dated = not is_number and not any(map(_ZONE.search, texts)) and date_time(texts[0]) is not None
+        if not is_dated or back.added_s != SUMMER_TIME_S or len(backs) > 1:
             raise cells.ask("clock-back", back.row, "time_s", back=back.back_s)
         assumed.append(f"time_s: {back.text(cells.table.lines[back.row])}")
     return seconds

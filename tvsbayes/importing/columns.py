@@ -16,7 +16,7 @@ import numpy as np
 
 from tvsbayes.errors import Candidate, InputError, Question, closest, escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.asking import listed, refused
+from tvsbayes.importing.asking import asked, listed, refused
 from tvsbayes.importing.cells import FLAGS, mark_of, plain_column
 from tvsbayes.importing.clock import is_clock
 from tvsbayes.importing.table import ForeignTable
@@ -105,6 +105,56 @@ def line_through(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
         dx, dy = x - x.mean(), y - y.mean()
         slope = float(np.divide(dx @ dy, dx @ dx))
         return slope, dy - slope * dx
+
+
+FILLED_MIN, FILL_SHARE, FILL_SDS = 4, 0.2, 20.0
+"""Fewest other readings, and least distance from their line, as a share of their range and in standard deviations about
+it, of a number that may stand for no reading."""
+
+
+def fill_values(x: np.ndarray, y: np.ndarray) -> list[float]:
+    """Numbers in y, far from the line of the others over x, that an instrument writes where it read nothing.
+
+    Such a number comes again at different x, or has nines alone.
+    """
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    fills = []
+    for fill in np.unique(y):
+        at = y == fill
+        rest = ~at
+        if 4 * at.sum() > len(y) or rest.sum() < FILLED_MIN or not np.ptp(x[rest]) or not np.ptp(y[rest]):
+            continue
+        slope, off = line_through(x[rest], y[rest])
+        away = np.abs(fill - y[rest].mean() - slope * (x[at] - x[rest].mean()))
+        far = away > max(FILL_SHARE * np.ptp(y[rest]), FILL_SDS * float(np.std(off)))
+        usual = abs(fill) >= 1e15 or fill in (0, -1) or (abs(fill) >= 99 and {*str(abs(int(fill)))} == {"9"})
+        if far.all() and (usual or len(np.unique(x[at])) > 1):
+            fills.append(float(fill))
+    return fills
+
+
+JUMP_SHARE = 0.1
+"""Largest difference of the jumps of a dial, and of other steps from their line, as a share of a jump."""
+
+
+def restarts(command: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Sizes of the jumps of readings that follow the commands but for jumps of one size, as of a dial; else none."""
+    dc, dv = np.diff(command), np.diff(value)
+    moved = dc != 0
+    if moved.sum() < 2 or np.ptp(value) == 0:
+        return np.zeros(0)
+    off = np.abs(dv - np.median(dv[moved] / dc[moved]) * dc)
+    far = off > 0.5 * np.ptp(value)
+    alike = far.sum() > 1 and np.ptp(off[far]) < JUMP_SHARE * off[far].min()
+    return off[far] if alike and (far.all() or off[~far].max() < JUMP_SHARE * off[far].min()) else np.zeros(0)
+
+
+def asked_of_dial(jumps: np.ndarray, unit: Unit | None) -> Question:
+    """The question after which reading a dial begins again."""
+    size = float(jumps.mean())
+    turns = dict.fromkeys((10.0 ** round(np.log10(size)), float(f"{size:.2g}")))
+    return asked("dial", "value", each=turns, jump=size, times=len(jumps), unit=unit.name if unit else "")
 
 
 # --- choosing --------------------------------------------------------------------------------------------------------

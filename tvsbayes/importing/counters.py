@@ -8,8 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from tvsbayes.importing.cells import FieldCells, homings_of, temperatures_of
 from tvsbayes.importing.clock import seconds_of
+from tvsbayes.importing.columns import line_through
 
 AXES = ("pan", "tilt")
 COUNTERS = ("pan_steps", "tilt_steps")
@@ -18,6 +21,9 @@ SIDES = {"pan": ("left", "right", "unknown"), "tilt": ("up", "down", "unknown")}
 """Words of an approach: the direction of the last move of an axis."""
 FIELDS = ("move", "segment", "time_s", *COUNTERS, "pan_approach", "tilt_approach", "temperature_degC")
 """Fields of a row of moves."""
+MOVES_MIN, MOVES_SHARE = 4, 0.1
+"""Least number of readings, and largest part of their spread that the sum of the moves leaves, where commands are
+moves: play leaves less."""
 Pair = tuple[int, int]
 
 
@@ -97,3 +103,27 @@ def _approaches(cells: FieldCells, axis: str, default: str) -> list[str]:
         if word not in SIDES[axis]:
             raise cells.refuse(row, name, ", ".join(SIDES[axis]), "name the direction of the last move of the axis")
     return words
+
+
+# --- lengths of moves -------------------------------------------------------------------------------------------------
+def summed_up(moves: Sequence[float], homings: Sequence[bool]) -> list[float]:
+    """Positions after moves, from 0 at every homing."""
+    begun = np.cumsum(homings)
+    total, moved = np.cumsum(moves), np.asarray(moves, dtype=float)
+    before = (total - moved)[np.searchsorted(begun, begun)]
+    return [float(f"{x:.13g}") for x in total - before]
+
+
+def are_moves(commands: Sequence[float], read: Sequence[float | None], homings: Sequence[bool]) -> bool:
+    """Whether the readings follow the sum of the commands, and not the commands."""
+    known = np.array([value is not None for value in read])
+    value = np.array([np.nan if v is None else v for v in read])[known]
+    if len(value) < MOVES_MIN or not np.ptp(value) > 0:
+        return False
+
+    def unexplained(x: Sequence[float]) -> float:
+        of_read = np.asarray(x, dtype=float)[known]
+        return float(np.std(line_through(of_read, value)[1])) if np.ptp(of_read) > 0 else np.inf
+
+    of_sums, of_commands = map(unexplained, (summed_up(commands, homings), commands))
+    return of_sums < MOVES_SHARE * min(of_commands, float(np.std(value)))

@@ -16,11 +16,11 @@ from typing import Any
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_kind import ID_MAX
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.asking import refused
-from tvsbayes.importing.cells import FieldCells, left_out, readable, status_of
+from tvsbayes.importing.asking import listed, refused
+from tvsbayes.importing.cells import FieldCells, homings_of, left_out, readable, status_of
 from tvsbayes.importing.clock import date_time, joined_clock, stamp_of, time_of_day
 from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of, missing_columns
-from tvsbayes.importing.counters import AXES, COUNTERS, moves_of_rows, whole_counters
+from tvsbayes.importing.counters import AXES, COUNTERS, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Unit, means, name_of, place_of, unit_named, vocabulary, words_of
@@ -41,6 +41,10 @@ FIELDS = (*MOVE_FIELDS, *LOOK_FIELDS, *BOOKED)
 SD_PX = 0.1
 """Standard uncertainty of a centroid where a table states none; the fit estimates its scale."""
 PIXEL_MAX, SD_MIN, SD_MAX, APERTURE_MAX_DEG, CORRELATION_MAX, POINT_MAX = 1e6, 1e-4, 100.0, 360.0, 0.999999, 4
+FILLS = (4095.0, 32767.0, 65535.0)
+"""Largest numbers of 12, 15 and 16 bits, which programs write for no spot."""
+SHARE_MIN = 8
+"""Fewest coordinates, all below 1, that are shares of the picture's width."""
 PLACEMENT_ROWS = 4
 """Fewest rows of a distance that stands for a placement of the sheet; distances of single rows are measured ones."""
 BOOK_PLACES_MAX = 8
@@ -157,7 +161,8 @@ def by_look(table: ForeignTable, stated: Mapping[str, str]) -> ForeignTable:
         return refused("rows-of-cameras", table.file, line=table.first_line, lack=what, columns=list(pixels))
 
     if len(cameras) != 1:
-        if all({*words_of(text)} & {*PLACES} for text in pixels):
+        of_cameras = any(place_of(words_of(text), "camera", WORDS) is not None for text in table.columns)
+        if all({*words_of(text)} & {*PLACES} for text in pixels) and not of_cameras:
             return table
         raise refuse("pixels that no column gives to a camera")
     camera = sides[cameras[0]]
@@ -200,6 +205,8 @@ def _kind_of_clock(cells: Sequence[str]) -> str:
 def _role(column: Column) -> str | None:
     """The field to which a column belongs; a reference that changes with every row counts no homings."""
     role = field_of(column.name.text)
+    if role is None and column.name.has("status", "excluded") and not column.numeric:
+        return "status"
     return role if role != "segment" or column.counts_homings or {*column.cells} <= _MARKS else None
 
 
@@ -241,6 +248,12 @@ def _check_open(chooser: Chooser, moves_listed: bool) -> None:
     twice, wanted = _claimed_twice(chooser), open_fields(chooser, moves_listed)
     missing = [name for name in wanted if name not in twice]
     texts = {role: " or ".join(map(escaped, names)) for role, names in twice.items()}
+    unused = chooser.understood().unused
+    left = {name: chooser.known[name] for name in unused}
+    numbers = [n for n, c in left.items() if c.numeric and not c.name.has("temperature", "time", "index")]
+    if not wanted and {*PIXELS}.isdisjoint(chooser.taken) and {*PIXELS}.isdisjoint(chooser.stated) and len(numbers) > 3:
+        answers = [chooser.answer(dict(zip(PIXELS, numbers, strict=False))), chooser.answer({PIXELS[0]: ""})]
+        raise chooser.ask(f"counters, and numbers that may be pixels ({listed(numbers)})", answers)
     if wanted and not missing:
         role, names = next(iter(twice.items()))
         answers = [chooser.answer({role: name}) for name in (*names, *([] if role in NEEDED else [""]))]
@@ -303,7 +316,10 @@ def look_rows(chooser: Chooser, wishes: LookWishes, moves_listed: int | None = N
     cells = FieldCells(table, columns)
     moves, aperture = None, _aperture_unit(cells, wishes)
     if all(name in cells for name in COUNTERS):
-        rows = moves_of_rows(cells, whole_counters(cells), assumed, relative=wishes.relative, approach=wishes.approach)
+        counters = whole_counters(cells)
+        _refuse_other_pixels(cells, wishes)
+        _ask_of_counters(cells, counters, wishes)
+        rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
         moves, move_of_row = rows.moves, rows.move_of_row
     else:
         move_of_row = _listed_moves(cells, moves_listed or 0)
@@ -343,6 +359,49 @@ def look_rows(chooser: Chooser, wishes: LookWishes, moves_listed: int | None = N
         Understood({name: columns[name] for name in FIELDS if name in columns}, tuple(unused)),
         units,
     )
+
+
+def _refuse_other_pixels(cells: FieldCells, wishes: LookWishes) -> None:
+    """Refuse centres in another unit, of pictures that were turned, or as shares of the picture."""
+    for pixel in PIXELS:
+        text = cells.columns.get(pixel, "")
+        if not text or pixel in wishes.columns:
+            continue
+        name, values = name_of(text), [v for v in cells.numbers(pixel, -PIXEL_MAX, PIXEL_MAX, optional=True) if v]
+        unit = name.unit if name.unit and name.unit.kind in ("length", "angle") else None
+        shares = len(values) > 1 and max(map(abs, values)) <= SHARE_MAX
+        turned = place_of(name.words, "rectified", WORDS) is not None
+        kinds = {unit.name if unit else "": unit, "shares of the picture": shares, "a rectified picture": turned}
+        if what := next((word for word, is_one in kinds.items() if is_one), ""):
+            said = {"name": text, "of": what, "field": pixel}
+            raise refused("other-pixels", cells.table.file, line=cells.table.first_line, **said)
+
+
+def _ask_of_counters(cells: FieldCells, counters: Sequence[tuple[int, int]], wishes: LookWishes) -> None:
+    """Ask where counters are angles by their names, or lengths of moves by what was seen."""
+    if {*COUNTERS} & {*wishes.columns}:
+        return
+    names = {name: cells.columns[name] for name in COUNTERS}
+    angles = [name for name, text in names.items() if (unit := name_of(text).unit) and unit.kind == "angle"]
+    if angles:
+        raise cells.table.ask("angles-of-motors", column=names[angles[0]], field=angles[0])
+    if wishes.relative:
+        return
+    homings = homings_of(cells, [])
+    seen = [cells.numbers(name, -PIXEL_MAX, PIXEL_MAX, optional=True) if name in cells else [] for name in PIXELS[:2]]
+    for k, counter in enumerate(COUNTERS):
+        moved = seen[k] and are_moves([pair[k] for pair in counters], seen[k], homings)
+        if moved or _points_apart(cells, counters):
+            raise cells.table.ask("moves-or-positions", column=names[counter], field=counter)
+
+
+def _points_apart(cells: FieldCells, counters: Sequence[tuple[int, int]]) -> bool:
+    """Whether points 3 and 4 of every experiment, at one position, have two counters, the second of which is 0."""
+    if not {*FOUR_POINT} <= {*cells.columns}:
+        return False
+    points = [_LABELLED.sub(r"\1", cell) for cell in cells.text("point")]
+    fourth = [k for k in range(1, len(points)) if (points[k - 1], points[k]) == ("3", "4")]
+    return bool(fourth) and all(counters[k] == (0, 0) != counters[k - 1] for k in fourth)
 
 
 def _aperture_unit(cells: FieldCells, wishes: LookWishes) -> Unit:
@@ -391,7 +450,7 @@ def _looks(
     seen: bool,
 ) -> dict[int, dict[str, Any]]:
     """The looks of a table by row, with centres or waiting for pictures; the other rows are moves without a look."""
-    pixels = {name: cells.numbers(name, -PIXEL_MAX, PIXEL_MAX, optional=True) for name in PIXELS}
+    pixels = _centres(cells, assumed)
     sds = {name: cells.numbers(name, -SD_MAX, SD_MAX, optional=True) for name in PIXEL_SDS if name in cells}
     if seen and len(sds) < len(PIXEL_SDS):
         text = f"standard uncertainty of a centroid: {wishes.sd_px:g} px; --sd-px states another"
@@ -434,6 +493,21 @@ def _looks(
         of_looks = statuses if seen else [statuses[r] for r in rows if statuses[r].strip().lower() != UNDETECTED]
         assumed += left_out(cells, of_looks, "look")
     return looks
+
+
+def _centres(cells: FieldCells, assumed: list[str]) -> dict[str, list[float | None]]:
+    """Pixels by field; none where a camera's two are one number that programs write for no spot."""
+    pixels = {name: cells.numbers(name, -PIXEL_MAX, PIXEL_MAX, optional=True) for name in PIXELS}
+    empty = set[int]()
+    for u, v in (PIXELS[:2], PIXELS[2:]):
+        for row, (x, y) in enumerate(zip(pixels[u], pixels[v], strict=True)):
+            if x is not None and x == y and (x <= 0 or x in FILLS or {*f"{x:g}"} == {"9"}):
+                pixels[u][row] = pixels[v][row] = None
+                empty.add(row)
+    if empty:
+        count = f"{len(empty)} look{'s' * (len(empty) > 1)}"
+        assumed.append(f"centres: none in {count} whose two pixels of a camera are one number, as -1 or 0")
+    return pixels
 
 
 def _four_point(cells: FieldCells, assumed: list[str], book: bool) -> dict[str, list[int | None]]:

@@ -18,6 +18,7 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX, NUMBER
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.importing.asking import refused
 from tvsbayes.importing.clock import over_midnight
+from tvsbayes.importing.prepared import prepared
 from tvsbayes.importing.table import WORKBOOKS, ForeignTable, Row, Rows, headed, table_of_rows
 from tvsbayes.importing.text import text_of, text_table_rows
 from tvsbayes.importing.workbook import sheet_rows
@@ -66,11 +67,16 @@ def labview_rows(text: str, file: str) -> Rows | None:
     ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
     if len(ends) < 2:
         raise refused("labview", file)
-    rows = []
-    for number, line in enumerate(lines[ends[-1] + 1 :], start=ends[-1] + 2):
-        cells = [cell.strip() for cell in line.split(separator)]
-        if any(cells):
-            rows.append(Row(number, cells))
+    rows, names = list[Row](), list[str]()
+    # Of several blocks each has a header, which ends so, and names.
+    for begin, end in pairwise([*ends[1:], len(lines)]):
+        block = [
+            (n, [c.strip() for c in line.split(separator)]) for n, line in enumerate(lines[:end], 1) if n > begin + 1
+        ]
+        heads = (k for k, (_, cells) in enumerate(block) if cells[0] == "Channels")
+        filled = [Row(n, cells) for n, cells in block[: next(heads, None)] if any(cells)]
+        names = names or (filled[0].cells if filled else [])
+        rows += filled[1:] if rows and filled and filled[0].cells == names else filled
     labels = next((line.split(separator) for line in lines[ends[-2] :] if line.startswith("Y_Unit_Label")), [])
     for k, label in enumerate(labels[1:], start=1):
         if rows and label.strip() and k < len(rows[0].cells) and "(" not in rows[0].cells[k]:
@@ -253,10 +259,10 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
     """
     data, file = read_bytes(Path(path), CSV_BYTES_MAX), escaped(Path(path).name)
     if data.startswith(WORKBOOKS):
-        return table_of_rows(file, *headed(sheet_rows(data, file, sheet)))
+        return prepared(table_of_rows(file, *headed(sheet_rows(data, file, sheet))))
     if sheet is not None:
         raise refused("sheet-of-text", file)
     decoded = text_of(data, file)
     readers = (renishaw_rows, labview_rows, json_rows, paired_rows)
     rows = next((rows for read in readers if (rows := read(decoded.text, file)) is not None), None)
-    return table_of_rows(file, *(rows or text_table_rows(decoded, file)))
+    return prepared(table_of_rows(file, *(rows or text_table_rows(decoded, file))))

@@ -25,7 +25,10 @@ POSITIONS_MIN = 3
 _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
 _SIGN = re.compile(r"^\s*([+-])\s*\d*\s*(?:[(\[/,]|$)|^\s*\d+\s*([+-])\s*(?:[(\[/,]|$)|\s\(?([+-])\)?\s*(?:[(\[/,]|$)")
 """A sign in place of a direction: "+1", "1 - (mm)", "Run 1 (+)"."""
-_NEVER = ("aside", "statistic", "temperature", "time", "index", "several", "moving", "resting", "status", "approach")
+_NEVER = (
+    *("aside", "statistic", "temperature", "time", "index", "several", "moving", "resting", "status", "excluded"),
+    "approach",
+)
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     """
     written, plain = table, {text: plain_column(text, cells) for text, cells in table.columns.items()}
     table = replace(table, columns={text: column.cells for text, column in plain.items()})
-    runs = _runs(table, {text: column.unit for text, column in plain.items()})
+    runs = _runs(table, {text: column.unit for text, column in plain.items()}, stated=order is not None)
     if not runs or stated.get("value") or stated.get("approach"):
         return LongTable(written, stated, [])
     command = stated.get("command") or _command(table, runs)
@@ -115,7 +118,7 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
         columns["cycle"] = [str(runs[k].number) for _, k in rows]
     columns[reading] = [_scaled(table.columns[names[k]][row], factors[k]) for row, k in rows]
     rest = [name for name in table.columns if name not in (*names, command)]
-    spread = [name for name in rest if name_of(name).has("u", "expanded")]
+    spread = [name for name in rest if name_of(name).is_u]
     if len(runs) > len(set(sides)):
         # Beside several runs of one side a standard deviation is theirs, not that of a reading.
         spread = [name for name in spread if place_of(name_of(name).words, "scatter") is None]
@@ -159,14 +162,14 @@ def _numeric(cells: Sequence[str]) -> bool:
     return bool(filled) and all(map(NUMBER.fullmatch, filled))
 
 
-def _runs(table: ForeignTable, units: Mapping[str, Unit | None]) -> list[Run]:
+def _runs(table: ForeignTable, units: Mapping[str, Unit | None], *, stated: bool = False) -> list[Run]:
     """Columns with one run each, in order: those with words of direction, else those alike but for a number."""
     sided: list[Run] = []
     alike: defaultdict[tuple[str, ...], list[Run]] = defaultdict(list)
     for text, cells in table.columns.items():
         name = name_of(text.translate(_ARROWS))
         name = replace(name, text=text, unit=units[text] or name.unit)
-        if not _numeric(cells) or (name.has(*_NEVER) and not name.has("run")) or name.has("u", "expanded"):
+        if not _numeric(cells) or (name.has(*_NEVER) and not name.has("run")) or name.is_u:
             continue
         signed = _SIGN.search(text)
         rising, falling = name.has("forward", "clockwise"), name.has("backward", "counterclockwise")
@@ -180,9 +183,13 @@ def _runs(table: ForeignTable, units: Mapping[str, Unit | None]) -> list[Run]:
             skeleton = tuple(word for word in name.words if not word.isdigit())
             alike[skeleton].append(Run(name, name.numbers[-1], 0))
     if len(sided) > 1 and len({(run.number, run.side) for run in sided}) == len(sided):
+        others = [of for of in alike.values() if {r.number for r in of} == {r.number for r in sided}]
+        if len({run.side for run in sided}) == 1 and len(others) == 1 and not others[0][0].name.has("command"):
+            texts = [[run.name.text for run in group] for group in (sided, others[0])]
+            raise refused("one-way-runs", table.file, line=table.first_line, runs=texts[0], others=texts[1])
         return sorted(sided, key=lambda run: (run.number, -run.side))
     groups = [runs for runs in alike.values() if len(runs) > 1 and len({run.number for run in runs}) == len(runs)]
-    groups = [runs for runs in groups if _are_runs(runs, table)]
+    groups = [runs for runs in groups if _are_runs(runs, table) or (stated and not runs[0].name.has("command"))]
     return sorted(groups[0], key=lambda run: run.number) if len(groups) == 1 else []
 
 

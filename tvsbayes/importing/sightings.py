@@ -11,14 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.cells import FieldCells, left_out, status_of
+from tvsbayes.importing.asking import listed
+from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of
 from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of
-from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, moves_of_rows, whole_counters
+from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, place_of, unit_named
+from tvsbayes.importing.words import Unit, name_of, place_of, unit_named
 
 STEP_DEG = 1e-5
 """Size of a counter step: encoders are read in degrees, and 0.04 arcsec is far below telescopes' pointing errors."""
@@ -33,6 +36,8 @@ TURNS_MAX = 3
 UNITS_ASKED = ("mrad", "arcmin", "arcsec")
 """Units of elevations beyond 90 deg, in the order in which they are asked for."""
 ELEVATION_MAX_DEG = 90.0
+FOUND_MIN, FAR_DEG = 4, 5.0
+"""Fewest directions by which others are judged, and distance from theirs of one that was not found."""
 LIMITS_DEG = {
     "azimuth_deg": (-360.0 * TURNS_MAX, 360.0 * TURNS_MAX),
     "elevation_deg": (-ELEVATION_MAX_DEG, ELEVATION_MAX_DEG),
@@ -95,7 +100,14 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
     of_encoders = [name for name in COUNTERS if name in units]
     counters = _counters(cells, units, assumed)
     rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
-    angles = {name: cells.scaled(name, units[name], *ends) for name, ends in LIMITS_DEG.items() if name in cells}
+    limits = LIMITS_DEG | ({"elevation_deg": (0.0, 2 * ELEVATION_MAX_DEG)} if from_zenith(cells) else {})
+    angles = {name: cells.scaled(name, units[name], *ends) for name, ends in limits.items() if name in cells}
+    if from_zenith(cells):
+        angles["elevation_deg"] = [None if z is None else ELEVATION_MAX_DEG - z for z in angles["elevation_deg"]]
+        assumed.append(f"elevation_deg: 90 deg less column {escaped(known.columns['elevation_deg'])}, from the zenith")
+    _without_directions(counters, angles, assumed)
+    if not wishes.relative and not {*COUNTERS} & {*wishes.columns}:
+        _ask_whether_moves(cells, counters, angles)
     if "u_deg" not in cells:
         u = U_DEG if wishes.u_deg is None else wishes.u_deg
         angles["u_deg"] = [u] * len(table)
@@ -116,6 +128,47 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
     shown = {name: unit.name for name, unit in units.items()}
     shown = {**dict.fromkeys(COUNTERS, "steps"), **shown, **({"time_s": "s"} if "time_s" in cells else {})}
     return SightingRows(rows.moves, sightings, encoders, tuple(assumed), known, shown)
+
+
+def from_zenith(cells: FieldCells) -> bool:
+    """Whether elevations are written as angles from the zenith; V in gon is a total station's."""
+    column = name_of(cells.columns["elevation_deg"])
+    is_v = column.words == ("v",) and column.unit is not None and column.unit.name == "gon"
+    return is_v or place_of(column.words, "zenith") is not None
+
+
+def _without_directions(
+    counters: Sequence[tuple[int, int]], angles: dict[str, list[float | None]], assumed: list[str]
+) -> None:
+    """Leave out directions whose two angles are one number far from all others, as 0 where nothing was found."""
+    pairs = list(zip(*(angles[name] for name in ANGLES), strict=True))
+    alike = [azimuth is not None and azimuth == elevation for azimuth, elevation in pairs]
+    others = [row for row, (azimuth, _) in enumerate(pairs) if azimuth is not None and not alike[row]]
+    if not any(alike) or len(others) < FOUND_MIN or len({counters[row][0] for row in others}) < 2:
+        return
+    found = np.unwrap([float(pairs[row][0] or 0.0) for row in others], period=360.0)
+    slope, start = np.polyfit([counters[row][0] for row in others], found, 1)
+    off = {row: (pairs[row][0] or 0.0) - start - slope * counters[row][0] for row in map(int, np.flatnonzero(alike))}
+    rows = [row for row, gap in off.items() if abs((gap + 180.0) % 360.0 - 180.0) > FAR_DEG]
+    for row in rows:
+        for name in ANGLES:
+            angles[name][row] = None
+    if rows:
+        assumed.append(f"directions: none in {len(rows)} rows whose two angles are one number, far from all others")
+
+
+def _ask_whether_moves(
+    cells: FieldCells, counters: Sequence[tuple[int, int]], angles: Mapping[str, Sequence[float | None]]
+) -> None:
+    """Ask where directions follow the sum of the counters, and not the counters."""
+    homings = homings_of(cells, [])
+    for k, angle in enumerate(ANGLES):
+        seen = [math.nan if value is None else value for value in angles[angle]]
+        there = np.unwrap([value for value in seen if not math.isnan(value)], period=360.0)
+        turned = iter(there.tolist())
+        found = [None if math.isnan(value) else next(turned) for value in seen]
+        if are_moves([pair[k] for pair in counters], found, homings):
+            raise cells.table.ask("moves-or-positions", column=cells.columns[COUNTERS[k]], field=COUNTERS[k])
 
 
 def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understood:
@@ -139,7 +192,10 @@ def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understo
         found = found if len(found) == 1 and role in ANGLES else names
         chooser.take(role, found, optional=role not in NEEDED)
     if missing := [name for name in NEEDED if name not in chooser.taken]:
-        raise chooser.missing(missing)
+        units = {n: c.name.unit for n, c in known.items() if c.name.has("deviation")}
+        errors = [n for n, unit in units.items() if unit is not None and unit.kind == "angle"]
+        hint = f"; {listed(errors)} are errors: add columns of the directions, command plus error" if errors else ""
+        raise chooser.missing(missing, hint)
     return chooser.understood()
 
 
@@ -152,11 +208,13 @@ def field_of(column: Column) -> str | None:
     if (
         name.has("expanded")
         or (name.has("u") and (words != ("s",)))
-        or (name.has("deviation") and kind == "angle" and len(of_axis) != 1)
+        or (name.has("deviation") and kind == "angle" and not of_axis and len(words) == 1)
     ):
         return "u_deg"
     if name.has("temperature") or kind == "temperature":
         return "temperature_degC"
+    if place_of(words, "zenith") is not None:
+        return ANGLES[1]
     if len(of_axis) == 1:
         if "approach" in words:
             return f"{AXES[of_axis[0]]}_approach"
@@ -165,6 +223,8 @@ def field_of(column: Column) -> str | None:
             return None
         counted = place_of(words, "counter") is not None and place_of(words, "observed") is None
         return COUNTERS[of_axis[0]] if counted else ANGLES[of_axis[0]]
+    if name.has("excluded", "status") and not column.numeric:
+        return "status"
     if name.has("aside") or of_axis:
         return None
     if kind == "time" or name.has("time"):
@@ -196,8 +256,9 @@ def _units(
             first, said = {column.name.text: column.first}, {"unit": column.name.unknown, "column": column.name.text}
             raise cells.table.ask("unknown-angles", each=("deg", "rad"), first=first, **said)
         if name in COUNTERS:
-            numbers = [float(cell) for cell in cells.text(name) if NUMBER.fullmatch(cell)]
-            if unit is None and any(not number.is_integer() for number in numbers):
+            # 200.0 is a counter that a program wrote as a float, 15.0000 an angle.
+            written_angles = [c for c in cells.text(name) if len(c.partition(".")[2]) > 1 or not _is_whole(c)]
+            if unit is None and written_angles:
                 unit = stated or units[ANGLES[0]]
         elif unit is None and name == "u_deg":
             unit = units["azimuth_deg"]
@@ -214,6 +275,10 @@ def _units(
         if unit is not None:
             units[name] = unit
     return units
+
+
+def _is_whole(cell: str) -> bool:
+    return not NUMBER.fullmatch(cell) or float(cell).is_integer()
 
 
 def _possible_units(cells: FieldCells) -> list[str]:

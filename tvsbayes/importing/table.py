@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 from tvsbayes.errors import InputError, Question, escaped, refusal
@@ -24,6 +25,8 @@ NUMERIC_SHARE = 0.6
 """Least share of numbers in a column of numbers."""
 ACROSS_MIN = 3
 """Least number of positions across a table, and one."""
+SHORT_MAX = 3
+"""Largest number of rows that are named because they have fewer cells than the others: cut off, perhaps."""
 ABOVE_MAX = 50
 """Largest number of lines above the names of columns: serial number, date, operator."""
 KINDS = "a table as text (CSV and its like), XLSX, XLS or ODS"
@@ -227,6 +230,9 @@ def table_of_rows(
     width = max(len(row.cells) for row in rows)
     if width > COLUMNS_MAX:
         raise refused("wide-table", file, count=width, most=COLUMNS_MAX)
+    short = [row.line for row in rows[1:] if len(row.cells) < width and is_number(row.cells[0])]
+    if 0 < len(short) <= SHORT_MAX and 10 * len(short) < len(rows):
+        description.append(f"fewer cells than elsewhere in line {', '.join(map(str, short))}")
     filled = [Row(line, cells + [""] * (width - len(cells))) for line, cells in rows]
     if _is_across(filled):
         filled = [Row(filled[0].line, list(cells)) for cells in zip(*(row.cells for row in filled), strict=True)]
@@ -272,10 +278,13 @@ def _is_across(rows: Sequence[Row]) -> bool:
 def _without_sums(rows: Sequence[Row]) -> tuple[Sequence[Row], str]:
     """The rows without those that begin with a word of a summary, as "Mean", and a note on these."""
     sums = []
+    width = min((len(row.cells) for row in rows), default=0)
+    numbered = [k for k in range(width) if 2 * sum(is_number(row.cells[k]) for row in rows) > len(rows)]
     for row in rows:
-        text = next((cell for cell in row.cells if cell), "")
-        words = words_of(text)
-        is_sum = words and len(words) <= 2 and place_of(words[:1], "summary") is not None
+        first = next((k for k, cell in enumerate(row.cells) if cell), 0)
+        labels = [c for k, c in enumerate(row.cells) if c and (k == first or k in numbered) and not is_number(c)]
+        words = [words_of(label) for label in labels]
+        is_sum = any(len(of) <= 2 and place_of(of[:1], "summary") is not None for of in words)
         if is_sum and any(map(is_number, row.cells)):
             sums.append(row)
     if not sums or 2 * len(sums) > len(rows):
@@ -305,6 +314,12 @@ def _without_titles(
     }
     if not titles or 2 * len(titles) > len(rows):
         return names, rows, ""
+    homed = [int(place_of(words_of(titles.get(row.line, "")), "homing") == 0) for row in rows]
+    if any(homed):
+        counts = accumulate(homed)
+        counted = [Row(row.line, [*row.cells, str(k)]) for row, k in zip(rows, counts, strict=True)]
+        kept = [row for row in counted if row.line not in titles]
+        return [*names, "segment"], kept, f"homings where lines say so ({escaped(next(iter(titles.values())), 30)})"
     side, sides = next((found for line in reversed(above) if (found := side_named(line))), ""), list[str]()
     for row in rows:
         side = side_named(titles[row.line]) if row.line in titles else side

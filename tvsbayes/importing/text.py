@@ -99,7 +99,13 @@ def _divided(body: Sequence[tuple[int, str]], separator: str, file: str) -> list
         count = body[0][1].count(separator) + 1
         raise refused("wide-table", file, line=body[0][0], count=count, most=COLUMNS_MAX)
     if separator == " ":
-        return [Row(number, line.split()) for number, line in body]
+        spaced = [Row(number, line.split()) for number, line in body]
+        # Names with spaces, apart by two or more.
+        for number, line in body[:1]:
+            names = re.split(r"\s{2,}|\t", line.strip())
+            if len(spaced) > 1 and len(spaced[0].cells) > len(names) == len(spaced[1].cells) > 1:
+                spaced[0] = Row(number, names)
+        return spaced
     reader = csv.reader((line for _, line in body), delimiter=separator, skipinitialspace=True, strict=True)
     rows: list[Row] = []
     try:

@@ -155,7 +155,7 @@ _PART = re.compile(
 def parse_unit(text: str) -> Unit | None:
     """The unit that a whole text states, as in brackets: "mm", "1/100 mm", "Hundertstel mm", "mm/100"."""
     units, parts = _units()
-    text = re.sub("[\u00b0\u00ba] ?(?=[cfCF]$)", "deg", text.strip())
+    text = re.sub("[\u00b0\u00ba] ?(?=[cfCF]$)", "deg", text.strip().removeprefix("\u00b1").removeprefix("+/-").strip())
     text = {
         "\u00b0": "deg",
         "\u00ba": "deg",
@@ -193,6 +193,8 @@ def parse_unit(text: str) -> Unit | None:
     return None
 
 
+HOUR_ANGLE = Unit("deg", "angle", 1.0, 15.0)
+"""An hour of right ascension."""
 _BRACKETS = re.compile(r"[(\[{]([^()\[\]{}]*)[)\]}]")
 _COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:[.,][0-9]+)?)\b|\b([23])\s*(?:x\s*)?(?:sd|s|std|stdev|stabw|sigma)\b")
 """Coverage factor in the name of a column of expanded uncertainties (GUM, 6.2), or a multiple of sd."""
@@ -210,6 +212,11 @@ _KNOWN = (
         "segment",
         "approach",
         "status",
+        "excluded",
+        "order",
+        "speed",
+        "increment",
+        "homing",
         "moving",
     ),
     *("resting", "temperature", "repeat", "index", "aside", "statistic", "run", "several", "forward", "backward"),
@@ -251,6 +258,11 @@ class Name:
         return tuple(int(word) for word in self.words if word.isdigit())
 
     @cached_property
+    def is_u(self) -> bool:
+        """Whether it names an uncertainty, standard or expanded, or a multiple of a standard deviation."""
+        return self.has("u", "expanded") or _COVERAGE.search(plain(self.text)) is not None
+
+    @cached_property
     def coverage(self) -> float | None:
         """The coverage factor of an expanded uncertainty; None for a standard one."""
         text = plain(self.text)
@@ -275,6 +287,8 @@ def name_of(text: str) -> Name:
     words = words_of(rest)
     if unit is None and not unknown:
         unit, words = _unit_of_words(rest, words)
+    if unit is not None and unit.name == "h" and place_of(words, "hour-angle") is not None:
+        unit = HOUR_ANGLE
     return Name(text, tuple(words), unit, "" if unit else unknown)
 
 
@@ -352,7 +366,7 @@ def _may_end(unit: Unit, word: str, before: Sequence[str]) -> bool:
     if unit.kind == "temperature":
         return place_of(before, "temperature") is not None or word in ("celsius", "kelvin", "fahrenheit", "degc")
     if unit.kind == "time" and len(word) < 2:
-        return place_of(before, "time") is not None
+        return place_of(before, "time") is not None or place_of(before, "hour-angle") is not None
     return True
 
 
