@@ -173,14 +173,14 @@ def import_(
 
         of_tables = {"coverage": "coverage factor of the column of u", "status_ok": "status of a good row"}
         of_rows = {"no_reading": "number that stands for no reading", "command_turn": "turn of commands, 0: none"}
+        of_rows |= {"deviation_sign": "-1 where deviations are commanded less actual position"}
         assumed = _assumptions(o.assume, {**ASSUMPTIONS, **of_tables, **of_rows}, "declination_deg=45.9")
         check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
         check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")
         units = dict(_named("--unit", text, "value=um") for text in o.unit or ())
-        coverage, status_ok, no_reading, command_turn = map(assumed.get, (*of_tables, *of_rows))
+        coverage, status_ok, *others = map(assumed.get, (*of_tables, *of_rows))
         table = Wishes(
-            *(stated, units, o.deviations, o.counts_per_turn, o.runs, coverage, status_ok, o.relative, no_reading),
-            command_turn,
+            *(stated, units, o.deviations, o.counts_per_turn, o.runs, coverage, status_ok, o.relative, *others),
         )
         wish = FileOptions(o.kind, o.run, assumed, o.encoders, table)
         task = import_readings(o.file, o.to, o.sheet, wish, yes=o.yes, as_json=o.as_json)

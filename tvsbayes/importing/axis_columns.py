@@ -6,6 +6,7 @@ commands as well as the one taken, a reading that is only a deviation, two clock
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -25,7 +26,7 @@ from tvsbayes.importing.columns import (
     restarts,
 )
 from tvsbayes.importing.counters import are_moves
-from tvsbayes.importing.runs import counts_rows
+from tvsbayes.importing.runs import FOLLOWS_R2, counts_rows
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, place_of
 
@@ -33,8 +34,6 @@ FIELDS = ("command", "value", "u", "status", "segment", "time_s", "approach", "t
 """All fields of a table of an axis."""
 COPY_SHARE = 1e-9
 """Largest deviation from a line, as a share of the span, of a column that repeats another."""
-FOLLOWS_R2 = 0.98
-"""Least squared correlation with the commands of a column that follows them."""
 STEADY_SHARE, STEP_TOLERANCE = 0.7, 0.2
 """Share of steps in proportion to those of the commands, to this tolerance, in a column that wraps or jumps."""
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
@@ -138,6 +137,9 @@ def _role(column: Column) -> str:
     if _states_sides(column):
         return "approach"
     command, value = name.place("command"), name.place("value")
+    if command is not None and value is not None and re.search(r"\w\s*[-\u2212\u2013]\s*\w", name.text):
+        # "Soll-Ist", "cmd-meas".
+        return "deviation"
     if (column.numeric or column.has_digits) and (command is not None or value is not None):
         is_number = value is not None and name.place("number") == value
         return "command" if value is None or (command is not None and (command < value or is_number)) else "value"
@@ -320,8 +322,9 @@ def _take_value(chooser: Chooser, deviations: bool | None) -> None:
         first = {name: known[name].first for name in pool}
         runs = [Candidate(meaning, ("--runs", order), first) for order, meaning in ORDERED.items()]
         answers = [chooser.answer({"value": name}) for name in pool]
-        are_counted = len(counted) == 1 and all(known[name].name.numbers for name in pool)
-        raise chooser.ask(found, [*answers[:3], *runs] if are_counted else answers)
+        are_runs = len(counted) == 1 and all(known[name].name.numbers for name in pool)
+        are_runs = are_runs or all(follows(command, known[name]) for name in pool)
+        raise chooser.ask(found, [*answers[:3], *runs] if are_runs else answers)
     if pool:
         (name,) = pool
         taken["value"] = name
@@ -341,6 +344,7 @@ def _take_value(chooser: Chooser, deviations: bool | None) -> None:
     elif differences:
         found = f"no reading but {listed(differences)}, by its name a deviation"
         answers = [_meaning(known[name], option) for option in _MEANING for name in differences]
+        answers += [_turned(known[name]) for name in differences]
         raise chooser.ask(found, answers, "deviations")
     elif rest := [*weak, *others, *chooser.of_role("u")]:
         found = f"no column that is surely the reading; numbers are in {listed(rest)}"
@@ -354,6 +358,12 @@ def _meaning(column: Column, option: str) -> Candidate:
     """The answer that a column holds deviations or positions; columns of runs are known by their names again."""
     name, first = column.name.text, column.first
     return Candidate(f"{escaped(name)} ({', '.join(first)}) holds {_MEANING[option]}", (option,), {name: first})
+
+
+def _turned(column: Column) -> Candidate:
+    """The answer that a column holds deviations of the other sign."""
+    name, words = column.name.text, (DEVIATIONS, "--assume", "deviation_sign=-1")
+    return Candidate(f"{escaped(name)} holds commanded less actual position", words, {name: column.first})
 
 
 def _set_aside(chooser: Chooser, names: Sequence[str]) -> list[str]:

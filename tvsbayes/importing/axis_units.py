@@ -39,6 +39,7 @@ class Wishes:
         status_ok: number of a status that means a good row.
         relative: whether commands are the lengths of moves.
         no_reading: number that stands for no reading.
+        deviation_sign: -1 where deviations are commanded less actual position.
         command_turn: whole turn of commands that go on through it; 0: nowhere.
     """
 
@@ -52,6 +53,7 @@ class Wishes:
     relative: bool = False
     no_reading: float | None = None
     command_turn: float | None = None
+    deviation_sign: float | None = None
 
 
 def stated_unit(cells: FieldCells, name: str, wishes: Wishes) -> Unit | None:
@@ -135,9 +137,10 @@ def in_one_unit(
     of_scale = command_unit if command_unit is not None and command_unit.kind in ("length", "angle") else None
     given = unit
     if wishes.deviations:
-        factor = _deviation_factor(cells, unit, command_unit)
+        factor = _deviation_factor(cells, unit, command_unit) * (wishes.deviation_sign or 1.0)
         values = [None if d is None else rounded(c + factor * d) for c, d in zip(commands, values, strict=True)]
-        assumed.append("value: the command plus the deviation, because --deviations says so")
+        how = "less" if (wishes.deviation_sign or 1.0) < 0 else "plus"
+        assumed.append(f"value: the command {how} the deviation, because --deviations says so")
         given, unit = unit or command_unit, command_unit or unit
     elif unit is not None and unit.per_number != 1.0:
         values = [None if v is None else rounded(unit.per_number * v) for v in values]

@@ -369,7 +369,7 @@ def _refuse_other_pixels(cells: FieldCells, wishes: LookWishes) -> None:
             continue
         name, values = name_of(text), [v for v in cells.numbers(pixel, -PIXEL_MAX, PIXEL_MAX, optional=True) if v]
         unit = name.unit if name.unit and name.unit.kind in ("length", "angle") else None
-        shares = len(values) > 1 and max(map(abs, values)) <= SHARE_MAX
+        shares = len(values) >= SHARE_MIN and all(v % 1 and abs(v) < 1 for v in values)
         turned = place_of(name.words, "rectified", WORDS) is not None
         kinds = {unit.name if unit else "": unit, "shares of the picture": shares, "a rectified picture": turned}
         if what := next((word for word, is_one in kinds.items() if is_one), ""):

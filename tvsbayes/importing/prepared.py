@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
-from itertools import accumulate, pairwise
+from itertools import pairwise
 
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
@@ -22,7 +22,11 @@ _PARTS = re.compile(
     r"(?P<stem>.+?)[ _.]*[\[(]?(?:(?P<d>d|deg|\u00b0|grad)|(?P<m>m|min|arcmin|')|(?P<s>s|sec|arcsec|\"))[\])]?$"
 )
 """Degrees, minutes and seconds of one angle: az_d, az_m, az_s."""
-_PAIR = re.compile(r"[(\[]\s*(?P<x>[-+.\deE]+)\s*[,;\s]\s*(?P<y>[-+.\deE]+)\s*[)\]]")
+FORMS = (
+    (re.compile(r"[(\[]\s*([-+.\deE]+)\s*[,;\s]\s*([-+.\deE]+)\s*[)\]]"), ("{} x", "{} y")),
+    (re.compile(r"([-+]?\d+[.,]?\d*)\s*(?:\u00b1|\+/-)\s*(\d+[.,]?\d*)"), ("{}", "u of {}")),
+)
+"""Two numbers in a cell, and what they are called."""
 CODES_MAX = 4
 """Largest number of different codes in a column of errors that marks rows."""
 NEWEST_MIN = 4
@@ -45,7 +49,7 @@ def _noted(table: ForeignTable, columns: dict[str, tuple[str, ...]], note: str) 
 # --- marks -----------------------------------------------------------------------------------------------------------
 def _marked(table: ForeignTable) -> ForeignTable:
     """Columns that mark rows as good or bad, whatever their names and words, as one column of statuses."""
-    marks = {text: found for text, cells in table.columns.items() if (found := _marks(text, cells))}
+    marks = {text: found for text, cells in table.columns.items() if (found := _marks(text, cells, [*table.columns]))}
     inverted = [text for text in marks if name_of(text).has("excluded") or not name_of(text).has("status")]
     if not inverted and len(marks) < 2:
         return table
@@ -56,7 +60,7 @@ def _marked(table: ForeignTable) -> ForeignTable:
     return _noted(table, columns | {name: statuses}, f"rows marked by {listed(marks)}")
 
 
-def _marks(text: str, cells: Sequence[str]) -> list[str]:
+def _marks(text: str, cells: Sequence[str], others: Sequence[str]) -> list[str]:
     """Why each row is marked as bad, "" where it is not; [] where a column marks no rows."""
     name = name_of(text)
     if name.unit is not None or name.has("command", "value", "temperature", "time", "approach"):
@@ -75,6 +79,9 @@ def _marks(text: str, cells: Sequence[str]) -> list[str]:
         return [label + f" {cell}" * (not means(cell, "yes")) if bad.get(cell) else "" for cell in cells]
     if name.has("status") and all(means(c, "yes") or means(c, "no") for c in filled):
         return [f"{label} {cell}" if means(cell, "no") else "" for cell in cells] if len(filled) > 1 else []
+    if any(name_of(other).has("aside") and place_of(words_of(other), "tolerance") is not None for other in others):
+        # Out of tolerance is no fault of a reading.
+        return []
     verdicts = {c: means(c, "bad") for c in filled if not (means(c, "yes") or means(c, "no")) or c.lower() == "ok"}
     if any(verdicts.values()) and all(bad or means(c, "good") for c, bad in verdicts.items()) and {*verdicts} == filled:
         return [f"{label} {cell}" if verdicts.get(cell) else "" for cell in cells]
@@ -129,24 +136,45 @@ def _filled_down(table: ForeignTable) -> ForeignTable:
         whole = all(any(other[row] for other in others) for row, cell in enumerate(cells) if not cell)
         # A mark, as "x" at a homing, is none of the rows below it.
         block = len({*filled}) > 1 and cells[:1] != ("",) and 2 * len(filled) <= len(cells) and whole
+        if block and name_of(text).has("approach") and not _sides_hold(table, _continued(cells)):
+            continue
         if block and name_of(text).has(*MERGED) and not name_of(text).has("value", "status", "deviation"):
-            columns[text] = tuple(accumulate(cells, lambda above, cell: cell or above))
+            columns[text] = _continued(cells)
             merged.append(text)
     return _noted(table, columns, f"merged cells of {listed(merged)} filled") if merged else table
 
 
+def _continued(cells: Sequence[str]) -> tuple[str, ...]:
+    """Cells with what stands above them where they are empty."""
+    done = [""]
+    for cell in cells:
+        done.append(cell or done[-1])
+    return tuple(done[1:])
+
+
+def _sides_hold(table: ForeignTable, sides: Sequence[str]) -> bool:
+    """Whether the commands go where filled cells say."""
+    named = [cells for text, cells in table.columns.items() if name_of(text).has("command")]
+    if len(named) != 1 or not all(map(NUMBER.fullmatch, named[0])):
+        return False
+    ways = [means(side, "forward") - means(side, "backward") for side in sides[1:]]
+    steps = [float(b) - float(a) for a, b in pairwise(named[0])]
+    return all(ways) and all(way * step >= 0 for way, step in zip(ways, steps, strict=True))
+
+
 def _split_pairs(table: ForeignTable) -> ForeignTable:
-    """The table with a column for each number of pairs in brackets, as (783.6, 440.3)."""
+    """The table with a column for each number of pairs, as (783.6, 440.3) and 5.01 \u00b1 0.02."""
     columns, split = dict[str, tuple[str, ...]](), list[str]()
     for text, cells in table.columns.items():
-        pairs = [_PAIR.fullmatch(cell) for cell in cells]
+        form, names = next(((f, n) for f, n in FORMS if any(map(f.fullmatch, cells))), FORMS[0])
+        pairs = [form.fullmatch(cell) for cell in cells]
         rest = [cell for pair, cell in zip(pairs, cells, strict=True) if not pair and cell]
         if any(pairs) and all(means(cell, "empty") for cell in rest):
-            columns |= {f"{text} {axis}": tuple(p[axis] if p else "" for p in pairs) for axis in "xy"}
+            columns |= {n.format(text): tuple(p[k] if p else "" for p in pairs) for k, n in enumerate(names, start=1)}
             split.append(text)
         else:
             columns[text] = cells
-    return _noted(table, columns, f"pairs of {listed(split)} split into x and y") if split else table
+    return _noted(table, columns, f"pairs of {listed(split)} split") if split else table
 
 
 def _joined_angles(table: ForeignTable) -> ForeignTable:
@@ -188,15 +216,25 @@ def _degrees(parts: Sequence[str]) -> str:
 
 
 def _one_unit(table: ForeignTable) -> ForeignTable:
-    """The table with a unit in the names that a column states for all rows, and one unit for readings in two."""
-    columns, notes = dict(table.columns), list[str]()
+    """The table with units in its names: those of columns of units, and one unit for readings in two."""
+    columns, notes, stated = dict(table.columns), list[str](), dict[str, str]()
     for text, cells in table.columns.items():
         unit = parse_unit(cells[0]) if cells and {*cells} == {cells[0]} else None
         if unit is not None and unit.kind != "other" and place_of(words_of(text), "unit") == 0:
-            bare = [n for n in columns if (o := name_of(n)).unit is None and not o.unknown]
-            bare = [n for n in bare if name_of(n).has("command", "value", "position", "deviation") and n != text]
-            columns = {f"{n} ({cells[0]})" if n in bare else n: own for n, own in columns.items() if n != text}
-            notes.append(f"unit of {listed(bare)} by column {escaped(text)}")
+            stated[text] = cells[0]
+    bare = [n for n in columns if (o := name_of(n)).unit is None and not o.unknown and n not in stated]
+    bare = [n for n in bare if name_of(n).has("command", "value", "position", "deviation")]
+    names, order = {n: n for n in columns}, list(columns)
+    for text, unit_text in stated.items():
+        # Of several each is of the column before it.
+        own = [n for n in bare if len(stated) == 1 or order.index(n) == order.index(text) - 1]
+        names |= {n: f"{n} ({unit_text})" for n in own}
+        notes.append(f"unit of {listed(own)} by column {escaped(text)}")
+    angles = any((unit := name_of(n).unit) is not None and unit.kind == "angle" for n in columns)
+    if angles:
+        # Beside degrees " is a second of arc.
+        names = {n: re.sub(r"([(\[])\"([)\]])", r"\1arcsec\2", text) for n, text in names.items()}
+    columns = {names[n]: own for n, own in columns.items() if n not in stated}
     units = {n: o.unit for n in columns if (o := name_of(n)).unit is not None and o.unit.kind in ("length", "angle")}
     for first, second in pairwise(units):
         factor = units[second].in_units_of(units[first])
@@ -209,7 +247,9 @@ def _one_unit(table: ForeignTable) -> ForeignTable:
                 columns = {n: tuple(turned) if n == first else own for n, own in columns.items() if n != second}
                 notes.append(f"{escaped(second)} turned into {escaped(first)}")
                 break
-    return _noted(table, columns, ", ".join(notes)) if notes else table
+    if not notes:
+        return replace(table, columns=columns) if angles else table
+    return _noted(table, columns, ", ".join(notes))
 
 
 def _homed(table: ForeignTable) -> ForeignTable:
@@ -220,8 +260,7 @@ def _homed(table: ForeignTable) -> ForeignTable:
             continue
         homed = ["1" if place_of(own[:2], "homing") == 0 and len(own) <= HOMED_WORDS else "0" for own in words]
         if 0 < homed.count("1") < len(homed) / 2 and not any(map(NUMBER.fullmatch, cells)):
-            columns = {f"{text} (homed)" if n == text else n: tuple(homed) if n == text else own
-                       for n, own in table.columns.items()}  # fmt: skip
+            columns = {**{n: own for n, own in table.columns.items() if n != text}, "homed": tuple(homed)}
             return _noted(table, columns, f"homings by column {escaped(text)}")
     return table
 

@@ -9,16 +9,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
+import numpy as np
+
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
 from tvsbayes.importing.cells import plain_column
+from tvsbayes.importing.columns import columns_of
 from tvsbayes.importing.table import ForeignTable, table_of
-from tvsbayes.importing.words import Name, Unit, means, name_of, place_of
+from tvsbayes.importing.words import Name, Unit, means, name_of, place_of, words_of
 
 FORWARD, ALTERNATE, REPEATS = "forward", "alternate", "repeats"
 ORDERS = (FORWARD, ALTERNATE, REPEATS)
 """Values of --runs: all runs rise; every second run falls; readings of one stop."""
+FOLLOWS_R2 = 0.98
+"""Least squared correlation with the commands of a column that follows them."""
 AGREEMENT_ERRORS = 3.0
 """Standard errors of the mean difference of two groups of runs within which they agree."""
 POSITIONS_MIN = 3
@@ -66,6 +71,8 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     written, plain = table, {text: plain_column(text, cells) for text, cells in table.columns.items()}
     table = replace(table, columns={text: column.cells for text, column in plain.items()})
     runs = _runs(table, {text: column.unit for text, column in plain.items()}, stated=order is not None)
+    if not runs and order is not None and not stated.get("value"):
+        runs = _in_columns(table, stated)
     if not runs or stated.get("value") or stated.get("approach"):
         return LongTable(written, stated, [])
     command = stated.get("command") or _command(table, runs)
@@ -103,7 +110,8 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     factors = [run.name.unit.in_units_of(unit) if run.name.unit and unit else 1.0 for run in runs]
     if None in factors or (unit and any(run.name.unit is None for run in runs)):
         raise refused("run-units", table.file, line=table.first_line, runs=names)
-    kind = "deviation" if any(run.name.has("deviation") for run in runs) else "reading"
+    above = [place_of(words_of(line), "deviation") for line in table.above]
+    kind = "deviation" if any(run.name.has("deviation") for run in runs) or above != [None] * len(above) else "reading"
     bracket = (
         f" ({unit.name})" if unit and unit.per_number == 1.0 else f" ({unit.per_number:g} {unit.name})" if unit else ""
     )
@@ -125,7 +133,7 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
     if len(spread) == 1:
         columns[spread[0]] = [table.columns[spread[0]][row] for row, _ in rows]
     by_rows = table_of(table.file, table.kind, columns, [table.lines[row] for row, _ in rows])
-    by_rows = replace(by_rows, first_line=table.first_line)
+    by_rows = replace(by_rows, first_line=table.first_line, above=table.above)
     unused = tuple(name for name in rest if spread != [name])
     return LongTable(by_rows, {**stated, "command": command}, remarks, unused)
 
@@ -182,6 +190,9 @@ def _runs(table: ForeignTable, units: Mapping[str, Unit | None], *, stated: bool
         elif not side and name.numbers:
             skeleton = tuple(word for word in name.words if not word.isdigit())
             alike[skeleton].append(Run(name, name.numbers[-1], 0))
+    if any(run.name.numbers for run in sided):
+        # "B" beside "Down 1" is a figure.
+        sided = [run for run in sided if run.name.numbers]
     if len(sided) > 1 and len({(run.number, run.side) for run in sided}) == len(sided):
         others = [of for of in alike.values() if {r.number for r in of} == {r.number for r in sided}]
         if len({run.side for run in sided}) == 1 and len(others) == 1 and not others[0][0].name.has("command"):
@@ -191,6 +202,22 @@ def _runs(table: ForeignTable, units: Mapping[str, Unit | None], *, stated: bool
     groups = [runs for runs in alike.values() if len(runs) > 1 and len({run.number for run in runs}) == len(runs)]
     groups = [runs for runs in groups if _are_runs(runs, table) or (stated and not runs[0].name.has("command"))]
     return sorted(groups[0], key=lambda run: run.number) if len(groups) == 1 else []
+
+
+def _in_columns(table: ForeignTable, stated: Mapping[str, str]) -> list[Run]:
+    """All columns that follow the commands, as runs in the order of the columns, where the user says that they are."""
+    known = {text: column for text, column in columns_of(table).items() if _numeric(column.cells)}
+    known = {text: column for text, column in known.items() if not column.name.has(*_NEVER) and not column.name.is_u}
+    commands = [text for text, column in known.items() if column.name.has("command")] or list(known)
+    command = known.get(stated.get("command") or next(iter(commands), ""))
+    runs = list[Run]()
+    for text, column in known.items():
+        if command is None or column is command or not np.isfinite(column.values).all():
+            continue
+        if not np.ptp(column.values) or np.corrcoef(command.values, column.values)[0, 1] ** 2 < FOLLOWS_R2:
+            continue
+        runs.append(Run(replace(column.name, text=text, unit=column.unit), len(runs) + 1, 0))
+    return runs
 
 
 def _are_runs(runs: Sequence[Run], table: ForeignTable) -> bool:

@@ -7,6 +7,7 @@ the names of `moves.csv` and `sightings.csv`. Degrees; u are standard uncertaint
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.asking import listed
+from tvsbayes.importing.asking import listed, refused
 from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of
 from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of
 from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, are_moves, moves_of_rows, whole_counters
@@ -36,6 +37,8 @@ TURNS_MAX = 3
 UNITS_ASKED = ("mrad", "arcmin", "arcsec")
 """Units of elevations beyond 90 deg, in the order in which they are asked for."""
 ELEVATION_MAX_DEG = 90.0
+ERROR_SHARE = 0.05
+"""Largest range of directions, as a share of that of encoders on the axes, at which they are errors."""
 FOUND_MIN, FAR_DEG = 4, 5.0
 """Fewest directions by which others are judged, and distance from theirs of one that was not found."""
 LIMITS_DEG = {
@@ -107,7 +110,7 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
         assumed.append(f"elevation_deg: 90 deg less column {escaped(known.columns['elevation_deg'])}, from the zenith")
     _without_directions(counters, angles, assumed)
     if not wishes.relative and not {*COUNTERS} & {*wishes.columns}:
-        _ask_whether_moves(cells, counters, angles)
+        _ask_whether_moves(cells, counters, angles, of_encoders)
     if "u_deg" not in cells:
         u = U_DEG if wishes.u_deg is None else wishes.u_deg
         angles["u_deg"] = [u] * len(table)
@@ -158,10 +161,19 @@ def _without_directions(
 
 
 def _ask_whether_moves(
-    cells: FieldCells, counters: Sequence[tuple[int, int]], angles: Mapping[str, Sequence[float | None]]
+    cells: FieldCells,
+    counters: Sequence[tuple[int, int]],
+    angles: Mapping[str, Sequence[float | None]],
+    encoders: Sequence[str],
 ) -> None:
-    """Ask where directions follow the sum of the counters, and not the counters."""
+    """Ask where directions follow the sum of the counters, or are far too small for them."""
     homings = homings_of(cells, [])
+    for k, angle in enumerate(ANGLES):
+        pairs = [(STEP_DEG * p[k], v) for p, v in zip(counters, angles[angle], strict=True) if v is not None]
+        span = [float(np.ptp(column)) for column in zip(*pairs, strict=True)] if len(pairs) > FOUND_MIN else [0.0]
+        if COUNTERS[k] in encoders and span[-1] < ERROR_SHARE * span[0]:
+            names = [cells.columns[name] for name in ANGLES]
+            raise refused("errors-of-directions", cells.table.file, line=cells.table.first_line, names=names)
     for k, angle in enumerate(ANGLES):
         seen = [math.nan if value is None else value for value in angles[angle]]
         there = np.unwrap([value for value in seen if not math.isnan(value)], period=360.0)
@@ -193,6 +205,7 @@ def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understo
         chooser.take(role, found, optional=role not in NEEDED)
     if missing := [name for name in NEEDED if name not in chooser.taken]:
         units = {n: c.name.unit for n, c in known.items() if c.name.has("deviation")}
+        units |= {n: c.name.unit for n, c in known.items() if re.match("d[A-Z]|\u0394", n)}
         errors = [n for n, unit in units.items() if unit is not None and unit.kind == "angle"]
         hint = f"; {listed(errors)} are errors: add columns of the directions, command plus error" if errors else ""
         raise chooser.missing(missing, hint)
@@ -218,7 +231,7 @@ def field_of(column: Column) -> str | None:
     if len(of_axis) == 1:
         if "approach" in words:
             return f"{AXES[of_axis[0]]}_approach"
-        if name.has("deviation"):
+        if name.has("deviation") or re.match("d[A-Z]|\u0394", name.text):
             # The error of a direction is none.
             return None
         counted = place_of(words, "counter") is not None and place_of(words, "observed") is None

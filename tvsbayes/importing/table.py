@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 from tvsbayes.errors import InputError, Question, escaped, refusal
@@ -35,6 +35,9 @@ WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?")
 _GROUPED_POINT = re.compile(r"[+-]?[0-9]{1,3}(?:,[0-9]{3})+\.[0-9]+")
 _GROUPED_COMMA = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+,[0-9]+")
+_GROUPS_OF = {mark: re.compile(rf"[+-]?[1-9][0-9]{{0,2}}(?:[{mark}][0-9]{{3}})+") for mark in ",."}
+"""Whole numbers with a mark between thousands, by the mark."""
+_APOSTROPHES = re.compile("(?<=[0-9])['\u2019](?=[0-9]{3}(?![0-9]))")
 _WITH_UNIT = re.compile(r"([+-]?[0-9][0-9.,]{0,20}) ?([^\W\d]{1,6}|\u00b0)")
 _THIN = re.compile("(?<=[0-9])[\u00a0\u2007\u2009\u202f](?=[0-9])")
 
@@ -117,7 +120,10 @@ def is_value(cell: str) -> bool:
 
 def cleaned(cell: str) -> str:
     """A cell without marks that spreadsheets put into numbers: a long minus, thin spaces between thousands."""
-    return _THIN.sub("", cell.strip().replace("\u2212", "-")) if not cell.isascii() else cell.strip()
+    cell = _THIN.sub("", cell.strip().replace("\u2212", "-")) if not cell.isascii() else cell.strip()
+    plain = _APOSTROPHES.sub("", cell)
+    # 1'000.02 is a number, 12'345 with another mark a text.
+    return plain if plain != cell and is_number(plain) else cell
 
 
 def filled_width(cells: Sequence[str]) -> int:
@@ -161,6 +167,9 @@ def headed(found: Rows) -> Rows:
     # "n", "v" and "w" are units too, where names stand above them.
     has_units = data > 1 and _all_units(rows[data - 1].cells) and _may_be_names(rows[data - 2].cells, rows[data].cells)
     head = data - 2 if has_units else data - 1
+    # "up" and "HOME" may stand between names and rows.
+    while head > 0 and sum(map(bool, rows[head].cells)) == 1 and not _may_be_names(rows[head].cells, rows[data].cells):
+        head -= 1
     if _may_be_names(rows[head].cells, rows[data].cells):
         first = head
         if first and _is_group_row(rows[first - 1].cells, rows[first].cells):
@@ -248,12 +257,10 @@ def table_of_rows(
         line = body[again.index(True)].line
         body = [row for row, is_head in zip(body, again, strict=True) if not is_head]
         description.append(f"the names again in line {line}{' ...' * (sum(again) > 1)}, left out")
-    names, body, titles = _without_titles(names, body, above)
+    names, body, titles = _without_titles(file, names, body, above)
     description += [titles] * bool(titles)
     cells = [cell for _, row in body for cell in row if not isinstance(cell, Number)]
-    commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
-    # No notation has both "1.5" and "1,5": such cells are unchanged and refused where a number is needed.
-    mixed = commas and any("." in cell and NUMBER.fullmatch(cell) for cell in cells)
+    commas, mixed = _notation(cells)
     description += ["decimal commas"] * (commas and not mixed)
     columns = {}
     for k, name in enumerate(names):
@@ -263,6 +270,21 @@ def table_of_rows(
     return ForeignTable(
         file, ", ".join(description), tuple(line for line, _ in body), columns, rows[0].line, tuple(above)
     )
+
+
+def _notation(cells: Sequence[str]) -> tuple[bool, bool]:
+    """Whether numbers have decimal commas, and whether their notations contradict each other.
+
+    Such cells, as "1.5" beside "1,5", are unchanged and refused where a number is needed.
+    """
+    commas = [cell for cell in cells if _COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell)]
+    points = [cell for cell in cells if "." in cell and NUMBER.fullmatch(cell)]
+    sure_commas, sure_points = (
+        any(not _GROUPS_OF[mark].fullmatch(cell) for cell in own) for mark, own in ((",", commas), (".", points))
+    )
+    if commas and points and sure_points and not sure_commas:
+        return False, False
+    return bool(commas), bool(commas) and sure_points
 
 
 def _is_across(rows: Sequence[Row]) -> bool:
@@ -294,7 +316,7 @@ def _without_sums(rows: Sequence[Row]) -> tuple[Sequence[Row], str]:
 
 
 def _without_titles(
-    names: list[str | None], rows: Sequence[Row], above: Sequence[str]
+    file: str, names: list[str | None], rows: Sequence[Row], above: Sequence[str]
 ) -> tuple[list[str | None], Sequence[Row], str]:
     """The rows without lines of text between and below them, and a note on these.
 
@@ -326,6 +348,8 @@ def _without_titles(
         sides.append(side)
     body = [(row, of) for row, of in zip(rows, sides, strict=True) if row.line not in titles]
     are_runs = all(of for _, of in body) and len({of for _, of in body}) > 1
+    if not are_runs and (blocks := _blocks([*above[-1:], *titles.values()])):
+        raise refused("several-machines", file, line=min(titles), name="of titles", machines=blocks)
     named = ", ".join(f'"{escaped(text, 30)}"' for text in list(titles.values())[:3]) + " ..." * (len(titles) > 3)
     # "Cote" of numbers is a dimension, "C\u00f4t\u00e9" of words a side.
     of_words = [name or "" for k, name in enumerate(names) if k not in numeric]
@@ -334,6 +358,17 @@ def _without_titles(
         return names, [row for row, _ in body], f"line{'s' * (not one)} of text left out ({named})"
     note = f"runs one below the other, with the directions of their titles ({named})"
     return [*names, "direction"], [Row(row.line, [*row.cells, of]) for row, of in body], note
+
+
+def _blocks(titles: Sequence[str]) -> list[str]:
+    """Titles of rows of several axes, or in several conditions: alike but for a word or number, and none of a run."""
+    words = [words_of(title) for title in titles]
+    for a, b in pairwise(words):
+        alike = len(a) == len(b) and sum(x != y for x, y in zip(a, b, strict=True)) == 1
+        conditions = all(place_of(own, "condition") is not None for own in (a, b)) and a != b
+        if (alike and len(a) > 1 and place_of(a, "run") is None and place_of(a, "repeat") is None) or conditions:
+            return list(titles)
+    return []
 
 
 def side_named(text: str) -> str:
@@ -366,7 +401,10 @@ def _is_second_header(cells: Sequence[str], next_cells: Sequence[str]) -> bool:
     """Whether a row below the names holds units or further names: no number in it, most of the next row numbers."""
     numbers = sum(map(is_number, next_cells))
     return (
-        not any(map(is_number, cells)) and any(cells) and numbers > 1 and 2 * numbers > sum(map(bool, next_cells)) - 1
+        not any(map(is_number, cells))
+        and sum(map(bool, cells)) > 1
+        and numbers > 1
+        and 2 * numbers > sum(map(bool, next_cells)) - 1
     )
 
 
@@ -386,6 +424,7 @@ def _with_point(cell: str, commas: bool) -> str:
     """A number with a decimal point and no marks between thousands; other cells are unchanged."""
     if isinstance(cell, Number):
         return str(cell)
-    if commas and (_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell)):
+    if commas and (_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) or _GROUPS_OF["."].fullmatch(cell)):
         return cell.replace(".", "").replace(",", ".")
-    return cell.replace(",", "") if not commas and _GROUPED_POINT.fullmatch(cell) else cell
+    grouped = _GROUPED_POINT.fullmatch(cell) or _GROUPS_OF[","].fullmatch(cell)
+    return cell.replace(",", "") if not commas and grouped else cell

@@ -30,6 +30,7 @@ def words_of(name: str) -> list[str]:
     # "Winkel [\u00b0]" is an angle; a temperature ("\u00b0C") and "N\u00b0" are not.
     name = re.sub("(?<![A-Za-z])[\u00b0\u00ba](?! ?[CFcf]\\b)", " deg ", name)
     name = re.sub("[\u03bc\u00b5](?=[A-Za-z])", "u", name).replace("\u03c3", " sigma ").replace("\u00df", "ss")
+    name = name.replace("\u0394", "delta ").replace("\u2206", "delta ")
     ascii_name = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     words = []
     for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", ascii_name):
@@ -217,6 +218,7 @@ _KNOWN = (
         "speed",
         "increment",
         "homing",
+        "condition",
         "moving",
     ),
     *("resting", "temperature", "repeat", "index", "aside", "statistic", "run", "several", "forward", "backward"),
@@ -260,7 +262,7 @@ class Name:
     @cached_property
     def is_u(self) -> bool:
         """Whether it names an uncertainty, standard or expanded, or a multiple of a standard deviation."""
-        return self.has("u", "expanded") or _COVERAGE.search(plain(self.text)) is not None
+        return self.has("u", "expanded") or "\u00b1" in self.text or _COVERAGE.search(plain(self.text)) is not None
 
     @cached_property
     def coverage(self) -> float | None:
