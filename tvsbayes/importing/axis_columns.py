@@ -22,6 +22,7 @@ from tvsbayes.importing.columns import (
     Understood,
     asked_of_dial,
     factor_between,
+    fill_values,
     line_through,
     restarts,
 )
@@ -39,6 +40,8 @@ STEADY_SHARE, STEP_TOLERANCE = 0.7, 0.2
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 """Readings in the unit of the commands are not positions if they span less than the first share of the commands' range
 and scatter by more than the second share of their own span about a line."""
+TURN_SHARE = 0.05
+"""Largest difference of angles from their commands but for whole turns, turns."""
 ROUND_RATIO = 1.3
 """Least ratio of the numbers of different commands and readings at which they may be exchanged."""
 STOPPED_SHARE = 0.2
@@ -229,8 +232,14 @@ def _ask_whether_it_follows(chooser: Chooser) -> None:
     names = {name: chooser.taken[name] for name in ("command", "value")}
     command, value = (chooser.known[text] for text in names.values())
     c, v = _in_both(command, value)
-    if len(c) < STRAY_ROWS or len(np.unique(c)) < 3 or np.ptp(v) == 0 or follows(command, value):
+    if len(c) < STRAY_ROWS or len(np.unique(c)) < 3 or np.ptp(v) == 0 or follows(command, value) or fill_values(c, v):
         return
+    if all(column.unit is not None and column.unit.kind == "angle" for column in (command, value)):
+        # Both may restart after a turn.
+        turns = [column.values * column.unit.scale * column.unit.per_number / 360 for column in (command, value)]  # type: ignore[union-attr]
+        gap = turns[1] - turns[0]
+        if np.nanmax(np.abs(gap - np.round(gap))) < TURN_SHARE:
+            return
     if np.corrcoef(c, v)[0, 1] ** 2 < STRAY_R2:
         found = f"readings in column {escaped(names['value'])} that do not follow column {escaped(names['command'])}"
         homed = homings_of(FieldCells(chooser.table, chooser.taken), [])
@@ -280,6 +289,9 @@ def _take_command(chooser: Chooser) -> None:
         if readings and not strong and not weak:
             only = f"column {escaped(pool[0])}, the only other one of numbers"
             chooser.remarks.append(f"command: {only}; --column command= says another")
+        return
+    if len(weak) == 1 and len(others) > 1 and all(follows(chooser.known[weak[0]], chooser.known[n]) for n in others):
+        taken["command"] = weak[0]
         return
     pool = [*weak, *others, *([] if len(readings) < 2 else readings)]
     if not pool or (not readings and len(pool) < 2):

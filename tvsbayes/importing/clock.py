@@ -159,6 +159,7 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
             raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=")
     times = np.array(written, dtype=float)
     is_day = is_number and unit is None and (place_of(words, "day-number") is not None or _are_days(times))
+    is_day |= is_number and unit is not None and unit.scale == DAY_S and min(times) > SPREADSHEET_DAYS[0]
     of_epoch = [scale for least, scale in EPOCH_SCALES.items() if times.max(initial=0.0) >= least]
     if is_day:
         times_s = DAY_S * (times - times[0])

@@ -142,7 +142,7 @@ def restarts(command: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Sizes of the jumps of readings that follow the commands but for jumps of one size, as of a dial; else none."""
     dc, dv = np.diff(command), np.diff(value)
     moved = dc != 0
-    if moved.sum() < 2 or np.ptp(value) == 0:
+    if moved.sum() < 2 or np.ptp(value) == 0 or fill_values(command, value):
         return np.zeros(0)
     off = np.abs(dv - np.median(dv[moved] / dc[moved]) * dc)
     far = off > 0.5 * np.ptp(value)

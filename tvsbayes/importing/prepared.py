@@ -50,7 +50,7 @@ def _noted(table: ForeignTable, columns: dict[str, tuple[str, ...]], note: str) 
 def _marked(table: ForeignTable) -> ForeignTable:
     """Columns that mark rows as good or bad, whatever their names and words, as one column of statuses."""
     marks = {text: found for text, cells in table.columns.items() if (found := _marks(text, cells, [*table.columns]))}
-    inverted = [text for text in marks if name_of(text).has("excluded") or not name_of(text).has("status")]
+    inverted = [text for text in marks if name_of(text).has("excluded", "deviation") or not name_of(text).has("status")]
     if not inverted and len(marks) < 2:
         return table
     statuses = tuple(next(filter(None, row), "ok") for row in zip(*marks.values(), strict=True))
