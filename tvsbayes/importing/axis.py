@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from tvsbayes.errors import escaped
-from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
 from tvsbayes.importing.axis_units import Wishes, in_one_unit, is_expanded, rounded, shown_units, stated_unit, units_of
@@ -27,8 +26,6 @@ from tvsbayes.importing.clock import seconds_of, stamp_of
 from tvsbayes.importing.columns import (
     Understood,
     asked_of_dial,
-    columns_of,
-    fill_values,
     restarts,
     table_document,
     table_lines,
@@ -36,98 +33,10 @@ from tvsbayes.importing.columns import (
 from tvsbayes.importing.counters import are_moves, summed_up
 from tvsbayes.importing.runs import long_table
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, means, name_of, parse_unit, place_of, plain, words_of
+from tvsbayes.importing.usable_rows import good_rows, resting_rows, without_fills
+from tvsbayes.importing.words import Unit, means, name_of, parse_unit, plain
 from tvsbayes.statistics.wrapped import turn_jumps
 
-ROWS_MIN = 4
-"""Rows of one command, in the median of all commands, from which a table is telemetry."""
-TAIL_SHARE = 1 / 3
-"""Last share of the rows of a command, in which the axis should rest."""
-QUIET_SHARE = 0.8
-"""Share of the commands, the quieter ones, whose last rows give the noise at rest."""
-MOVING_SHARE = 0.3
-"""Least share of commands with rows in motion: with fewer, rows of a command are readings of one stop."""
-PLATEAU_ROWS = 3
-"""Least number of rows that rest elsewhere."""
-NOISE_SDS, DIGITS, FLICKER_DIGITS = 5.0, 1.5, 3.0
-"""Largest distance from rest of a row at rest: standard deviations of last rows, and digits of the readings; more of
-these, up to the last number, where the last rows of the command differ by them."""
-STEP_SHARE = 0.02
-"""Least distance of the first row of a command from rest, as a share of its step, at which the axis was under way."""
-
-
-def at_rest(command: np.ndarray, value: np.ndarray, parts: Sequence[Sequence[str]] = ()) -> np.ndarray:
-    """Whether the axis rests at each row, by the readings of each command, shape (rows,).
-
-    The first rows of a command are left out while they differ from the last ones by more than the noise of these; all
-    rows of a command, where the last ones still differ. A table with few rows a command rests everywhere, as does one
-    whose first rows rest elsewhere, neither where the axis came from nor where it ends: they are of another stop.
-
-    Args:
-        command: commands in time order, nan where missing, shape (rows,).
-        value: readings, nan where missing.
-        parts: cells of columns that state a side or count runs: where one changes another stop begins.
-    """
-    rests = np.ones(len(command), bool)
-    begins = np.r_[True, command[1:] != command[:-1]][: len(command)]
-    for cells in parts:
-        begins[1:] |= np.array([a != b for a, b in pairwise(cells)], bool)
-    starts = np.flatnonzero(begins)
-    blocks = [np.arange(a, b) for a, b in zip(starts, [*starts[1:], len(command)], strict=True)]
-    passed = _passed(command, blocks)
-    rests[[row for block in passed for row in block]] = False
-    blocks = [block[np.isfinite(value[block])] for block in blocks if not any(block is ramp for ramp in passed)]
-    if len(blocks) < 2 or np.median([len(block) for block in blocks]) < ROWS_MIN:
-        return rests
-    tails = [block[-max(3, round(TAIL_SHARE * len(block))) :] for block in blocks]
-    levels = [float(np.median(value[tail])) if len(tail) else np.nan for tail in tails]
-    variances = sorted(float(np.var(value[tail], ddof=1)) for tail in tails if len(tail) > 1)
-    # An axis that never came to rest adds nothing to the noise at rest.
-    noise = np.sqrt(np.mean(variances[: max(1, round(QUIET_SHARE * len(variances)))]))
-    steps = np.diff(np.unique(value[np.isfinite(value)]))
-    resolution = float(steps.min()) if len(steps) else 0.0
-    least = max(NOISE_SDS * float(noise), DIGITS * resolution)
-    elsewhere = set[int]()
-    for k, (block, level) in enumerate(zip(blocks, levels, strict=True)):
-        if len(block) < 2:
-            continue
-        tolerance = max(least, min(float(np.ptp(value[tails[k]])), FLICKER_DIGITS * resolution))
-        off = np.abs(value[block] - level) > tolerance
-        before = levels[k - 1] if k else np.nan
-        way = abs(level - before) if np.isfinite(before) else np.inf
-        if off[0] and (k == 0 or abs(value[block[0]] - level) > STEP_SHARE * way):
-            settled = int(np.argmax(~off)) if (~off).any() else len(block)
-            last = np.flatnonzero(off)
-            # Beyond a single outlier the axis came back: only the rows on its way count.
-            run = last[: np.argmax(np.diff(np.r_[last, len(block) + 1]) > 1) + 1]
-            out = block[: max(settled, int(run[-1]) + 1)]
-            rests[out] = False
-            stays = len(out) >= PLATEAU_ROWS and np.ptp(value[out]) <= 2 * tolerance
-            if stays and not abs(float(np.median(value[out])) - before) <= tolerance:
-                elsewhere.add(k)
-        if len(block) >= ROWS_MIN and abs(value[block[-1]] - value[block[-2]]) > tolerance and off.mean() > 0.5:
-            rests[block] = False
-    under_way = np.mean([k not in elsewhere and not rests[block].all() for k, block in enumerate(blocks)][1:])
-    kept = np.ones(len(command), bool)
-    kept[[row for block in passed for row in block]] = False
-    return rests if under_way >= MOVING_SHARE else kept
-
-
-def _passed(command: np.ndarray, blocks: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Blocks of a command that the axis passed: short ones, on the way from one long stop to the next."""
-    long = [k for k, block in enumerate(blocks) if len(block) >= RAMP_ROWS]
-    short = [k for k in range(len(blocks)) if long and long[0] < k < long[-1] and len(blocks[k]) <= 2]
-    at = [float(command[block[0]]) for block in blocks]
-    for a, b in pairwise(long):
-        steps = np.diff(at[a : b + 1])
-        if b > a + 1 and not (np.all(steps > 0) or np.all(steps < 0)):
-            return []
-    whole = len(short) + len(long) == len(blocks) and 2 * sum(len(blocks[k]) for k in long) > len(command)
-    return [blocks[k] for k in short] if whole and len(short) >= len(long) >= 3 else []
-
-
-RAMP_ROWS = 6
-"""Least number of rows of a stop, between which commands are passed."""
 NUMBER_MAX = 1e12
 """Largest absolute command or reading."""
 TURN_TOLERANCE = 0.1
@@ -158,8 +67,6 @@ STALE_MIN = 4
 """Least number of moves of an export of two series, whose rows repeat the last reading."""
 SEAM_GAPS = 3.0
 """Least size of the part of a circle that commands leave out, in median distances of commands."""
-STATUS_SHARE = 0.5
-"""Share of rows that a status of 0 and 1 may leave out without a question."""
 
 
 @dataclass(frozen=True)
@@ -212,8 +119,8 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     if wishes.relative:
         table = _summed(table, columns)
         assumed.append("command: summed up, because --relative says that each is the length of its move")
-    table = _without_fills(_good_rows(table, columns, wishes, assumed), columns, wishes, assumed)
-    table = _resting_rows(table, columns, wishes, assumed)
+    table = without_fills(good_rows(table, columns, wishes, assumed), columns, wishes, assumed)
+    table = resting_rows(table, columns, wishes, assumed)
     cells, written = FieldCells(table, columns).with_plain(("command", "value", "u"), assumed)
     units = units_of(cells, written, wishes, assumed)
     commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
@@ -316,85 +223,6 @@ def _through_the_seam(
         return commands
     assumed.append(f"command: whole turns of {turn:g} added, because --assume command_turn says so")
     return [rounded(c) for c in np.unwrap(commands, period=turn)]
-
-
-# --- rows that count -------------------------------------------------------------------------------------------------
-def _good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
-    """The table with a status that can be one: it leaves some readings, and its 0 and 1 say which is good."""
-    if "status" not in columns:
-        return table
-    name = columns["status"]
-    cells = table.columns[name]
-    if wishes.status_ok is not None:
-        good = [
-            "ok" if NUMBER.fullmatch(cell) and float(cell) == wishes.status_ok else cell and f"status {cell}"
-            for cell in cells
-        ]
-        return replace(table, columns={**table.columns, name: tuple(good)})
-    bad = [bool(cell.strip()) and not means(cell, "good") for cell in cells]
-    if "status" in wishes.columns or not any(bad):
-        return table
-    codes = {float(cell) for cell in cells if NUMBER.fullmatch(cell)}
-    if all(bad) and len(codes) < 2:
-        assumed.append(f"status: column {escaped(name)} would leave out every reading, so it is none")
-        del columns["status"]
-        return table
-    coded = all(NUMBER.fullmatch(cell) or not cell for cell in cells)
-    if coded and (sum(bad) > STATUS_SHARE * len(cells) or all(bad)):
-        known = columns_of(table)
-        said = {"column": name, "bad": sum(bad), "rows": len(cells)}
-        raise table.ask("status", each=sorted(codes), first={name: known[name].first}, **said)
-    return table
-
-
-def _without_fills(table: ForeignTable, columns: Mapping[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
-    """The table without numbers that stand for no reading; asks where some may."""
-    name = columns["value"]
-    command, value = (columns_of(table)[columns[field_]].values for field_ in ("command", "value"))
-    if wishes.no_reading is not None:
-        cells = tuple("" if v == wishes.no_reading else c for v, c in zip(value, table.columns[name], strict=True))
-        count = sum(v == wishes.no_reading for v in value)
-        assumed.append(f"value: {count} cells of {wishes.no_reading:g} are empty, because --assume no_reading says so")
-        return replace(table, columns={**table.columns, name: cells})
-    if "value" not in wishes.columns:
-        statuses = table.columns[columns["status"]] if "status" in columns else ()
-        good = [not cell.strip() or means(cell, "good") for cell in statuses]
-        for fill in fill_values(command, np.where(good, value, np.nan) if good else value):
-            rows = [table.lines[k] for k in np.flatnonzero(value == fill)]
-            raise table.ask("no-reading", fill=fill, column=name, rows=rows)
-    return table
-
-
-def _resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
-    """The rows at which the axis rests: by a column that says so, else by the readings of each command."""
-    if wishes.columns.get("moving") == "":
-        return table
-    known = columns_of(table)
-    command, value = (known[columns[name]].values for name in ("command", "value"))
-    if "moving" in columns:
-        name = columns.pop("moving")
-        is_resting = place_of(words_of(name), "resting") is not None
-        is_speed = name_of(name).has("speed")
-        says_yes = known[name].values != 0 if is_speed else np.array([means(c, "good") for c in table.columns[name]])
-        rests, how = says_yes == is_resting, f"column {escaped(name)}"
-    else:
-        sides = table.columns[columns["approach"]] if "approach" in columns else ()
-        words = [next((w for w in ("forward", "backward") if means(cell, w)), "") for cell in sides]
-        # Where no side is stated that before goes on.
-        told = list[str]()
-        for word in words:
-            told.append(word or (told[-1] if told else ""))
-        runs = [column.cells for column in known.values() if column.name.has("repeat") and column.whole]
-        rests, how = at_rest(command, value, [part for part in (told, *runs) if part]), "the readings of each command"
-    if rests.all() or not rests.any():
-        return table
-    moved = int((~rests).sum())
-    assumed.append(
-        f"rest: {moved} of {len(rests)} rows left out, where the axis still moved by {how}; --column moving= keeps them"
-    )
-    keep = np.flatnonzero(rests)
-    cells = {name: tuple(column[k] for k in keep) for name, column in table.columns.items()}
-    return replace(table, columns=cells, lines=tuple(table.lines[k] for k in keep))
 
 
 # --- moves -----------------------------------------------------------------------------------------------------------

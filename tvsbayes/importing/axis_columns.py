@@ -403,6 +403,8 @@ def difference(column: Column, command: Column, value: Column) -> str:
         return ""
     # The written digits of the difference, of the reading and of the command, in the unit of the difference.
     tolerance = _half_digit(column) + to_column * (_half_digit(value) + to_reading * _half_digit(command)) + 1e-12
+    if np.max(np.abs(column.values[rows])) <= tolerance:
+        return ""
     a, b = escaped(value.name.text), escaped(command.name.text)
     forms = {f"{a} - {b}": gap, f"{b} - {a}": -gap, f"|{a} - {b}|": np.abs(gap)}
     fits = (text for text, numbers in forms.items() if np.all(np.abs(numbers - column.values)[rows] <= tolerance))

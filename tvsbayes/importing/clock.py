@@ -174,6 +174,9 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
         assumed.append(f"time_s: counted in {of_epoch[0]:g} s since 1970, so seconds since the first row")
     else:
         times_s = times * (unit.scale if unit is not None and unit.kind == "time" else 1.0)
+        if unit is None and len(times) and SPREADSHEET_DAYS[0] <= times.min() and times.max() <= SPREADSHEET_DAYS[1]:
+            said = "time_s: in s, though spreadsheets count days by such numbers; a column of days is named Time (d)"
+            assumed.append(said)
     seconds, backs = forward(map(float, times_s), repeat("time_s"))
     for back in backs:
         is_dated = not is_number and not any(map(_ZONE.search, texts)) and date_time(texts[0]) is not None

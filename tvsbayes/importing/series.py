@@ -20,10 +20,10 @@ import numpy as np
 from tvsbayes.errors import Candidate, InputError, escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import ANSWERS_MAX, asked, refused
-from tvsbayes.importing.axis import MOVING_SHARE, ROWS_MIN
 from tvsbayes.importing.clock import date_time, forward
 from tvsbayes.importing.columns import line_through
 from tvsbayes.importing.table import ForeignTable, table_of
+from tvsbayes.importing.usable_rows import MOVING_SHARE, ROWS_MIN
 from tvsbayes.importing.words import place_of, words_of
 
 STANDSTILL_INTERVALS = 3.0

@@ -402,7 +402,7 @@ def _is_second_header(cells: Sequence[str], next_cells: Sequence[str]) -> bool:
     numbers = sum(map(is_number, next_cells))
     return (
         not any(map(is_number, cells))
-        and sum(map(bool, cells)) > 1
+        and (sum(map(bool, cells)) > 1 or (any(cells) and _all_units(cells)))
         and numbers > 1
         and 2 * numbers > sum(map(bool, next_cells)) - 1
     )
