@@ -191,6 +191,12 @@ def test_ramps_and_repeated_readings_are_no_stops(tmp_path):
     ) == 12
 
 
+def test_a_reading_of_a_later_command_is_left_out(tmp_path):
+    lines = [line for c, v in zip(PLACES, READ, strict=True) for line in (f"target: {c}", f"pos: {v}")]
+    rows = axis_rows(table(tmp_path, *lines[:5], *lines[7:]), Wishes())
+    assert [r["value"] for r in rows.readings] == [*READ[:2], *READ[4:]] and any("line 5" in t for t in rows.assumed)
+
+
 @pytest.mark.parametrize(("name", "step"), [("JD", 120 / 86400), ("Time", 60 / 86400)])
 def test_days_are_no_seconds(name, step, tmp_path):
     start = 2461100.5 if name == "JD" else 46085.5

@@ -33,7 +33,7 @@ from tvsbayes.importing.columns import (
 from tvsbayes.importing.counters import are_moves, summed_up
 from tvsbayes.importing.runs import long_table
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.usable_rows import good_rows, resting_rows, without_fills
+from tvsbayes.importing.usable_rows import good_rows, resting_rows, without_fills, without_strays
 from tvsbayes.importing.words import Unit, means, name_of, parse_unit, plain
 from tvsbayes.statistics.wrapped import turn_jumps
 
@@ -120,7 +120,7 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
         table = _summed(table, columns)
         assumed.append("command: summed up, because --relative says that each is the length of its move")
     table = without_fills(good_rows(table, columns, wishes, assumed), columns, wishes, assumed)
-    table = resting_rows(table, columns, wishes, assumed)
+    table = without_strays(resting_rows(table, columns, wishes, assumed), columns, assumed)
     cells, written = FieldCells(table, columns).with_plain(("command", "value", "u"), assumed)
     units = units_of(cells, written, wishes, assumed)
     commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]

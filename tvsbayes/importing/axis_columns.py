@@ -118,14 +118,14 @@ def _role(column: Column) -> str:
         return "temperature_degC" if bool(np.isfinite(column.values).any()) else "aside"
     if name.has("speed") and column.numeric and STOPPED_SHARE <= np.mean(column.values == 0) <= 1 - STOPPED_SHARE:
         return "speed"
+    if name.has("status", "excluded") and not kind and not column.numeric and not name.has("command", "value"):
+        return "status"
     if name.has("aside") or kind in ("other", "voltage"):
         return "aside"
     if kind == "time" or (name.has("time") and not kind):
         return "time_s"
     if name.is_u:
         return "u"
-    if name.has("status", "excluded") and not kind and not column.numeric and not name.has("command", "value"):
-        return "status"
     if name.has("deviation"):
         return "deviation"
     if name.has("excluded") and not kind:

@@ -11,7 +11,7 @@ import numpy as np
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.axis_units import Wishes
-from tvsbayes.importing.columns import columns_of, fill_values
+from tvsbayes.importing.columns import columns_of, fill_values, line_through
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, name_of, place_of, words_of
 
@@ -30,6 +30,10 @@ NOISE_SDS, DIGITS, FLICKER_DIGITS = 5.0, 1.5, 3.0
 these, up to the last number, where the last rows of the command differ by them."""
 STEP_SHARE = 0.02
 """Least distance of the first row of a command from rest, as a share of its step, at which the axis was under way."""
+PAIRS = 'lines of "name: value"'
+"""Kind of a table in which a line may be lost between a command and its reading."""
+STRAY_MIN, STRAY_MADS, STRAY_SHARE = 8, 20.0, 0.1
+"""Fewest rows, least distance from the line in median distances, and largest share of such readings."""
 RAMP_ROWS = 6
 """Least number of rows of a stop, between which commands are passed."""
 STATUS_SHARE = 0.5
@@ -80,6 +84,31 @@ def without_fills(table: ForeignTable, columns: Mapping[str, str], wishes: Wishe
             rows = [table.lines[k] for k in np.flatnonzero(value == fill)]
             raise table.ask("no-reading", fill=fill, column=name, rows=rows)
     return table
+
+
+def without_strays(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) -> ForeignTable:
+    """The table without readings of lines in pairs that are far from their own command, on the way to the next one.
+
+    Two lines were lost in a row: a reading and the command after it.
+    """
+    known = columns_of(table)
+    command, value = (known[columns[name]].values for name in ("command", "value"))
+    if not table.kind.startswith(PAIRS) or len(value) < STRAY_MIN or not np.isfinite([command, value]).all():
+        return table
+    slope, off = line_through(command, value)
+    off = off - np.median(off)
+    noise = float(np.median(np.abs(off)))
+    ahead = slope * (np.r_[command[1:], command[-1:]] - command)
+    step = abs(slope) * float(np.median(np.abs(np.diff(command))))
+    of_next = ((off * ahead > 0) & (np.abs(off) < np.abs(ahead))) | (np.abs(np.abs(off) - step) < 0.1 * step)
+    strays = np.flatnonzero((np.abs(off) > STRAY_MADS * noise) & of_next)
+    if not len(strays) or len(strays) > STRAY_SHARE * len(value):
+        return table
+    lines = ", ".join(str(table.lines[row]) for row in strays)
+    assumed.append(f"value: left out in line {lines}, where a reading is that of a later command: lines lost")
+    name = columns["value"]
+    cells = tuple("" if row in strays else cell for row, cell in enumerate(table.columns[name]))
+    return replace(table, columns={**table.columns, name: cells})
 
 
 def resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
