@@ -278,6 +278,19 @@ def test_directions_of_nothing_and_errors_are_no_directions(tmp_path):
         sighting_rows(foreign, SightingWishes(columns, angle_unit="deg"))
 
 
+def test_counters_of_a_head_that_restart_are_refused(tmp_path):
+    counters = np.arange(0, 1200, 100)
+    with pytest.raises(InputError, match="jump by about"):
+        head(
+            tmp_path,
+            "pan_steps,tilt_steps,az (deg),el (deg)",
+            counters % 512,
+            0 * counters,
+            0.06 * counters,
+            0 * counters + 5.5,
+        )
+
+
 def test_moves_of_two_axes_are_seen(tmp_path):
     moved = np.r_[PAN[0], np.diff(PAN)]
     with pytest.raises(Question) as asked:

@@ -193,3 +193,16 @@ def test_messages_that_would_expand_are_small():
     messages.append({"q": "angle:a", "params": {"data": [[10.0, 5], [20.0, 7]]}})
     table = klipper_table(b"\x03".join(json.dumps(message).encode() for message in messages), "log")
     assert [float(cell) for cell in table.columns["steps"]] == pytest.approx([10_000_000, 19_999_999], abs=2)
+
+
+def test_values_on_the_way_are_no_readings_of_a_stop():
+    """A monitor posts each change; the last value before the next command is that of the stop."""
+    rows = [line("m.VAL", 0, 0.0), line("m.enc", 1, 0.01)]
+    for move in range(1, 6):
+        rows.append(line("m.VAL", 20 * move, 5.0 * move))
+        way = [5.0 * (move - 1) + part for part in range(1, 6)]
+        rows += [line("m.enc", 20 * move + 0.5 * k, at + 0.01) for k, at in enumerate(way, start=1)]
+    table = epics_table("\n".join(rows), "log.txt", {})
+    assert [float(cell) for cell in table.columns["m.enc"]] == pytest.approx(
+        [5.0 * k + 0.01 for k in range(5)], abs=1e-9
+    )

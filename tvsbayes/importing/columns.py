@@ -138,15 +138,21 @@ JUMP_SHARE = 0.1
 """Largest difference of the jumps of a dial, and of other steps from their line, as a share of a jump."""
 
 
-def restarts(command: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Sizes of the jumps of readings that follow the commands but for jumps of one size, as of a dial; else none."""
+def restarts(command: np.ndarray, value: np.ndarray, least: int = 2) -> np.ndarray:
+    """Sizes of the jumps of readings that follow the commands but for jumps of one size, as of a dial; else none.
+
+    Args:
+        command: commands, shape (rows,).
+        value: readings.
+        least: fewest jumps.
+    """
     dc, dv = np.diff(command), np.diff(value)
     moved = dc != 0
     if moved.sum() < 2 or np.ptp(value) == 0 or fill_values(command, value):
         return np.zeros(0)
     off = np.abs(dv - np.median(dv[moved] / dc[moved]) * dc)
     far = off > 0.5 * np.ptp(value)
-    alike = far.sum() > 1 and np.ptp(off[far]) < JUMP_SHARE * off[far].min()
+    alike = far.sum() >= least and np.ptp(off[far]) < JUMP_SHARE * off[far].min()
     return off[far] if alike and (far.all() or off[~far].max() < JUMP_SHARE * off[far].min()) else np.zeros(0)
 
 

@@ -28,6 +28,8 @@ from tvsbayes.importing.words import place_of, words_of
 
 STANDSTILL_INTERVALS = 3.0
 """Typical intervals of a series after which a value that did not change is held, not interpolated."""
+PASSED_SHARE = 0.05
+"""Least share of the way of a move between two values on the way."""
 INTERVAL_MAX_S = 2.0
 """Longest time between two values of an axis in motion: a command logged once per move is valid until the next."""
 EQUAL_S = 1e-6
@@ -120,6 +122,11 @@ def epics_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable
     if not moving.any() and np.median(counts) < ROWS_MIN and np.mean(counts > 1) >= MOVING_SHARE:
         # A value that is logged at its change, and soon after another one, is of an axis under way.
         rests[:-1] = (np.diff(times_s) > INTERVAL_MAX_S) | (np.diff(before) > 0)
+    elif not moving.any():
+        # Of many values on the way those that are followed by a good part of the way.
+        way = np.abs(line_through(held, values)[0] * (logged - np.r_[logged[:1], logged[:-1]]))[before]
+        rests[:-1] = (np.abs(np.diff(values)) <= PASSED_SHARE * way[:-1]) | (np.diff(before) > 0) | (way[:-1] == 0)
+    if not moving.any():
         notes += [f"{int((~rests).sum())} readings under way left out"] * (not rests.all())
     return _joined(file, notes, read[:, rests], commands[rests], (command, value))
 

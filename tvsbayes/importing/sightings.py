@@ -18,7 +18,7 @@ from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
 from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of
-from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of
+from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of, restarts
 from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
@@ -179,6 +179,13 @@ def _ask_whether_moves(
         there = np.unwrap([value for value in seen if not math.isnan(value)], period=360.0)
         turned = iter(there.tolist())
         found = [None if math.isnan(value) else next(turned) for value in seen]
+        read = np.array(
+            [pair[k] for pair, value in zip(counters, seen, strict=True) if not math.isnan(value)], dtype=float
+        )
+        if len(read) > FOUND_MIN and len(jumps := restarts(there, read, least=1)):
+            said = {"name": cells.columns[COUNTERS[k]], "field": COUNTERS[k]}
+            line = cells.table.first_line
+            raise refused("counters-restart", cells.table.file, line=line, jump=float(jumps.mean()), **said)
         if are_moves([pair[k] for pair in counters], found, homings):
             raise cells.table.ask("moves-or-positions", column=cells.columns[COUNTERS[k]], field=COUNTERS[k])
 
