@@ -230,6 +230,35 @@ def test_columns_without_words_are_runs_where_the_user_says_so(tmp_path):
     assert [r["value"] for r in rows.readings] == [*up, *down[::-1]]
 
 
+@pytest.mark.parametrize("word", ["lost", "#REF!", "nan", "n/a", "---", "19.99*", "(19.99)"])
+def test_a_word_in_a_run_costs_one_reading(word, tmp_path):
+    columns = [[f"{v:.3f}" for v in READ[:6] + 0.001 * k] for k in range(4)]
+    columns[2][2] = word
+    names = "Pos (mm),Forward 1,Backward 1,Forward 2,Backward 2"
+    rows = axis_rows(sheet(tmp_path, names, PLACES[:6], *columns), Wishes())
+    assert sum(r["status"] == "ok" for r in rows.readings) == 23
+
+
+def test_runs_of_which_one_word_is_known(tmp_path):
+    up, down = READ[:6], READ[5:][::-1] + 0.01
+    foreign = sheet(
+        tmp_path, "Pos (mm),Wyj 1 (mm),Backward 1 (mm),Wyj 2 (mm),Backward 2 (mm)", PLACES[:6], up, down, up, down
+    )
+    with pytest.raises(Question) as asked:
+        axis_rows(foreign, Wishes())
+    assert asked.value.candidates[0].options == ("--runs", "alternate")
+    assert [r["value"] for r in axis_rows(foreign, Wishes(order="alternate")).readings] == [*up, *down[::-1]] * 2
+
+
+def test_units_that_are_another_beside_degrees(tmp_path):
+    rows = axis_rows(sheet(tmp_path, "Command (grad),Read (deg)", PLACES, 0.9 * PLACES + 0.01), Wishes())
+    assert rows.axis == {"command_unit": "gon"}
+    with pytest.raises(Question, match="angular mil"):
+        axis_rows(sheet(tmp_path, "Command (deg),Read (mil)", PLACES, READ / 0.05625), Wishes())
+    rows = axis_rows(sheet(tmp_path, "pulses,read (mm)", [f"{c:g}k" for c in PLACES], READ), Wishes())
+    assert [m["command"] for m in rows.moves] == [1000 * c for c in PLACES]
+
+
 def test_deviations_of_the_other_sign(tmp_path):
     foreign = sheet(tmp_path, "Soll (mm),Soll-Ist (um)", PLACES, np.round(1000 * (PLACES - READ), 1))
     with pytest.raises(Question) as asked:

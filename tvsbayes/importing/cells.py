@@ -54,6 +54,12 @@ def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
     matches = [_WITH_UNIT.fullmatch(cell) for cell in cells if cell]
     units = {match["unit"].strip() if match else "" for match in matches}
     unit = parse_unit(units.pop()) if len(units) == 1 else None
+    if unit is not None and unit.name == "K" and place_of(words_of(name), "temperature") is None:
+        parts = [_WITH_UNIT.fullmatch(cell) for cell in cells]
+        thousands = tuple(
+            "" if part is None else repr(1000.0 * float(part["number"].replace(",", "."))) for part in parts
+        )
+        return PlainColumn(thousands, None, f"column {escaped(name)}: k, thousands")
     if unit is not None and unit.kind != "other":
         found = (_WITH_UNIT.fullmatch(cell) for cell in cells)
         plain = tuple("" if match is None else match["number"].replace(",", ".") for match in found)

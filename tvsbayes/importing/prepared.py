@@ -234,6 +234,10 @@ def _one_unit(table: ForeignTable) -> ForeignTable:
     if angles:
         # Beside degrees " is a second of arc.
         names = {n: re.sub(r"([(\[])\"([)\]])", r"\1arcsec\2", text) for n, text in names.items()}
+        # A mil of an angle is one of several; grad is no degree where another column is in degrees.
+        names = {n: re.sub(r"([(\[])mils?([)\]])", r"\1angular mil\2", text) for n, text in names.items()}
+        if any(re.search(r"[(\[](?:deg|degrees?|\u00b0)[)\]]", text) for text in columns):
+            names = {n: re.sub(r"([(\[])grad([)\]])", r"\1gon\2", text) for n, text in names.items()}
     columns = {names[n]: own for n, own in columns.items() if n not in stated}
     units = {n: o.unit for n in columns if (o := name_of(n)).unit is not None and o.unit.kind in ("length", "angle")}
     for first, second in pairwise(units):

@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from statistics import fmean, stdev
 
 import numpy as np
@@ -27,6 +28,8 @@ FOLLOWS_R2 = 0.98
 AGREEMENT_ERRORS = 3.0
 """Standard errors of the mean difference of two groups of runs within which they agree."""
 POSITIONS_MIN = 3
+NUMERIC_SHARE = 0.6
+"""Least share of numbers among the cells of a run."""
 _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
 _SIGN = re.compile(r"^\s*([+-])\s*\d*\s*(?:[(\[/,]|$)|^\s*\d+\s*([+-])\s*(?:[(\[/,]|$)|\s\(?([+-])\)?\s*(?:[(\[/,]|$)")
 """A sign in place of a direction: "+1", "1 - (mm)", "Run 1 (+)"."""
@@ -69,7 +72,9 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
         Question: the order of runs that differ, or which column has the commands.
     """
     written, plain = table, {text: plain_column(text, cells) for text, cells in table.columns.items()}
-    table = replace(table, columns={text: column.cells for text, column in plain.items()})
+    between = {text: _words_between(table, text, column.cells) for text, column in plain.items()}
+    cells_of = {t: tuple("" if k in between[t] else c for k, c in enumerate(p.cells)) for t, p in plain.items()}
+    table = replace(table, columns=cells_of)
     runs = _runs(table, {text: column.unit for text, column in plain.items()}, stated=order is not None)
     if not runs and order is not None and not stated.get("value"):
         runs = _in_columns(table, stated)
@@ -106,6 +111,9 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
         else:
             words = f"all {'rise' if min(sides) > 0 else 'rise and fall in turn'}; --runs says another"
         remarks.append(f"runs: {len(runs)} columns ({listed(names)}), read one after the other; {words}")
+    lost = [f'"{escaped(word, 20)}" (line {table.lines[row]})' for text in names for row, word in between[text].items()]
+    if lost:
+        remarks.append(f"cells of runs that are no numbers, left out: {listed(lost)}")
     unit = next((run.name.unit for run in runs if run.name.unit), None)
     factors = [run.name.unit.in_units_of(unit) if run.name.unit and unit else 1.0 for run in runs]
     if None in factors or (unit and any(run.name.unit is None for run in runs)):
@@ -165,6 +173,13 @@ def _scaled(cell: str, factor: float | None) -> str:
     return cell if factor == 1.0 or not NUMBER.fullmatch(cell) else repr((factor or 1.0) * float(cell))
 
 
+def _words_between(table: ForeignTable, text: str, cells: Sequence[str]) -> dict[int, str]:
+    """Words in a column of numbers, as "lost" or "19.99*", by row; empty for other columns."""
+    filled = [cell for cell in cells if cell]
+    found = {row: table.columns[text][row] for row, cell in enumerate(cells) if cell and not NUMBER.fullmatch(cell)}
+    return found if len(found) <= (1 - NUMERIC_SHARE) * len(filled) else {}
+
+
 def _numeric(cells: Sequence[str]) -> bool:
     filled = [cell for cell in cells if cell]
     return bool(filled) and all(map(NUMBER.fullmatch, filled))
@@ -194,9 +209,14 @@ def _runs(table: ForeignTable, units: Mapping[str, Unit | None], *, stated: bool
         # "B" beside "Down 1" is a figure.
         sided = [run for run in sided if run.name.numbers]
     if len(sided) > 1 and len({(run.number, run.side) for run in sided}) == len(sided):
-        others = [of for of in alike.values() if {r.number for r in of} == {r.number for r in sided}]
+        others = [of for of in alike.values() if {r.number for r in of} & {r.number for r in sided}]
         if len({run.side for run in sided}) == 1 and len(others) == 1 and not others[0][0].name.has("command"):
             texts = [[run.name.text for run in group] for group in (sided, others[0])]
+            places = [[*table.columns].index(text) for text in texts[0]]
+            if stated:
+                return []
+            if min(b - a for a, b in pairwise(sorted(places))) > 1:
+                raise table.ask("one-way-runs-in-turn", runs=texts[0], others=texts[1])
             raise refused("one-way-runs", table.file, line=table.first_line, runs=texts[0], others=texts[1])
         return sorted(sided, key=lambda run: (run.number, -run.side))
     groups = [runs for runs in alike.values() if len(runs) > 1 and len({run.number for run in runs}) == len(runs)]
