@@ -345,6 +345,7 @@ def test_a_book_with_points_apart(tmp_path):
         ("xL_mm,yL_mm,xR_mm,yR_mm", 0.01, "mm"),
         ("xL,yL,xR,yR", 0.001, "shares"),
         ("xL_rect,yL_rect,xR_rect,yR_rect", 1, "rectified"),
+        ("x left,y left (from bottom),x right,y right", 1, "bottom"),
     ],
 )
 def test_other_than_pixels_are_refused(names, scale, match, tmp_path):
@@ -365,3 +366,11 @@ def test_pairs_and_unnamed_pixels(tmp_path):
     degrees = sheet(tmp_path, "pan_deg,tilt_deg,xl,yl,xr,yr", 6 * np.arange(9), [0] * 9, *numbers)
     with pytest.raises(Question, match="angles"):
         look_rows(look_columns(degrees, {}), LookWishes())
+
+
+def test_a_sheet_of_merged_cells(tmp_path):
+    numbers = [300.5 + np.arange(9) + k for k in range(4)]
+    sheets = ["near", "", "", "", "", "far", "", "", ""]
+    foreign = sheet(tmp_path, "pan,tilt,sheet,xl,yl,xr,yr", 100 * np.arange(9), [0] * 9, sheets, *numbers)
+    rows = look_rows(look_columns(foreign, {}), LookWishes())
+    assert [look["target"] for look in rows.looks] == ["near"] * 5 + ["far"] * 4

@@ -22,6 +22,7 @@ from tvsbayes.importing.clock import date_time, joined_clock, stamp_of, time_of_
 from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of, missing_columns
 from tvsbayes.importing.counters import AXES, COUNTERS, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
+from tvsbayes.importing.prepared import continued
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Unit, means, name_of, place_of, unit_named, vocabulary, words_of
 
@@ -371,7 +372,13 @@ def _refuse_other_pixels(cells: FieldCells, wishes: LookWishes) -> None:
         unit = name.unit if name.unit and name.unit.kind in ("length", "angle") else None
         shares = len(values) >= SHARE_MIN and all(v % 1 and abs(v) < 1 for v in values)
         turned = place_of(name.words, "rectified", WORDS) is not None
-        kinds = {unit.name if unit else "": unit, "shares of the picture": shares, "a rectified picture": turned}
+        upward = place_of(name.words, "upward", WORDS) is not None
+        kinds = {
+            unit.name if unit else "": unit,
+            "shares of the picture": shares,
+            "a rectified picture": turned,
+            "rows from the bottom": upward,
+        }
         if what := next((word for word, is_one in kinds.items() if is_one), ""):
             said = {"name": text, "of": what, "field": pixel}
             raise refused("other-pixels", cells.table.file, line=cells.table.first_line, **said)
@@ -474,6 +481,10 @@ def _looks(
         values[name] = [v or 0.0 for v in cells.numbers(name, -CORRELATION_MAX, CORRELATION_MAX, optional=True)]
     readings = cells.scaled("aperture_deg", aperture, -APERTURE_MAX_DEG, APERTURE_MAX_DEG)
     looks, targets = dict[int, dict[str, Any]](), cells.text("target")
+    if targets and targets[0] and 2 * targets.count("") > len(targets) and len({*targets}) > 2:
+        # Merged cells: the name of a sheet stands in its first row alone.
+        targets = list(continued(targets))
+        assumed.append("target: rows without one are of the sheet above them")
     for row in rows:
         centre = {name: column[row] for name, column in pixels.items()}
         word = statuses[row].strip()

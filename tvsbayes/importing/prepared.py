@@ -136,15 +136,15 @@ def _filled_down(table: ForeignTable) -> ForeignTable:
         whole = all(any(other[row] for other in others) for row, cell in enumerate(cells) if not cell)
         # A mark, as "x" at a homing, is none of the rows below it.
         block = len({*filled}) > 1 and cells[:1] != ("",) and 2 * len(filled) <= len(cells) and whole
-        if block and name_of(text).has("approach") and not _sides_hold(table, _continued(cells)):
+        if block and name_of(text).has("approach") and not _sides_hold(table, continued(cells)):
             continue
         if block and name_of(text).has(*MERGED) and not name_of(text).has("value", "status", "deviation"):
-            columns[text] = _continued(cells)
+            columns[text] = continued(cells)
             merged.append(text)
     return _noted(table, columns, f"merged cells of {listed(merged)} filled") if merged else table
 
 
-def _continued(cells: Sequence[str]) -> tuple[str, ...]:
+def continued(cells: Sequence[str]) -> tuple[str, ...]:
     """Cells with what stands above them where they are empty."""
     done = [""]
     for cell in cells:
