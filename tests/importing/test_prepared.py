@@ -239,6 +239,18 @@ def test_a_word_in_a_run_costs_one_reading(word, tmp_path):
     assert sum(r["status"] == "ok" for r in rows.readings) == 23
 
 
+def test_states_of_a_machine_and_scales_of_a_gantry_are_asked_about(tmp_path):
+    # Written to 0.01 mm, the first follows the commands to the last digit.
+    for names in (
+        "vor Justage (mm),nach Justage (mm)",
+        "As found (mm),As left (mm)",
+        "left scale (mm),right scale (mm)",
+    ):
+        foreign = sheet(tmp_path, f"Pos (mm),{names}", PLACES, np.round(1.002 * PLACES, 3), READ)
+        with pytest.raises(Question):
+            axis_rows(foreign, Wishes())
+
+
 def test_runs_of_which_one_word_is_known(tmp_path):
     up, down = READ[:6], READ[5:][::-1] + 0.01
     foreign = sheet(

@@ -33,6 +33,8 @@ from tvsbayes.importing.words import means, place_of
 
 FIELDS = ("command", "value", "u", "status", "segment", "time_s", "approach", "temperature_degC", "moving")
 """All fields of a table of an axis."""
+COPY_SLOPE = 1e-6
+"""Largest deviation of the slope from that of the units of a column that repeats another."""
 COPY_SHARE = 1e-9
 """Largest deviation from a line, as a share of the span, of a column that repeats another."""
 STEADY_SHARE, STEP_TOLERANCE = 0.7, 0.2
@@ -131,7 +133,8 @@ def _role(column: Column) -> str:
     if name.has("excluded") and not kind:
         return "aside"
     for role in ("moving", "resting", "status", "approach"):
-        if name.has(role) and not kind and not (name.has("command", "value") and column.numeric):
+        measured = column.numeric and (name.has("command", "value") or not column.whole)
+        if name.has(role) and not kind and not measured:
             return role
     if name.has("segment") and not kind and column.counts_homings:
         return "segment"
@@ -443,6 +446,9 @@ def _repeats(command: Column, column: Column) -> bool:
     if len(np.unique(c)) < 3:
         return bool(len(c)) and bool(np.all(c == v))
     slope, off = line_through(c, v)
+    factor = factor_between(command.unit, column.unit) if command.unit and column.unit else None
+    if factor is not None and abs(slope / factor - 1.0) > COPY_SLOPE:
+        return False
     return bool(slope) and bool(np.max(np.abs(off)) <= COPY_SHARE * np.ptp(v))
 
 

@@ -198,7 +198,8 @@ def _runs(table: ForeignTable, units: Mapping[str, Unit | None], *, stated: bool
         rising, falling = name.has("forward", "clockwise"), name.has("backward", "counterclockwise")
         side = (1 if "+" in signed.groups() else -1) if signed else rising - falling
         both = rising and falling
-        if name.has("several") and not side:
+        turning = name.has("clockwise", "counterclockwise") and not name.has("forward", "backward")
+        if name.has("several") and (not side or (turning and not name.has("run"))):
             continue
         if side and not both and len(name.numbers) < 2 and not name.has("command"):
             sided.append(Run(name, name.numbers[0] if name.numbers else 1, side))
