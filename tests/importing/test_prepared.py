@@ -386,3 +386,40 @@ def test_a_sheet_of_merged_cells(tmp_path):
     foreign = sheet(tmp_path, "pan,tilt,sheet,xl,yl,xr,yr", 100 * np.arange(9), [0] * 9, sheets, *numbers)
     rows = look_rows(look_columns(foreign, {}), LookWishes())
     assert [look["target"] for look in rows.looks] == ["near"] * 5 + ["far"] * 4
+
+
+@pytest.mark.parametrize("name", ["T degC", "T_K", "T cam", "t_amb_C"])
+def test_a_letter_t_beside_words_is_no_clock(name, tmp_path):
+    warming = [f"{20 + 0.1 * k:.1f}" for k in range(8)]
+    rows = head(tmp_path, f"pan_steps,tilt_steps,az (deg),el (deg),{name}", PAN, FLAT * 0, AZIMUTH, FLAT, warming)
+    assert [m["time_s"] for m in rows.moves] == list(range(8))
+    with pytest.raises(Question, match="thermometer"):
+        head(tmp_path, "pan_steps,tilt_steps,az (deg),el (deg),T", PAN, FLAT * 0, AZIMUTH, FLAT, warming)
+
+
+def test_half_steps_are_no_angles(tmp_path):
+    with pytest.raises(InputError, match="whole number"):
+        head(tmp_path, "pan_steps,tilt_steps,az (deg),el (deg)", PAN / 8, FLAT * 0, AZIMUTH, FLAT)
+
+
+@pytest.mark.parametrize(
+    "remark", ["wrong - see next row", "bad reading", "nicht verwenden", "\u00e0 ignorer", "discard"]
+)
+def test_remarks_that_discard_a_row(remark, tmp_path):
+    remarks = ["lamp off" if row == 1 else remark if row in BAD else "" for row in range(11)]
+    rows = axis_rows(sheet(tmp_path, "command (mm),reading (mm),remark", PLACES, READ, remarks), Wishes())
+    assert [k for k, r in enumerate(rows.readings) if r["status"] != "ok"] == [*BAD]
+
+
+@pytest.mark.parametrize("name", ["S/N", "Spindel", "Machine", "Pr\u00fcfling"])
+def test_rows_of_two_machines_in_a_column_are_refused(name, tmp_path):
+    machines = [20714] * 6 + [20715] * 5
+    with pytest.raises(InputError, match="20714, 20715"):
+        axis_rows(sheet(tmp_path, f"{name},command (mm),reading (mm)", machines, PLACES, READ), Wishes())
+
+
+def test_minutes_of_arc_are_no_clock(tmp_path):
+    parts = [np.floor(PLACES), np.round(PLACES % 1 * 60 + 3 + 0.3 * (np.arange(11) % 3), 1)]
+    for names in ("Ist Grad,Ist Min", "Lecture degr\u00e9s,Lecture minutes"):
+        rows = axis_rows(sheet(tmp_path, f"Soll (deg),{names}", PLACES, *parts), Wishes())
+        np.testing.assert_allclose([r["value"] for r in rows.readings], PLACES + parts[1] / 60, atol=1e-9)

@@ -171,9 +171,9 @@ def import_(
         from tvsbayes.importing.guide import ASSUMPTIONS
         from tvsbayes.importing.runs import ORDERS
 
-        of_tables = {"coverage": "coverage factor of the column of u", "status_ok": "status of a good row"}
-        of_rows = {"no_reading": "number that stands for no reading", "command_turn": "turn of commands, 0: none"}
-        of_rows |= {"deviation_sign": "-1 where deviations are commanded less actual position"}
+        of_tables = {"coverage": "factor of u", "status_ok": "good status"}
+        of_rows = {"no_reading": "none read", "command_turn": "0: none"}
+        of_rows |= {"deviation_sign": "-1: commanded less actual"}
         assumed = _assumptions(o.assume, {**ASSUMPTIONS, **of_tables, **of_rows}, "declination_deg=45.9")
         check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
         check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")

@@ -20,6 +20,7 @@ from tvsbayes.importing.columns import (
     Chooser,
     Column,
     Understood,
+    ask_of_t,
     asked_of_dial,
     factor_between,
     fill_values,
@@ -48,8 +49,6 @@ ROUND_RATIO = 1.3
 """Least ratio of the numbers of different commands and readings at which they may be exchanged."""
 STOPPED_SHARE = 0.2
 """Least share of rows of either kind in a column of speeds that says where the axis moves."""
-ROOM_DEGC = (10.0, 40.0)
-"""Temperatures of a room."""
 MACHINES_MAX, MACHINE_ROWS = 8, 3
 """Largest number of axes or readers in a table, and fewest rows of each."""
 STRAY_ROWS, STRAY_R2 = 6, 0.5
@@ -124,7 +123,7 @@ def _role(column: Column) -> str:
         return "status"
     if name.has("aside") or kind in ("other", "voltage"):
         return "aside"
-    if kind == "time" or (name.has("time") and not kind):
+    if kind == "time" or (name.is_time and not kind):
         return "time_s"
     if name.is_u:
         return "u"
@@ -209,10 +208,8 @@ def _take_others(chooser: Chooser) -> None:
         first = next(iter(usable.values()), np.zeros(1))
         if len(usable) == 1 or (usable and all(equal_clocks(first, time) for time in usable.values())):
             clocks = list(usable)[:1]
-    elif clocks and chooser.is_open("time_s") and _may_be_degC(known[clocks[0]]):
-        found = f"column {escaped(clocks[0])}, which could be a clock or a thermometer"
-        columns = ({"time_s": clocks[0]}, {"temperature_degC": clocks[0]}, {"time_s": ""})
-        raise chooser.ask(found, list(map(chooser.answer, columns)))
+    else:
+        ask_of_t(chooser)
     chooser.take("time_s", clocks, what="that could be the clock")
 
 
@@ -262,17 +259,14 @@ def _refuse_several(chooser: Chooser) -> None:
         enough = min(map(column.cells.count, names), default=0) >= MACHINE_ROWS
         # Commands of another axis, "Joint 2 demand", name no machine.
         is_machine = place_of(column.name.words, "machine") is not None
-        is_machine = is_machine and not column.unit and not column.name.has("command", "value", "position")
+        is_machine = (
+            is_machine
+            and (column.unit is None or column.unit.kind == "other")
+            and not column.name.has("command", "value", "position")
+        )
         if is_machine and 1 < len(names) <= MACHINES_MAX and enough:
             line = chooser.table.first_line
             raise refused("several-machines", chooser.table.file, line=line, name=text, machines=list(names))
-
-
-def _may_be_degC(column: Column) -> bool:
-    """Whether a column T holds temperatures of a room as well as times."""
-    values, (low, high) = column.values, ROOM_DEGC
-    is_room = np.isfinite(values).all() and values[0] and np.all((low <= values) & (values <= high))
-    return column.name.text.strip() == "T" and bool(is_room) and float(np.ptp(values)) < 0.5 * (high - low)
 
 
 def _take_command(chooser: Chooser) -> None:

@@ -134,6 +134,8 @@ def fill_values(x: np.ndarray, y: np.ndarray) -> list[float]:
     return fills
 
 
+ROOM_DEGC = (10.0, 40.0)
+"""Temperatures of a room."""
 JUMP_SHARE = 0.1
 """Largest difference of the jumps of a dial, and of other steps from their line, as a share of a jump."""
 
@@ -280,6 +282,26 @@ def missing_columns(
     said["known"] = ", ".join(f"{name} = {escaped(text)}" for name, text in known.items()) or "nothing"
     names = listed(table.columns, len(table.columns))
     return refused("missing-column", table.file, line=table.first_line, names=names, **said)
+
+
+def ask_of_t(chooser: Chooser) -> None:
+    """Ask whether a column T, which rises as times do, is a clock or a thermometer.
+
+    Raises:
+        Question: it is the only clock, and its numbers are temperatures of a room as well.
+    """
+    clocks = chooser.roles.get("time_s", []) if chooser.is_open("time_s") else []
+    if len(clocks) == 1 and _may_be_degC(chooser.known[clocks[0]]):
+        found = f"column {escaped(clocks[0])}, which could be a clock or a thermometer"
+        columns = ({"time_s": clocks[0]}, {"temperature_degC": clocks[0]}, {"time_s": ""})
+        raise chooser.ask(found, list(map(chooser.answer, columns)))
+
+
+def _may_be_degC(column: Column) -> bool:
+    """Whether a column T holds temperatures of a room as well as times."""
+    values, (low, high) = column.values, ROOM_DEGC
+    is_room = np.isfinite(values).all() and values[0] and np.all((low <= values) & (values <= high))
+    return column.name.text.strip() == "T" and bool(is_room) and float(np.ptp(values)) < 0.5 * (high - low)
 
 
 # --- showing ---------------------------------------------------------------------------------------------------------

@@ -50,10 +50,10 @@ DRIVEN = {"drive_arcsec_per_s": SIDEREAL_ARCSEC_PER_S, "pe_sign": 1.0}
 ASSUMPTIONS = {
     "declination_deg": "declination of the star",
     "pulse_arcsec_per_s": "what a pulse turns the axis by, arcsec/s",
-    "pixel_arcsec": "scale of the guide camera, arcsec per pixel",
+    "pixel_arcsec": "arcsec per pixel",
     "drive_arcsec_per_s": "rate of the drive: sidereal",
-    "pe_sign": "1 where a positive periodic error is an axis ahead of its drive, else -1",
-    "ra_axis": "1 where X of a guide camera is right ascension, 2 where Y",
+    "pe_sign": "1 where an axis ahead has a positive error, else -1",
+    "ra_axis": "1 where X is right ascension, 2 where Y",
 }
 """Values that `--assume` may state, with their meaning."""
 MAXIM = "Track Log Started at UT"

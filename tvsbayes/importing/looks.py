@@ -19,7 +19,7 @@ from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
 from tvsbayes.importing.cells import FieldCells, homings_of, left_out, readable, status_of
 from tvsbayes.importing.clock import date_time, joined_clock, stamp_of, time_of_day
-from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of, missing_columns
+from tvsbayes.importing.columns import Chooser, Column, Understood, ask_of_t, columns_of, missing_columns
 from tvsbayes.importing.counters import AXES, COUNTERS, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.prepared import continued
@@ -131,6 +131,7 @@ def look_columns(table: ForeignTable, stated: Mapping[str, str]) -> Chooser:
     """
     chooser = Chooser.of(by_look(table, stated), stated, FIELDS, _role)
     clocks = chooser.roles.get("time_s", []) if chooser.is_open("time_s") else []
+    ask_of_t(chooser)
     kinds = {_kind_of_clock(table.columns[name]): name for name in clocks}
     if len(clocks) == 2 and kinds.keys() == {"day", "hour"}:
         name = " ".join(clocks)
@@ -206,6 +207,11 @@ def _kind_of_clock(cells: Sequence[str]) -> str:
 def _role(column: Column) -> str | None:
     """The field to which a column belongs; a reference that changes with every row counts no homings."""
     role = field_of(column.name.text)
+    of_unit = column.name.unit.kind if column.name.unit else ""
+    if of_unit == "temperature" and role in (None, "time_s"):
+        return "temperature_degC"
+    if role == "time_s" and column.name.words[:1] == ("t",) and not column.name.is_time:
+        return None
     if role is None and column.name.has("status", "excluded") and not column.numeric:
         return "status"
     return role if role != "segment" or column.counts_homings or {*column.cells} <= _MARKS else None

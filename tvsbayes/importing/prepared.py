@@ -19,7 +19,9 @@ from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, name_of, parse_unit, place_of, words_of
 
 _PARTS = re.compile(
-    r"(?P<stem>.+?)[ _.]*[\[(]?(?:(?P<d>d|deg|\u00b0|grad)|(?P<m>m|min|arcmin|')|(?P<s>s|sec|arcsec|\"))[\])]?$"
+    r"(?P<stem>.+?)[ _.]*[\[(]?(?:(?P<d>d|deg|degr.s|\u00b0|grad)|(?P<m>m|min|minuten|minutes|arcmin|'|\u2032)"
+    r"|(?P<s>s|sec|sekunden|secondes|seconds|arcsec|\"|''|\u2033))[\])]?$",
+    re.IGNORECASE,
 )
 """Degrees, minutes and seconds of one angle: az_d, az_m, az_s."""
 FORMS = (
@@ -77,6 +79,9 @@ def _marks(text: str, cells: Sequence[str], others: Sequence[str]) -> list[str]:
             return []
         bad = {c: not means(c, "no") and (means(c, "yes") or not means(c, "good")) for c in filled}
         return [label + f" {cell}" * (not means(cell, "yes")) if bad.get(cell) else "" for cell in cells]
+    said = {cell: place_of(words_of(cell), "discard") is not None for cell in filled}
+    if any(said.values()) and not any(map(NUMBER.fullmatch, filled)) and 2 * len(rows) < len(cells):
+        return [f"{label}: {cell}" if said.get(cell) else "" for cell in cells]
     if name.has("status") and all(means(c, "yes") or means(c, "no") for c in filled):
         return [f"{label} {cell}" if means(cell, "no") else "" for cell in cells] if len(filled) > 1 else []
     if any(name_of(other).has("aside") and place_of(words_of(other), "tolerance") is not None for other in others):

@@ -18,7 +18,7 @@ from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
 from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of
-from tvsbayes.importing.columns import Chooser, Column, Understood, columns_of, restarts
+from tvsbayes.importing.columns import Chooser, Column, Understood, ask_of_t, columns_of, restarts
 from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
@@ -205,6 +205,7 @@ def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understo
         whole = [name for name in names if known[name].whole and known[name].name.unit is None]
         if len(names) == 2 and len(whole) == 1 and counter not in roles and chooser.is_open(counter):
             roles[counter], roles[angle] = whole, [name for name in names if name not in whole]
+    ask_of_t(chooser)
     for role, names in roles.items():
         # Of two directions the one that was found.
         found = [name for name in names if place_of(known[name].name.words, "observed") is not None]
@@ -247,7 +248,7 @@ def field_of(column: Column) -> str | None:
         return "status"
     if name.has("aside") or of_axis:
         return None
-    if kind == "time" or name.has("time"):
+    if name.is_time:
         return "time_s"
     if place_of(words, "move") is not None:
         return "move"
@@ -278,7 +279,8 @@ def _units(
         if name in COUNTERS:
             # 200.0 is a counter that a program wrote as a float, 15.0000 an angle.
             written_angles = [c for c in cells.text(name) if len(c.partition(".")[2]) > 1 or not _is_whole(c)]
-            if unit is None and written_angles:
+            counted = column.name.unit is not None and column.name.unit.kind == "count"
+            if unit is None and written_angles and not counted:
                 unit = stated or units[ANGLES[0]]
         elif unit is None and name == "u_deg":
             unit = units["azimuth_deg"]

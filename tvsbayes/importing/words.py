@@ -259,6 +259,12 @@ class Name:
         """Whole numbers among its words."""
         return tuple(int(word) for word in self.words if word.isdigit())
 
+    @property
+    def is_time(self) -> bool:
+        """Whether it names a time; a letter t beside other words, as in "T cam", does not."""
+        place, is_unit = self.place("time"), self.unit is not None and self.unit.kind == "time"
+        return is_unit or (place is not None and (self.words[place] != "t" or len(self.words) == 1))
+
     @cached_property
     def is_u(self) -> bool:
         """Whether it names an uncertainty, standard or expanded, or a multiple of a standard deviation."""
