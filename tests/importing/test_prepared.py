@@ -332,6 +332,12 @@ def test_counters_of_a_head_that_restart_are_refused(tmp_path):
         )
 
 
+def test_large_moves_of_a_head_are_no_restarts(tmp_path):
+    counters = np.array([2150, -1100, 2350, -2400, 2900, -600, 550, 2050])
+    rows = head(tmp_path, "pan_steps,tilt_steps,az (deg),el (deg)", counters, FLAT * 0, 0.05 * counters % 360, FLAT)
+    assert [m["pan_steps"] for m in rows.moves] == list(counters)
+
+
 def test_moves_of_two_axes_are_seen(tmp_path):
     moved = np.r_[PAN[0], np.diff(PAN)]
     with pytest.raises(Question) as asked:

@@ -39,6 +39,8 @@ UNITS_ASKED = ("mrad", "arcmin", "arcsec")
 ELEVATION_MAX_DEG = 90.0
 ERROR_SHARE = 0.05
 """Largest range of directions, as a share of that of encoders on the axes, at which they are errors."""
+TURN_SHARE = 0.05
+"""Largest distance from whole turns of a jump that is one, turns."""
 FOUND_MIN, FAR_DEG = 4, 5.0
 """Fewest directions by which others are judged, and distance from theirs of one that was not found."""
 LIMITS_DEG = {
@@ -182,12 +184,20 @@ def _ask_whether_moves(
         read = np.array(
             [pair[k] for pair, value in zip(counters, seen, strict=True) if not math.isnan(value)], dtype=float
         )
-        if len(read) > FOUND_MIN and len(jumps := restarts(there, read, least=1)):
+        jumps = restarts(there, read, least=1) if len(read) > FOUND_MIN else read[:0]
+        if len(jumps) and not _are_turns(jumps, there, read):
             said = {"name": cells.columns[COUNTERS[k]], "field": COUNTERS[k]}
             line = cells.table.first_line
             raise refused("counters-restart", cells.table.file, line=line, jump=float(jumps.mean()), **said)
         if are_moves([pair[k] for pair in counters], found, homings):
             raise cells.table.ask("moves-or-positions", column=cells.columns[COUNTERS[k]], field=COUNTERS[k])
+
+
+def _are_turns(jumps: np.ndarray, there_deg: np.ndarray, counters: np.ndarray) -> bool:
+    """Whether jumps are whole turns of a direction, which a large move leaves open."""
+    moved = np.diff(counters) != 0
+    turns = np.median(np.diff(there_deg)[moved] / np.diff(counters)[moved]) * jumps.mean() / 360.0
+    return bool(abs(turns - round(turns)) < TURN_SHARE)
 
 
 def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understood:
