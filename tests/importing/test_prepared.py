@@ -321,6 +321,16 @@ def test_directions_of_nothing_and_errors_are_no_directions(tmp_path):
 
 def test_counters_of_a_head_that_restart_are_refused(tmp_path):
     counters = np.arange(0, 1200, 100)
+    with pytest.raises(InputError, match="jump by about 4096"):
+        ticks = np.arange(3600, 5400, 120)
+        head(
+            tmp_path,
+            "pan_steps,tilt_steps,az (deg),el (deg)",
+            ticks % 4096,
+            0 * ticks,
+            ticks * 360 / 4096 % 360,
+            0 * ticks + 5,
+        )
     with pytest.raises(InputError, match="jump by about"):
         head(
             tmp_path,

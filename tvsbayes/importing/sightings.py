@@ -41,6 +41,8 @@ ERROR_SHARE = 0.05
 """Largest range of directions, as a share of that of encoders on the axes, at which they are errors."""
 TURN_SHARE = 0.05
 """Largest distance from whole turns of a jump that is one, turns."""
+LONG_DEG = 90.0
+"""Least move beside which one of nearly a turn is nothing special."""
 FOUND_MIN, FAR_DEG = 4, 5.0
 """Fewest directions by which others are judged, and distance from theirs of one that was not found."""
 LIMITS_DEG = {
@@ -195,9 +197,12 @@ def _ask_whether_moves(
 
 def _are_turns(jumps: np.ndarray, there_deg: np.ndarray, counters: np.ndarray) -> bool:
     """Whether jumps are whole turns of a direction, which a large move leaves open."""
-    moved = np.diff(counters) != 0
-    turns = np.median(np.diff(there_deg)[moved] / np.diff(counters)[moved]) * jumps.mean() / 360.0
-    return bool(abs(turns - round(turns)) < TURN_SHARE)
+    moves = np.diff(counters)
+    slope = np.median(np.diff(there_deg)[moves != 0] / moves[moves != 0])
+    turns, others = slope * jumps.mean() / 360.0, np.abs(moves)[np.abs(moves) < 0.5 * jumps.mean()]
+    # Where all other moves are short, an encoder has restarted after its turn.
+    long = len(others) < len(moves) - 2 * len(jumps) or np.abs(slope) * others.max(initial=0.0) > LONG_DEG
+    return bool(abs(turns - round(turns)) < TURN_SHARE and long)
 
 
 def sighting_columns(table: ForeignTable, stated: Mapping[str, str]) -> Understood:
