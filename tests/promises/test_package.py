@@ -17,8 +17,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 VERSION = PROJECT["project"]["version"]
-SIZES_MAX = {".whl": 2_200_000, ".gz": 4_000_000}
-"""Bytes: an eighth more than 0.3.0 takes, so that pictures or results that slip in are seen."""
+SIZES_MAX = {".whl": 2_300_000, ".gz": 4_000_000}
+"""Bytes: a few percent more than they take, so that pictures or results that slip in are seen."""
 SHIPPED = (
     *("rigs/mounted/rig.toml", "rigs/nominal/rig.toml", "twins/paper_twin/spots.csv", "twins/grid_twin/truth.json"),
     *("schemas/fit-1.schema.json", "report/report.html", "report/report.css", "templates/campaign.toml"),
