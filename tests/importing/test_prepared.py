@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError, Question
+from tvsbayes.importing import columns
 from tvsbayes.importing.axis import axis_rows
 from tvsbayes.importing.axis_units import Wishes
+from tvsbayes.importing.columns import line_through
 from tvsbayes.importing.looks import LookWishes, look_columns, look_rows
 from tvsbayes.importing.reader import read_foreign
 from tvsbayes.importing.sightings import SightingWishes, sighting_rows
@@ -76,6 +78,16 @@ def test_numbers_that_stand_for_no_reading(fill, tmp_path):
     assert [r["value"] for r in rows.readings] == [v for k, v in enumerate(READ) if k not in BAD]
     if abs(number) < 1e12:
         assert len(axis_rows(foreign, Wishes(columns={"value": second[1].partition("=")[2]})).readings) == 11
+
+
+def test_numbers_for_no_reading_are_sought_among_few(monkeypatch):
+    """A log of many different readings costs no line for each of them."""
+    fits = []
+    monkeypatch.setattr(columns, "line_through", lambda *xy: fits.append(1) or line_through(*xy))
+    x = np.arange(5000.0)
+    y = x + 0.01 * np.sin(x)
+    y[1234] = -9999.0
+    assert columns.fill_values(x, y) == [-9999.0] and len(fits) <= columns.FILLS_TRIED + 1
 
 
 def test_a_spot_of_two_equal_numbers_is_none(tmp_path):

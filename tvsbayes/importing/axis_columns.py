@@ -30,7 +30,7 @@ from tvsbayes.importing.columns import (
 from tvsbayes.importing.counters import are_moves
 from tvsbayes.importing.runs import FOLLOWS_R2, counts_rows
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import means, place_of
+from tvsbayes.importing.words import means, place_of, words_of
 
 FIELDS = ("command", "value", "u", "status", "segment", "time_s", "approach", "temperature_degC", "moving")
 """All fields of a table of an axis."""
@@ -142,8 +142,7 @@ def _role(column: Column) -> str:
     if _states_sides(column):
         return "approach"
     command, value = name.place("command"), name.place("value")
-    if command is not None and value is not None and re.search(r"\w\s*[-\u2212\u2013]\s*\w", name.text):
-        # "Soll-Ist", "cmd-meas".
+    if command is not None and value is not None and _is_difference(name.text):
         return "deviation"
     if (column.numeric or column.has_digits) and (command is not None or value is not None):
         is_number = value is not None and name.place("number") == value
@@ -157,6 +156,13 @@ def _role(column: Column) -> str:
     if name.has("statistic") and not name.has("position"):
         return "mean" if place_of(name.words, "mean") is not None else "aside"
     return "position" if name.has("position") or (unit is not None and not name.words) else ""
+
+
+def _is_difference(text: str) -> bool:
+    """Whether a name is a command less a reading, or a reading less a command: "Soll-Ist", "cmd-meas"."""
+    left, sign, right = re.sub("[\u2212\u2013]", "-", text).partition("-")
+    sides = [{c for c in ("command", "value") if place_of(words_of(part), c) is not None} for part in (left, right)]
+    return bool(sign) and sides in ([{"command"}, {"value"}], [{"value"}, {"command"}])
 
 
 def _states_sides(column: Column) -> bool:

@@ -48,9 +48,9 @@ class PlainColumn:
 
 def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
     """A column whose cells may be in degrees, minutes and seconds, have fractions or include one unit."""
-    filled = [cell for cell in cells if cell and not means(cell, "empty")]
-    if all(NUMBER.fullmatch(cell) for cell in filled):
+    if all(NUMBER.fullmatch(cell) or not cell or means(cell, "empty") for cell in cells):
         return PlainColumn(tuple(cells), None, "")
+    filled = [cell for cell in cells if cell and not means(cell, "empty")]
     matches = [_WITH_UNIT.fullmatch(cell) for cell in cells if cell]
     units = {match["unit"].strip() if match else "" for match in matches}
     unit = parse_unit(units.pop()) if len(units) == 1 else None

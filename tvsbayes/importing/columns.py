@@ -107,6 +107,8 @@ def line_through(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
         return slope, dy - slope * dx
 
 
+FILL_HUGE, FILLS_TRIED = 1e15, 8
+"""Least number that no machine reads, and how many different numbers are tried as fills."""
 FILLED_MIN, FILL_SHARE, FILL_SDS = 4, 0.2, 20.0
 """Fewest other readings, and least distance from their line, as a share of their range and in standard deviations about
 it, of a number that may stand for no reading."""
@@ -120,7 +122,14 @@ def fill_values(x: np.ndarray, y: np.ndarray) -> list[float]:
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     fills = []
-    for fill in np.unique(y):
+    # They lie farthest from the line of all, or are too large for one.
+    plain = np.abs(y) < FILL_HUGE
+    off = np.full(len(y), np.inf)
+    if plain.sum() > 1:
+        off[plain] = np.abs(line_through(x[plain], y[plain])[1])
+    farthest = y[np.argsort(-off, kind="stable")]
+    _, first = np.unique(farthest, return_index=True)
+    for fill in np.sort(farthest[np.sort(first)[:FILLS_TRIED]]):
         at = y == fill
         rest = ~at
         if 4 * at.sum() > len(y) or rest.sum() < FILLED_MIN or not np.ptp(x[rest]) or not np.ptp(y[rest]):
@@ -128,7 +137,7 @@ def fill_values(x: np.ndarray, y: np.ndarray) -> list[float]:
         slope, off = line_through(x[rest], y[rest])
         away = np.abs(fill - y[rest].mean() - slope * (x[at] - x[rest].mean()))
         far = away > max(FILL_SHARE * np.ptp(y[rest]), FILL_SDS * float(np.std(off)))
-        usual = abs(fill) >= 1e15 or fill in (0, -1) or (abs(fill) >= 99 and {*str(abs(int(fill)))} == {"9"})
+        usual = abs(fill) >= FILL_HUGE or fill in (0, -1) or (abs(fill) >= 99 and {*str(abs(int(fill)))} == {"9"})
         if far.all() and (usual or len(np.unique(x[at])) > 1):
             fills.append(float(fill))
     return fills

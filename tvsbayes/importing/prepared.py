@@ -29,6 +29,8 @@ FORMS = (
     (re.compile(r"([-+]?\d+[.,]?\d*)\s*(?:\u00b1|\+/-)\s*(\d+[.,]?\d*)"), ("{}", "u of {}")),
 )
 """Two numbers in a cell, and what they are called."""
+WORDS_MAX = 1000
+"""Largest number of different cells of a column that marks rows: with more they are measured, or written freely."""
 CODES_MAX = 4
 """Largest number of different codes in a column of errors that marks rows."""
 NEWEST_MIN = 4
@@ -67,9 +69,12 @@ def _marks(text: str, cells: Sequence[str], others: Sequence[str]) -> list[str]:
     name = name_of(text)
     if name.unit is not None or name.has("command", "value", "temperature", "time", "approach"):
         return []
-    filled = {cell for cell in cells if cell and not means(cell, "empty")}
-    rows = [cell for cell in cells if cell and not means(cell, "empty")]
-    zeros = sum(means(cell, "no") for cell in rows)
+    empty = {cell: not cell or means(cell, "empty") for cell in {*cells}}
+    filled = {cell for cell, is_empty in empty.items() if not is_empty}
+    if len(filled) > WORDS_MAX and not name.has("excluded"):
+        return []
+    rows = [cell for cell in cells if not empty[cell]]
+    zeros = sum(map(rows.count, (cell for cell in filled if means(cell, "no"))))
     seldom = 2 * len(rows) < len(cells) or (len(filled) <= CODES_MAX and 2 * zeros > len(rows))
     codes = name.has("excluded") or (name.has("deviation") and seldom)
     label = escaped(text.strip(" ?"), 40)
@@ -84,7 +89,7 @@ def _marks(text: str, cells: Sequence[str], others: Sequence[str]) -> list[str]:
         return [f"{label}: {cell}" if said.get(cell) else "" for cell in cells]
     if name.has("status") and all(means(c, "yes") or means(c, "no") for c in filled):
         return [f"{label} {cell}" if means(cell, "no") else "" for cell in cells] if len(filled) > 1 else []
-    if any(name_of(other).has("aside") and place_of(words_of(other), "tolerance") is not None for other in others):
+    if any(place_of(words_of(other), "tolerance") is not None for other in others):
         # Out of tolerance is no fault of a reading.
         return []
     verdicts = {c: means(c, "bad") for c in filled if not (means(c, "yes") or means(c, "no")) or c.lower() == "ok"}
@@ -124,11 +129,16 @@ def _instant(cell: str) -> float | None:
 
 def _sorted_by_command(table: ForeignTable) -> bool:
     """Whether the only column of commands rises or falls through the whole file."""
+    steps = _command_steps(table)
+    return steps is not None and (min(steps, default=1.0) >= 0 or max(steps) <= 0)
+
+
+def _command_steps(table: ForeignTable) -> list[float] | None:
+    """Steps of the only column of commands; None where there is none of numbers."""
     named = [cells for text, cells in table.columns.items() if name_of(text).has("command")]
     if len(named) != 1 or not all(map(NUMBER.fullmatch, named[0])):
-        return False
-    steps = [float(b) - float(a) for a, b in pairwise(named[0])]
-    return min(steps, default=1.0) >= 0 or max(steps) <= 0
+        return None
+    return [float(b) - float(a) for a, b in pairwise(named[0])]
 
 
 # --- cells -----------------------------------------------------------------------------------------------------------
@@ -136,14 +146,14 @@ def _filled_down(table: ForeignTable) -> ForeignTable:
     """The table with merged cells filled: what stands in the first row of a block is that of the block."""
     columns, merged = dict(table.columns), list[str]()
     for text, cells in table.columns.items():
-        filled = [cell for cell in cells if cell]
-        others = [other for name, other in table.columns.items() if name != text]
-        whole = all(any(other[row] for other in others) for row, cell in enumerate(cells) if not cell)
+        filled, name = [cell for cell in cells if cell], name_of(text)
         # A mark, as "x" at a homing, is none of the rows below it.
-        block = len({*filled}) > 1 and cells[:1] != ("",) and 2 * len(filled) <= len(cells) and whole
-        if block and name_of(text).has("approach") and not _sides_hold(table, continued(cells)):
+        block = len({*filled}) > 1 and cells[:1] != ("",) and 2 * len(filled) <= len(cells)
+        if not block or not name.has(*MERGED) or name.has("value", "status", "deviation"):
             continue
-        if block and name_of(text).has(*MERGED) and not name_of(text).has("value", "status", "deviation"):
+        others = [other for other_name, other in table.columns.items() if other_name != text]
+        whole = all(any(other[row] for other in others) for row, cell in enumerate(cells) if not cell)
+        if whole and (not name.has("approach") or _sides_hold(table, continued(cells))):
             columns[text] = continued(cells)
             merged.append(text)
     return _noted(table, columns, f"merged cells of {listed(merged)} filled") if merged else table
@@ -159,11 +169,10 @@ def continued(cells: Sequence[str]) -> tuple[str, ...]:
 
 def _sides_hold(table: ForeignTable, sides: Sequence[str]) -> bool:
     """Whether the commands go where filled cells say."""
-    named = [cells for text, cells in table.columns.items() if name_of(text).has("command")]
-    if len(named) != 1 or not all(map(NUMBER.fullmatch, named[0])):
+    steps = _command_steps(table)
+    if steps is None:
         return False
     ways = [means(side, "forward") - means(side, "backward") for side in sides[1:]]
-    steps = [float(b) - float(a) for a, b in pairwise(named[0])]
     return all(ways) and all(way * step >= 0 for way, step in zip(ways, steps, strict=True))
 
 
@@ -264,11 +273,12 @@ def _one_unit(table: ForeignTable) -> ForeignTable:
 def _homed(table: ForeignTable) -> ForeignTable:
     """The table with homings marked, where a column of events or remarks speaks of them in some rows."""
     for text, cells in table.columns.items():
-        words = [words_of(cell) for cell in cells]
-        if name_of(text).has("segment", "command", "value", "approach", "status") or sum(map(bool, words)) == 0:
+        if name_of(text).has("segment", "command", "value", "approach", "status") or any(map(NUMBER.fullmatch, cells)):
             continue
-        homed = ["1" if place_of(own[:2], "homing") == 0 and len(own) <= HOMED_WORDS else "0" for own in words]
-        if 0 < homed.count("1") < len(homed) / 2 and not any(map(NUMBER.fullmatch, cells)):
+        words = {cell: words_of(cell) for cell in {*cells}}
+        says = {c: place_of(own[:2], "homing") == 0 and len(own) <= HOMED_WORDS for c, own in words.items()}
+        homed = ["1" if says[cell] else "0" for cell in cells]
+        if 0 < homed.count("1") < len(homed) / 2:
             columns = {**{n: own for n, own in table.columns.items() if n != text}, "homed": tuple(homed)}
             return _noted(table, columns, f"homings by column {escaped(text)}")
     return table

@@ -12,6 +12,7 @@ from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.axis_units import Wishes
 from tvsbayes.importing.columns import columns_of, fill_values, line_through
+from tvsbayes.importing.prepared import continued
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, name_of, place_of, words_of
 
@@ -125,11 +126,8 @@ def resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, a
         rests, how = says_yes == is_resting, f"column {escaped(name)}"
     else:
         sides = table.columns[columns["approach"]] if "approach" in columns else ()
-        words = [next((w for w in ("forward", "backward") if means(cell, w)), "") for cell in sides]
         # Where no side is stated that before goes on.
-        told = list[str]()
-        for word in words:
-            told.append(word or (told[-1] if told else ""))
+        told = continued([next((w for w in ("forward", "backward") if means(cell, w)), "") for cell in sides])
         runs = [column.cells for column in known.values() if column.name.has("repeat") and column.whole]
         rests, how = at_rest(command, value, [part for part in (told, *runs) if part]), "the readings of each command"
     if rests.all() or not rests.any():
