@@ -204,5 +204,7 @@ def test_values_on_the_way_are_no_readings_of_a_stop():
         rows += [line("m.enc", 20 * move + 0.5 * k, at + 0.01) for k, at in enumerate(way, start=1)]
     table = epics_table("\n".join(rows), "log.txt", {})
     assert [float(cell) for cell in table.columns["m.enc"]] == pytest.approx(
-        [5.0 * k + 0.01 for k in range(5)], abs=1e-9
+        [5.0 * k + 0.01 for k in range(6)], abs=1e-9
     )
+    cut = epics_table("\n".join(rows[:-2]), "log.txt", {})
+    assert float(cut.columns["m.enc"][-1]) == pytest.approx(20.01, abs=1e-9)

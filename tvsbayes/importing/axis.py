@@ -111,6 +111,7 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
         InputError: a cell is not a value of its field, or the table has no row or lacks a column.
     """
     table.require_rows()
+    wishes = replace(wishes, columns=table.named(wishes.columns))
     runs = long_table(table, wishes.columns, wishes.order)
     settled = wishes.deviations is not None or wishes.relative or wishes.counts_per_turn is not None
     known = axis_columns(runs.table, runs.stated, wishes.deviations, settled=settled)
@@ -348,6 +349,9 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
         word: 1 if means(text, "forward") else -1 if means(text, "backward") else 0
         for word, text in zip(words, texts, strict=True)
     }
+    if "0" in sides:
+        # Beside 0 a 1 may be either.
+        sides |= dict.fromkeys(sides.keys() & {"0", "1"}, 0)
     unknown = sorted(word for word, side in sides.items() if not side and word not in ("", "unknown"))
     if 0 < len(unknown) < 3 and set(unknown) == set(words) - {"", "unknown"}:
         steps = np.diff(commands) * ~np.array(homings[1:], bool)

@@ -167,7 +167,7 @@ def _is_difference(text: str) -> bool:
 
 def _states_sides(column: Column) -> bool:
     """Whether the cells of a column are words of direction, whatever its name."""
-    words = {cell for cell in column.cells if cell}
+    words = {cell for cell in column.cells if cell} - {"in"}
     sides = ("forward", "backward", "clockwise", "counterclockwise")
     return (
         bool(words)
@@ -258,21 +258,22 @@ def _ask_whether_it_follows(chooser: Chooser) -> None:
 
 
 def _refuse_several(chooser: Chooser) -> None:
-    """Refuse rows of several axes or readers: a column that names them."""
-    for text in chooser.understood().unused:
-        column = chooser.known[text]
+    """Refuse rows of several axes or readers, or of one in several states: a column that names them."""
+    for text, column in chooser.known.items():
         names = dict.fromkeys(filter(None, column.cells))
-        enough = min(map(column.cells.count, names), default=0) >= MACHINE_ROWS
-        # Commands of another axis, "Joint 2 demand", name no machine.
-        is_machine = place_of(column.name.words, "machine") is not None
-        is_machine = (
-            is_machine
-            and (column.unit is None or column.unit.kind == "other")
-            and not column.name.has("command", "value", "position")
-        )
-        if is_machine and 1 < len(names) <= MACHINES_MAX and enough:
+        few = 1 < len(names) <= MACHINES_MAX and min(map(column.cells.count, names)) >= MACHINE_ROWS
+        if not few or text in (chooser.taken.get(field) for field in FIELDS if field != "status"):
+            continue
+        # "ok" and "lost" are no states of a machine; commands of another axis, "Joint 2 demand", name none.
+        of_rows = any(means(name, concept) for name in names for concept in ("good", "bad"))
+        of_numbers = column.unit is not None and column.unit.kind != "other"
+        named = place_of(column.name.words, "machine") is not None
+        named &= not column.name.has("command", "value", "position")
+        stated = all(place_of(words_of(name), "condition") is not None for name in names)
+        if stated or (named and not of_numbers and not (of_rows and text == chooser.taken.get("status"))):
+            where = f"in column {escaped(text)}"
             line = chooser.table.first_line
-            raise refused("several-machines", chooser.table.file, line=line, name=text, machines=list(names))
+            raise refused("several-machines", chooser.table.file, line=line, where=where, machines=list(names))
 
 
 def _take_command(chooser: Chooser) -> None:

@@ -257,8 +257,9 @@ def _standard_u(
         assumed.append(f"u: column {escaped(name)} in {unit.name}, turned into {result.name}")
     coverage = wishes.coverage or name_of(name).coverage
     if is_expanded(cells, wishes):
+        what = f"{coverage:g} standard deviations, taken as" if name_of(name).is_spread else "is"
         how = f"over {coverage:g}; --assume coverage=NUMBER says another"
-        assumed.append(f"u: column {escaped(name)} is an expanded uncertainty, {how}")
+        assumed.append(f"u: column {escaped(name)} {what} an expanded uncertainty, {how}")
     return [rounded(u * (factor or 1.0) / (coverage or 1.0)) for u in stated]
 
 

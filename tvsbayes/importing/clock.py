@@ -27,10 +27,11 @@ TIME_MAX = 1e20
 """Largest number of a time: nanoseconds of 3000 years."""
 STEPS_USUAL = 50
 """Number of times before a step back that give the usual step."""
-_OF_DAY = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:[.,][0-9]{1,9})?)(?: ?([AaPp])[Mm])?)?")
+_OF_DAY = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:[.,][0-9]{1,9})?))?(?: ?([AaPp])[Mm])?")
+_SLASHED = re.compile(r"([0-9]{1,2})/([0-9]{1,2})/([0-9]{4})(?:[ ,T]+(.*))?")
 _SHORT = re.compile(r"[0-9]{1,3}:[0-9]{2}")
 _ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")
-_FORMS = ("", "%Y-%m-%dT%I:%M:%S %p", "%d-%b-%Y %H:%M:%S", "%b %d, %Y %H:%M:%S")
+_FORMS = ("", "%Y-%m-%dT%I:%M:%S %p", "%d-%b-%Y %H:%M:%S", "%b %d, %Y %H:%M:%S", "%Y-%m-%dT%I:%M %p")
 """Of dates; "" is ISO 8601."""
 
 
@@ -49,6 +50,27 @@ def date_time(text: str) -> datetime.datetime | None:
             continue
         return at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
     return None
+
+
+def dates_in_order(cells: Sequence[str]) -> tuple[list[str], str] | None:
+    """Dates such as 3/14/2026 with the year first, and how they were read; of one day that both orders allow its times.
+
+    None for other cells, and where days may be months.
+    """
+    matches = [_SLASHED.fullmatch(cell) for cell in cells if cell]
+    found = [match for match in matches if match]
+    if not found or len(found) < len(matches):
+        return None
+    firsts, seconds = ({int(match[k]) for match in found} for k in (1, 2))
+    month_first, day_first = max(firsts) <= 12 < max(seconds), max(seconds) <= 12 < max(firsts)
+    if month_first or day_first:
+        form = r"\3/\1/\2 \4" if month_first else r"\3/\2/\1 \4"
+        said = "dates as month/day/year" if month_first else "dates as day/month/year"
+    elif len({match.group(1, 2, 3) for match in found}) == 1 and all(match[4] for match in found):
+        form, said = r"\4", f"times alone, as {found[0][1]}/{found[0][2]} may be of two months,"
+    else:
+        return None
+    return [_SLASHED.sub(form, cell).strip() for cell in cells], said
 
 
 def time_of_day(text: str) -> float | None:

@@ -129,6 +129,7 @@ def look_columns(table: ForeignTable, stated: Mapping[str, str]) -> Chooser:
     Raises:
         InputError: a field or column that does not exist is stated.
     """
+    stated = table.named(stated)
     chooser = Chooser.of(by_look(table, stated), stated, FIELDS, _role)
     clocks = chooser.roles.get("time_s", []) if chooser.is_open("time_s") else []
     ask_of_t(chooser)
@@ -156,8 +157,11 @@ def by_look(table: ForeignTable, stated: Mapping[str, str]) -> ForeignTable:
     several = {"u", "v"} - {*axes} or len({*axes}) != len(axes)
     if several or {*stated, *map(field_of, table.columns)} & {*PIXELS}:
         return table
-    sides = {text: [_side_of(cell) for cell in cells] for text, cells in table.columns.items() if text not in pixels}
+    sides = {text: _sides_of(cells) for text, cells in table.columns.items() if text not in pixels}
     cameras = [text for text, found in sides.items() if {*found} == {"left", "right"}]
+    # A target "left wall", a star "R Leo", sheets 1 and 2 are no cameras beside a column that is called so.
+    called = [text for text in cameras if place_of(words_of(text), "camera", WORDS) is not None]
+    cameras = called if len(called) == 1 else cameras
 
     def refuse(what: str) -> InputError:
         return refused("rows-of-cameras", table.file, line=table.first_line, lack=what, columns=list(pixels))
@@ -193,9 +197,16 @@ def _pixel_of(name: str) -> str:
     return f"{'s' * (len(found) == 2)}{found[0]}"
 
 
-def _side_of(cell: str) -> str:
-    sides = [side for side in ("left", "right") if place_of(words_of(cell), side, WORDS) is not None]
-    return sides[0] if len(sides) == 1 else ""
+def _sides_of(cells: Sequence[str]) -> list[str]:
+    """The camera of each row, "left" or "right"; "" where a cell names none or both. Of 0 and 1 the first is left."""
+    words = {cell: words_of(cell) for cell in {*cells}}
+    counted = {"0": "1", "1": "2"} if any("0" in own for own in words.values()) else {}
+    named = {}
+    for cell, own in words.items():
+        own = [counted.get(word, word) for word in own]
+        sides = [side for side in ("left", "right") if place_of(own, side, WORDS) is not None]
+        named[cell] = sides[0] if len(sides) == 1 else ""
+    return [named[cell] for cell in cells]
 
 
 def _kind_of_clock(cells: Sequence[str]) -> str:

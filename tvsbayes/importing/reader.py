@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from datetime import date
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -17,10 +18,11 @@ from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX, NUMBER
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.importing.asking import refused
-from tvsbayes.importing.clock import over_midnight
+from tvsbayes.importing.clock import DAY_S, over_midnight
 from tvsbayes.importing.prepared import prepared
 from tvsbayes.importing.table import WORKBOOKS, ForeignTable, Row, Rows, headed, table_of_rows
 from tvsbayes.importing.text import text_of, text_table_rows
+from tvsbayes.importing.words import name_of
 from tvsbayes.importing.workbook import sheet_rows
 
 DEPTH_MAX = 4
@@ -124,12 +126,16 @@ REPEATED_SHARE = 0.1
 NAMED_MAX = 6
 TIME = "time (s)"
 _PAIR = re.compile(
-    r"(?P<name>[^\W\d][^:=,;|\t]*?)\s*[:=]\s*(?P<value>[+-]?(?:\d+[.,]\d+|\d+\.?|\.\d+)(?:[eE][+-]?\d+)?)"
-    r"(?:\s*(?P<unit>\u00b0|mm|um|\u00b5m|deg|rad|counts|steps|ms|us|s)(?![\w:]))?\s*(?:[,;|\t]\s*|\s+|$)"
+    r"(?P<name>[^\W\d][^:=,;|/\t]*?)(?P<mark>\s*[:=]\s*|\s+)(?P<value>[+-]?(?:\d+[.,]\d+|\d+\.?|\.\d+)(?:[eE][+-]?\d+)?)"
+    r"(?:\s*(?P<unit>\u00b0|mm|um|\u00b5m|deg|rad|counts|steps|ms|us|s)(?![\w:]))?\s*(?:[,;|/\t]\s*|\s+|$)"
 )
-"""One pair of "Step: 200, Angle: 12.5 deg"."""
-_CLOCK = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)\]?\s*(?:->|>)?\s*")
-"""Time of day that a serial monitor puts before a line."""
+"""One pair of "Step: 200, Angle: 12.5 deg", or of "MOVE 200"."""
+_PREFIX = re.compile(
+    r"(?:\[?(?:(?P<day>\d{4}-\d\d-\d\d)[T ])?(?P<h>\d{1,2}):(?P<m>\d{2}):(?P<s>\d{2}(?:[.,]\d+)?)\]?"
+    r"\s*(?:->|>|-\s)?\s*)?(?:(?:[\w.]+ - )?\[?(?:TRACE|DEBUG|INFO|NOTICE|WARN|WARNING|ERROR)\b\]?"
+    r"(?::[\w.]+(?=:\s*[^\W\d]))?(?:\s*[:|-])?\s*)?"
+)
+"""What a serial monitor or a logger puts before a line: day and time of day, the logger's name, a level."""
 
 
 class _Pair(NamedTuple):
@@ -190,12 +196,19 @@ def paired_rows(text: str, file: str) -> Rows | None:
 
 def _pairs(number: int, line: str) -> list[_Pair]:
     """The pairs of a line, [] where it holds anything else."""
-    clock = _CLOCK.match(line)
-    content = line[clock.end() if clock else 0 :]
+    before = _PREFIX.match(line)
+    content = line[before.end() if before else 0 :]
     found = list(_PAIR.finditer(content))
-    if "".join(match.group() for match in found) != content:
+    marked = all(
+        m["mark"].strip() or name_of(m["name"]).has("command", "increment", "value", "position") for m in found
+    )
+    if "".join(match.group() for match in found) != content or not marked:
         return []
-    clock_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) if clock else None
+    clock_s = None
+    if before and before["h"]:
+        day = date.fromisoformat(before["day"]).toordinal() if before["day"] else 0
+        second = float(before["s"].replace(",", "."))
+        clock_s = DAY_S * day + int(before["h"]) * 3600 + int(before["m"]) * 60 + second
     names = [m["name"].strip() + (f" ({m['unit']})" if m["unit"] else "") for m in found]
     return [_Pair(number, name, m["value"].replace(",", "."), clock_s) for name, m in zip(names, found, strict=True)]
 

@@ -30,6 +30,8 @@ STANDSTILL_INTERVALS = 3.0
 """Typical intervals of a series after which a value that did not change is held, not interpolated."""
 PASSED_SHARE = 0.05
 """Least share of the way of a move between two values on the way."""
+USUAL_SHARE = 0.9
+"""Least time after the last command, as a share of the usual one, of a last reading that may still be under way."""
 INTERVAL_MAX_S = 2.0
 """Longest time between two values of an axis in motion: a command logged once per move is valid until the next."""
 EQUAL_S = 1e-6
@@ -102,23 +104,29 @@ def epics_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable
     series, notes = _archived(text, file) if is_archive(text) else _monitored(text)
     command, value = _pair(series, file, stated)
     (log_s, logged), read = series[command], series[value]
-    inside = (read[0] >= log_s[0] - EQUAL_S) & (read[0] <= log_s[-1] + EQUAL_S)
+    steps_s = np.diff(log_s)
+    # The last command stays as long as any before it.
+    inside = (read[0] >= log_s[0] - EQUAL_S) & (read[0] <= log_s[-1] + max(steps_s, default=0.0) + EQUAL_S)
     if not inside.any():
         raise refused("apart", file, command=command, value=value)
     times_s, values = read = read[:, inside]
     before = np.maximum(np.searchsorted(log_s, times_s + EQUAL_S, side="right") - 1, 0)
     after = np.minimum(before + 1, len(log_s) - 1)
     gap_s, since_s, held = log_s[after] - log_s[before], times_s - log_s[before], logged[before]
-    usual_s = float(np.median(np.diff(log_s))) if len(log_s) > 1 else 0.0
-    moving = (gap_s <= min(STANDSTILL_INTERVALS * usual_s, INTERVAL_MAX_S)) & (since_s > EQUAL_S)
+    usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    moving = (gap_s <= min(STANDSTILL_INTERVALS * usual_s, INTERVAL_MAX_S)) & (since_s > EQUAL_S) & (gap_s > 0)
     share = np.divide(since_s, gap_s, out=np.zeros(len(held)), where=moving)
     commands = held + share * (logged[after] - held)
+    early, rests = times_s <= log_s[-1] + EQUAL_S, np.ones(len(held), dtype=bool)
     # A command that is logged once a move jumps; between two such rows no axis was halfway.
-    if _scatter(held, values) <= _scatter(commands, values):
+    if _scatter(held[early], values[early]) <= _scatter(commands[early], values[early]):
         commands, moving = held, np.zeros(1)
+    elif moving.any():
+        rests = early
+    outside = int((~inside).sum() + (~rests).sum())
     notes += [f"command {escaped(command)}, reading {escaped(value)}"]
-    notes += [f"{int(moving.sum())} commands interpolated in time, {int((~inside).sum())} readings outside left out"]
-    counts, rests = np.unique(before, return_counts=True)[1], np.ones(len(held), dtype=bool)
+    notes += [f"{int(moving.sum())} commands interpolated in time, {outside} readings outside left out"]
+    counts = np.unique(before, return_counts=True)[1]
     if not moving.any() and np.median(counts) < ROWS_MIN and np.mean(counts > 1) >= MOVING_SHARE:
         # A value that is logged at its change, and soon after another one, is of an axis under way.
         rests[:-1] = (np.diff(times_s) > INTERVAL_MAX_S) | (np.diff(before) > 0)
@@ -126,6 +134,11 @@ def epics_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable
         # Of many values on the way those that are followed by a good part of the way.
         way = np.abs(line_through(held, values)[0] * (logged - np.r_[logged[:1], logged[:-1]]))[before]
         rests[:-1] = (np.abs(np.diff(values)) <= PASSED_SHARE * way[:-1]) | (np.diff(before) > 0) | (way[:-1] == 0)
+    ends = np.flatnonzero(np.diff(before) > 0)
+    if not moving.any() and len(ends):
+        # The log may end on the way.
+        steady = abs(values[-1] - values[-2]) <= PASSED_SHARE * abs(values[-1] - values[ends[-1]])
+        rests[-1] = steady or since_s[-1] >= USUAL_SHARE * np.median(since_s[ends])
     if not moving.any():
         notes += [f"{int((~rests).sum())} readings under way left out"] * (not rests.all())
     return _joined(file, notes, read[:, rests], commands[rests], (command, value))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -100,6 +100,7 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
         InputError: a cell is not a value of its field, the table has no row or lacks a column.
     """
     table.require_rows()
+    wishes = replace(wishes, columns=table.named(wishes.columns))
     known = sighting_columns(table, wishes.columns)
     assumed = list(known.remarks)
     cells, written = FieldCells(table, known.columns).with_plain((*NEEDED, "u_deg"), assumed)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
@@ -53,6 +53,7 @@ class ForeignTable:
         columns: cells by name of column; "column 1" ... where the file has no names.
         first_line: row of the file with the names, or the first row where there are none.
         above: texts of the lines above.
+        titles: names of columns by the titles that the file has for them, where they differ.
     """
 
     file: str
@@ -61,9 +62,14 @@ class ForeignTable:
     columns: dict[str, tuple[str, ...]]
     first_line: int = 1
     above: tuple[str, ...] = ()
+    titles: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.lines)
+
+    def named(self, stated: Mapping[str, str]) -> dict[str, str]:
+        """Columns by field as a user states them, by their titles in the file, under their names here."""
+        return {field: text if text in self.columns else self.titles.get(text, text) for field, text in stated.items()}
 
     def require_rows(self) -> None:
         """Refuse a table without rows."""
@@ -165,8 +171,9 @@ def headed(found: Rows) -> Rows:
         return Rows(rows, notes)
     first = data
     # "n", "v" and "w" are units too, where names stand above them.
-    has_units = data > 1 and _all_units(rows[data - 1].cells) and _may_be_names(rows[data - 2].cells, rows[data].cells)
-    head = data - 2 if has_units else data - 1
+    head = data - 1
+    while head > 0 and _all_units(rows[head].cells) and _may_be_names(rows[head - 1].cells, rows[data].cells):
+        head -= 1
     # "up" and "HOME" may stand between names and rows.
     while head > 0 and sum(map(bool, rows[head].cells)) == 1 and not _may_be_names(rows[head].cells, rows[data].cells):
         head -= 1
@@ -215,7 +222,12 @@ def _may_be_names(cells: Sequence[str], data: Sequence[str]) -> bool:
 def _all_units(cells: Sequence[str]) -> bool:
     """Whether a row below the names holds units and nothing else."""
     texts = [cell.strip("()[] ") for cell in cells if cell]
-    return bool(texts) and all(parse_unit(t) is not None or not words_of(t) or means(t, "empty") for t in texts)
+    return bool(texts) and all(parse_unit(t) is not None or not words_of(t) or _no_unit(t) for t in texts)
+
+
+def _no_unit(text: str) -> bool:
+    """Whether a cell among units states none: it is empty, the type of a column, or what the row holds."""
+    return not text or any(means(text, concept) for concept in ("empty", "type", "unit"))
 
 
 def _is_group_row(above: Sequence[str], names: Sequence[str]) -> bool:
@@ -349,7 +361,7 @@ def _without_titles(
     body = [(row, of) for row, of in zip(rows, sides, strict=True) if row.line not in titles]
     are_runs = all(of for _, of in body) and len({of for _, of in body}) > 1
     if not are_runs and (blocks := _blocks([*above[-1:], *titles.values()])):
-        raise refused("several-machines", file, line=min(titles), name="of titles", machines=blocks)
+        raise refused("several-machines", file, line=min(titles), where="under titles", machines=blocks)
     named = ", ".join(f'"{escaped(text, 30)}"' for text in list(titles.values())[:3]) + " ..." * (len(titles) > 3)
     # "Cote" of numbers is a dimension, "C\u00f4t\u00e9" of words a side.
     of_words = [name or "" for k, name in enumerate(names) if k not in numeric]
@@ -381,10 +393,10 @@ def side_named(text: str) -> str:
 def _names(rows: Sequence[Row], width: int) -> tuple[list[str | None], Sequence[Row], str]:
     """Names of the columns, from one header line or more, the rows below, and a note on the other lines."""
     head, body, notes = list(rows[0].cells), rows[1:], list[str]()
-    while len(body) > 1 and _is_second_header(body[0].cells, body[1].cells):
+    while len(body) > 1 and _is_second_header(body[0].cells, _below_units(body[1:])):
         below, are_units = body[0].cells, _all_units(body[0].cells)
         if are_units:
-            marks = ["" if not cell or means(cell, "empty") else f" ({cell.strip('()[] ')})" for cell in below]
+            marks = ["" if _no_unit(cell) else f" ({cell.strip('()[] ')})" for cell in below]
             head = [name and f"{name}{mark}" for name, mark in zip(head, marks, strict=True)]
         else:
             # Below a group of columns its name is that of the first.
@@ -395,6 +407,10 @@ def _names(rows: Sequence[Row], width: int) -> tuple[list[str | None], Sequence[
         notes.append("units in the row below the names" if are_units else "names in two rows")
         body = body[1:]
     return _unique(head), body, "names in three rows" if len(notes) > 1 else "".join(notes)
+
+
+def _below_units(rows: Sequence[Row]) -> list[str]:
+    return next((row.cells for row in rows if not _all_units(row.cells)), [])
 
 
 def _is_second_header(cells: Sequence[str], next_cells: Sequence[str]) -> bool:

@@ -38,7 +38,7 @@ STRAY_MIN, STRAY_MADS, STRAY_SHARE = 8, 20.0, 0.1
 RAMP_ROWS = 6
 """Least number of rows of a stop, between which commands are passed."""
 STATUS_SHARE = 0.5
-"""Share of rows that a status of 0 and 1 may leave out without a question."""
+"""Share of rows from which a status of numbers leaves out too many without a question."""
 
 
 def good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
@@ -62,7 +62,7 @@ def good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assu
         del columns["status"]
         return table
     coded = all(NUMBER.fullmatch(cell) or not cell for cell in cells)
-    if coded and (sum(bad) > STATUS_SHARE * len(cells) or all(bad)):
+    if coded and sum(bad) >= STATUS_SHARE * len(cells):
         known = columns_of(table)
         said = {"column": name, "bad": sum(bad), "rows": len(cells)}
         raise table.ask("status", each=sorted(codes), first={name: known[name].first}, **said)

@@ -271,6 +271,12 @@ class Name:
         return self.has("u", "expanded") or "\u00b1" in self.text or _COVERAGE.search(plain(self.text)) is not None
 
     @cached_property
+    def is_spread(self) -> bool:
+        """Whether it names a multiple of a standard deviation."""
+        match = _COVERAGE.search(plain(self.text))
+        return match is not None and match[2] is not None
+
+    @cached_property
     def coverage(self) -> float | None:
         """The coverage factor of an expanded uncertainty; None for a standard one."""
         text = plain(self.text)

@@ -1,0 +1,166 @@
+"""Habits of people and programs, a case each: what is read of a file, or what is said of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from tvsbayes.errors import InputError, Question
+from tvsbayes.importing.axis import axis_rows
+from tvsbayes.importing.axis_units import Wishes
+from tvsbayes.importing.looks import LookWishes, look_columns, look_rows
+from tvsbayes.importing.reader import read_foreign
+
+PLACES = [0, 10, 20, 30, 40, 50]
+UP, DOWN = ([round(1.0002 * p - side, 4) for p in PLACES] for side in (0.02, -0.02))
+COMMANDS, READ = PLACES + PLACES[::-1], UP + DOWN[::-1]
+ROWS = list(zip(COMMANDS, READ, strict=True))
+
+
+def sheet(names: str, *columns) -> str:
+    return "\n".join([names, *(",".join(map(str, row)) for row in zip(*columns, strict=True)), ""])
+
+
+def lines(form: str) -> str:
+    return "".join(form.format(c=c, v=v, k=k) for k, (c, v) in enumerate(ROWS))
+
+
+def marked(*words: str, of: int = 6) -> list[str]:
+    return [word for word in words for _ in range(of)]
+
+
+def plc(below: str) -> str:
+    return f"t;Axis.SetPos;Axis.ActPos\n{below}\n" + lines("{k};{c};{v}\n")
+
+
+READ_AS_THEY_ARE = {
+    "the uncertainty of last digits": sheet("Pos (mm),Ist (mm)", COMMANDS, [f"{v:.4f}(20)" for v in READ]),
+    "month/day/year": sheet(
+        "time,Pos (mm),Ist (mm)", [f"3/14/2026 1:{k:02d}:00 PM" for k in range(12)], COMMANDS, READ
+    ),
+    "day/month/year": sheet("time,Pos (mm),Ist (mm)", [f"14/3/2026 13:{k:02d}" for k in range(12)], COMMANDS, READ),
+    "one day": sheet("time,Pos (mm),Ist (mm)", [f"3/4/2026 13:{k:02d}" for k in range(12)], COMMANDS, READ),
+    "words and numbers": lines("TARGET {c} / ANGLE {v}\n"),
+    "words and numbers in turn": lines("SETPOINT {c}\nANGLE {v}\n"),
+    "levels": lines("INFO target={c} actual={v}\n"),
+    "a logger's lines": lines("2026-01-02 10:{k:02d}:00,123 - stage - INFO - target: {c}, actual: {v}\n"),
+    "a logger's names": lines("INFO:stage:target: {c} actual: {v}\n"),
+    "units of a controller": plc("s;mm;mm"),
+    "types of a controller": plc("TIME;LREAL;LREAL"),
+    "types and units of a controller": plc("LREAL;LREAL;LREAL\nUnit;mm;mm"),
+    "a monitor": lines("M.VAL 2026-10-25 10:{k:02d}:00.0 {c}\nM.RBV 2026-10-25 10:{k:02d}:10.0 {v}\n"),
+}
+
+
+def rows_of(text: str, tmp_path, wishes: Wishes | None = None):
+    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+    return axis_rows(read_foreign(tmp_path / "t.csv"), wishes or Wishes())
+
+
+@pytest.mark.parametrize("habit", READ_AS_THEY_ARE)
+def test_readings_are_read_as_they_are(habit, say, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.csv").write_text(READ_AS_THEY_ARE[habit], encoding="utf-8")
+    code, *texts = say("import", "t.csv", "--axis", "--to", "out", "--yes")
+    assert code == 0, texts
+    moves, readings = (
+        [line.split(",") for line in (tmp_path / "out" / name).read_text().splitlines()[1:]]
+        for name in ("moves.csv", "readings.csv")
+    )
+    commands = {row[0]: float(row[3]) for row in moves}
+    assert [(commands[row[1]], float(row[2])) for row in readings] == ROWS
+    if habit.startswith("the uncertainty"):
+        assert {float(row[3]) for row in readings} == {0.002}
+    if habit in ("month/day/year", "day/month/year", "one day", "a monitor", "a logger's lines"):
+        assert [float(row[2]) for row in moves] == [60.0 * k for k in range(12) if k != 6]
+
+
+def test_moves_by_their_word_may_be_lengths(tmp_path):
+    with pytest.raises(Question, match="lengths of moves") as asked:
+        rows_of(lines("MOVE {c} / ANGLE {v}\n"), tmp_path)
+    assert [c.options for c in asked.value.candidates] == [("--relative",), ("--column", "command=MOVE")]
+
+
+SIDES = {
+    "0 and 1": marked("0", "1"),
+    "1 and 0": marked("1", "0"),
+    "out and in": marked("out", "in"),
+    "hin and her": marked("hin", "her"),
+    "in the first row of a block": ["up", *[""] * 5, "down", *[""] * 5],
+}
+
+
+@pytest.mark.parametrize("words", SIDES)
+def test_sides_by_words_and_commands(words, tmp_path):
+    rows = rows_of(sheet("Pos (mm),dir,Ist (mm)", COMMANDS, SIDES[words], READ), tmp_path)
+    moves = {move["move"]: move for move in rows.moves}
+    assert [r["value"] for r in rows.readings] == READ and rows.moves[0]["approach"] == "forward"
+    steps = [moves[r["move"]]["command"] - moves[r["move"] - 1]["command"] for r in rows.readings[1:]]
+    assert [step > 0 for step in steps] == [True] * 5 + [False] * 6
+
+
+def test_the_side_of_a_block_that_is_sorted_upwards(tmp_path):
+    """Each of its readings is approached from above."""
+    sides = ["vor", *[""] * 5, "zur\u00fcck", *[""] * 5]
+    rows = rows_of(sheet("Pos (mm),Richtung,Ist (mm)", PLACES * 2, sides, UP + DOWN), tmp_path)
+    commands = [move["command"] for move in rows.moves]
+    falls = [commands[r["move"]] < commands[r["move"] - 1] for r in rows.readings[1:]]
+    assert falls == [False] * 5 + [True] * 6
+    homed = sheet("Pos (mm),approach,Ist (mm),segment", PLACES * 2, sides, UP + DOWN, marked("0", "1"))
+    assert not any("assumed" in move for move in rows_of(homed, tmp_path).moves)
+
+
+def test_one_way_runs_out_and_back_in_groups(tmp_path):
+    rows = rows_of(sheet("Pos (mm),Hin 1,Hin 2,Hin 3,Her 1,Her 2", PLACES, UP, UP, UP, DOWN, DOWN), tmp_path)
+    assert [r["value"] for r in rows.readings] == [*(UP + DOWN[::-1]) * 2, *UP]
+
+
+def test_a_doubted_reading_is_left_out_and_named(tmp_path):
+    read = [f"{v}?" if k == 3 else v for k, v in enumerate(READ)]
+    rows = rows_of(sheet("Pos (mm),Ist (mm)", COMMANDS, read), tmp_path)
+    assert [r["value"] for r in rows.readings] == READ[:3] + READ[4:] and "29.986? in line 5" in rows.lines[0]
+
+
+def test_a_multiple_of_a_standard_deviation_is_said(tmp_path):
+    rows = rows_of(sheet("Pos (mm),Ist (mm),2 sd (um)", COMMANDS, READ, marked("3", of=12)), tmp_path)
+    assert rows.readings[0]["u"] == 0.0015
+    assert any("2 standard deviations, taken as an expanded uncertainty, over 2" in text for text in rows.assumed)
+
+
+def test_the_title_of_a_column_stays_its_name(tmp_path):
+    seconds = [round(3600 * v, 1) for v in READ]
+    text = sheet('cmd (deg),read ("),check (")', COMMANDS, seconds, [0.9 * s for s in seconds])
+    rows = rows_of(text, tmp_path, Wishes(columns={"value": 'read (")'}))
+    assert [r["value"] for r in rows.readings] == seconds and rows.unit == "arcsec"
+    assert 'read (") taken as read (arcsec)' in rows.lines[0]
+
+
+STATES = {
+    "state": ("as found", "as left"),
+    "Zustand": ("vorher", "nachher"),
+    "condition": ("before adj.", "after adj."),
+    "note": ("before repair", "after repair"),
+    "machine": ("A", "B"),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_rows_in_two_states_are_two_campaigns(name, tmp_path):
+    text = sheet(f"target (mm),reading (mm),{name}", COMMANDS * 2, READ + UP + UP[::-1], marked(*STATES[name], of=12))
+    with pytest.raises(InputError, match=f"rows of {', '.join(STATES[name])} in column {name}"):
+        rows_of(text, tmp_path)
+    with pytest.raises(InputError, match="rows of As found, As left under titles"):
+        table = sheet("target (mm),reading (mm)", COMMANDS, READ)
+        rows_of(f"As found\n{table}As left\n{table}", tmp_path)
+
+
+@pytest.mark.parametrize("cameras", [("left", "right"), ("L", "R"), ("0", "1"), ("1", "2"), ("cam0", "cam1")])
+@pytest.mark.parametrize("targets", [("T1", "T2"), ("left wall", "right wall"), ("R Leo", "L Pup"), ("near", "far")])
+def test_a_target_beside_the_camera_of_a_row(cameras, targets, tmp_path):
+    rows = [
+        f"{100 * k},0,{targets[k % 2]},{camera},{600 + 30 * (camera == cameras[0])},{400 + k}"
+        for k in range(4)
+        for camera in cameras
+    ]
+    (tmp_path / "t.csv").write_text("\n".join(["pan,tilt,target,camera,u,v", *rows, ""]))
+    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), LookWishes()).looks
+    assert [(k["target"], k["u_left_px"], k["u_right_px"]) for k in looks] == [(t, 630, 600) for t in targets * 2]
