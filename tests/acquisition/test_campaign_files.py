@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from support.bench_runs import HEADER, Run, ctrl_c, small_plan
 
-from tvsbayes.acquisition.campaign_files import behind_journal
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG
+from tvsbayes.acquisition.journal_check import behind_journal
 from tvsbayes.acquisition.session import acquire, begin
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError

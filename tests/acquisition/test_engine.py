@@ -12,10 +12,9 @@ import pytest
 from support.bench_runs import HEADER, Run, ctrl_c, events, raise_error, small_plan
 
 from tvsbayes.acquisition.bench import SIMULATED_START
-from tvsbayes.acquisition.campaign_files import check_journal, repair_campaign
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK, _approach
 from tvsbayes.acquisition.journal import LOG, read_journal
-from tvsbayes.acquisition.journal_check import verify
+from tvsbayes.acquisition.journal_check import check_journal, repair_campaign, verify
 from tvsbayes.acquisition.observation import DetectedSpot, Observation, TwinObserver
 from tvsbayes.acquisition.operator import SimulatedOperator, Terminal
 from tvsbayes.acquisition.recorder import LOST_STEPS, recorded

@@ -84,7 +84,7 @@ def test_a_run_on_a_grbl_board_that_is_reset_and_resumed(mounted_rig, tmp_path):
     campaign, record = read_campaign(tmp_path / "c"), recorded(read_journal(tmp_path / "c").records)
     looked = [(s.experiment, s.point) for s in campaign.spots if s.experiment is not None]
     assert looked == [(n, point) for n in (0, 1) for point in (1, 2, 3, 4)]
-    assert {move.segment for move in campaign.moves} == {0, 1} and record.unverified == (0, 1) and record.lost == ()
+    assert {move.segment for move in campaign.moves} == {0, 1} and record.unverified == (0, 1) and not record.lost
     start = events(tmp_path / "c", "start")[0]
     assert start["device"]["fw"] == "Grbl 1.1h" and start["setup"]["positioner.port"] == "/dev/ttyUSB0"
 

@@ -11,12 +11,10 @@ from tvsbayes.acquisition.journal import (
     LOG_EVENTS_MAX,
     Journal,
     Record,
-    event_of,
     read_journal,
 )
 from tvsbayes.acquisition.journal_check import repair, verify
-from tvsbayes.acquisition.journal_events import Stop
-from tvsbayes.acquisition.recorder import recorded
+from tvsbayes.acquisition.recorder import Stop, event_of, recorded
 from tvsbayes.errors import InputError
 
 
@@ -123,7 +121,7 @@ def test_lines_that_changed_places_are_put_back(tmp_path):
     done = repair(tmp_path / "run", tmp_path / "new")
     assert done.lost_lines == [] and done.kept == len(lines)
     history = recorded(read_journal(tmp_path / "new").records)
-    assert (len(history.spots), len(history.moves), history.ignored_lines) == (4, 5, ())
+    assert (len(history.spots), len(history.moves), history.ignored_lines) == (4, 5, [])
     assert "gap" not in [record.event for record in read_journal(tmp_path / "new").records]
 
 

@@ -74,7 +74,7 @@ def test_an_error_of_the_program_is_reported_too(mounted_rig, tmp_path):
     bug = Run(mounted_rig, tmp_path / "c", at=2, then=lambda i: raise_error(ZeroDivisionError()), live=live)
     with pytest.raises(ZeroDivisionError):
         bug.engine.run()
-    assert (live.latest.reason, live.latest.fault.code) == ("crashed", "ZeroDivisionError") and bug.dark()
+    assert (live.latest.reason, live.latest.fault["code"]) == ("crashed", "ZeroDivisionError") and bug.dark()
 
 
 def test_unread_data_cost_no_memory():

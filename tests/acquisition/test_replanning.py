@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from functools import partial
-from types import SimpleNamespace
 
 import pytest
 from support.bench_runs import RIG_FILE, Run, events, small_plan
 from support.fits_beside import given_rig, proposing, two_directions
 
-from tvsbayes.acquisition.journal import Journal, read_journal
+from tvsbayes.acquisition.journal import Journal, Record, read_journal
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.replanning import (
@@ -92,7 +91,8 @@ def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
     u = tuple(0.00012345678901234567 + n * 1e-17 for n in range(count))
     proposal = Proposal(steps, u, u[0], 100_000, "80 looks at d1, d2 lower u(worst) most per minute" + 80 * ".")
     with closing(Journal.create(tmp_path / "c", created="2026-01-01T00:00:00+00:00")) as journal:
-        assert journal.append("adapted", **adapted_entries(proposal, 99_999, steps).entries()).event == "adapted"
+        entries = adapted_entries(proposal, 99_999, steps).entries()
+        assert journal.append(entries.pop("event"), **entries).event == "adapted"
 
 
 def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
@@ -167,7 +167,7 @@ def test_a_damaged_change_of_plan_is_refused(mounted_rig, tmp_path):
     data = {"row": 3, "looks": 4, "why": "", "steps": [{"action": "fly"}]}
     for entries, fault in ((data, "fly"), ({**data, "row": "3"}, "row")):
         with pytest.raises(InputError, match=f"line 7: .*{fault}.*entries of the event adapted"):
-            adapted_plan(small_plan(1), [SimpleNamespace(event="adapted", line=7, data=entries)])
+            adapted_plan(small_plan(1), [Record(0, "adapted", entries, 7)])
 
 
 def test_options_that_do_not_fit(capsys):

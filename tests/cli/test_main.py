@@ -128,7 +128,7 @@ def reading(monkeypatch):
             raise error
 
         monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", broken)
-        monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", broken)
+        monkeypatch.setattr("tvsbayes.acquisition.journal_check.read_campaign", broken)
 
     return fail
 

@@ -21,11 +21,10 @@ from msgspec import UNSET
 
 from tvsbayes.acquisition.drivers import cameras_of, connect_trigger, positioner_of
 from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
-from tvsbayes.acquisition.journal import LOG, event_of, read_journal
-from tvsbayes.acquisition.journal_events import Homed, Moved
+from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
 from tvsbayes.acquisition.operator import Operator, SimulatedOperator
-from tvsbayes.acquisition.recorder import Recorded, recorded
+from tvsbayes.acquisition.recorder import Homed, Moved, Recorded, event_of, recorded
 from tvsbayes.acquisition.simulated_drivers import SimulatedCamera
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer, reference_pose_deg
 from tvsbayes.files.disk import write_atomically
@@ -151,12 +150,12 @@ def write_truth(folder: Path, instrument: Instrument) -> None:
     """Writes `truth.json`: the true rig, and the true angles of the moves in the journal."""
     if not (folder / LOG).is_file():
         return
-    reading = read_journal(folder)
-    record = recorded(reading.records)
+    records = read_journal(folder).records
+    record = recorded(records)
     # As in `recorded`: motions after a gap are not rows of moves.csv.
-    counted = [r for r in reading.records if r.line not in set(record.ignored_lines)]
-    events = [event_of(r, Homed) or event_of(r, Moved) for r in counted]
-    motions = [event.twin for event in events if event is not None and event.twin is not UNSET]
+    counted = [r for r in records if r.line not in set(record.ignored_lines)]
+    events = [event for r in counted if (event := event_of(r, Homed) or event_of(r, Moved)) is not None]
+    motions = [event.twin for event in events if event.twin is not UNSET]
     looks = [motions[spot.move] for spot in record.spots if spot.status == "ok" and spot.move < len(motions)]
     truth = replace(
         instrument.truth,
@@ -164,6 +163,6 @@ def write_truth(folder: Path, instrument: Instrument) -> None:
         stop_errors_deg=pan_and_tilt(m.stop_errors_deg for m in motions),
         reference_pose_deg=reference_pose_deg(looks),
     )
-    campaign = Campaign(record.moves, record.spots, instrument.rig.stereo, instrument.rig.table)
+    campaign = Campaign(tuple(record.moves), record.spots, instrument.rig.stereo, instrument.rig.table)
     text = json.dumps(truth.as_json(campaign), indent=1, allow_nan=False) + "\n"
     write_atomically(folder / "truth.json", text.encode())

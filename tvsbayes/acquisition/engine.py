@@ -11,7 +11,6 @@ Counters in motor steps, seconds where a name says `_s`, raw px.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,22 +18,22 @@ from msgspec import structs
 
 from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.journal import Journal
-from tvsbayes.acquisition.journal_events import Four, Homed, Looked, Moved, Placed, Start
 from tvsbayes.acquisition.live_run import COMING_MAX, REMARKS_MAX, LiveRun, SeenLook
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
 from tvsbayes.acquisition.place_command import PlaceCommand, require_placed
-from tvsbayes.acquisition.recorder import Recorded
-from tvsbayes.acquisition.replanning import Proposal, Replanning, adapted_entries, check_plan
+from tvsbayes.acquisition.recorder import Four, Homed, Looked, Moved, Placed, Recorded, Start, recorded
+from tvsbayes.acquisition.replanning import adapted_entries, check_plan
 from tvsbayes.acquisition.run_identity import setup_entries
 from tvsbayes.acquisition.run_log import Outcome, RunLog
-from tvsbayes.acquisition.running_estimate import Aim, RunningEstimate
+from tvsbayes.acquisition.running_estimate import RunningEstimate
 from tvsbayes.errors import InputError, TvsError, fault
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import UNDETECTED, Spot, pixels_of
-from tvsbayes.instrument.plan import PlanStep, continued, plan_minutes, plan_seconds, run_plan
+from tvsbayes.instrument.plan import PlanLog, PlanStep, continued, plan_minutes, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import triangulate
+from tvsbayes.positioner.protocol import DeviceState
 
 ATTEMPTS_PER_LOOK = 3
 PLACEMENTS_MAX = 3
@@ -54,21 +53,6 @@ DEPTH_SHARE = 0.25
 
 class _Stopped(Exception):
     """Ends the plan early, in an orderly way."""
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """Sheet and counters at a step of a plan.
-
-    Attributes:
-        target: position of the sheet, "" before the first placement.
-        placement: its number in the plan, from 0; -1 before the first.
-        counters: (pan, tilt) of the last two motions, fewer at the beginning.
-    """
-
-    target: str
-    placement: int
-    counters: tuple[tuple[int, int], ...]
 
 
 class Acquisition:
@@ -99,16 +83,20 @@ class Acquisition:
         live: LiveRun | None = None,
         place_command: PlaceCommand | None = None,
     ):
-        self.rig, self.plan, self.journal = rig, tuple(plan), journal
+        self.rig, self.plan, self.journal, self.bench = rig, tuple(plan), journal, bench
         self._stop, self._show, self._estimate = stop or StopKey(), show, estimate
+        self._live, self._place_command = live or LiveRun(), place_command
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
-        self._place_command, self._retries, self._check_depth, self._placement = place_command, 0, False, -1
+        self._retries, self._check_depth, self._placement = 0, False, -1
         self._log = RunLog(journal, rig, bench.utc)
-        self._live = live or LiveRun()
-        self.bench = bench
+        self._spot = self._log.next_spot()
         if estimate is not None:
             estimate.meanwhile = self._goes_on
-        self._spot = self._log.next_spot()
+
+    @property
+    def _target(self) -> str:
+        """Where the sheet is."""
+        return self._log.record.target
 
     def run(self) -> Outcome:
         """Runs the plan to its end, or to the stop key.
@@ -143,123 +131,110 @@ class Acquisition:
                 finally:
                     self._log.end(reason, exit_code)
                     self._live.ended(reason, fault)
-        estimate = None if self._estimate is None else self._estimate.latest
-        return replace(self._log.outcome(reason, self._retries), estimate=estimate)
+        return self._log.outcome(reason, self._retries, None if self._estimate is None else self._estimate.latest)
 
     def _run(self) -> str:
         if not self.bench.operator.accept(HAZARD):
             return "declined"
         setup = setup_entries(self.rig, bool(self.journal.records[0].data.get("synthetic")))
         self._log.write(Start(utc=self._log.utc_text(), setup=setup, **self.bench.details))
-        resumed = self._log.recorder.result()
+        before = recorded(self.journal.records)
         # Events before the first homing do not count, including placements.
-        next_row = resumed.next_step if resumed.moves else 0
+        row = before.next_step if before.moves else 0
         self._log.keep_edited()
-        self._restore(resumed, next_row)
-        reason = self._follow_plan(next_row)
-        if reason != "interrupted" and self._log.recorder.moves:
+        self._restore(before, row)
+        reason = self._follow_plan(row)
+        if reason != "interrupted" and self._log.record.moves:
             self._log.close_segment(self.bench.positioner.home())
         return reason
 
     def _follow_plan(self, row: int) -> str:
         """Follows the plan from a row on, with its changes; returns why it ended."""
         while row < len(self.plan):
-            step = self.plan[row]
+            step, minutes = self.plan[row], None if self._estimate is None else self._estimate.minutes
+            row += 1
             if self._stop.requested:
                 return "interrupted"
-            if isinstance(self._estimate, Replanning) and self._minutes(row + 1) > self._estimate.minutes:
+            if minutes is not None and plan_minutes(self.rig, self.plan[:row]) > minutes:
                 return "time over"
             self._report(step)
             self._do(step)
-            row += 1
             if step.action == "look" and self._estimate is not None and self._update_estimate(row, self._estimate):
                 return "target met"
         return "done"
 
     def _update_estimate(self, row: int, estimate: RunningEstimate) -> bool:
-        """Take the result of the fits after the look before `row`; return whether the target is met."""
+        """Take the result of the fits after the look before `row`; return whether the target is met.
+
+        If not, proposed looks replace the remaining ones; the journal records the change before it takes effect.
+        """
         met = estimate.update(self._log.ok_looks)
-        if not isinstance(estimate, Replanning):
-            self._live.estimated(estimate.latest)
-            return met
         if not met and row == len(self.plan):
             met = estimate.last(self._log.ok_looks)
         self._live.estimated(estimate.latest)
-        confirmed = estimate.confirmed()
-        if confirmed is not None:
+        if confirmed := estimate.confirmed():
             self._log.write(confirmed)
-        if not met:
-            self._adapt(row, estimate.proposal())
-        return met
-
-    def _minutes(self, row: int) -> float:
-        """Duration of the plan up to a row, by `[costs]`."""
-        return plan_minutes(self.rig, self.plan[:row])
-
-    def _adapt(self, row: int, proposal: Proposal | None) -> None:
-        """Replaces the remaining looks by proposed ones; the journal records the change before it takes effect."""
+        proposal = None if met else estimate.proposal()
         if proposal is None:
-            return
-        steps = continued(proposal.steps, row, self._log.recorder.state.target)
+            return met
+        steps = continued(proposal.steps, row, self._target)
         try:
             check_plan(self.rig, steps)
         except InputError as error:
             self._log.warnings.append(f"proposed looks were not followed: {error}")
-            return
-        self._log.write(adapted_entries(proposal, row, steps))
-        self.plan = (*self.plan[:row], *steps)
+        else:
+            self._log.write(adapted_entries(proposal, row, steps))
+            self.plan = (*self.plan[:row], *steps)
+        return met
 
     def _do(self, step: PlanStep) -> None:
         if step.action == "home":
             self._home(step.step, step.counters((0, 0)))
         elif step.action == "place":
-            self._place(step.target, self._scene(step.step).placement + 1, "", step.step)
+            self._place(step.target, len(self._before(step.step).targets), "", step.step)
         elif step.action == "move":
-            self._move(*step.counters(run_plan(self.plan[: step.step], self.rig).at), step.step)
+            self._move(step.counters(self._before(step.step).at), step.step)
         else:
             self._look(step.step, step.experiment, step.point)
+
+    def _before(self, row: int) -> PlanLog:
+        """Sheet and counters at the beginning of the step in this row, from the plan."""
+        return run_plan(self.plan[:row], self.rig)
 
     def _home(self, step: int | None, counters: tuple[int, int]) -> None:
         self.journal.append("intent", step=step, action="home")
         report = self.bench.positioner.home()
         self._log.close_segment(report)
-        switches = report.state.pan_steps, report.state.tilt_steps
+        state, entries = self._reach(counters)
+        legs = zip(AXES, counters, (report.state.pan_steps, report.state.tilt_steps), strict=True)
+        pan, tilt = (_approach(axis, target - start, report.ends_negative) for axis, target, start in legs)
+        self._log.write(Homed(step=step, boot=state.boot, approach=(pan, tilt), **entries))
+
+    def _move(self, counters: tuple[int, int], step: int | None, **entries: Any) -> None:
+        pan, tilt = counters
+        self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
+        self._log.write(Moved(step=step, **self._reach(counters)[1], **entries))
+
+    def _reach(self, counters: tuple[int, int]) -> tuple[DeviceState, dict[str, Any]]:
+        """Move and settle; returns the device's state and the entries of the motion's event."""
         state = self.bench.positioner.move_to(*counters)
         self._live.publish(device=state)
         self.bench.clock.sleep(self._settle_s)
-        legs = zip(AXES, counters, switches, strict=True)
-        pan, tilt = (_approach(axis, target - start, report.ends_negative) for axis, target, start in legs)
-        event = Homed(
-            step=step,
-            time_s=self._log.now_s(),
-            pan_steps=state.pan_steps,
-            tilt_steps=state.tilt_steps,
-            boot=state.boot,
-            approach=(pan, tilt),
-            **self.bench.annotate(),
-        )
-        self._log.write(event)
+        entries = {"time_s": self._log.now_s(), "pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
+        return state, {**entries, **self.bench.annotate()}
 
     def _place(self, target: str, placement: int, remark: str, step: int | None) -> None:
+        x_mm = self.rig.sheets_mm[target]
         if self._place_command is not None:
             self.bench.positioner.laser(False)
-            event = self._place_command.run(target, self.rig.sheets_mm[target], placement, self._goes_on)
+            event = self._place_command.run(target, x_mm, placement, self._goes_on)
             self._log.write(structs.replace(event, time_s=self._log.now_s()))
             self._require_going()
             require_placed(event)
-        if not self.bench.operator.place(target, self.rig.sheets_mm[target], placement, remark):
+        if not self.bench.operator.place(target, x_mm, placement, remark):
             raise _Stopped
         self._log.write(Placed(step=step, target=target, again=step is None, utc=self._log.utc_text()))
         self._placement, self._check_depth = placement, True
-
-    def _move(self, pan: int, tilt: int, step: int | None, **entries: Any) -> None:
-        self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
-        state = self.bench.positioner.move_to(pan, tilt)
-        self._live.publish(device=state)
-        self.bench.clock.sleep(self._settle_s)
-        counters: dict[str, Any] = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
-        entries |= self.bench.annotate()
-        self._log.write(Moved(step=step, time_s=self._log.now_s(), **counters, **entries))
 
     def _look(self, step: int | None, experiment: int | None, point: int | None, reference: Spot | None = None) -> None:
         for _ in range(PLACEMENTS_MAX):
@@ -267,17 +242,16 @@ class Acquisition:
             misplacement = self._misplaced(observation)
             if misplacement is None:
                 break
-            self._place(self._log.recorder.state.target, self._placement, misplacement, None)
+            self._place(self._target, self._placement, misplacement, None)
         else:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
             raise fault("placement", f"the sheet is not where it should be: {misplacement}", remedy)
         frames = tuple(self.journal.store(name, data) for name, data in observation.pictures.items())
         spot = observation.spot
-        comparison = {} if reference is None else self._compared(reference, spot.pixels_px)
         event = Looked(
             step=step,
             spot=self._spot,
-            target=self._log.recorder.state.target,
+            target=self._target,
             experiment=experiment,
             point=point,
             status=spot.status,
@@ -286,18 +260,20 @@ class Acquisition:
             correlations=spot.correlations,
             frames=frames,
             time_s=self._log.now_s(),
-            **comparison,
+            **({} if reference is None else self._compared(reference, spot.pixels_px)),
         )
         self._log.write(event)
         pictures = {name: data for name, data in observation.pictures.items() if name.startswith("frames/")}
-        sheet = self._log.recorder.state.target
-        self._live.looked(SeenLook(self._spot, spot.status, sheet, spot.pixels_px, spot.sds_px, pictures))
+        self._live.looked(SeenLook(self._spot, spot.status, self._target, spot.pixels_px, spot.sds_px, pictures))
         self._spot += 1
         self._log.derive()
 
     def _compared(self, reference: Spot, pixels_px: Four | None) -> dict[str, Any]:
-        """The change of a reference spot, for the event of the look; a large one is a warning."""
-        shift_px = None if pixels_px is None else _shift_px(reference, pixels_px)
+        """The largest change of a reference spot, for the event of the look; a large one is a warning."""
+        shift_px = None
+        if pixels_px is not None:
+            pairs = zip(pixels_of([reference])[0], pixels_px, strict=True)
+            shift_px = round(max(abs(float(a) - b) for a, b in pairs), 3)
         if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
             change = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
             self._log.warnings.append(f"the reference spot {reference.spot} {change}: have camera or sheet been moved?")
@@ -316,36 +292,28 @@ class Acquisition:
 
     def _misplaced(self, observation: Observation) -> str | None:
         """Why the sheet seems misplaced, judged by the first spot after its placement; None if it does not."""
-        pixels = observation.spot.pixels_px
+        pixels, target = observation.spot.pixels_px, self._target
         if not self._check_depth or observation.spot.status != "ok" or pixels is None:
             return None
         depth_mm = float(triangulate(self.rig.stereo_pair, np.array([pixels]))[0, 0])
-        target = self._log.recorder.state.target
         nominal_mm = self.rig.sheets_mm[target]
         distances_mm = [abs(x - nominal_mm) for x in self.rig.sheets_mm.values() if x != nominal_mm]
-        tolerance_mm = DEPTH_SHARE * min([*distances_mm, nominal_mm])
-        if abs(depth_mm - nominal_mm) > tolerance_mm:
+        if abs(depth_mm - nominal_mm) > DEPTH_SHARE * min([*distances_mm, nominal_mm]):
             return f"its spot lies at X = {depth_mm:.0f} mm, {target} is at {nominal_mm:.0f} mm"
         self._check_depth = False
         return None
 
-    def _scene(self, row: int) -> _Scene:
-        """Sheet and counters at the beginning of the step in this row, from the plan."""
-        run = run_plan(self.plan[:row], self.rig)
-        counters = tuple((move.pan_steps, move.tilt_steps) for move in run.moves[-2:])
-        return _Scene(run.sheet, len(run.targets) - 1, counters)
-
-    def _restore(self, record: Recorded, next_row: int) -> None:
+    def _restore(self, record: Recorded, row: int) -> None:
         """Restores the state of the plan: the sheet, a new segment with reference looks, and looks that a repair lost.
 
         The plan gives that state: the last event of the journal may belong to an interrupted reference look.
         """
-        remaining, scene = self.plan[next_row:], self._scene(next_row)
-        lost = [s for s in self.plan[:next_row] if s.action == "look" and s.step not in record.looked_steps]
+        remaining, before = self.plan[row:], self._before(row)
+        lost = [s for s in self.plan[:row] if s.action == "look" and s.step not in record.looked_steps]
         if not (remaining or lost):
             return
-        if scene.target:
-            self._place(scene.target, scene.placement, "as before the interruption", None)
+        if before.sheet:
+            self._place(before.sheet, len(before.targets) - 1, "as before the interruption", None)
         homes_next = bool(remaining) and remaining[0].action == "home"
         if not record.moves or (homes_next and not lost):
             return
@@ -354,36 +322,36 @@ class Acquisition:
         for step in lost:
             self._retake(step)
         if lost and remaining and remaining[0].action != "place":
-            self._put_sheet(scene, "as before the looks that were taken again")
+            self._put_sheet(before, "as before the looks that were taken again")
         if remaining and not homes_next:
-            self._move(*scene.counters[-1], None)
+            self._move(before.at, None)
 
     def _look_at_references(self, record: Recorded) -> None:
         """Looks again at the last spots on the present sheet."""
         candidates: dict[tuple[int, int], Spot] = {}
         for spot in reversed(record.spots):
-            if spot.status == "ok" and spot.target == self._log.recorder.state.target:
+            if spot.status == "ok" and spot.target == self._target:
                 move = record.moves[spot.move]
                 candidates.setdefault((move.pan_steps, move.tilt_steps), spot)
-        for (pan, tilt), spot in list(candidates.items())[:REFERENCE_LOOKS]:
+        for counters, spot in list(candidates.items())[:REFERENCE_LOOKS]:
             self._require_going()
-            self._move(pan, tilt, None, reference=True)
+            self._move(counters, None, reference=True)
             self._look(None, None, None, reference=spot)
 
     def _retake(self, step: PlanStep) -> None:
         """Repeats a look of the plan that a repair of the journal lost, reached by the same motions."""
         self._require_going()
         self._report(step)
-        scene = self._scene(step.step)
-        self._put_sheet(scene, "for a look that was lost")
+        before = self._before(step.step)
+        self._put_sheet(before, "for a look that was lost")
         # Moves start from the previous counters, for the same sense and the same side of the play.
-        for counters in scene.counters:
-            self._move(*counters, None)
+        for move in before.moves[-2:]:
+            self._move((move.pan_steps, move.tilt_steps), None)
         self._look(step.step, step.experiment, step.point)
 
-    def _put_sheet(self, scene: _Scene, remark: str) -> None:
-        if scene.target and scene.target != self._log.recorder.state.target:
-            self._place(scene.target, scene.placement, remark, None)
+    def _put_sheet(self, before: PlanLog, remark: str) -> None:
+        if before.sheet and before.sheet != self._target:
+            self._place(before.sheet, len(before.targets) - 1, remark, None)
 
     def _goes_on(self) -> bool:
         return not self._stop.requested
@@ -394,22 +362,21 @@ class Acquisition:
 
     def _report(self, step: PlanStep) -> None:
         remaining = self.plan[step.step :]
-        spots = self._log.recorder.spots
         latest = None if self._estimate is None else self._estimate.latest
         progress = Progress(
-            step.step,
-            len(self.plan),
-            sum(s.action == "look" for s in self.plan[: step.step]),
-            sum(s.action == "look" for s in self.plan),
-            sum(spot.status not in ("ok", UNDETECTED) for spot in spots),
-            self._retries,
-            plan_seconds(self.rig, remaining),
-            _step_text(step),
-            "" if latest is None else latest.text,
+            step=step.step,
+            steps=len(self.plan),
+            looks=sum(s.action == "look" for s in self.plan[: step.step]),
+            looks_total=sum(s.action == "look" for s in self.plan),
+            refused=sum(spot.status not in ("ok", UNDETECTED) for spot in self._log.record.looks),
+            retries=self._retries,
+            seconds_left=plan_seconds(self.rig, remaining),
+            doing=_in_words(step),
+            estimate="" if latest is None else latest.text,
         )
         self._show(progress)
         self._live.estimated(latest)
-        coming = tuple(map(_step_text, remaining[1 : 1 + COMING_MAX]))
+        coming = tuple(map(_in_words, remaining[1 : 1 + COMING_MAX]))
         self._live.publish(progress=progress, coming=coming, warnings=tuple(self._log.warnings[-REMARKS_MAX:]))
 
     def _begin_live(self) -> None:
@@ -419,13 +386,12 @@ class Acquisition:
             name=str(created.get("name", "")),
             simulated=bool(created.get("synthetic")),
             image_px=(stereo.image_width, stereo.image_height),
-            aim=Aim() if self._estimate is None else self._estimate.aim,
+            **({} if self._estimate is None else {"aim": self._estimate.aim}),
         )
         self._live.begun()
 
 
-def _step_text(step: PlanStep) -> str:
-    """A step in words."""
+def _in_words(step: PlanStep) -> str:
     return {
         "home": "homing",
         "place": f"placing {step.target}",
@@ -438,8 +404,3 @@ def _approach(axis: str, steps: int, ends_negative: bool) -> str:
     """The side from which an axis arrives by `steps` after a homing, which may end in the negative sense."""
     cleared = abs(steps) >= CLEARED_STEPS or (steps <= 0 and ends_negative)
     return direction_of(axis, 1 if steps > 0 else -1) if cleared else "unknown"
-
-
-def _shift_px(reference: Spot, pixels_px: Four) -> float:
-    """Largest change of a coordinate since the reference, px."""
-    return round(max(abs(float(a) - b) for a, b in zip(pixels_of([reference])[0], pixels_px, strict=True)), 3)

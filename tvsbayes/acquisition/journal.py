@@ -6,7 +6,7 @@ is detected. Frames are files of their own: written under a temporary name, flus
 flushed. Only then is the line with their SHA-256 appended and flushed, and the event counts. A crash or a power cut at
 any moment therefore leaves every acknowledged event complete, and at most one incomplete line at the end.
 
-Times in the events: UTC for people, `time_s` for the campaign (seconds since the first start, never decreasing).
+What an event says is declared in `recorder`; here it is a kind with entries.
 """
 
 from __future__ import annotations
@@ -17,16 +17,18 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 
-from tvsbayes.acquisition.journal_events import FRAME_NAME, Event, Frame
 from tvsbayes.errors import DeviceFault, InputError, escaped, fault, refusal
 from tvsbayes.files.disk import flush_folder, locked, make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import parse_json
+from tvsbayes.results.records import ClosedRecord
 
 LOG = "log.jsonl"
 FORMAT = "tvsbayes-log/1"
@@ -41,34 +43,20 @@ Source: `experiments/robustness/hostile.md`.
 FRAME_BYTES_MAX = 128 * 1024 * 1024
 FRAME_FOLDERS = ("frames", "dark")
 """Pictures with the laser on and, for the background, off."""
+FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
+"""Names made by `instrument.campaign.frame_name`."""
 LOG_LINE = re.compile(rb"([0-9a-f]{8}) (0|[1-9][0-9]{0,8}) ([0-9a-f]{8}) (\{[ -~]*\})")
 EMPTY_REMEDY = "nothing was recorded: begin again in another folder, without --resume"
 """Remedy for a run that was killed before its first event, or whose journal was emptied."""
 REPAIR_REMEDY = "copy the intact part to a new folder: tvsbayes check FOLDER --repair-to NEW"
 
 
-class Disk:
-    """The calls through which a journal reaches the disk, so that tests can make each of them fail and replay them."""
+class Frame(ClosedRecord, frozen=True, rename={"size": "bytes"}):
+    """A stored picture: name relative to the folder, SHA-256 of the file, its size in bytes."""
 
-    def open(self, path: Path, flags: int) -> int:
-        """`os.open` for a file, or a folder to be flushed."""
-        return os.open(path, flags | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0), 0o666)
-
-    def write(self, descriptor: int, data: bytes) -> int:
-        """`os.write`; may write less than asked for."""
-        return os.write(descriptor, data)
-
-    def fsync(self, descriptor: int) -> None:
-        """`os.fsync`."""
-        os.fsync(descriptor)
-
-    def close(self, descriptor: int) -> None:
-        """`os.close`."""
-        os.close(descriptor)
-
-    def replace(self, source: Path, target: Path) -> None:
-        """`os.replace`."""
-        os.replace(source, target)
+    name: Annotated[str, Meta(pattern=rf"\A{FRAME_NAME.pattern}\Z")]
+    sha256: str
+    size: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,38 +72,33 @@ class Record:
 
     number: int
     event: str
-    data: dict[str, object]
+    data: dict[str, Any]
     line: int
     previous: int = 0
     crc: int = 0
 
+    def refused(self, found: object) -> InputError:
+        """The refusal of an event that is invalid or contradicts those before it."""
+        allowed, remedy = f"the entries of the event {self.event}", "tvsbayes check FOLDER --repair-to NEW"
+        return refusal("event", file=LOG, line=self.line, found=escaped(str(found), 80), allowed=allowed, remedy=remedy)
 
-def refused(record: Record, found: object) -> InputError:
-    """The refusal of an event that is invalid or contradicts those before it."""
-    allowed, remedy = f"the entries of the event {record.event}", "tvsbayes check FOLDER --repair-to NEW"
-    found = escaped(str(found), 80)
-    return refusal("event", file=LOG, line=record.line, found=found, allowed=allowed, remedy=remedy)
+    @property
+    def frames(self) -> list[Frame]:
+        """The frames that the event names.
+
+        Raises:
+            InputError: entries that this program never writes.
+        """
+        try:
+            return msgspec.convert(self.data.get("frames", []), list[Frame])
+        # JSON may hold a lone surrogate, which UTF-8 cannot encode.
+        except (msgspec.ValidationError, UnicodeEncodeError) as error:
+            raise damaged(self.line, "another", "frames as { name, sha256, bytes }") from error
 
 
-def kind_of(event: type[Event]) -> str:
-    """A journal's name for events of a class."""
-    return str(event.__struct_config__.tag)
-
-
-def event_of[E: Event](record: Record, *kinds: type[E]) -> E | None:
-    """An event of one of these kinds, its entries checked by type; None for every other kind.
-
-    Raises:
-        InputError: an entry is missing or of another type, with the line of the journal.
-    """
-    for kind in kinds:
-        if kind_of(kind) == record.event:
-            try:
-                return msgspec.convert({"event": record.event, **record.data}, kind)
-            # JSON may hold a lone surrogate, which UTF-8 cannot encode.
-            except (msgspec.ValidationError, UnicodeEncodeError) as error:
-                raise refused(record, error) from error
-    return None
+def damaged(line: int | None, found: str, allowed: str, remedy: str = REPAIR_REMEDY) -> InputError:
+    """The refusal of a journal."""
+    return refusal("journal", file=LOG, line=line, found=found, allowed=allowed, remedy=remedy)
 
 
 @dataclass(frozen=True)
@@ -201,11 +184,8 @@ def require_journal(folder: Path, remedy: str) -> None:
 def read_log(folder: Path) -> bytes:
     """The bytes of `log.jsonl`, limited in size, events and entries before parsing."""
     data = read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
-    counts = {
-        "events": (data.count(b"\n"), LOG_EVENTS_MAX),
-        "entries": (sum(map(data.count, (b",", b"[", b"{"))), LOG_ENTRIES_MAX),
-    }
-    for unit, (count, limit) in counts.items():
+    entries = sum(map(data.count, (b",", b"[", b"{")))
+    for unit, count, limit in (("events", data.count(b"\n"), LOG_EVENTS_MAX), ("entries", entries, LOG_ENTRIES_MAX)):
         if count > limit:
             found, allowed, remedy = f"{count} {unit}", f"at most {limit}", "split the run into several campaigns"
             raise refusal("size", file=LOG, found=found, allowed=allowed, remedy=remedy)
@@ -218,27 +198,54 @@ def read_journal(folder: Path) -> Reading:
     Raises:
         InputError: missing, damaged, or not a journal of this format.
     """
-    folder = Path(folder)
-    data = read_log(folder)
+    data = read_log(Path(folder))
     records: list[Record] = []
     position, previous = 0, 0
     while position < len(data):
         end = data.find(b"\n", position)
-        line = data[position:] if end < 0 else data[position:end]
-        record = _following(line, len(records), previous) if end >= 0 else "a line without its end"
+        record = "a line without its end" if end < 0 else _following(data[position:end], len(records), previous)
         if isinstance(record, str):
             tail = data[position:]
             if (end < 0 or end + 1 == len(data)) and _is_torn(tail, len(records), previous):
                 return Reading(tuple(records), tail, position, previous)
-            number, allowed = len(records) + 1, "events in their order, each with its CRC"
-            raise refusal("journal", file=LOG, line=number, found=record, allowed=allowed, remedy=REPAIR_REMEDY)
+            raise damaged(len(records) + 1, record, "events in their order, each with its CRC")
         if not records and (record.event != "created" or record.data.get("format") != FORMAT):
-            allowed, event = f"the event created of the format {FORMAT}", escaped(record.event)
-            raise refusal("journal", file=LOG, line=1, found=event, allowed=allowed, remedy=REPAIR_REMEDY)
+            raise damaged(1, escaped(record.event), f"the event created of the format {FORMAT}")
         previous = record.crc
         records.append(record)
         position = end + 1
     return Reading(tuple(records), b"", position, previous)
+
+
+def orphans(folder: Path, records: Iterable[Record]) -> list[str]:
+    """Frames on the disk that no event names, sorted."""
+    in_events = {frame.name for record in records for frame in record.frames}
+    stored = (f"{name}/{p.name}" for name in FRAME_FOLDERS for p in sorted((Path(folder) / name).glob("*.png")))
+    return [name for name in stored if name not in in_events]
+
+
+class Disk:
+    """The calls through which a journal reaches the disk, so that tests can make each of them fail and replay them."""
+
+    def open(self, path: Path, flags: int) -> int:
+        """`os.open` for a file, or a folder to be flushed."""
+        return os.open(path, flags | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0), 0o666)
+
+    def write(self, descriptor: int, data: bytes) -> int:
+        """`os.write`; may write less than asked for."""
+        return os.write(descriptor, data)
+
+    def fsync(self, descriptor: int) -> None:
+        """`os.fsync`."""
+        os.fsync(descriptor)
+
+    def close(self, descriptor: int) -> None:
+        """`os.close`."""
+        os.close(descriptor)
+
+    def replace(self, source: Path, target: Path) -> None:
+        """`os.replace`."""
+        os.replace(source, target)
 
 
 class Journal:
@@ -264,8 +271,7 @@ class Journal:
         Raises:
             InputError: there is already a journal, or the folder cannot be written.
         """
-        disk = disk or Disk()
-        folder = Path(folder)
+        disk, folder = disk or Disk(), Path(folder)
         make_folder(folder)
         try:
             descriptor = disk.open(folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND)
@@ -296,8 +302,7 @@ class Journal:
             InputError: the journal is damaged, or another program writes it.
             DeviceFault: the disk refuses.
         """
-        disk = disk or Disk()
-        folder = Path(folder)
+        disk, folder = disk or Disk(), Path(folder)
         read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
         try:
             descriptor = disk.open(folder / LOG, os.O_WRONLY | os.O_APPEND)
@@ -311,18 +316,15 @@ class Journal:
                 os.ftruncate(descriptor, reading.size)
                 disk.fsync(descriptor)
             if not reading.records:
-                raise refusal(
-                    "journal", file=LOG, found="no event", allowed="at least the event created", remedy=EMPTY_REMEDY
-                )
+                raise damaged(None, "no event", "at least the event created", EMPTY_REMEDY)
             for name in FRAME_FOLDERS:
                 # This program holds the lock: no other program writes frames.
                 for unfinished in (folder / name).glob(".*.png.tmp"):
                     unfinished.unlink(missing_ok=True)
-        except OSError as error:
+        except BaseException as error:
             os.close(descriptor)
-            raise _disk_fault(error) from error
-        except BaseException:
-            os.close(descriptor)
+            if isinstance(error, OSError):
+                raise _disk_fault(error) from error
             raise
         return cls(folder, descriptor, reading, disk)
 
@@ -345,7 +347,6 @@ class Journal:
             descriptor = self._disk.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             try:
                 self._write(descriptor, data)
-                self._disk.fsync(descriptor)
             finally:
                 self._disk.close(descriptor)
             self._disk.replace(temporary, target)
@@ -358,18 +359,18 @@ class Journal:
         Raises:
             DeviceFault: the disk refuses; the journal is closed.
         """
-        line = encode(len(self.records), self._crc, event, data)
+        number = len(self.records)
+        line = encode(number, self._crc, event, data)
         with self._guarded() as descriptor:
-            if len(self.records) >= LOG_EVENTS_MAX or self._size + len(line) > LOG_BYTES_MAX:
+            if number >= LOG_EVENTS_MAX or self._size + len(line) > LOG_BYTES_MAX:
                 raise fault("journal-full", "the journal is full", "begin a new campaign for the rest of the plan")
             for folder in sorted(self._dirty):
                 flush_folder(folder, self._disk)
             self._dirty.clear()
             self._write(descriptor, line)
-            self._disk.fsync(descriptor)
         self._size += len(line)
         self._crc = int(line[:8], 16)
-        record = Record(len(self.records), event, json.loads(json.dumps(data)), len(self.records) + 1)
+        record = Record(number, event, json.loads(json.dumps(data)), number + 1)
         self.records.append(record)
         return record
 
@@ -393,14 +394,16 @@ class Journal:
             raise
 
     def _write(self, descriptor: int, data: bytes) -> None:
+        """Write all of `data`, in as many calls as it takes, and flush it."""
         view = memoryview(data)
         while view:
             view = view[self._disk.write(descriptor, bytes(view)) :]
+        self._disk.fsync(descriptor)
 
 
 def _disk_fault(error: OSError) -> DeviceFault:
-    found = escaped(error.strerror or str(error))
     remedy = "free space or change the disk, then go on with --resume: nothing acknowledged is lost"
+    found = escaped(error.strerror or str(error))
     return DeviceFault("disk", f"the journal cannot be written: {found}; {remedy}", found=found, remedy=remedy)
 
 

@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from tvsbayes.acquisition.journal_events import Four
 from tvsbayes.acquisition.operator import Progress
-from tvsbayes.acquisition.running_estimate import Aim, Estimate
+from tvsbayes.acquisition.recorder import Four
+from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.files.images import decode_image, small_picture
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 from tvsbayes.positioner.protocol import DeviceState
@@ -51,15 +51,6 @@ class SeenLook:
 
 
 @dataclass(frozen=True)
-class Fault:
-    """A fault that has ended a run: code, message and remedy."""
-
-    code: str
-    message: str
-    remedy: str
-
-
-@dataclass(frozen=True)
 class Snapshot:
     """A run at one moment.
 
@@ -75,10 +66,10 @@ class Snapshot:
         look: the last look.
         trail: centres of the last looks that count.
         estimates: oldest first.
-        aim: aim of the estimates.
+        aim: directions that the plan measures, and the target u of each, None for no target.
         remarks: events outside the plan, newest last.
         warnings: warnings for the user.
-        fault: fault that ended the run.
+        fault: code, message and remedy of the fault that ended the run.
         reason: reason of the end, "" before.
     """
 
@@ -93,10 +84,10 @@ class Snapshot:
     look: SeenLook | None = None
     trail: tuple[Four, ...] = ()
     estimates: tuple[Estimate, ...] = ()
-    aim: Aim = field(default_factory=Aim)
+    aim: Mapping[str, object] = field(default_factory=lambda: {"directions": (), "target_u_deg_per_step": None})
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    fault: Fault | None = None
+    fault: Mapping[str, str] | None = None
     reason: str = ""
 
 
@@ -175,21 +166,19 @@ class LiveRun:
         """Publish the end of the run, with its fault where there was one."""
         fault = None
         if error is not None:
-            code, remedy = getattr(error, "code", type(error).__name__), getattr(error, "remedy", None)
-            fault = Fault(str(code), str(error) or str(code), remedy or "")
+            code, remedy = str(getattr(error, "code", type(error).__name__)), getattr(error, "remedy", None)
+            fault = {"code": code, "message": str(error) or code, "remedy": remedy or ""}
         self.publish(state=ENDED, reason=reason, fault=fault)
 
     def document(self) -> dict[str, Any]:
         """The newest snapshot as a JSON document."""
-        snapshot = self.latest
-        fields = asdict(replace(snapshot, look=None, trail=()))
-        look = None
+        snapshot, look = self.latest, None
         if snapshot.look is not None:
             look = asdict(replace(snapshot.look, pictures={}))
             look["pictured"] = [c for c in CAMERAS if frame_name(snapshot.look.spot, c) in snapshot.look.pictures]
         agreement = temperature(snapshot.estimates)
         return {
-            **fields,
+            **asdict(replace(snapshot, look=None, trail=())),
             "look": look,
             "trail": [list(centre) for centre in snapshot.trail],
             "temperature": None if agreement is None else asdict(agreement),
@@ -198,15 +187,13 @@ class LiveRun:
     def picture(self, spot: int, camera: str, kind: str) -> bytes | None:
         """JPEG of look `spot`, if it is the last one and has pictures."""
         look = self.latest.look
-        if look is None or look.spot != spot or camera not in CAMERAS or kind not in KINDS:
+        png = None if look is None else look.pictures.get(frame_name(spot, camera))
+        if look is None or png is None or kind not in KINDS or (kind == "spot" and look.pixels_px is None):
             return None
-        png = look.pictures.get(frame_name(spot, camera))
-        if png is None or (kind == "spot" and look.pixels_px is None):
-            return None
-        index = 2 * CAMERAS.index(camera)
         centre = None
-        if look.pixels_px is not None and kind == "spot":
-            centre = look.pixels_px[index], look.pixels_px[index + 1]
+        if kind == "spot" and look.pixels_px is not None:
+            u_left, v_left, u_right, v_right = look.pixels_px
+            centre = (u_left, v_left) if camera == "left" else (u_right, v_right)
         try:
             return small_picture(decode_image(png, "picture"), centre)
         except ValueError:

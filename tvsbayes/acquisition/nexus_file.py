@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 from msgspec import UNSET
 
-from tvsbayes.acquisition.journal import LOG, LOG_BYTES_MAX, Record, event_of, read_journal
-from tvsbayes.acquisition.journal_check import frames_of
-from tvsbayes.acquisition.journal_events import Looked, Stop
+from tvsbayes.acquisition.journal import LOG, LOG_BYTES_MAX, Record, read_journal
+from tvsbayes.acquisition.recorder import Looked, Stop, event_of
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_kind import Column
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
@@ -200,7 +199,7 @@ def _look_times(records: Sequence[Record]) -> Mapping[int, float]:
 
 def _pictures(group: Any, records: Sequence[Record]) -> int:
     """Names and hashes of the pictures, which stay in the campaign's folder; returns their number."""
-    frames = [frame for record in records for frame in frames_of(record)]
+    frames = [frame for record in records for frame in record.frames]
     _put(group, "description", "pictures in the campaign's folder: frames/ with the laser on, dark/ with it off")
     if frames:
         _put(group, "file_name", [frame.name for frame in frames])

@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tvsbayes.acquisition.journal_events import Four
+from tvsbayes.acquisition.recorder import Four
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import StereoCamera, StereoImage
 from tvsbayes.cameras.contour import epipolar_refused

@@ -20,13 +20,13 @@ from typing import IO
 
 from msgspec import UNSET
 
-from tvsbayes.acquisition.journal_events import PlaceCommanded
+from tvsbayes.acquisition.recorder import PlaceCommanded
 from tvsbayes.errors import InputError, escaped, fault
 
 LIMIT_S = 600.0
 """Default longest time of one placement."""
 POLL_S = 0.1
-"""Interval at which requests to the run are served during a placement."""
+"""Interval at which a placement asks whether the run goes on."""
 GRACE_S = 5.0
 """Time between SIGTERM, after which a program can stop its motion, and SIGKILL."""
 OUTPUT_BYTES_MAX = 64 * 1024

@@ -1,36 +1,232 @@
-"""The campaign in the events of a journal, at any time.
+"""The events of a journal, and the campaign in them at any time.
+
+`created` opens a journal. An `intent` precedes every motion of the plan, and every completed order has an event. Other
+events, such as `asked` of releases up to 0.3.0, are kept and mean nothing. Counters in motor steps, raw px, degrees and
+seconds by suffix; `utc` and `created` are ISO 8601; `time_s` counts from the first start and never decreases. Fields
+have the order in which they are written; those that are UNSET by default may be missing.
 
 A segment begins with a homing and ends with the next one, which shows whether steps were lost in between: then no spot
-of the segment counts. After a gap that may have lost a motion, nothing counts until the next homing. Counters in motor
-steps, px and seconds as in moves.csv and spots.csv.
+of the segment counts. After a gap that may have lost a motion, nothing counts until the next homing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Literal, cast
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
-from msgspec import UNSET
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
 
-from tvsbayes.acquisition.journal import Record, event_of, refused
-from tvsbayes.acquisition.journal_events import Gap, Homed, Looked, Moved, Placed, Start, Stop, Verified
+from tvsbayes.acquisition.journal import Frame, Record
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, next_move, with_pixels
+from tvsbayes.results.plan_record import Action
 
 HOME_TOLERANCE_STEPS = 2
 """Scatter of a home switch between homings; larger deviations mean lost steps."""
 LOST_STEPS = "lost-steps"
 """Status of a spot in whose segment steps were lost."""
+Four = tuple[float, float, float, float]
+"""u_left, v_left, u_right, v_right."""
 
 
-@dataclass(frozen=True)
+class Event(Struct, frozen=True, kw_only=True, tag_field="event", tag=str.lower):
+    """Base of the events; unknown keys are ignored."""
+
+    def entries(self) -> dict[str, Any]:
+        """The entries of its JSON object, with its kind."""
+        return cast("dict[str, Any]", msgspec.to_builtins(self, enc_hook=float))
+
+
+class Created(Event, frozen=True):
+    """The first event: it identifies a plan by its SHA-256, a rig by the entries that may not change.
+
+    Earlier journals identify the rig by a SHA-256 too.
+    """
+
+    format: str
+    created: str
+    name: str | UnsetType = UNSET
+    synthetic: bool | UnsetType = UNSET
+    seed: int | UnsetType = UNSET
+    plan_sha256: str | UnsetType = UNSET
+    rig: dict[str, Any] | UnsetType = UNSET
+    rig_sha256: str | UnsetType = UNSET
+    repaired: bool | UnsetType = UNSET
+
+
+class Start(Event, frozen=True):
+    """A run begins, for the first time or again: settings that may differ between runs, device and cameras."""
+
+    utc: str = ""
+    setup: dict[str, Any] | UnsetType = UNSET
+    device: dict[str, Any] | UnsetType = UNSET
+    cameras: dict[str, Any] | UnsetType = UNSET
+    simulated: bool | UnsetType = UNSET
+
+
+class Placed(Event, frozen=True):
+    """The sheet stands at a target; `again` where the plan did not ask for it."""
+
+    step: int | None
+    target: str
+    again: bool | UnsetType = UNSET
+    utc: str = ""
+
+
+class PlaceCommanded(Event, frozen=True, kw_only=True, tag="place_command"):
+    """A program has placed the sheet (`exit_code` 0) or failed; None where it had to be ended.
+
+    `words`: the end of its output of `output_bytes`; `left_running`: it left something running, which was ended.
+    `placement` counts the placements of the plan from 0. `placed` follows after success.
+    """
+
+    time_s: float | UnsetType = UNSET
+    target: str
+    x_mm: float
+    placement: int
+    command: list[str]
+    exit_code: int | None
+    seconds: float
+    limit_s: float
+    words: str
+    output_bytes: int | UnsetType = UNSET
+    left_running: bool | UnsetType = UNSET
+
+
+class TrueAngles(Struct, frozen=True):
+    """Mirror angles (psi, beta) of a simulated rig at rest, and the stop errors (pan, tilt) in them, degrees."""
+
+    mirror_angles_deg: tuple[float, float]
+    stop_errors_deg: tuple[float, float]
+
+
+class Moved(Event, frozen=True):
+    """A move is completed, at these counters; `step` is the step of the plan, None for motions of a resumed run.
+
+    `twin` holds the true mirror angles of a simulation.
+    """
+
+    step: int | None
+    time_s: float
+    pan_steps: int
+    tilt_steps: int
+    reference: bool | UnsetType = UNSET
+    twin: TrueAngles | UnsetType = UNSET
+
+
+class Homed(Event, frozen=True):
+    """A homing and the motion to its counters: boot id of the device, side of arrival of pan and tilt."""
+
+    step: int | None
+    time_s: float
+    pan_steps: int
+    tilt_steps: int
+    boot: int
+    approach: tuple[str, str]
+    twin: TrueAngles | UnsetType = UNSET
+
+
+class Verified(Event, frozen=True):
+    """Result of a homing for the segment before: (pan, tilt) switches minus counters; None where it is unknown."""
+
+    segment: int
+    deviation_steps: tuple[int, int] | None
+
+
+class Looked(Event, frozen=True):
+    """A look and the detector's result.
+
+    `reference_of` is the spot with which a look of a resumed run is compared, `shift_px` the largest change.
+    """
+
+    step: int | None
+    spot: int
+    target: str
+    experiment: int | None
+    point: int | None
+    status: str
+    pixels_px: Four | None
+    sds_px: Four | None
+    correlations: tuple[float, float] = (0.0, 0.0)
+    frames: tuple[Frame, ...] = ()
+    time_s: float | UnsetType = UNSET
+    reference_of: int | UnsetType = UNSET
+    shift_px: float | UnsetType | None = UNSET
+    aperture_deg: float | UnsetType | None = UNSET
+
+
+class AdaptedStep(Action, frozen=True):
+    """A step of a changed plan; a look has the expected target value before and after it."""
+
+    u_before_deg_per_step: float | None = None
+    u_after_deg_per_step: float | None = None
+
+
+class Adapted(Event, frozen=True):
+    """A change of plan: the new steps from row `row` on, from an estimate of `looks` looks, and the reason for them."""
+
+    row: int
+    looks: int
+    why: str
+    steps: tuple[AdaptedStep, ...]
+
+
+class Confirmed(Event, frozen=True):
+    """Whether the posterior, sampled where the Laplace approximation met the target, meets it too.
+
+    From `looks` looks; worst u of the directions by both, deg/step; `accepted`: whether the weighted draws may be used.
+    """
+
+    looks: int
+    target_u_deg_per_step: float
+    laplace_u_deg_per_step: float
+    importance_u_deg_per_step: float
+    accepted: bool
+    reached: bool
+
+
+class Stop(Event, frozen=True):
+    """The end of a run."""
+
+    reason: str
+    exit_code: int | UnsetType = UNSET
+    utc: str = ""
+
+
+class Gap(Event, frozen=True):
+    """Lines were lost before a line of the journal that was repaired.
+
+    `motion_lost` is false where the missing lines contained no motion: later events then count.
+    """
+
+    before_line: int
+    motion_lost: bool = True
+
+
+def event_of[E: Event](record: Record, *kinds: type[E]) -> E | None:
+    """An event of one of these kinds, its entries checked by type; None for every other kind.
+
+    Raises:
+        InputError: an entry is missing or of another type, with the line of the journal.
+    """
+    for kind in kinds:
+        if kind.__struct_config__.tag == record.event:
+            try:
+                return msgspec.convert({"event": record.event, **record.data}, kind)
+            except (msgspec.ValidationError, UnicodeEncodeError) as error:
+                raise record.refused(error) from error
+    return None
+
+
+@dataclass
 class Recorded:
-    """The campaign in a journal so far.
+    """The campaign in a journal so far, followed event by event.
 
     Attributes:
         moves: rows of moves.csv; empty before the first homing.
-        spots: rows of spots.csv.
+        looks: rows of spots.csv, before it is known whether steps were lost.
         next_step: first step of the plan after the last completed one.
         looked_steps: completed looks of the plan; after a repair some before `next_step` may be missing.
         references: looks outside the plan, by which resumed runs checked earlier spots.
@@ -39,44 +235,38 @@ class Recorded:
         boot: boot id of the device at its last homing, None before.
         home_steps: counters that the last `home` of the plan asked for.
         lost: segments in which steps were lost, with the deviation found.
-        unverified: segments whose closing homing had no result, or did not take place.
         ignored_lines: lines after a gap that do not count.
         ended: the reason of the last `stop`, None while running or after a crash.
     """
 
-    moves: tuple[Move, ...] = ()
-    spots: tuple[Spot, ...] = ()
+    moves: list[Move] = field(default_factory=list)
+    looks: list[Spot] = field(default_factory=list)
     next_step: int = 0
-    looked_steps: frozenset[int] = frozenset()
+    looked_steps: set[int] = field(default_factory=set)
     references: int = 0
     target: str = ""
     starts: int = 0
     boot: int | None = None
     home_steps: tuple[int, int] = (0, 0)
-    lost: tuple[tuple[int, tuple[int, int]], ...] = ()
-    unverified: tuple[int, ...] = ()
-    ignored_lines: tuple[int, ...] = ()
+    lost: dict[int, tuple[int, int]] = field(default_factory=dict)
+    ignored_lines: list[int] = field(default_factory=list)
     ended: str | None = None
+    _verified: set[int] = field(default_factory=set)
+    _trusted: bool = True
 
+    @property
+    def spots(self) -> tuple[Spot, ...]:
+        """Rows of spots.csv; none counts in whose segment steps were lost."""
+        # Refused and undetected spots too: `detect` may still find them in their frames.
+        return tuple(
+            replace(spot, status=LOST_STEPS) if self.moves[spot.move].segment in self.lost else spot
+            for spot in self.looks
+        )
 
-class Recorder:
-    """Follows a journal event by event.
-
-    Attributes:
-        moves: rows of moves.csv so far.
-        spots: rows of spots.csv so far, before it is known whether steps were lost.
-        state: the fields of `Recorded` that the last event determines; the growing fields are empty.
-    """
-
-    def __init__(self) -> None:
-        self.moves: list[Move] = []
-        self.spots: list[Spot] = []
-        self.state = Recorded()
-        self._lost: dict[int, tuple[int, int]] = {}
-        self._closed: set[int] = set()
-        self._ignored: list[int] = []
-        self._looked: set[int] = set()
-        self._trusted = True
+    @property
+    def unverified(self) -> tuple[int, ...]:
+        """Segments whose closing homing had no result, or did not take place."""
+        return tuple(sorted({move.segment for move in self.moves} - self._verified))
 
     def add(self, record: Record) -> None:
         """Adds the next event.
@@ -87,83 +277,59 @@ class Recorder:
         event = event_of(record, Gap, Start, Stop, Placed, Verified, Homed, Moved, Looked)
         if isinstance(event, Moved | Looked):
             if not self._trusted:
-                self._ignored.append(record.line)
+                self.ignored_lines.append(record.line)
                 return
             if not self.moves:
-                raise refused(record, "it stands before the first homing")
+                raise record.refused("it stands before the first homing")
         match event:
             case Gap():
                 self._trusted &= not event.motion_lost
             case Start():
-                self.state = replace(self.state, starts=self.state.starts + 1, ended=None)
+                self.starts, self.ended = self.starts + 1, None
             case Stop():
-                self.state = replace(self.state, ended=event.reason)
-            case Placed():
-                self.state = replace(self.state, target=event.target)
-            case Verified():
-                self._verified(event)
-            case Homed():
-                self._homed(event)
-            case Moved():
-                self._moved(event, self.moves[-1].segment)
+                self.ended = event.reason
+            case Verified(deviation_steps=(pan, tilt)):
+                # A device that was restarted has no counters for a comparison.
+                self._verified.add(event.segment)
+                if max(abs(pan), abs(tilt)) > HOME_TOLERANCE_STEPS:
+                    self.lost[event.segment] = pan, tilt
+            case Homed() | Moved():
+                self._reach(event)
             case Looked():
-                self._looks(event)
-                # The target is known even if the line of the placement is lost.
-                self.state = replace(self.state, target=event.target)
+                self._look(event)
+        if isinstance(event, Placed | Looked):
+            # A look knows the target even if the line of the placement is lost.
+            self.target = event.target
         if isinstance(event, Homed | Moved | Placed | Looked) and event.step is not None:
-            self.state = replace(self.state, next_step=max(self.state.next_step, event.step + 1))
+            self.next_step = max(self.next_step, event.step + 1)
 
-    def _verified(self, event: Verified) -> None:
-        if event.deviation_steps is None:
-            # A device that was restarted has no counters for a comparison.
-            return
-        self._closed.add(event.segment)
-        if max(map(abs, event.deviation_steps)) > HOME_TOLERANCE_STEPS:
-            self._lost[event.segment] = event.deviation_steps
-
-    def _homed(self, event: Homed) -> None:
-        self._trusted = True
-        segment = self.moves[-1].segment + 1 if self.moves else 0
-        pan, tilt = event.approach
-        # The words are checked when the tables are written.
-        approach = cast("PanApproach", pan), cast("TiltApproach", tilt)
-        self._moved(event, segment, approach)
-        # Only a homing of the plan states counters; one of a resumed run repeats them.
-        self.state = replace(self.state, boot=event.boot, home_steps=(event.pan_steps, event.tilt_steps))
-
-    def _moved(
-        self,
-        event: Moved | Homed,
-        segment: int,
-        approach: tuple[PanApproach | Literal[""], TiltApproach | Literal[""]] = ("", ""),
-    ) -> None:
+    def _reach(self, event: Homed | Moved) -> None:
         steps = event.pan_steps, event.tilt_steps
-        self.moves.append(next_move(self.moves, segment, event.time_s, steps, approach))
+        segment = self.moves[-1].segment if self.moves else -1
+        if isinstance(event, Moved):
+            self.moves.append(next_move(self.moves, segment, event.time_s, steps))
+            return
+        # The words are checked when the tables are written.
+        approach = cast("tuple[PanApproach, TiltApproach]", event.approach)
+        self.moves.append(next_move(self.moves, segment + 1, event.time_s, steps, approach))
+        # Only a homing of the plan states counters; one of a resumed run repeats them.
+        self._trusted, self.boot, self.home_steps = True, event.boot, steps
 
-    def _looks(self, event: Looked) -> None:
-        self.spots.append(_spot(event, len(self.moves) - 1))
-        if event.step is not None:
-            self._looked.add(event.step)
+    def _look(self, event: Looked) -> None:
+        row = Spot(
+            spot=event.spot,
+            move=len(self.moves) - 1,
+            target=event.target,
+            experiment=event.experiment,
+            point=event.point,
+            aperture_deg=None if event.aperture_deg is UNSET else event.aperture_deg,
+        )
+        pixels, sds = event.pixels_px or NO_PIXELS, event.sds_px or NO_PIXELS
+        self.looks.append(with_pixels(row, event.status, pixels, sds, event.correlations))
+        if event.step is None:
+            self.references += 1
         else:
-            self.state = replace(self.state, references=self.state.references + 1)
-
-    def result(self) -> Recorded:
-        """The campaign so far."""
-        segment_of = [move.segment for move in self.moves]
-        spots = tuple(
-            # Refused and undetected spots too: `detect` may still find them in their frames.
-            replace(spot, status=LOST_STEPS) if segment_of[spot.move] in self._lost else spot
-            for spot in self.spots
-        )
-        return replace(
-            self.state,
-            moves=tuple(self.moves),
-            spots=spots,
-            looked_steps=frozenset(self._looked),
-            lost=tuple(sorted(self._lost.items())),
-            unverified=tuple(s for s in sorted(set(segment_of)) if s not in self._closed),
-            ignored_lines=tuple(self._ignored),
-        )
+            self.looked_steps.add(event.step)
 
 
 def recorded(records: Iterable[Record]) -> Recorded:
@@ -172,20 +338,7 @@ def recorded(records: Iterable[Record]) -> Recorded:
     Raises:
         InputError: events that contradict each other, with their line.
     """
-    recorder = Recorder()
-    for record in records:
-        recorder.add(record)
-    return recorder.result()
-
-
-def _spot(event: Looked, move: int) -> Spot:
-    row = Spot(
-        spot=event.spot,
-        move=move,
-        target=event.target,
-        experiment=event.experiment,
-        point=event.point,
-        aperture_deg=None if event.aperture_deg is UNSET else event.aperture_deg,
-    )
-    pixels, sds = event.pixels_px or NO_PIXELS, event.sds_px or NO_PIXELS
-    return with_pixels(row, event.status, pixels, sds, event.correlations)
+    record = Recorded()
+    for line in records:
+        record.add(line)
+    return record

@@ -10,21 +10,20 @@ a resumed run has the same plan as the interrupted one.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-from tvsbayes.acquisition.journal import Record, event_of, refused
-from tvsbayes.acquisition.journal_events import Adapted, Confirmed
-from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
-from tvsbayes.errors import escaped, refusal
+from tvsbayes.acquisition.journal import Record
+from tvsbayes.acquisition.recorder import Adapted, AdaptedStep, Confirmed, event_of
+from tvsbayes.acquisition.running_estimate import Estimate, Proposal, RunningEstimate
+from tvsbayes.errors import refusal
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
-from tvsbayes.results.plan_record import actions_of
 
 NEXT_SHARE, NEXT_LEAST, NEXT_MOST = 0.3, 8, 80
 """Looks of a proposal: a share of the looks so far, which suffices until the next fit, with its minimum and maximum.
@@ -54,33 +53,12 @@ def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
             found = f"target {step.target} in step {step.step}"
             raise refusal("unknown-target", file="plan", found=found, allowed=allowed, remedy=remedy, column="target")
         for axis, counter in zip(AXES, (step.pan_steps, step.tilt_steps), strict=True):
-            if counter is None:
-                continue
             low, high = limits[axis]
-            if not low <= counter <= high:
+            if counter is not None and not low <= counter <= high:
                 remedy = f"correct the plan, or {' and '.join(LIMIT_KEYS[axis])} in [positioner]"
                 found, allowed = f"{counter} in step {step.step}", f"{low} to {high}, the soft limits"
                 column = f"{axis}_steps"
                 raise refusal("limit", file="plan", found=found, allowed=allowed, remedy=remedy, column=column)
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """The next looks.
-
-    Attributes:
-        steps: placements, moves and looks, numbered from 0; the first is a placement.
-        after_each: the target's value after each look, deg/step.
-        now: its value before them.
-        looks: number of looks behind the estimate.
-        why: reason, in words.
-    """
-
-    steps: tuple[PlanStep, ...]
-    after_each: tuple[float, ...]
-    now: float
-    looks: int
-    why: str
 
 
 @dataclass(frozen=True)
@@ -131,51 +109,12 @@ class Replanning(RunningEstimate):
         wait: bool = False,
     ):
         super().__init__(folder, ahead, target_u_deg_per_step, DIRECTIONS, wait=wait)
-        self.minutes = minutes
-        self._proposal: Proposal | None = None
-        self._confirmed: Confirmed | None = None
-        self._ratio = 1.0
+        self.minutes, self._target_u, self._ratio = minutes, target_u_deg_per_step, 1.0
 
     @property
     def met(self) -> bool:
         """Return whether the sampled posterior meets the target in every direction."""
         return self.latest is not None and self.latest.tier == "importance" and super().met
-
-    @property
-    def confirm_below(self) -> float:
-        """Worst Laplace u at which sampling may confirm the target, by the last ratio of the two."""
-        return float(self.target or 0.0) / self._ratio
-
-    def _arguments(self, looks: int) -> tuple[object, ...]:
-        return self.folder, looks, self.target, looks_next(looks), self.confirm_below
-
-    def _read(self, result: Ahead) -> Estimate:
-        """The estimate of the sampled posterior where it can be used, else Laplace's; the event has both."""
-        self._proposal, laplace, sampled, target = result.proposal, result.laplace, result.sampled, self.target or 0.0
-        if sampled is None:
-            return laplace
-        laplace_u, sampled_u = (max(estimate.u_deg_per_step.values()) for estimate in (laplace, sampled))
-        if result.accepted:
-            self._ratio = max(1.0, sampled_u / laplace_u)
-        self._confirmed = Confirmed(
-            looks=laplace.looks,
-            target_u_deg_per_step=target,
-            laplace_u_deg_per_step=laplace_u,
-            importance_u_deg_per_step=sampled_u,
-            accepted=result.accepted,
-            reached=result.accepted and sampled_u <= target,
-        )
-        return sampled if result.accepted else laplace
-
-    def proposal(self) -> Proposal | None:
-        """The newest proposal, once."""
-        newest, self._proposal = self._proposal, None
-        return newest
-
-    def confirmed(self) -> Confirmed | None:
-        """The newest event of a sampled posterior, once."""
-        newest, self._confirmed = self._confirmed, None
-        return newest
 
     def last(self, looks: int) -> bool:
         """Waits at the end of the plan for one more estimate, from all looks; returns whether the target is met."""
@@ -185,30 +124,37 @@ class Replanning(RunningEstimate):
             self._wait_for_fit()
         return self.met
 
+    def _arguments(self, looks: int) -> tuple[object, ...]:
+        # The worst Laplace u at which sampling may confirm the target, by the last ratio of the two.
+        return self.folder, looks, self.target, looks_next(looks), self._target_u / self._ratio
 
-def _step(number: int, entry: Mapping[str, Any]) -> PlanStep:
-    action = str(entry["action"])
-    if action == "place":
-        return PlanStep(number, "place", target=str(entry["target"]))
-    if action == "move":
-        return PlanStep(number, "move", int(entry["pan_steps"]), int(entry["tilt_steps"]))
-    if action == "look":
-        return PlanStep(number, "look")
-    raise ValueError(f"no action of a continued plan: {escaped(action)}")
+    def _read(self, result: Ahead) -> Estimate:
+        """The estimate of the sampled posterior where it can be used, else Laplace's; the event has both."""
+        self._proposal, laplace, sampled = result.proposal, result.laplace, result.sampled
+        if sampled is None:
+            return laplace
+        laplace_u, sampled_u = (max(estimate.u_deg_per_step.values()) for estimate in (laplace, sampled))
+        if result.accepted:
+            self._ratio = max(1.0, sampled_u / laplace_u)
+        self._confirmed = Confirmed(
+            looks=laplace.looks,
+            target_u_deg_per_step=self._target_u,
+            laplace_u_deg_per_step=laplace_u,
+            importance_u_deg_per_step=sampled_u,
+            accepted=result.accepted,
+            reached=result.accepted and sampled_u <= self._target_u,
+        )
+        return sampled if result.accepted else laplace
 
 
 def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> Adapted:
     """The event of a change of plan: from which row on, the steps, and why each look was chosen."""
-    looks = iter(proposal.after_each)
-    u_before, entries = proposal.now, []
-    for action in actions_of(steps):
-        entry = action.as_json()
-        if action.action == "look":
-            u_after = next(looks)
-            # The gain of this look, given the looks before it.
-            entry |= {"u_before_deg_per_step": u_before, "u_after_deg_per_step": u_after}
-            u_before = u_after
-        entries.append(entry)
+    # The gain of a look, given the looks before it.
+    gains = pairwise((proposal.now, *proposal.after_each))
+    entries = (
+        AdaptedStep(s.action, s.pan_steps, s.tilt_steps, s.target, *(next(gains) if s.action == "look" else ()))
+        for s in steps
+    )
     return Adapted(row=row, looks=proposal.looks, why=proposal.why, steps=tuple(entries))
 
 
@@ -220,11 +166,10 @@ def adapted_plan(plan: Sequence[PlanStep], records: Iterable[Record]) -> tuple[P
     """
     steps = tuple(plan)
     for record in records:
-        event = event_of(record, Adapted)
-        if event is None:
-            continue
-        try:
-            steps = (*steps[: event.row], *(_step(event.row + n, entry) for n, entry in enumerate(event.steps)))
-        except (KeyError, TypeError, ValueError) as error:
-            raise refused(record, repr(error)) from error
+        if event := event_of(record, Adapted):
+            changed = enumerate(event.steps, event.row)
+            steps = (
+                *steps[: event.row],
+                *(PlanStep(row, s.action, s.pan_steps, s.tilt_steps, s.target) for row, s in changed),
+            )
     return steps

@@ -19,7 +19,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from tvsbayes.acquisition.recorder import Confirmed
 from tvsbayes.display import concise
+from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.results.estimates import Uncertain
 
 FIRST_LOOKS = 12
@@ -29,7 +31,7 @@ GROWTH = 1.2
 FIT_MAX_S = 3600.0
 """Longest wait for a fit; a fit takes a minute or less."""
 FIT_POLL_S = 0.1
-"""Interval at which requests to the run are served while it waits for a fit."""
+"""Interval at which a run that waits for a fit is asked whether it goes on."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,25 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Proposal:
+    """The next looks.
+
+    Attributes:
+        steps: placements, moves and looks, numbered from 0; the first is a placement.
+        after_each: the target's value after each look, deg/step.
+        now: its value before them.
+        looks: number of looks behind the estimate.
+        why: reason, in words.
+    """
+
+    steps: tuple[PlanStep, ...]
+    after_each: tuple[float, ...]
+    now: float
+    looks: int
+    why: str
+
+
+@dataclass(frozen=True)
 class EstimateOptions:
     """Options of the running estimate, with its target.
 
@@ -73,18 +94,6 @@ class EstimateOptions:
     fit: Callable[[Path, int], Estimate]
     target_u_deg_per_step: float | None = None
     enabled: bool | None = None
-
-    def holds(self, simulate: bool) -> bool:
-        """Whether to fit a run, simulated or not."""
-        return self.target_u_deg_per_step is not None or (not simulate if self.enabled is None else self.enabled)
-
-
-@dataclass(frozen=True)
-class Aim:
-    """Aim of the running estimate: directions of the plan, and the target u of each, None for no target."""
-
-    directions: tuple[str, ...] = ()
-    target_u_deg_per_step: float | None = None
 
 
 class Worker:
@@ -177,8 +186,11 @@ class RunningEstimate:
 
     Attributes:
         latest: the newest estimate.
+        minutes: duration allowed for the run, None for that of its plan.
         meanwhile: called repeatedly while waiting for a fit; False ends both.
     """
+
+    minutes: float | None = None
 
     def __init__(
         self,
@@ -193,6 +205,8 @@ class RunningEstimate:
         self.latest: Estimate | None = None
         self.meanwhile: Callable[[], bool] = lambda: True
         self._wait, self._worker, self._looks = wait, Worker(fit), 0
+        self._proposal: Proposal | None = None
+        self._confirmed: Confirmed | None = None
 
     def __enter__(self) -> RunningEstimate:
         return self
@@ -201,9 +215,9 @@ class RunningEstimate:
         self._worker.end()
 
     @property
-    def aim(self) -> Aim:
-        """Directions and target of the fits."""
-        return Aim(tuple(sorted(self.directions)), self.target)
+    def aim(self) -> dict[str, object]:
+        """Directions that must meet the target, and the target u of each, None for no target."""
+        return {"directions": sorted(self.directions), "target_u_deg_per_step": self.target}
 
     @property
     def met(self) -> bool:
@@ -222,6 +236,20 @@ class RunningEstimate:
             if self._wait:
                 self._wait_for_fit()
         return self.met
+
+    def last(self, looks: int) -> bool:
+        """Return whether the target is met at the end of the plan."""
+        return self.met
+
+    def proposal(self) -> Proposal | None:
+        """The newest proposal of looks, once."""
+        newest, self._proposal = self._proposal, None
+        return newest
+
+    def confirmed(self) -> Confirmed | None:
+        """The newest event of a sampled posterior, once."""
+        newest, self._confirmed = self._confirmed, None
+        return newest
 
     def _arguments(self, looks: int) -> tuple[object, ...]:
         """Arguments of the fit of `looks` looks."""

@@ -60,7 +60,7 @@ def acquire(
         adapt: chooses the remaining looks from that fit; `estimate` must have a target.
         vision: how pictures are made and searched; by default left to `detect`, and a simulation gives centroids.
         terminal: output of messages and questions; by default nothing is shown.
-        live: publishes the run and receives requests.
+        live: publishes the run.
         place_command: a program that places the sheet instead of a person.
 
     Raises:
@@ -71,6 +71,9 @@ def acquire(
     check_plan(rig, plan)
     check_hazard(laser_class, simulate)
     record = _earlier_runs(folder) if resume else Recorded()
+    header: dict[str, object] = {"name": str(rig.header.get("name", NAME_ACQUIRED))}
+    if simulate:
+        header |= {"created": SIMULATED_START.isoformat(), "synthetic": True, "seed": int(seed)}
     stop = StopKey(terminal.say)
     with ExitStack() as stack:
         # Device and cameras first: a failure to open them leaves no folder behind.
@@ -82,7 +85,7 @@ def acquire(
             bench = stack.enter_context(hardware(rig, vision.detector, operator))
         for warning in bench.warnings:
             terminal.say(f"warning: {warning}")
-        journal = begin(folder, rig, plan, resume, _header(rig, seed if simulate else None))
+        journal = begin(folder, rig, plan, resume, header)
         stack.callback(journal.close)
         if journal.torn:
             terminal.say(f"{len(journal.torn)} bytes of an unfinished line were cut off and kept in log.torn-*")
@@ -115,14 +118,15 @@ def _running(
     simulate: bool,
 ) -> RunningEstimate | None:
     """The running estimate of a run, None without one."""
-    target = None if estimate is None else estimate.target_u_deg_per_step
+    if estimate is None:
+        return None
+    target = estimate.target_u_deg_per_step
     if adapt is not None and target is not None:
         minutes = plan_minutes(rig, plan) if adapt.minutes is None else adapt.minutes
         return Replanning(folder, adapt.ahead, target, minutes, wait=simulate)
-    if estimate is None or not estimate.holds(simulate):
+    if target is None and (simulate if estimate.enabled is None else not estimate.enabled):
         return None
-    directions = set(legs_of(run_plan(plan, rig).moves))
-    return RunningEstimate(folder, estimate.fit, target, directions, wait=simulate)
+    return RunningEstimate(folder, estimate.fit, target, legs_of(run_plan(plan, rig).moves), wait=simulate)
 
 
 def _earlier_runs(folder: Path) -> Recorded:
@@ -137,35 +141,29 @@ def _earlier_runs(folder: Path) -> Recorded:
     return recorded(read_journal(folder).records)
 
 
-def _header(rig: Rig, seed: int | None) -> dict[str, object]:
-    """Header entries of a campaign in its journal; `seed` is that of a simulation."""
-    header: dict[str, object] = {"name": str(rig.header.get("name", NAME_ACQUIRED))}
-    if seed is not None:
-        header |= {"created": SIMULATED_START.isoformat(), "synthetic": True, "seed": int(seed)}
-    return header
-
-
 def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header: Mapping[str, object]) -> Journal:
     """Open the journal to write: a new one, or the one to continue.
 
     Raises:
         InputError: no journal to continue, another plan or rig than before, or a folder that has a journal.
     """
-    if not resume:
-        if folder.is_dir() and any(folder.iterdir()):
-            shown_path, remedy = escaped(str(folder), 200), "name another folder, or go on with --resume"
-            if (folder / LOG).is_file() and not (folder / LOG).stat().st_size:
-                remedy = EMPTY_REMEDY
-            found, allowed = "a folder with files", "a new or empty folder"
-            raise refusal("occupied", file=shown_path, found=found, allowed=allowed, remedy=remedy)
-        created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        return Journal.create(
-            folder, **{"created": created, **header}, **identity(rig, plan, bool(header.get("synthetic")))
+    if resume:
+        journal = Journal.open(folder)
+        try:
+            check_same(journal.records[0].data, rig, plan, header)
+        except BaseException:
+            journal.close()
+            raise
+        return journal
+    if folder.is_dir() and any(folder.iterdir()):
+        emptied = (folder / LOG).is_file() and not (folder / LOG).stat().st_size
+        raise refusal(
+            "occupied",
+            file=escaped(str(folder), 200),
+            found="a folder with files",
+            allowed="a new or empty folder",
+            remedy=EMPTY_REMEDY if emptied else "name another folder, or go on with --resume",
         )
-    journal = Journal.open(folder)
-    try:
-        check_same(journal.records[0].data, rig, plan, header)
-    except BaseException:
-        journal.close()
-        raise
-    return journal
+    created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    entries = {"created": created, **header, **identity(rig, plan, bool(header.get("synthetic")))}
+    return Journal.create(folder, **entries)

@@ -18,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tvsbayes.acquisition.journal_events import TrueAngles
+from tvsbayes.acquisition.recorder import TrueAngles
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.mechanisms import mechanism_of

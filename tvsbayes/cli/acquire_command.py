@@ -76,7 +76,7 @@ def acquire(
     place_seconds: Annotated[
         float | None, typer.Option("--place-seconds", min=1.0, help="With --place-command: longest time (default 600).")
     ] = None,
-    live: Annotated[bool, typer.Option("--live", help="A page on this machine to watch and stop the run.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="A page on this machine to watch the run.")] = False,
     port: Annotated[
         int | None, typer.Option("--port", min=0, max=65535, help="With --live: to listen on; 0 takes a free one.")
     ] = None,

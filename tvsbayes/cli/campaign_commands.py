@@ -181,7 +181,7 @@ def check(
     if repair_to is not None:
         if plan_file is not None:
             raise InputError("usage", "a repaired journal takes no plan", remedy="leave out PLAN or --repair-to")
-        from tvsbayes.acquisition.campaign_files import repair_campaign
+        from tvsbayes.acquisition.journal_check import repair_campaign
 
         repaired = repair_campaign(path, repair_to)
         lines = [f"{key}: {value}" for key, value in repaired.items()]
@@ -261,7 +261,7 @@ def campaign_contents(path: Path, campaign: Campaign | None = None) -> dict[str,
 
     journal: dict[str, Any] | None = None
     if (path / "log.jsonl").exists():
-        from tvsbayes.acquisition.campaign_files import check_journal
+        from tvsbayes.acquisition.journal_check import check_journal
 
         journal = check_journal(path)
     if journal is not None and not journal["moves"]:

@@ -47,7 +47,7 @@ def _warn_implausible(campaign: Campaign, *, stops: bool = False) -> None:
     Raises:
         InputError: `stops`, and a finding is certain.
     """
-    from tvsbayes.acquisition.campaign_files import behind_journal
+    from tvsbayes.acquisition.journal_check import behind_journal
     from tvsbayes.estimators.findings import stop_at
     from tvsbayes.estimators.plausibility import implausible
 
