@@ -1,4 +1,4 @@
-"""Documents: links, tables of commands and parameters, map of modules, examples, the site."""
+"""Documents: links, tables of commands and parameters, map of rooms, examples, the site."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from support.package_imports import MODULES, ORDER, imports_of, room
+from support.package_imports import MODULES, ORDER
 from support.printed_pages import first_difference
 
 import tvsbayes
@@ -205,19 +205,9 @@ def test_table_of_parameters_is_the_registry():
     assert sorted(all_names) == sorted(RIG_PRIORS)
 
 
-def test_map_lists_every_module_once_in_the_order_of_imports():
-    """A module imports, of its own package, only what stands above it."""
-    text = section(read("data/docs/architecture.md"), "Packages and modules")
-    listed = [name.replace("/", ".") for name in re.findall(r"^\| `([\w/]+)` \|", text, flags=re.MULTILINE)]
-    assert sorted(listed) == sorted(MODULES), set(listed) ^ set(MODULES)
-    rooms = list(dict.fromkeys(map(room, listed)))
-    assert rooms == list(ORDER)
-    place = {name: number for number, name in enumerate(listed)}
-    for name in listed:
-        for other in {o.removeprefix("tvsbayes.") for o in imports_of(name)} & set(MODULES):
-            assert room(other) != room(name) or place[other] < place[name], (
-                f"{name} imports {other}, which stands below"
-            )
+def test_map_lists_the_rooms_in_the_order_of_imports():
+    text = section(read("data/docs/architecture.md"), "Rooms")
+    assert re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE) == list(ORDER)
 
 
 def test_modules_named_elsewhere_in_the_map_exist():

@@ -28,7 +28,7 @@ FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>
 CSS = """math { font-family: "Cambria Math", "STIX Two Math", "Latin Modern Math", math, serif; }
 math[display=block] { overflow-x: auto; padding: 0.4em 0; }
 """
-MODULE_LINE = re.compile(r"^\| `([a-z0-9_]+(?:/[a-z0-9_]+)?)` \|", re.MULTILINE)
+ROOM = re.compile(r"^\| `(\w+)` \|", re.MULTILINE)
 
 
 def place_in_site(path: str) -> str:
@@ -44,11 +44,12 @@ def place_in_repository(path: str) -> str:
 
 
 def modules() -> dict[str, list[str]]:
-    """Modules by package, in the order of the map in architecture.md."""
-    found: dict[str, list[str]] = {}
-    text = (ROOT / "data" / "docs" / "architecture.md").read_text(encoding="utf-8")
-    for name in MODULE_LINE.findall(text.split("## Packages and modules")[1]):
-        found.setdefault(name.partition("/")[0], []).append(f"tvsbayes.{name.replace('/', '.')}")
+    """Modules by room, in the order of the rooms in architecture.md."""
+    text = (ROOT / "data" / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Rooms")[1]
+    found = {}
+    for room in ROOM.findall(text):
+        names = sorted(path.stem for path in (ROOT / "tvsbayes" / room).glob("*.py") if path.stem != "__init__")
+        found[room] = [f"tvsbayes.{room}.{name}" for name in names] or [f"tvsbayes.{room}"]
     return found
 
 
