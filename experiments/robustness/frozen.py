@@ -56,7 +56,7 @@ AXIS = (
     *("check {}", "classic {}", "classic {} --json", "fit {} --details", "fit {} --json"),
     *("compare {} --by positions", "plan --given {}", "plan --given {} --json", "plan {} --watch", "report {}"),
     *("compensate {} --to csv -o {}.csv", "compensate {} --to linuxcnc -o {}.comp", "plan {} --verify"),
-    *("report {} --tolerance 0.05 --of A --out {}.html"),
+    "report {} --tolerance 0.05 --of A --out {}.html",
 )
 HEAD = ("check {}", "fit {} --quick", "fit {} --json", "report {}", "compensate {} --to urdf", "plan {} --watch")
 ONCE = (
