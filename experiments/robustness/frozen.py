@@ -97,14 +97,15 @@ def screw(seed: int, unit: str, warm: bool, absolute: bool) -> str:
     """A table of an axis read up and down, by NumPy alone."""
     rng = np.random.default_rng(seed)
     travel, play, per = (300.0, 0.012, 1.0) if unit == "mm" else (360.0, 0.03, 0.01)
-    places = np.linspace(0, travel, 13) / per
+    # An encoder on the axis sees no play.
+    lost, places = play * (not absolute), np.linspace(0, travel, 13) / per
     rows = []
     for cycle in range(3):
         for side, commands in (("forward", places), ("backward", places[::-1])):
             for command in commands:
                 growth = 0.01 * (1 - np.exp(-len(rows) / 40)) if warm else 0.0
                 wave = play / 3 * np.sin(2 * np.pi * command * per / (travel / 7))
-                value = per * 1.0002 * command - play * (side == "backward") + wave + growth + rng.normal(0, play / 20)
+                value = per * 1.0002 * command - lost * (side == "backward") + wave + growth + rng.normal(0, play / 20)
                 more = [f"{20 + 2 * growth:.3f}"] if warm else []
                 rows.append([f"{command:g}", f"{value:.5f}", side, f"{60 * len(rows)}", *more])
         if not absolute and cycle < 2:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.axes import drawn, random_moves, runs
+from support.axes import OFF, drawn, random_moves, runs
 from support.refusals import refusal
 
 from tvsbayes.single_axis.axis_budget import _variances, axis_budgets
@@ -79,6 +79,14 @@ def test_the_scale_of_the_reference_is_in_line_figures_and_budget(reference):
     assert row.contribution == pytest.approx(3e-6, rel=0.01)
     accuracy = next(budget for budget in summary.budgets if budget.quantity == "ISO 230-2 A")
     assert accuracy.u == u["accuracy"] and accuracy.estimate == figures["accuracy"]
+
+
+def test_a_quantity_that_is_stated_exactly_has_no_budget():
+    """As of an absolute encoder on the axis, which sees no play."""
+    exact = dict.fromkeys(("backlash", "play_variation", "ratio_contrast"), OFF)
+    campaigns = [drawn(5, runs(2), **stated).campaign for stated in ({}, exact)]
+    free, fixed = ({budget.quantity for budget in summary_of(campaign).budgets} for campaign in campaigns)
+    assert free - fixed == {"effective_backlash"}
 
 
 def test_budgets_sum_to_the_stated_u():

@@ -140,7 +140,7 @@ def _input(fit: AxisFit, part: str) -> tuple[float, str]:
 def axis_budgets(fit: AxisFit, line: Estimate, play: Estimate | None, classic: ClassicAxis) -> tuple[BudgetTable, ...]:
     """Budgets of the line through the positions read, of the play, and of ISO 230-2's figures.
 
-    None for a drive that never stops, or with too many rows.
+    None for a drive that never stops, or with too many rows; a quantity that is stated exactly has none.
 
     Args:
         fit: the fit.
@@ -153,8 +153,9 @@ def axis_budgets(fit: AxisFit, line: Estimate, play: Estimate | None, classic: C
     headline = headline_functionals(fit.model, fit.w)
     slope = headline[..., HEADLINE_DRAWS.index("effective_per_command"), :]
     unit, tables = fit.campaign.unit, []
-    tables.append(_table(fit, "effective_per_command", f"{unit} per command", line, slope))
-    if play is not None:
+    if line.sd > 0:
+        tables.append(_table(fit, "effective_per_command", f"{unit} per command", line, slope))
+    if play is not None and play.sd > 0:
         tables.append(_table(fit, "effective_backlash", unit, play, mean_play(fit.model)))
     return (*tables, *_figure_budgets(fit, classic))
 
