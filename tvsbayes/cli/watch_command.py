@@ -103,7 +103,7 @@ def _plan_axis_watch(folder: Path, minutes: float | None, out: Path | None, seed
     from msgspec import structs
 
     from tvsbayes.comparison.axis_sessions import plan_watch_axis
-    from tvsbayes.compensation.promise import refuse_answer
+    from tvsbayes.compensation.promise import SURER, refuse_answer
     from tvsbayes.report.watch_text import watch_plan_text
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import results_for
@@ -111,7 +111,7 @@ def _plan_axis_watch(folder: Path, minutes: float | None, out: Path | None, seed
     known = read_axis(folder)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 1.0}, progress) as job:
         results = results_for(known, progress=job.part(FITTING), seed=seed, notify=report_line)
-        refuse_answer(results.summary.answer)
+        refuse_answer(results.summary.answer, SURER, "what a watch would notice cannot be trusted")
         job.begin(PLANNING)
         plan, stops = plan_watch_axis(results.fit, minutes=minutes, seed=seed)
     text = watch_plan_text(plan, "stops")

@@ -79,20 +79,28 @@ def run_up_of(machine: PredictedMachine, commands: np.ndarray, fitted: float, re
     return float(np.quantile(gap, 0.975, axis=0).max()) / abs(fitted) + step
 
 
-def refuse_answer(answer: str, remedy: str = "run `tvsbayes fit` again, without --no-sample or --quick") -> None:
+SURER = "run `tvsbayes fit` again, without --no-sample or --quick"
+"""How an axis gets an accepted answer."""
+
+
+def refuse_answer(
+    answer: str,
+    remedy: str = f"{SURER}, then compensate",
+    reason: str = "the promise of a table made of it cannot be trusted",
+) -> None:
     """Refuse a fit without an accepted answer, since its table would move a machine.
 
     Args:
         answer: answer of the fit.
-        remedy: how to obtain an accepted one.
+        remedy: how to obtain an accepted one, and what then.
+        reason: why none will do.
 
     Raises:
         NotConverged: the answer is rough, or a Laplace approximation.
     """
     if answer != "accepted":
         what = "a rough answer" if answer == "rough" else "a Laplace approximation"
-        message = f"the fit is {what}, not an accepted answer: the promise of a table made of it cannot be trusted"
-        raise NotConverged("unaccepted", message, remedy=f"{remedy}, then compensate")
+        raise NotConverged("unaccepted", f"the fit is {what}, not an accepted answer: {reason}", remedy=remedy)
 
 
 def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:
