@@ -193,12 +193,3 @@ def test_causes_add_up_to_the_posterior(mounted_rig):
         assert np.any(part != 0)
     # Fixed in the rig: no cause.
     assert not any("harmonic" in name for name in causes.names)
-
-
-def test_worse_cameras_have_a_larger_share(mounted_rig):
-    shares = []
-    for stereo in (0.5, 1.0, 2.0):
-        causes = causes_of(fit_of(*linear_problem(stereo), mounted_rig))
-        ratio = causes.covariance[:, 0, 0]
-        shares.append(ratio[causes.names.index("stereo calibration")] / ratio.sum())
-    assert shares[0] < shares[1] < shares[2]

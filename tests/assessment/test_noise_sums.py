@@ -44,11 +44,6 @@ def test_what_is_known_in_a_sum_alone_is_named(parts, text):
     assert set(weak.loadings) == {*parts} - {LEFT} and all(-1 <= value < -0.4 for value in weak.loadings.values())
 
 
-def test_noise_and_looks_without_stops_ask_for_no_second_look():
-    (weak,) = sum_directions(FREE, known_sum_of(LOOK, NOISE), EVEN)
-    assert "look scatter pan and noise, estimated / stated is known" in weak.text and "look twice" not in weak.text
-
-
 def test_what_is_separated_or_fixed_is_not_named():
     assert sum_directions(FREE, independent(), EVEN) == ()
     assert sum_directions(~FREE, independent(), EVEN) == ()
@@ -57,9 +52,3 @@ def test_what_is_separated_or_fixed_is_not_named():
     assert sum_directions(fixed, shared, EVEN) == ()
     shared[:, INDEX[LOOK]] = 0.01
     assert sum_directions(FREE, shared, EVEN) == ()
-
-
-def test_draws_count_with_their_weights():
-    mixed, weights = np.concatenate([known_sum_of(LEFT, LOOK), independent()]), np.repeat([1 / DRAWS, 0.0], DRAWS)
-    assert sum_directions(FREE, mixed, weights)
-    assert sum_directions(FREE, mixed, weights[::-1]) == ()

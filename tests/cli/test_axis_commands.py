@@ -75,30 +75,6 @@ def test_simulate_and_new(ask, folder, tmp_path):
     assert code == 3 and assert_error(document, "too-few-positions")
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        ("fit", "AXIS", "--robust"),
-        ("fit", "AXIS", "--no-sample", "--quick"),
-        ("compare", "AXIS", "--by", "steps"),
-        ("report", "AXIS", "--limit-mm", "1"),
-        ("plan", "--given", "AXIS", "--target", "speed"),
-        ("plan", "AXIS"),
-        ("simulate", "AXIS", "OUT", "--frames"),
-        ("locate", "AXIS", "--pan-steps", "1", "--tilt-steps", "1", "--aperture-deg", "60"),
-        ("steps-for", "AXIS", "--x-mm", "1", "--y-mm", "1", "--z-mm", "1"),
-        ("detect", "AXIS"),
-        ("export", "AXIS", "--nexus", "OUT"),
-    ],
-)
-def test_options_of_scanners_are_refused(ask, folder, tmp_path, line):
-    words = [{"AXIS": folder, "OUT": tmp_path / "out"}.get(word, word) for word in line]
-    code, document = ask(*words)
-    assert code == 2 and assert_error(document, "target" if "speed" in line else "usage")
-    if line[0] in ("locate", "steps-for", "detect", "export"):
-        assert "is an axis folder" in document["error"]["message"] and "report" in document["error"]["remedy"]
-
-
 def test_later_readings_are_compared_and_watched(ask, say, folder, tmp_path):
     later = drawn(7, runs(1), backlash=AxisPrior(0.0, 0.1))
     later.write(tmp_path / "later")

@@ -138,6 +138,7 @@ def demonstrated(own_compilation_cache) -> SimpleNamespace:
     return SimpleNamespace(document=json.loads(json.dumps(document)), text=text, summary=fitted[0])
 
 
+@pytest.mark.thorough
 def test_demo_shows_classic_and_joint_beside_the_truth(demonstrated):
     document = demonstrated.document
     assert set(document) == {"classic", "fit", "truth"}
@@ -159,6 +160,7 @@ def test_demo_shows_classic_and_joint_beside_the_truth(demonstrated):
         assert abs(predicted["value"] - result["mean_deg_per_step"]) < 5 * sd
 
 
+@pytest.mark.thorough
 def test_demo_keeps_campaign_and_results_in_the_given_folder(ask, demonstrated, tmp_path, monkeypatch):
     out, kept = tmp_path / "kept", []
 
@@ -178,6 +180,7 @@ def test_demo_keeps_campaign_and_results_in_the_given_folder(ask, demonstrated, 
     assert ask("demo", out)[0] == 2
 
 
+@pytest.mark.thorough
 def test_readme_shows_the_output_of_the_demo(demonstrated):
     """Same lines; each number within a tenth of its uncertainty (another processor rounds differently)."""
     readme = DATA.parent / "README.md"

@@ -9,7 +9,7 @@ from dataclasses import replace
 import jsonschema
 import numpy as np
 import pytest
-from support.commands import PAPER_TWIN, assert_error
+from support.commands import assert_error
 from support.compensated import driven, results, to_and_fro, true_axis
 from support.fit_documents import shipped_schema
 
@@ -17,8 +17,6 @@ from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import stored_compensation
 from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
 from tvsbayes.single_axis.axis_record import keep_fit
-
-AT = ("--distance-mm", "500")
 
 
 @pytest.fixture
@@ -92,35 +90,7 @@ def test_too_few_readings_give_no_verdict(ask, folder, tmp_path):
     assert_error(document, "same-looks")
 
 
-@pytest.mark.parametrize("line", [("compensate", PAPER_TWIN, "--to", "csv"), ("plan", "--verify")])
-def test_scanners_are_refused_with_a_remedy(ask, line):
-    code, document = ask(*line)
-    assert code == 2
-    assert_error(document, "usage")
-
-
-def test_verify_needs_two_campaigns_of_one_kind_and_results(ask, folder):
-    for line in (("verify", PAPER_TWIN, folder), ("verify", folder, PAPER_TWIN), ("verify", folder, folder, *AT)):
-        code, document = ask(*line)
-        assert code == 2
-        assert_error(document, "usage")
-    code, document = ask("verify", PAPER_TWIN, PAPER_TWIN, *AT)
-    assert code == 2 and "tvsbayes steps-for" in document["error"]["remedy"]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ("--to", "csv", "--resolution", "0,01"),
-        ("--to", "csv", "--applied-by", "me"),
-        ("--to", "grbl", "--in-force", "250", "--letter", "Q"),
-    ],
-)
-def test_impossible_options_are_refused(ask, folder, options):
-    code, document = ask("compensate", folder, *options)
-    assert code == 2 and document["error"]["remedy"]
-
-
+@pytest.mark.thorough
 def test_a_promise_is_tied_to_its_table(ask, say, folder, tmp_path):
     """A second table leaves the first in force, one in its place ends it, a file of 0.3.0 is known by its numbers."""
     first, second = tmp_path / "one.comp", tmp_path / "two.csv"

@@ -169,23 +169,6 @@ def test_with_a_closed_standard_input_no_question_is_asked(say, table, tmp_path,
     assert code == 0 and "nothing written: add --yes" in text
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--angles", "furlong"), "deg, rad"),
-        (("--column", "XL"), "u_left_px=XL"),
-        (("--column", "uleft=XL"), "u_left_px"),
-        (("--column", "u_left_px=X"), "did you mean XL|allowed: Nr"),
-        (("--pan-approach", "up"), "left, right"),
-        (("--sheet", "one"), "no sheets"),
-    ],
-)
-def test_unusable_options_are_refused(say, table, tmp_path, options, message):
-    code, _, log = say("import", table, "--to", tmp_path / "mine", *options)
-    assert code == 2
-    assert any(part in log for part in message.split("|")), log
-
-
 def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path):
     (tmp_path / "log.csv").write_text("# bench 3\n\na,b\n1,2\n")
     code, document = ask("import", tmp_path / "log.csv", "--to", tmp_path / "axis", "--axis")

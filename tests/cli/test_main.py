@@ -36,33 +36,6 @@ def test_hostile_files_are_input_errors(ask, say, grid_folder, command):
     assert "Traceback" not in log
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("fit", "x", "--nope"),
-        ("frobnicate",),
-        ("classic",),
-        ("simulate", "a", "b", "c", "--seed", "-1"),
-        ("simulate", "a", "b", "c", "--seed", "many"),
-    ],
-)
-def test_wrong_usage_is_bad_input(ask, say, arguments):
-    code, document = ask(*arguments)
-    assert code == 2
-    assert set(document) == {"error"}
-    assert_error(document, "usage")
-    code, out, log = say(*arguments)
-    assert (code, out) == (2, "")
-    assert log
-
-
-@pytest.mark.parametrize("command", ["check", "classic", "fit"])
-def test_a_folder_that_is_not_there_is_bad_input(ask, tmp_path, command):
-    code, document = ask(command, tmp_path / "nowhere")
-    assert code == 2
-    assert_error(document, "missing-file")
-
-
 def test_control_characters_of_a_name_do_not_reach_the_terminal(say, tmp_path):
     code, out, log = say("check", tmp_path / "a\x1b[31mb")
     assert code == 2
@@ -200,15 +173,6 @@ def test_main_silences_messages_of_xla(monkeypatch):
     with pytest.raises(SystemExit):
         main()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
-
-
-@pytest.mark.parametrize("number", ["0,0004", "-1,5", ",5"])
-def test_a_decimal_comma_is_refused_with_the_point(ask, say, number):
-    code, document = ask("report", PAPER_TWIN, "--limit-mm", number)
-    wanted = f"write a decimal point: {number.replace(',', '.')}"
-    assert code == 2 and assert_error(document, "usage")["remedy"] == wanted
-    assert wanted in say("report", PAPER_TWIN, "--limit-mm", number)[2]
-    assert ask("report", PAPER_TWIN, "--limit-mm", "many")[1]["error"]["remedy"] == "see tvsbayes --help"
 
 
 def test_missing_packages_are_named_with_what_to_install():

@@ -137,19 +137,6 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
     assert mine.provenance.seed == 4
 
 
-@pytest.mark.thorough
-def test_a_sample_of_another_fit_is_removed(grid_folder, monkeypatch):
-    """A report that fits first replaces fit.json, so the sample of the earlier fit no longer belongs to it."""
-    results, messages = grid_folder / "results", []
-    results.mkdir()
-    (results / "posterior.nc").write_bytes(b"of an earlier fit")
-    monkeypatch.setattr("tvsbayes.assessment.summary.worth_sampling", lambda fit: False)
-    record = StoredOrFitted(read_campaign(grid_folder), messages.append).reported.record
-    assert record.summary.estimator == "laplace" and (results / "fit.json").is_file()
-    assert not (results / "posterior.nc").exists()
-    assert any("posterior.nc of an earlier fit is removed" in line for line in messages)
-
-
 @pytest.mark.parametrize(
     "call",
     [lambda c: calibrate(c, c.path / "results"), lambda c: StoredOrFitted(c).reported],

@@ -45,14 +45,6 @@ def test_plan_writes_a_plan_and_its_exit_code_states_whether_the_target_is_met(a
     assert code == 0 and not place.exists() and f"nothing written to {place}" in text
 
 
-@pytest.mark.parametrize("options", [("--target", "u(left) <= 1 mm"), ("--criterion", "E"), ("--minutes", "0.2")])
-def test_bad_options_of_plan_are_refused(ask, options):
-    code, document = ask("plan", MOUNTED / "rig.toml", "--draws", 20, *options)
-    assert code == 2
-    assert document["error"]["column"] == options[0]
-    assert document["error"]["allowed"] and document["error"]["remedy"]
-
-
 @pytest.mark.thorough
 def test_check_takes_a_rig_with_a_plan(ask):
     code, document = ask("check", MOUNTED / "rig.toml", MOUNTED / "grid.csv")

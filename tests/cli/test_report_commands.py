@@ -56,13 +56,6 @@ def test_without_a_browser_nothing_is_fitted(ask, grid_folder, tmp_path, monkeyp
         assert set(document) == {"error"} and sorted(folder.rglob("*")) == before
 
 
-@pytest.mark.parametrize("option", ["--laboratory", "--customer", "--country", "--customer-country"])
-def test_empty_names_are_refused(ask, tmp_path, option):
-    code, document = ask("report", tmp_path, "--dcc", option, " ")
-    assert code == 2 and option in document["error"]["message"]
-    assert "leave the option out" in document["error"]["remedy"]
-
-
 @pytest.mark.thorough
 def test_it_stops_at_an_unusable_fit(ask, grid_campaign, tmp_path, no_page):
     """Relative counters contradict the model everywhere."""
@@ -84,11 +77,3 @@ def test_an_axis_becomes_a_report_in_one_go(ask, say, tmp_path, no_pictures):
     code, text, _ = say("calibrate", tmp_path / "axis", "--no-sample")
     parts = [text.index(word) for word in ("axis\n", "scatter about the line", "verdict: usable", "next: open ")]
     assert code == 0 and parts == sorted(parts)
-
-
-@pytest.mark.parametrize("name", ["mine.pdf", "mine.PDF"])
-def test_a_page_named_as_its_own_pdf_is_refused_before_the_fit(ask, tmp_path, name):
-    """Chromium would overwrite the page with an empty PDF."""
-    code, document = ask("report", tmp_path, "-o", tmp_path / name, "--pdf")
-    assert (code, document["error"]["code"], document["error"]["remedy"]) == (2, "usage", "write -o NAME.html --pdf")
-    assert not (tmp_path / name).exists()

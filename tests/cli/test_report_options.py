@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.axes import runs
-from support.commands import assert_error
 from support.refusals import refusal
 from support.signers import signer
 
@@ -42,26 +41,6 @@ def test_a_tolerance_decides_the_exit_code(ask, folder):
     assert narrow["criteria"][0]["guard_band"] is None
     code, plain = ask("report", folder)
     assert (code, plain["criteria"]) == (0, [])
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--tolerance", "15um"), "--of"),
-        (("--tolerance", "15um", "--of", "Q"), "a forward"),
-        (("--tolerance", "15kg", "--of", "A"), "15um"),
-        (("--tolerance", "-1", "--of", "A"), "above 0"),
-        (("--of", "A"), "--tolerance"),
-        (("--tolerance", "15um", "--of", "A", "--rule", "strict"), "guarded"),
-        (("--tolerance", "15um", "--of", "A", "--rule", "simple", "--guard", "2"), "guarded"),
-        (("--sign", "key.pem"), "--dcc"),
-        (("--dcc", "--sign", "key.pem"), "--certificate"),
-        (("--limit-mm", "5"), "scanner"),
-    ],
-)
-def test_options_that_say_nothing_are_refused(ask, folder, options, said):
-    code, document = ask("report", folder, *options)
-    assert code == 2 and said in str(assert_error(document, document["error"]["code"]))
 
 
 def test_a_signed_certificate_lies_beside_the_page(ask, folder, tmp_path):

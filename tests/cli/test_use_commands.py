@@ -177,15 +177,6 @@ def test_invalid_points_are_refused_with_line_and_column(ask, folder, tmp_path, 
     assert error["remedy"] and error["allowed"]
 
 
-def test_diverging_and_half_given_points_are_bad_input(ask, folder):
-    code, document = ask("locate", folder, "--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 150)
-    assert (code, document["error"]["code"]) == (2, "diverging")
-    for arguments in ((), ("--pan-steps", 100), (*POINT, "--points", "x.csv"), (*POINT, "--pan-approach", "up")):
-        assert ask("locate", folder, *arguments)[0] == 2
-    code, document = ask("locate", folder, "--pan-steps", "nan", "--tilt-steps", 20, "--aperture-deg", 70)
-    assert (code, document["error"]["code"]) == (2, "number")
-
-
 def test_budget_adds_up(ask, folder):
     code, document = ask("locate", folder, *POINT, "--budget")
     assert code == 0
@@ -253,26 +244,6 @@ def test_exports_are_read_back(folder, ask, say, tmp_path):
     assert load_calibration(path).steps_for(point).as_json() == exported.steps_for(point).as_json()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--export", "header", "--x-mm", 1, "--y-mm", 2, "--z-mm", 3), "--x-mm and --y-mm and --z-mm are"),
-        (("--export", "json", "--azimuth-deg", 3), "--azimuth-deg is"),
-        (("--x-mm", 700, "--y-mm", 2, "--z-mm", 3, "--out", "c.h"), "--out is"),
-    ],
-)
-def test_an_export_takes_no_target_and_a_target_no_file(ask, folder, options, message):
-    code, document = ask("steps-for", folder, *options)
-    assert (code, document["error"]["code"]) == (2, "usage")
-    assert document["error"]["message"].startswith(message) and "--export" in document["error"]["remedy"]
-
-
-@pytest.mark.parametrize("arguments", [(), ("--x-mm", 1, "--y-mm", 2), ("--azimuth-deg", 1), ("--export", "xml")])
-def test_steps_for_needs_one_target(ask, folder, arguments):
-    code, document = ask("steps-for", folder, *arguments)
-    assert (code, document["error"]["code"]) == (2, "usage")
-
-
 def test_damaged_results_are_refused_and_not_replaced(ask, folder):
     draws = folder / "results" / "draws.npz"
     draws.write_bytes(draws.read_bytes()[:1000])
@@ -297,18 +268,6 @@ def test_a_file_of_points_becomes_a_cloud(ask, say, folder, tmp_path, ending):
     assert code == 0 and "cloud.refused.csv" in text
     before = points.read_bytes()
     assert ask("locate", folder, "--points", points, "--cloud", points)[0] == 2 and points.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "remedy"),
-    [
-        ((*POINT, "--cloud", "c.ply"), "usage", "--points"),
-        (("--points", "looks.csv", "--cloud", "c.xyz"), "usage", ".ply"),
-    ],
-)
-def test_clouds_that_cannot_be_written_are_refused_with_a_remedy(ask, folder, options, code, remedy):
-    exit_code, document = ask("locate", folder, *options)
-    assert exit_code == 2 and document["error"]["code"] == code and remedy in document["error"]["remedy"]
 
 
 @pytest.mark.parametrize("kind", ["json", "header"])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.axes import drawn, runs
+from support.axes import runs
 
 from tvsbayes.comparison.axis_sessions import (
     compare_axes,
@@ -144,25 +144,3 @@ def test_axes_without_common_positions_are_not_compared(known):
     readings = tuple(reading for reading in narrow.readings if narrow.moves[reading.move].command > 2000.0)
     with pytest.raises(NothingToEstimate):
         shared_positions(known.rows, rows_of(replace(narrow, readings=readings)))
-
-
-@pytest.mark.thorough
-def test_drawn_axes_raise_no_more_alarms_than_stated():
-    """Forty second days of four axes: more than four alarms have a probability of 1e-4 at 1 %."""
-    alarms = 0
-    for seed in range(4):
-        axis = drawn(seed, cycles(2))
-        first = fit_axis(axis.campaign, sampled=False)
-        for day in range(10):
-            later = drawn_again(axis, seed * 100 + day)
-            alarms += watch_axis(first, later).verdict == MOVED
-    assert alarms <= 4
-
-
-def drawn_again(axis, seed: int) -> AxisCampaign:
-    """Fresh readings of a drawn axis after a homing."""
-    from tvsbayes.twin.simulated_axis import stops_of
-
-    rng, moves, u = np.random.default_rng(seed), cycles(1), axis.campaign.readings[0].u
-    value = stops_of(axis.truth, moves, rng) + u * rng.standard_normal(len(moves))
-    return replace(axis.campaign, moves=moves, readings=tuple(Reading(k, k, float(v), u) for k, v in enumerate(value)))

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
-import os
-import tracemalloc
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,8 +10,7 @@ import pytest
 from plyfile import PlyData
 from support.bent_rig import ROUNDING_MM, calibration
 
-from tvsbayes.coordinates import cloud_files
-from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
+from tvsbayes.coordinates.cloud import EvenSample, checked, cloud
 from tvsbayes.coordinates.cloud_files import cloud_place, columns_of, write_cloud
 from tvsbayes.coordinates.location import locate_linear
 from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOKS, LookRows, look_blocks
@@ -139,53 +135,6 @@ def test_what_fails_half_way_leaves_the_old_cloud(tmp_path):
     with pytest.raises(InputError) as refused:
         write_cloud([], tmp_path / "c.xyz", [])
     assert ".ply" in str(refused.value.remedy)
-
-
-@pytest.mark.parametrize("part", ["points", "cloud"])
-def test_a_full_disk_leaves_the_old_cloud_and_is_reported(tmp_path, monkeypatch, part):
-    def full(*_) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    if part == "points":
-        monkeypatch.setattr(cloud_files._Ply, "add", full)
-    else:
-        monkeypatch.setattr(cloud_files.shutil, "copyfileobj", full)
-    place = tmp_path / "c.ply"
-    place.write_text("old")
-    with pytest.raises(InputError, match="No space left") as refused:
-        write_cloud(cloud(calibration(), [looks(5)], {}), place, [])
-    assert (refused.value.code, refused.value.file) == ("write", str(place)) and refused.value.remedy
-    assert place.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
-
-
-def test_memory_does_not_grow_with_the_number_of_points(tmp_path):
-    one = calibration()
-
-    def peak(blocks: int) -> int:
-        tracemalloc.start()
-        stream = (looks(400, first_line=2 + 400 * k) for k in range(blocks))
-        write_cloud(cloud(one, EvenSample().of(stream), SIMPLE), tmp_path / "c.ply", ["nominal"])
-        peak_bytes = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return peak_bytes
-
-    peak(1)
-    # The refused ones are kept, a seventh of the looks: 200 bytes each.
-    assert peak(12) < 1.3 * peak(3) + 9 * 60 * 400
-
-
-@pytest.mark.parametrize("count", [1, CHECKED_MAX, 3 * CHECKED_MAX + 1])
-def test_the_sample_is_even_whatever_the_blocks(count):
-    rows = looks(count)
-    samples = []
-    for size in (count, 7):
-        sample = EvenSample()
-        parts = (LookRows(*(getattr(rows, name)[k : k + size] for name in vars(rows))) for k in range(0, count, size))
-        assert sum(len(part.lines) for part in sample.of(parts)) == count
-        samples.append(sample.looks)
-    assert samples[0] == samples[1] and len(samples[0]) <= CHECKED_MAX
-    stride = 1 if count <= CHECKED_MAX else 4
-    assert [look[0] for look in samples[0]] == list(rows.pan_steps[::stride])
 
 
 def test_the_law_is_checked_by_draws():

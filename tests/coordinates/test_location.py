@@ -22,15 +22,13 @@ from support.bent_rig import (
     twin_points,
     twin_ray_at,
 )
-from support.published_equations import published_point
 from support.waits import check_forward
 
 from tvsbayes.calibration.drawn_looks import drawn
 from tvsbayes.calibration.located_point import DIVERGING_SHARE
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.coordinates.location import BLOCK, carry, locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
-from tvsbayes.statistics.intervals import NORMAL_95
 
 A_MM = 200.0
 
@@ -178,17 +176,6 @@ def test_impossible_arguments_are_refused():
     assert (caught.value.code, caught.value.column) == ("approach", "pan_approach")
 
 
-def test_draws_are_chosen_evenly_or_used_again():
-    one = calibration(noise_spread=0.0)
-    few, all_, more = (drawn(one, n, 0).inputs[:, : len(INPUT_NAMES)] for n in (500, DRAWS, DRAWS + 7))
-    np.testing.assert_array_equal(few[[0, -1]], one.inputs[[0, -1]])
-    assert len({tuple(row) for row in few}) == 500
-    np.testing.assert_array_equal(all_, one.inputs)
-    np.testing.assert_array_equal(more, np.concatenate([one.inputs, one.inputs[:7]]))
-    noise = drawn(one, DRAWS + 7, 0).noise
-    assert not np.any(noise[:7] == noise[DRAWS:]), "rows that come again get other noises"
-
-
 def test_the_law_is_validated_near_and_refuted_far():
     # The law holds the sds of the noises still; here they are.
     small = {name: 0.02 * sd for name, sd in NOISE_DEG.items()}
@@ -208,12 +195,6 @@ C_DEG, B_DEG = 80.0, 75.0
 """Angles at which the sensitivities are checked; the beam leaves from the baseline, level."""
 
 
-PLAIN = NOMINAL | {"mirror_offset_mm": 0.0, "pan_zero_emission_deg": C_DEG, "backlash_deg.pan": 0.4}
-
-
-PLAY_DEG = 0.4
-
-
 def sensitivities() -> dict[str, np.ndarray]:
     """Per degree of angle and per mm of a."""
     B, C = np.radians([B_DEG, C_DEG])
@@ -228,47 +209,3 @@ def sensitivities() -> dict[str, np.ndarray]:
         "a": np.array([x, y, 0.0]) / A_MM,
         "tilt": np.array([0.0, 0.0, math.pi / 180 * x / math.sin(C)]),
     }
-
-
-ALONE = {
-    "stop_sd_deg.left": ("C", ("left", "up")),
-    "stop_sd_deg.right": ("C", ("right", "up")),
-    "stop_sd_deg.up": ("tilt", ("left", "up")),
-    "stop_sd_deg.down": ("tilt", ("left", "down")),
-    "aperture_sd_deg": ("B", ("left", "up")),
-    "baseline_mm": ("a", ("left", "up")),
-    "pan_zero_emission_deg": ("C", ("left", "up")),
-    "aperture_zero_deg": ("B", ("left", "up")),
-    "play": ("C", ("unknown", "up")),
-}
-
-
-@pytest.mark.parametrize("cause", ALONE)
-def test_each_cause_alone_has_its_sensitivity(cause):
-    """The counter brings the beam to C whatever the play: the side's half play is taken back."""
-    quantity, approach = ALONE[cause]
-    u = 0.01
-    # No exact zeros: the root mean square of two sds has no derivative there.
-    noise = dict.fromkeys(NOISE_NAMES, 1e-9) | ({cause: u} if cause in NOISE_NAMES else {})
-    one = calibration(PLAIN, {cause: u} if cause in INPUT_NAMES else {}, noise, noise_spread=0.0)
-    side = {"left": 1.0, "right": -1.0, "unknown": 0.0}[approach[0]]
-    steps = 0.5 * side * PLAY_DEG / PLAIN["degrees_per_step.pan"]
-    if cause in INPUT_NAMES:
-        u = math.sqrt(one.covariance[INPUT_NAMES.index(cause), INPUT_NAMES.index(cause)])
-    if cause == "play":
-        u = PLAY_DEG / math.sqrt(12)
-    one = replace(one, mean=np.array([PLAIN[name] for name in INPUT_NAMES]))
-    slope = sensitivities()[quantity]
-    expected = u**2 * np.outer(slope, slope)
-    law = locate_linear(one, settings_of(steps, 0.0, B_DEG, approach))
-    # The mirror offset is zero and the elevation level: what is left is rounding.
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(law.covariance[0] / scale, expected / scale, atol=1e-9)
-    np.testing.assert_allclose(law.value[0], published_point(B_DEG, C_DEG, 0.0, A_MM), atol=ROUNDING_MM)
-    numpy = one.locate(steps, 0.0, B_DEG, approach).covariance_mm2
-    np.testing.assert_allclose(numpy / scale, expected / scale, atol=1e-9)
-    point = locate(one, steps, 0.0, B_DEG, approach, draws=DRAWS)
-    # 1.96 of a normal, 0.95 sqrt(3) of a uniform distribution; a half width of n draws errs by 2.67 / sqrt(2 n) sd.
-    wide = 0.95 * math.sqrt(3) if cause == "play" else NORMAL_95
-    bound = 5 * 2.67 / math.sqrt(2 * DRAWS) * u * np.abs(slope).max()
-    assert np.abs(point.u95_mm[0] - wide * u * np.abs(slope)).max() < bound

@@ -12,15 +12,9 @@ from tvsbayes.errors import InputError
 from tvsbayes.estimators.findings import Finding, mending_command, stop_at
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.results.records import plain
 
 DOUBT = Finding("units", "is it in metres?")
 SIGN = Finding("counter-sign", "spots move right", "flip it", True, "moves.csv", 7)
-
-
-def test_doubts_stop_nothing():
-    stop_at([], "go on")
-    stop_at([DOUBT, DOUBT], "go on")
 
 
 def test_what_is_certain_stops_with_where_and_what_to_do():
@@ -31,11 +25,6 @@ def test_what_is_certain_stops_with_where_and_what_to_do():
     assert (error.code, error.exit_code, error.file, error.line) == ("counter-sign", 2, "moves.csv", 7)
     assert error.message == "spots move right; left is right"
     assert error.remedy == "flip it; exchange them; --anyway goes on"
-
-
-def test_a_sentence_has_its_remedy():
-    assert SIGN.sentence == "spots move right; flip it" and DOUBT.sentence == "is it in metres?"
-    assert plain(SIGN)["certain"] is True and plain(SIGN)["line"] == 7
 
 
 @pytest.mark.parametrize(

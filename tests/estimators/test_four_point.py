@@ -17,10 +17,8 @@ from support.written_rows import move_row, spot_row
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import (
     classic,
-    four_point_angle_deg,
     four_point_ratios,
     ratio_deg_per_step,
-    ratio_slopes,
     select_experiments,
     stereo_variance,
 )
@@ -108,14 +106,6 @@ def test_undistortion_converges_to_the_corners():
     assert np.max(np.abs(five - pixels)) > 100, "the distortion of this test is strong at the corners"
 
 
-def test_undistortion_reports_a_pixel_without_origin():
-    """Beyond the radius where the polynomial turns back there is no answer: NaN, not a guess."""
-    camera = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
-    folding = np.array([-0.5, 0.0, 0.0, 0.0, 0.0])  # r (1 - r^2/2) peaks at 0.544
-    result = undistort(np.array([[640.0 + 800 * 0.5, 360.0], [640.0 + 800 * 0.6, 360.0]]), camera, folding)
-    assert np.isfinite(result[0]).all() and np.isnan(result[1]).all()
-
-
 @pytest.mark.parametrize("focal_scale", [1.0, 1.004])
 def test_triangulation_inverts_projection(focal_scale: float):
     """Points all over the shared field come back, with the same focal scale on both sides."""
@@ -126,35 +116,6 @@ def test_triangulation_inverts_projection(focal_scale: float):
     inside = np.isfinite(pixels).all(axis=1)
     assert inside.sum() > 150
     assert np.abs(triangulate(stereo, pixels[inside], focal_scale) - points[inside]).max() < ROUNDING_MM
-
-
-def test_directions_follow_the_sign_of_the_move():
-    """Left and up are positive counters; every sane ratio is positive."""
-    result = classic(
-        make_campaign(
-            [
-                ("pan", 200, 0.0, 12.0),
-                ("pan", -200, 12.0, 0.0),
-                ("tilt", 200, -7.0, 7.0),
-                ("tilt", -200, 7.0, -7.0),
-            ]
-        )
-    )
-    assert [(e.direction, e.steps) for e in result.experiments] == [
-        ("left", 200), ("right", -200), ("up", 200), ("down", -200)
-    ]  # fmt: skip
-    ratios = [e.deg_per_step for e in result.experiments]
-    assert ratios == pytest.approx([0.06, 0.06, 0.07, 0.07], abs=ROUNDING_DEG)
-
-
-def test_tilt_is_read_in_the_xz_plane_of_the_stereo_frame():
-    """A beam at azimuth az shows tan(el)/cos(az): the paper's reading, kept as it is."""
-    azimuth, elevations = np.radians(27.0), np.radians([2.0, 12.0])
-    beam = np.stack([[np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)] for e in elevations])
-    points = np.stack([beam[0] * 100, beam[0] * 300, beam[1] * 300, beam[1] * 100])
-    angles = four_point_angle_deg(points, "tilt")
-    expected = np.degrees(np.arctan(np.tan(elevations) / np.cos(azimuth)))
-    assert [angles.theta_i_deg, angles.theta_f_deg] == pytest.approx(expected, abs=1e-12)
 
 
 def test_statistics_of_known_ratios():
@@ -251,31 +212,6 @@ def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
     # The near and far points share the intercept, which scales with depth and leaves the slope alone.
     assert ratio == pytest.approx((angles[1] - angles[0]) / 200, abs=ROUNDING_DEG)
     assert ratio / 0.0595 - 1 == pytest.approx(-0.0033, abs=0.00005)  # two digits
-
-
-def test_slopes_by_pixels_are_those_of_the_closed_form():
-    """Ideal parallel cameras: depth and width by the disparity in one row, differentiated by the complex step.
-
-    Vertical pixels count for nothing in a pan; the DLT agrees with the closed form in them, where both rows are equal,
-    to first order.
-    """
-    pixels = project(four_points(18.5, 30.4, "pan"), IDEAL).reshape(4, 4)
-
-    def ratio(spots: np.ndarray) -> complex:
-        left, right = ((spots[:, k] - m[0, 2]) / m[0, 0] for k, m in ((0, IDEAL.M1), (2, IDEAL.M2)))
-        depth = 85.0 / (left - right)
-        across = -left * depth
-        after, before = ((across[j] - across[i]) / (depth[j] - depth[i]) for i, j in ((3, 2), (0, 1)))
-        return np.degrees(1) * (np.arctan(after) - np.arctan(before)) / 200
-
-    step = 1e-30
-    expected = [
-        [ratio(pixels + 1j * step * np.eye(16)[4 * p + k].reshape(4, 4)).imag / step for k in (0, 2)] for p in range(4)
-    ]
-    slopes = ratio_slopes(pixels, np.array([200]), "pan", IDEAL)
-    assert slopes.ratio[0] == pytest.approx(ratio(pixels).real, abs=ROUNDING_DEG)
-    # A difference quotient over 0.01 px of what bends within 10 px: 1e-3 at most.
-    assert slopes.by_pixel[0][:, [0, 2]] == pytest.approx(np.array(expected), rel=1e-3)
 
 
 def test_a_step_out_of_the_lens_model_is_shortened():

@@ -8,12 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.estimators.joint_fit import DIAGNOSING, NEWTON, fit
+from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
-from tvsbayes.estimators.mode_search import SEARCHING
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import ModelChoice
@@ -38,11 +36,6 @@ def with_priors(campaign: Campaign, **priors: Prior) -> Campaign:
     return replace(campaign, rig=replace(campaign.rig, priors={**campaign.rig.priors, **named}))
 
 
-def test_a_fit_reports_what_it_does(mixed_fit, mixed_waits):
-    check_forward(mixed_waits)
-    assert doings(mixed_waits)[-3:] == [SEARCHING, NEWTON, DIAGNOSING]
-
-
 def test_truth_is_found_within_its_uncertainty(mixed_run, mixed_fit):
     """Ratios, play, optics, the noise of pixels and stops."""
     assert mixed_fit.converged, mixed_fit.problems
@@ -63,13 +56,6 @@ def test_truth_is_found_within_its_uncertainty(mixed_run, mixed_fit):
     offset = effective_mirror_offset_mm(true, pose)
     spread = mixed_fit.draws["effective_mirror_offset_mm"].std()
     assert abs(mixed_fit.mode["effective_mirror_offset_mm"] - offset) < FAR * spread
-
-
-def test_the_data_shrink_the_ratios_a_hundredfold(mixed_fit):
-    prior = mixed_fit.prior_draws.effective_deg_per_step.std(axis=0)
-    posterior = mixed_fit.draws.effective_deg_per_step.std(axis=0)
-    # The prior is 0.01 deg/step, stereo and focal scale leave 0.3 to 0.5 % of 0.06.
-    assert np.all(posterior < prior / 30)
 
 
 @pytest.mark.thorough

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.dense_likelihood import dense_log_density, drawn_at_every_move, physical, play_band_deg, stop_labels
+from support.dense_likelihood import dense_log_density
 
 from experiments.common.jax_density import log_density, without_padding
 from tvsbayes.estimators import likelihood as density
-from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, spot_constants
+from tvsbayes.estimators.campaign_arrays import campaign_arrays, spot_constants
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import ordered_spots
@@ -44,22 +43,6 @@ def astray(dozen) -> np.ndarray:
     for name, offset in (("rotation_rad.x", 10), ("rotation_rad.z", -10), ("translation_mm.y", 12)):
         z[INDEX[f"extrinsics.{name}"]] += offset
     return z
-
-
-def test_dozen_exercises_every_state(dozen, evaluate):
-    """The comparison below means something: shared stops, home offsets, unknown play, readings, correlations."""
-    campaign, values = dozen.campaign, physical(evaluate(dozen.z, dozen.space, dozen.arrays))
-    looked = [s.move for s in ordered_spots(campaign)]
-    assert 12 <= len(looked) <= 16
-    for axis in ("pan", "tilt"):
-        numbers = [stop_labels(campaign.moves, axis)[m][0] for m in looked]
-        across_moves = [a == b and m != k for (a, m), (b, k) in pairwise(zip(numbers, looked, strict=True))]
-        assert any(across_moves), f"no {axis} stop is held while the other axis moves"
-        widths = play_band_deg(campaign.moves, axis, values)[looked]
-        assert len(set(np.round(widths[widths > 0], 6))) > 1, f"no {axis} band of play that narrows"
-    assert {m.segment for m in campaign.moves} == {0, 1, 2}
-    assert {s.aperture_deg is None for s in campaign.spots} == {True, False}
-    assert {s.ruv_left for s in campaign.spots} == {0.0, 0.4}
 
 
 @pytest.mark.parametrize("offset_sds", [0.0, 0.3, 1.0])
@@ -142,15 +125,6 @@ def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
     assert cut + 0.5 * dozen.z @ dozen.z == pytest.approx(whole, abs=FINE_UNIT, rel=1e-12)
 
 
-def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
-    """The mistake formulation 3.1 names: new draws of both axes at every move."""
-    mistaken = drawn_at_every_move(dozen.campaign, dozen.arrays)
-    right, wrong = (evaluate(dozen.z, dozen.space, arrays) for arrays in (dozen.arrays, mistaken))
-    dense = dense_log_density(dozen.campaign, right, persistent=False)
-    assert wrong.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
-    assert abs(wrong.log_likelihood - right.log_likelihood) > 0.5 * LOG_UNIT
-
-
 @pytest.mark.thorough
 def test_padding_changes_nothing(grid_campaign, monkeypatch):
     """Against the length that users have."""
@@ -166,20 +140,6 @@ def test_padding_changes_nothing(grid_campaign, monkeypatch):
     np.testing.assert_allclose(two.place_errors_rad, one.place_errors_rad, atol=FINE_UNIT * 1e-3)
     moves = len(grid_campaign.moves)
     assert np.all(long.moves.steps[moves:] == long.moves.steps[moves - 1])
-
-
-def test_bucket_sizes():
-    assert [bucket(n, 512) for n in (1, 512, 513, 4000)] == [512, 512, 1024, 4096]
-
-
-def test_order_of_rows_is_irrelevant(dozen):
-    """spots.csv may list its rows in any order; what is not ok is not read."""
-    spots = list(dozen.campaign.spots)
-    np.random.default_rng(3).shuffle(spots)
-    refused = replace(spots[0], spot=999, status="saturated", u_left_px=-1e6, v_right_px=None)
-    shuffled = campaign_arrays(replace(dozen.campaign, spots=(refused, *spots)))
-    for one, two in zip(jax.tree.leaves(dozen.arrays), jax.tree.leaves(shuffled), strict=True):
-        np.testing.assert_array_equal(one, two)
 
 
 def test_excluded_spot_leaves_no_trace(dozen, evaluate):

@@ -23,7 +23,7 @@ from support.dense_likelihood import (
     side,
     stop_labels,
 )
-from support.varying_gears import PERIODS_DEG, coordinates_with, perfect_gears, varying_gears
+from support.varying_gears import PERIODS_DEG, coordinates_with, varying_gears
 
 from tvsbayes.estimators import likelihood
 from tvsbayes.estimators.annealed_stage import Fixed, linear_campaign
@@ -104,17 +104,6 @@ def test_log_density_is_that_of_the_dense_gaussian(varying, point):
     assert point.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
 
 
-def test_every_scale_matters(varying, point):
-    """Each error left out of the dense covariance is seen a thousand times above what the comparison allows."""
-    dense = dense_log_density(varying.campaign, point)
-    for name, value in point.values.items():
-        scale = any(part in name for part in ("transmission_error", "play_var", "drift", "amplitude", "scatter"))
-        if not scale or value < 1e-9:
-            continue
-        other = dense_log_density(varying.campaign, point, {**point.values, name: value * 1.1})
-        assert abs(other - dense) > 1e3 * FINE_UNIT, name
-
-
 def dense_places(varying: Varying, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
     """Prior covariance of errors at the places, rad^2, and what each does to the angles of spots, (2, spots, errors).
 
@@ -182,21 +171,6 @@ def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying,
     np.testing.assert_allclose(root.T @ value, slope, atol=ALGEBRA * np.abs(slope).max())
     curvature = jacobian.T @ solved[:, 1:] + np.eye(len(NAMES))
     np.testing.assert_allclose(root.T @ root, curvature, atol=ALGEBRA * np.abs(curvature).max())
-
-
-def test_scales_of_zero_are_perfect_gears(varying, dozen, evaluate):
-    """With all scales zero the density is that of a campaign that has no places at all."""
-    table = perfect_gears(dozen.campaign.rig)
-    assert not campaign_arrays(dozen.campaign, table).gears.filled
-    with jax.enable_x64(True):
-        arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
-        space = jax.tree.map(jnp.asarray, parameter_space(table, dozen.campaign.stereo))
-        none = {n: 0.0 for n in SCALES["rough"] if "length" not in n}
-        at_zero = found_at(evaluate, varying, coordinates_with(varying.space, varying.z, none))
-        z = coordinates_of(space, physical_at(varying.z, varying.space).value)
-        perfect = evaluate(z, space, arrays).log_likelihood
-    # What is left is the floor of 1e-12 rad under every place: with slopes of 1e4 per rad 1e-16 of a variance.
-    assert at_zero.log_likelihood == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)
 
 
 def test_errors_that_the_priors_fix_have_no_column(varying, evaluate):

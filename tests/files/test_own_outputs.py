@@ -86,11 +86,6 @@ def test_a_page_replaces_pages_only(ask, say, axis, tmp_path, no_pictures):
     check_kept(ask, say, ("report", axis), tmp_path / "page.html")
 
 
-@pytest.mark.thorough
-def test_a_plan_replaces_plans_only(ask, say, axis, tmp_path):
-    check_kept(ask, say, ("plan", "--given", axis), tmp_path / "plan.csv")
-
-
 @pytest.mark.parametrize("command", ["compensate --to csv", "plan --given", "report"])
 def test_force_without_an_output_is_refused(ask, axis, command):
     name, *rest = command.split()

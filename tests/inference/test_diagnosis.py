@@ -13,7 +13,7 @@ from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, autoregres
 
 from tvsbayes.inference.chain import GROUPS, Chain, better
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT, autocorrelation_steps, diagnose, grouped
+from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT, autocorrelation_steps, diagnose
 from tvsbayes.inference.importance import Sample
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.results.convergence import Convergence, Importance, NamedValue, Reweighted
@@ -162,22 +162,6 @@ def test_a_chain_that_says_something_else_is_known_no_better_than_both_agree(jud
     (message,) = sample.convergence.missing
     words = f"emcee and importance sampling differ on {agreement.worst.quantity} by {agreement.worst.value:.1f} Monte"
     assert message.startswith(words)
-
-
-def test_where_every_headline_is_fixed_the_others_must_agree(judged, monkeypatch):
-    """A rig whose geometry is stated as known: the campaign determines its noise."""
-    monkeypatch.setattr(TwoNormals, "headlines", ("effective_mirror_offset_mm",))
-    assert judged(chain_of(independent()), weighted()).convergence.converged
-    sample = judged(chain_of(independent()), weighted(-0.15))
-    assert sample.convergence.missing and NAMES[RATIO] in sample.convergence.agreement.worst.quantity
-
-
-def test_groups_are_neighbours_in_order_of_time():
-    """Of eight walkers, two each: their draws alternate, the first of both before the second of both."""
-    values = 10 * np.arange(2 * GROUPS)[:, None] + np.arange(3)
-    groups = grouped(values)
-    assert groups.shape == (GROUPS, 6)
-    np.testing.assert_array_equal(groups[1], [20, 30, 21, 31, 22, 32])
 
 
 @pytest.mark.parametrize(

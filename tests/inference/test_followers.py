@@ -76,18 +76,6 @@ def test_new_values_of_some_coordinates_leave_a_pair_as_it_is():
         assert np.all(np.abs(first.mean(axis=0) - last.mean(axis=0)) < SIGMAS * scatter)
 
 
-def test_between_two_nodes_the_tables_are_mixed():
-    followers = followed().followers
-    w = np.column_stack([np.full(len(GRID), LEADER_NODES[2] + 0.25 * (LEADER_NODES[1] - LEADER_NODES[0])), GRID])
-    low, high = (np.exp(Tables(followers.log_density[0][[node]]).at(GRID[:, None]))[:, 0] for node in (2, 3))
-    np.testing.assert_allclose(np.exp(followers.at(w)[:, 0]), 0.75 * low + 0.25 * high, rtol=1e-12)
-    # Beyond the outermost nodes the outermost tables stay.
-    for end, node in ((-9.0, 0), (11.0, -1)):
-        w[:, 0] = end
-        expected = Tables(followers.log_density[0][[node]]).at(GRID[:, None])
-        np.testing.assert_allclose(followers.at(w), expected, rtol=1e-12)
-
-
 def effective_share(target, dimension: int) -> float:
     """Of draws from the first proposal, all coordinates tabulated."""
     proposal = first_proposal(target, dimension, np.ones(dimension, bool), np.zeros(dimension, bool))
@@ -110,18 +98,6 @@ def test_a_pair_that_explains_the_same_scatter_is_proposed_as_the_target_has_it(
     assert followed > 0.2 > 20 * effective_share(target, 2)
 
 
-def test_two_followers_that_mend_one_misfit_are_counted_once():
-    """Three variances of which only the sum is known: where the leader's is small, either of the others is enough."""
-
-    def target(w: np.ndarray) -> np.ndarray:
-        variance = np.exp(w) @ [0.5, 0.1, 0.1]
-        return -0.5 * np.sum(w**2, axis=1) - 20 * (np.log(variance) + 0.7 / variance)
-
-    assert {leader for leader, _ in forest(target, np.arange(3), 3)} == {0}
-    # Counted twice, the leader would be drawn where nothing is: a share of 1e-4.
-    assert effective_share(target, 3) > 0.2
-
-
 def test_coordinates_follow_those_that_they_depend_on_most(monkeypatch):
     """A chain of three, the middle one known by both others, and a fourth that depends on none."""
 
@@ -137,25 +113,6 @@ def test_coordinates_follow_those_that_they_depend_on_most(monkeypatch):
     followed = effective_share(target, 4)
     monkeypatch.setattr("tvsbayes.inference.proposal.forest", lambda *_: [])
     assert followed > 0.3 > 2 * effective_share(target, 4)
-
-
-def test_fitting_tilts_the_tables_of_followers():
-    """A target that is the proposal times e^0.2 w of the follower: every row of its tables turns by that."""
-    proposal = followed()
-    w = proposal.draw(20_000, np.random.RandomState(6))
-    tilt = 0.2 * w[:, 1]
-    fitted = proposal.fitted(w, proposal._each(w).sum(axis=1) + tilt, tilt)
-    # Beyond four sds a tilt does not grow.
-    mean, sd = proposal.mean[1], proposal.sd[1]
-    turned = 0.2 * (mean + sd * np.clip((NODES - mean) / sd, -4, 4))
-    expected = Tables.normalised(proposal.followers.log_density[0] + turned).log_density
-    inside = np.abs(NODES - mean) < 4 * sd
-    # The few draws out there are seen at four sds, which turns the regression by a few per cent.
-    tilted = fitted.followers.log_density[0][:, inside]
-    np.testing.assert_allclose(tilted, expected[:, inside], atol=0.1)
-    assert np.abs(tilted - proposal.followers.log_density[0][:, inside]).max() > 0.5
-    masses = Tables(fitted.followers.log_density[0]).masses.sum(axis=1)
-    np.testing.assert_allclose(masses, 1.0, rtol=1e-9)
 
 
 def test_between_cuts_a_density_goes_on_as_it_does_at_them():
@@ -191,13 +148,3 @@ def test_a_hole_between_cuts_swings_nothing_above_its_neighbours():
     # The inner one, at 2, is filled to the lower of its neighbours, at 3.
     at = np.argmin(np.abs(NODES - CUT_NODES[inner]))
     assert values[at] == pytest.approx(-0.5 * CUT_NODES[inner + 1] ** 2)
-
-
-def test_a_cliff_far_from_the_mode_leaves_the_density_beside_it_as_it_is():
-    """Where the map's steps diverge a target falls by 1e15: Akima's weights must not take all other slopes as equal."""
-    cuts = -0.5 * CUT_NODES**2
-    cuts[CUT_NODES >= 5] = [-7e2, -3e4, -5e15]
-    values = between_cuts(cuts[None])[0]
-    # Akima weighs the slope before a node by how far the two after it differ: those of the cliff by 700 against 1.
-    np.testing.assert_allclose(values[NODES < 3], -0.5 * NODES[NODES < 3] ** 2, atol=0.2)
-    assert np.all(values[NODES >= 3] <= cuts[CUT_NODES == 3])

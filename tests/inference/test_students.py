@@ -95,12 +95,6 @@ def test_numbers_of_what_is_integrated_out_are_of_the_seed_and_of_no_other_round
     assert len(begun) > 3 * 6 and len(set(numbers)) == len(numbers)
 
 
-def test_a_seed_gives_the_same_numbers_whatever_is_integrated_out():
-    one, again = (weighted_run(Integrating(bent, 0.1), 1, pilots_max=3).pool.drawn for _ in range(2))
-    np.testing.assert_array_equal(one.parts["beside"], again.parts["beside"])
-    np.testing.assert_array_equal(one.w, weighted_run(Toy(bent, 0.1), 1, pilots_max=3).pool.drawn.w)
-
-
 @pytest.mark.parametrize("which", [0, 1])
 def test_its_steps_keep_the_target(which):
     mixture = StudentMixture.about(np.zeros(2), np.eye(2))

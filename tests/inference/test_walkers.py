@@ -9,13 +9,12 @@ from __future__ import annotations
 import emcee
 import numpy as np
 import pytest
-from support.small_posterior import ROUNDING, SIGMAS
+from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
 from tvsbayes.inference.chain import GROUPS
 from tvsbayes.inference.proposal import Independence
 from tvsbayes.inference.walkers import GroupEvolution, moves
-from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.target import WALKERS, walkers_for
 
 RESOLVED = 0.05
@@ -81,40 +80,6 @@ def test_differential_evolution_keeps_the_target(dimension):
     move, _ = moves(off_target(dimension))[2]
     assert isinstance(move, GroupEvolution)
     assert bias(run(move, dimension, EVOLUTION_STEPS[dimension], max(64, 2 * dimension))) == ""
-
-
-def test_the_moves_are_the_three_of_this_test():
-    mixture = moves(off_target(3))
-    assert [type(move) for move, _ in mixture] == [emcee.moves.MHMove, emcee.moves.MHMove, GroupEvolution]
-    assert sum(share for _, share in mixture) == pytest.approx(1.0, abs=len(mixture) * ROUNDING)
-
-
-@pytest.mark.parametrize("which", ["independence", "renewal"])
-def test_a_wrong_sign_of_the_factor_is_seen(which):
-    dimension = 5
-    proposal = off_target(dimension)
-    right = {"independence": proposal, "renewal": proposal.renewed}[which]
-
-    def wrong(w, generator):
-        proposed, factor = right(w, generator)
-        return proposed, -factor
-
-    chain = run(emcee.moves.MHMove(wrong), dimension, INDEPENDENT_STEPS[dimension], walkers_for(dimension))
-    assert "E[x.x]/d" in bias(chain)
-    # statistics.md: sd x0.52 and x0.44.
-    assert np.mean(chain**2) < 0.6
-
-
-def test_walkers_that_move_together_are_seen():
-    # emcee 3.1.6 adds one vector to all walkers when a Gaussian move has a full covariance.
-    assert "Var(mean of ensemble)" in bias(run(emcee.moves.GaussianMove(np.eye(1)), 1, INDEPENDENT_STEPS[1], 64))
-
-
-def test_walkers_are_half_the_dimensions_or_more_in_whole_batches():
-    for dimension in range(1, 200):
-        walkers = walkers_for(dimension)
-        assert 2 * walkers >= dimension and walkers >= WALKERS
-        assert walkers % (2 * BATCH) == 0
 
 
 def test_groups_never_use_one_another():

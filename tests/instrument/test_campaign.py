@@ -14,11 +14,8 @@ from support.written_rows import move_row
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import (
     Campaign,
-    Spot,
     input_hashes,
-    parse_spots,
     read_campaign,
-    spots_bytes,
     write_campaign,
 )
 from tvsbayes.instrument.copies import refuse_same_looks
@@ -125,12 +122,6 @@ def test_bom_crlf_order_of_rows_and_columns(tmp_path):
     assert read_campaign(tmp_path / "c").spots == again.spots[::-1]
 
 
-def test_a_campaign_may_have_no_spots_yet(tmp_path):
-    campaign = dataclasses.replace(small_campaign(), spots=())
-    write_campaign(campaign, tmp_path / "c")
-    assert read_campaign(tmp_path / "c").spots == ()
-
-
 def test_a_campaign_has_its_stated_title():
     """Otherwise that of its folder; titles of earlier templates are ignored, and a folder's name is untrusted."""
     campaign = dataclasses.replace(small_campaign(), path=Path("/data/rig 7"))
@@ -170,27 +161,6 @@ def test_hashes_cover_data_and_no_names(tmp_path):
         assert {key for key in reference if changed[key] != reference[key]} == {name}
 
 
-def test_transmission_error_is_written_read_and_hashed(tmp_path):
-    campaign = small_campaign()
-    hashes = {input_hashes(campaign)["rig"]}
-    for number, (priors, periods) in enumerate(
-        [
-            ({}, {"pan": (30.0,)}),
-            ({}, {"pan": (40.0, 2.5)}),
-            ({"harmonic_deg.pan.2.cos": Prior(0.01, 0.1)}, {"pan": (30.0,)}),
-            ({"harmonic_deg.tilt.1.sin": Prior(0.0, 0.1)}, {"pan": (30.0,), "tilt": (360.0,)}),
-        ]
-    ):
-        table = dataclasses.replace(campaign.rig, priors={**campaign.rig.priors, **priors}, harmonic_period_deg=periods)
-        wobbling = dataclasses.replace(campaign, rig=table)
-        write_campaign(wobbling, tmp_path / str(number))
-        again = read_campaign(tmp_path / str(number))
-        assert_same(wobbling, again)
-        assert again.rig == table
-        hashes.add(input_hashes(again)["rig"])
-    assert len(hashes) == 5
-
-
 @pytest.mark.parametrize(("name", "moves", "spots"), [("rig_a", 195, 384), ("rig_b", 145, 144), ("rig_c", 195, 384)])
 def test_campaigns_of_unknown_rigs(tmp_path, name, moves, spots):
     if not (UNKNOWN_RIGS / name).is_dir():
@@ -200,31 +170,6 @@ def test_campaigns_of_unknown_rigs(tmp_path, name, moves, spots):
     assert campaign.rig.priors["mirror_offset_mm"] == Prior(30.0, 2.0)
     write_campaign(campaign, tmp_path / name)
     assert_same(campaign, read_campaign(tmp_path / name))
-
-
-@pytest.mark.thorough
-def test_forty_thousand_spots_and_more_are_read():
-    campaign = small_campaign()
-    base = campaign.spots[4]
-    spots = [dataclasses.replace(base, spot=i, u_left_px=100.0 + i / 1000) for i in range(40_000)]
-    again = parse_spots(spots_bytes(spots), "spots.csv", campaign.moves, campaign.stereo)
-    assert list(again) == spots
-
-
-def test_a_refused_spot_keeps_its_pixels(tmp_path):
-    write_campaign(small_campaign(), tmp_path / "c")
-    undetected, refused = read_campaign(tmp_path / "c").spots[6:]
-    assert (undetected.status, undetected.u_left_px, undetected.su_left_px) == ("undetected", None, None)
-    assert (refused.status, refused.v_left_px) == ("saturated, 41 px", 1e4)
-
-
-def test_records_are_hashable_and_small():
-    # Frozen, slotted records: 40 000 spots are small and cannot be changed during an estimate.
-    assert not hasattr(small_campaign().spots[0], "__dict__")
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        small_campaign().spots[0].u_left_px = 1.0  # type: ignore[misc]
-    assert len({*small_campaign().spots, *small_campaign().spots}) == len(small_campaign().spots)
-    assert Spot.__slots__
 
 
 def test_looks_that_were_seen_before_are_refused():

@@ -2,12 +2,11 @@
 
 from dataclasses import replace
 
-import pytest
 from support.small_campaign import small_campaign
 from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.homing import ANYWHERE, every_way, has_play, homed, prior_chance, unrecorded, ways
+from tvsbayes.instrument.homing import ANYWHERE, has_play, homed, unrecorded
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.rig import RigTable
 
@@ -33,19 +32,6 @@ def test_no_way_of_homing_is_weighed_of_an_absolute_encoder_or_without_play():
     assert unrecorded(unknown, RigTable(absolute=("pan",))) == ("tilt",)
     tight = dict.fromkeys(("backlash_deg.tilt", "play_variation_deg.tilt"), none)
     assert unrecorded(unknown, RigTable(tight)) == ("pan",)
-
-
-@pytest.mark.parametrize("axis", ["pan", "tilt"])
-def test_chances_of_an_axis_sum_to_one(axis):
-    # Three numbers of two digits: exact except for rounding.
-    assert sum(ways(axis).values()) == pytest.approx(1.0, abs=1e-15)
-    assert ways(axis)[ANYWHERE] == pytest.approx(0.1, abs=1e-15)
-
-
-def test_every_combination_once():
-    choices = every_way(("pan", "tilt"))
-    assert len(choices) == 9 and len({tuple(sorted(sides.items())) for sides in choices}) == 9
-    assert sum(map(prior_chance, choices)) == pytest.approx(1.0, abs=1e-14)
 
 
 def test_only_unknown_approaches_are_replaced():

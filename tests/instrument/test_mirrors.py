@@ -8,18 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from support.printed_vector import VECTOR
 
 from tvsbayes.instrument.mirrors import (
     Mirror,
     Optics,
     Ray,
-    Turn,
     Vectors,
     beam_path,
-    intersect_plane,
-    reflect,
     reflected,
 )
 from tvsbayes.instrument.parameters import BLOCKS, OPTICS_NAMES
@@ -51,63 +47,11 @@ def unit_vectors(seed: int, count: int = 50) -> Vectors:
     return drawn * (1 / np.sqrt(drawn.dot(drawn)))
 
 
-@pytest.mark.parametrize("functions", [np, jnp])
-@pytest.mark.usefixtures("x64")
-def test_a_turn_is_the_rotation_about_z(functions):
-    many, angles = vectors(2, 20), np.linspace(-np.pi, np.pi, 20)
-    turn = Turn.by(functions.asarray(angles), functions)
-    turned = turn.forward(many)
-    expected = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).apply(many.stacked().T).T
-    np.testing.assert_allclose(Vectors(*map(np.asarray, turned)).stacked(), expected, atol=4 * ROUNDING)
-    np.testing.assert_allclose(turn.back(turned), many, atol=4 * ROUNDING)
-
-
 def test_products_of_vectors():
     first, second = np.random.default_rng(3).standard_normal((2, 3, 5, 7))
     one, other = Vectors.of(first), Vectors.of(second)
     np.testing.assert_allclose(one.dot(other), np.sum(first * second, axis=0), atol=10 * ROUNDING)
     np.testing.assert_allclose(one.cross(other).stacked(), np.cross(first, second, axis=0), atol=10 * ROUNDING)
-
-
-@pytest.mark.parametrize("factor", [2.0, 2, np.float64(2.0), np.full(50, 2.0), jnp.full(50, 2.0)])
-@pytest.mark.usefixtures("x64")
-def test_a_factor_stands_on_either_side(factor):
-    """A tuple would be repeated, and an array would treat it as an array of three rows."""
-    many = vectors(4)
-    for product in (many * factor, factor * many):
-        assert isinstance(product, Vectors)
-        np.testing.assert_array_equal(product, 2.0 * np.array(many))
-
-
-def test_one_vector_broadcasts_against_many():
-    many = vectors(5, 4)
-    both = (many + Vectors(0.0, 2.0, 0.0) - many) * 0.5
-    np.testing.assert_allclose(both.stacked(), np.repeat([[0.0], [1.0], [0.0]], 4, axis=1), atol=4 * ROUNDING)
-
-
-@pytest.mark.usefixtures("x64")
-def test_vectors_are_stacked_by_the_functions_of_their_kind():
-    assert isinstance(vectors(6).stacked(), np.ndarray)
-    traced = jax.jit(lambda v: v.stacked())(jax.tree.map(jnp.asarray, vectors(6)))
-    np.testing.assert_array_equal(traced, vectors(6).stacked())
-
-
-def test_reflection_keeps_tangential_and_negates_normal_components():
-    direction, normal = unit_vectors(7), unit_vectors(8)
-    out = reflect(direction, normal)
-    incoming, outgoing = direction.dot(normal), out.dot(normal)
-    np.testing.assert_allclose(outgoing, -incoming, atol=4 * ROUNDING)
-    np.testing.assert_allclose(out - normal * outgoing, direction - normal * incoming, atol=4 * ROUNDING)
-    np.testing.assert_allclose(reflect(out, normal), direction, atol=4 * ROUNDING)
-
-
-def test_intersection_is_on_line_and_plane():
-    origin, direction, point, normal = vectors(9), unit_vectors(10), vectors(11), unit_vectors(12)
-    hit = intersect_plane(origin, direction, point, normal)
-    size = np.maximum(1.0, np.sqrt(hit.dot(hit)))
-    assert np.max(np.abs((hit - point).dot(normal)) / size) < 10 * ROUNDING
-    across = (hit - origin).cross(direction)
-    assert np.max(np.sqrt(across.dot(across)) / size) < 10 * ROUNDING
 
 
 def test_any_number_of_mirrors_in_sequence():
@@ -148,15 +92,3 @@ def test_floats_numpy_and_jax_agree():
         np.testing.assert_allclose(np.array(moved[k]).imag / step, slopes[k], atol=10 * CHAIN_ROUNDING)
         singles = [beam_path(optics(), p, t, math).rays[-1][k] for p, t in zip(PAN_RAD, TILT_RAD, strict=True)]
         np.testing.assert_allclose(np.transpose(singles), expected[k], atol=CHAIN_ROUNDING)
-
-
-def test_each_part_may_be_materialised_once():
-    """The rotations of the stages and the ray of each mirror pass through the function, and its results are used."""
-    trees = []
-
-    def materialise(tree):
-        trees.append(tree)
-        return tree
-
-    way = beam_path(optics(), 0.1, 0.2, math, materialise)
-    assert trees[0][0] is way.pan and [tuple(ray) for ray in way.rays] == trees[1:]

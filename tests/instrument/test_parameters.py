@@ -5,24 +5,14 @@ from __future__ import annotations
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import (
     BLOCKS,
-    INDEX,
     KINDS,
     NAMES,
-    NOISE_NAMES,
-    RECEIVER_NAMES,
     REGISTRY,
     RIG_NAMES,
     RIG_PRIORS,
-    STEREO_PARAMETER_NAMES,
     names_of,
     unit_of,
 )
-
-
-def test_names_are_those_of_the_documents():
-    assert NAMES == (*RIG_PRIORS, *STEREO_PARAMETER_NAMES) and RIG_NAMES == tuple(RIG_PRIORS)
-    assert len(set(NAMES)) == len(NAMES) == 88
-    assert all(NAMES[index] == name for name, index in INDEX.items())
 
 
 def test_the_order_of_stored_draws():
@@ -51,14 +41,6 @@ def test_every_default_lies_in_its_range():
         assert parameter.low <= prior.value <= parameter.high and 0 <= prior.u <= parameter.u_max, name
         assert prior.distribution in KINDS
         assert prior.distribution != "half-normal" or parameter.low == parameter.high == 0
-
-
-def test_noise_and_receiver():
-    gears = "transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"
-    plain = (*BLOCKS["stop_sd_deg"], "pixel_scale", "aperture_sd_deg")
-    assert NOISE_NAMES == (*plain, *names_of(*gears, "harmonic_amplitude_deg", "look_scatter_deg", "home_sd_deg"))
-    assert RECEIVER_NAMES == ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg", "aperture_sd_deg")
-    assert {RIG_PRIORS[name].distribution for name in plain} == {"log-normal"}
 
 
 def test_every_prior_is_in_one_group():

@@ -42,26 +42,6 @@ def test_interpolation_is_exact_for_cubics(count):
     np.testing.assert_allclose(interpolation(nodes, nodes), np.eye(count), atol=ROUNDING)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_nodes_use_polynomials_of_lower_degree(count):
-    nodes = np.linspace(-10.0, 30.0, count)
-    polynomial = np.polynomial.Polynomial(np.arange(1.0, 1 + count))
-    counters = np.array([-10.0, 3.0, 30.0])
-    np.testing.assert_allclose(interpolation(counters, nodes) @ polynomial(nodes), polynomial(counters), atol=1e-9)
-
-
-def test_four_nearest_nodes_carry_a_counter():
-    share = interpolation(np.array([5.2, 0.1, 9.9]), np.arange(11.0))
-    assert [np.flatnonzero(row).tolist() for row in share] == [[4, 5, 6, 7], [0, 1, 2, 3], [7, 8, 9, 10]]
-
-
-def test_few_counters_are_their_own_places():
-    counters = np.array([40, -20, 40, 3, -20])
-    np.testing.assert_array_equal(places_of(counters, 0.06), [-20.0, 3.0, 40.0])
-    most = np.arange(OWN_PLACES_MAX) ** 2
-    np.testing.assert_array_equal(places_of(most, 0.06), most)
-
-
 @pytest.mark.parametrize(
     ("degrees", "count"), [(5.0, OWN_PLACES_MAX), (16 * SPACING_DEG - 0.01, 17), (400.0, PLACES_MAX)]
 )

@@ -65,15 +65,6 @@ def test_approaches_of_the_protocols():
     assert _approach_signs(PROTOCOLS["mixed"]()) == {name: {True, False} for name in DIRECTION_SIGNS}
 
 
-def test_the_papers_protocol_is_plain_go_and_return():
-    """Pan 0, 200, 0, ... from the homing on, without overshoot; tilt likewise."""
-    counters = [(s.pan_steps, s.tilt_steps) for s in PROTOCOLS["paper"]() if s.action in ("home", "move")]
-    assert counters[:4] == [(0, 0), (200, 0), (0, 0), (200, 0)]
-    assert {pan for pan, _ in counters} == {0, 100, 200} and {tilt for _, tilt in counters} == {-100, 0, 100}
-    # Left: 24 out, 23 back; right the same; to mid pan and the low start; up and down likewise.
-    assert len(counters) == 1 + 47 + 47 + 2 + 47 + 47
-
-
 def test_grid_sees_every_pose_from_both_sides():
     """At each of three sheets each pose once per side of pan and of tilt, with one placement per sheet."""
     plan = grid_protocol()

@@ -44,12 +44,6 @@ def test_any_parameter_may_stand_in_the_priors():
     assert one == other and other.priors["baseline_mm"] == Prior(199.0, 0.2)
 
 
-def test_one_camera_of_both_pictures_may_be_a_number(tmp_path):
-    """As in the template."""
-    text = re.sub(r"(?m)^(source|left|right) = .*\n", "", RIG_FILE).replace("[cameras]", "[cameras]\nsource = 3")
-    assert read_rig(write_rig(tmp_path, text)).cameras["source"] == 3
-
-
 def test_rig_table_round_trip():
     priors = {
         name: Prior(p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution)
@@ -103,21 +97,6 @@ def test_periods_in_every_spelling():
         assert table.harmonic_period_deg == {"tilt": periods}
         assert table.first_period_deg == {"tilt": periods[0]}
         assert rig_table(rig_table_toml(table)) == table
-
-
-def test_harmonics_in_every_spelling():
-    quoted = rig_table(
-        '[rig]\n"harmonic_period_deg.pan" = { value = 30, u = 0 }\n'
-        '[rig.prior]\n"harmonic_deg.pan.2.sin" = { value = 0.0, u = 0.05 }\n'
-    )
-    dotted = rig_table(
-        "[rig]\nharmonic_period_deg.pan = { value = 30, u = 0 }\n"
-        "[rig.prior]\nharmonic_deg.pan.2.sin = { value = 0.0, u = 0.05 }\n"
-    )
-    assert quoted == dotted
-    assert quoted.harmonic_period_deg == {"pan": (30.0,)}
-    assert quoted.priors["harmonic_deg.pan.2.sin"] == Prior(0.0, 0.05)
-    assert quoted.priors["harmonic_deg.pan.1.sin"] == Prior(0.0, 0.0)
 
 
 def test_a_table_completes_its_priors_and_refuses_harmonics_without_a_period():

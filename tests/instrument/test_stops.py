@@ -43,10 +43,6 @@ def test_two_looks_at_rest_are_one_stop():
     assert observed_stops(moves, {1, 2, 3, 4}, "tilt") == (Stop(0, 0, 1), Stop(0, 50, 1))
 
 
-def test_unobserved_stops_are_left_out_but_set_the_sense():
-    assert observed_stops(pan_moves(0, 240, 200), {2}, "pan") == (Stop(0, 200, -1),)
-
-
 def test_a_homing_begins_a_new_stop_at_the_same_counter():
     moves = (*pan_moves(0, 200), move_row(2, 1, 2.0, 200, 0, "right", "unknown"), move_row(3, 1, 3.0, 0, 0))
     assert observed_stops(moves, range(4), "pan") == (

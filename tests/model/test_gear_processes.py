@@ -158,13 +158,3 @@ def test_an_error_that_grows_with_the_counter_is_ratio_to_the_line_alone(line):
     # The azimuth is bent: over 0.3 deg its slope changes by some 1e-4.
     assert (with_error - without)[:2].mean() == pytest.approx(np.degrees(grown) * mirrors, rel=1e-2)
     assert with_error[2:] == pytest.approx(without[2:], rel=1e-12)
-
-
-def test_turns_of_the_beam_are_unwrapped(line):
-    """Beyond half a turn the azimuth wraps; its line does not."""
-    ratio = float(line.model.transmission.ratio_rad_per_step[0])
-    beyond = np.array([0.0, 0.0, np.pi - ratio * 300 + 0.05, 0.0, *[0.0] * 4])
-    slopes = np.asarray(line.slopes(beyond, SECANT)[0])
-    turned = (np.pi + 0.05 + ratio * 200) / 500
-    # Slopes of bent mirrors, within some per cent of 1.
-    assert slopes[:2].mean() == pytest.approx(np.degrees(turned), rel=0.05)

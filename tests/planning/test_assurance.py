@@ -9,11 +9,11 @@ import pytest
 from support.coarse_planning import ROUNDING
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, RIG_NAMES
+from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX
 from tvsbayes.model.parameter_space import STOP_COLUMNS
-from tvsbayes.planning.assurance import SCALES, Assurance, Family, judged_z
+from tvsbayes.planning.assurance import Assurance, Family, judged_z
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
-from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, information_of
+from tvsbayes.planning.expectation import PARAMETERS, information_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
@@ -91,21 +91,6 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
     assert values[[0, 2]] == pytest.approx(every[[0, 2]], rel=1e-12) and np.isfinite(every).all()
 
 
-def test_other_noise_scales_need_no_new_look(knowledge, pool, seen):
-    """Looks whitened again for other stop errors and pixels carry the information that looking again would give."""
-    family = Family(knowledge, pool, np.arange(len(pool.looks)), False)
-    truth = believers(knowledge, knowledge.z)
-    assurance = Assurance(family, parse_target(DEFAULT_TARGET), truth, 0)
-    z = knowledge.z.copy()
-    z[SCALES] = (0.7, -1.1, 0.4, 1.3, -0.6)
-    again = assurance.arrays.at(z, knowledge.space).rows
-    quick = assurance.rescaled(assurance.arrays.at_all(truth.z, truth.value), truth, z[None]).rows[0]
-    one, other = (np.einsum("mij,mik->jk", rows, rows) for rows in (again, quick))
-    assert np.abs(one - other).max() < ROUNDING * np.abs(one).max()
-    before = np.einsum("mij,mik->jk", seen.rows, seen.rows)
-    assert np.abs(one - before).max() > 0.1 * np.abs(one).max(), "the scales matter, or the law would be empty"
-
-
 def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, seen):
     """Thousands of stops give the true sd; none leave the prior's root mean square; the scatter is 1 / sqrt(2 n)."""
     true = knowledge.z.copy()
@@ -127,28 +112,3 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, s
     per_direction = len(many) / 2
     # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
     assert scales(many, 1.0) - scales(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
-
-
-def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, pool, seen):
-    """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
-    columns = STOP_COLUMNS.ravel()
-    true = knowledge.z.copy()
-    true[columns] = 1.5
-    truth = believers(knowledge, true)
-    chosen = np.resize(np.arange(len(pool.looks)), 60)
-
-    def scatter(covariance):
-        low, high = (
-            judged_z(truth, seen[None], pool.looks.side, chosen, covariance[None], knowledge, np.full((1, 5), x))
-            for x in (0.0, 1.0)
-        )
-        return (high - low)[0, columns]
-
-    exact = np.zeros((PARAMETERS, PARAMETERS))
-    geometry = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
-    # No information is gained where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
-    precision = np.diag(knowledge.precision)
-    unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
-    left_over = 1 - np.sum(geometry & (precision > 0)) / (2 * seen.seen[chosen].sum())
-    # Scatter is 1 / sqrt(information) but for the prior, which 30 stops of a direction outweigh 50 times.
-    assert scatter(exact) / scatter(unknown) == pytest.approx(1 / math.sqrt(left_over), rel=0.03)

@@ -7,40 +7,25 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from support.coarse_planning import ROUNDING, with_priors
+from support.coarse_planning import ROUNDING
 from support.commands import steps
 from support.dozen_spots import dozen_plan
 
 from tvsbayes.estimators.mode_search import Problem
-from tvsbayes.instrument.parameters import INDEX, TARGETS, Prior
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.model.parameter_space import half_normal_coordinate
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import (
     NOISE_COLUMNS,
-    design_arrays,
     expect,
     information_of,
-    prior_knowledge,
 )
-from tvsbayes.planning.looks import covariance_of
-from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth, draw_truth
 
 pytestmark = pytest.mark.usefixtures("small_searches")
-
-
-def u_of(steps, knowledge, z=None) -> np.ndarray:
-    """U of every headline after a plan, at the pose of its own looks."""
-    information = information_of(steps, knowledge)
-    at = [
-        sensitivity(Target("", q, 1.0, ""), knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad)
-        for q in TARGETS
-    ]
-    covariance = covariance_of(knowledge.precision + information.fisher)
-    return np.array([s.value(covariance) for s in at])
 
 
 def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch):
@@ -88,51 +73,12 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
     assert both[ratio, ratio] < 0.9 * less[ratio, ratio]
 
 
-@pytest.mark.parametrize("moves", [256, 257])
-def test_arrays_hold_every_move_of_a_plan(mounted_rig, moves):
-    """One move more than twice the smallest number of looks: a homing and two moves per look, 128 times."""
-    orders = (("home", 0, 0), ("place", "d1"), *(("move", n, 0) for n in range(2, moves + 1)), ("look",))
-    log = run_plan(steps(*orders), mounted_rig, ("left", "up"))
-    arrays = design_arrays(log.moves, [moves - 1], mounted_rig, homed_from=1, aperture=False)
-    assert len(log.moves) == moves and np.array_equal(arrays.moves.steps[:moves, 0], [m.pan_steps for m in log.moves])
-
-
-def test_more_looks_never_raise_a_variance(knowledge):
-    """At a fixed point every added step of a plan adds a positive semi-definite matrix."""
-    steps = paper_protocol(2)
-    looks = [k for k, step in enumerate(steps) if step.action == "look"]
-    previous = np.diag(knowledge.covariance)
-    for count in (2, 5, 9, 16, 32):
-        information = information_of(steps[: looks[count - 1] + 1], knowledge).fisher
-        variance = np.diag(covariance_of(knowledge.precision + information))
-        assert np.all(variance <= previous * (1 + ROUNDING)), count
-        previous = variance
-    assert previous[INDEX["degrees_per_step.pan"]] < 0.01
-
-
 def test_plans_of_any_ordinary_size_share_one_trace(knowledge):
     information_of(paper_protocol(1), knowledge)
     traces = expect.traces
     for plan in (paper_protocol(1)[:7], four_point_protocol(30), paper_protocol()):
         information_of(plan, knowledge)
     assert expect.traces == traces
-
-
-def test_mirroring_a_counter_swaps_names(mounted_rig, knowledge):
-    """A motor that counts the other way: the same beams, left and right exchanged."""
-    steps = tuple(s for s in four_point_protocol(3, approaches={"left": ("reversed",)}))
-    assert steps[2].action != "look"
-    mirrored = tuple(
-        replace(s, pan_steps=-s.pan_steps) if s.action in ("move", "home") and s.pan_steps is not None else s
-        for s in steps
-    )
-    turned = prior_knowledge(with_priors(mounted_rig, degrees_per_step__pan=Prior(-0.06, 0.01)))
-    u, v = u_of(steps, knowledge), u_of(mirrored, turned)
-    names = list(TARGETS)
-    swapped = {"left": "right", "right": "left"}
-    expected = [u[names.index(swapped.get(name, name))] for name in names]
-    assert v == pytest.approx(expected, rel=1e-6)
-    assert abs(u[0] / u[1] - 1) > 1e-4, "left and right differ, or the law would be empty"
 
 
 def test_looks_that_miss_an_image_tell_nothing(knowledge):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -15,16 +13,12 @@ from support.commands import steps
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, Prior, names_of
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
-from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.gear_processes import Places
-from tvsbayes.model.headlines import SeenLine, line_deg_per_step
-from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.planning.assurance import Assurance, Family, instrument_gears, judged_z
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
-from tvsbayes.planning.gear_places import NO_PLACES, FittedErrors, GearPlaces, regular_places, windows_of
+from tvsbayes.planning.gear_places import FittedErrors, GearPlaces, regular_places, windows_of
 from tvsbayes.planning.limits import split_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.plan_check import check_plan
@@ -117,39 +111,6 @@ def test_a_line_through_looks_is_the_least_squares_line_of_what_places_carry():
 
 
 @pytest.mark.thorough
-def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
-    """The slope and its derivatives along any line, at one instrument: by the formula of fits itself, by differences.
-
-    An axis without a line has the slope of its mirrors at the pose.
-    """
-    known, _ = real
-    gears, pose = known.gears, np.radians([7.0, 3.0])
-    z = known.z + 0.3 * np.random.default_rng(2).standard_normal(PARAMETERS)
-    share = gears.line_through(np.array([[0, -60], [60, 20], [200, 75]]), np.ones(3))
-    places = Places(placed(gears.steps), placed(gears.on_tilt), placed(np.ones(len(gears.steps), dtype=bool)))
-
-    @jax.jit
-    def traced(z, errors_rad, share):
-        model = known.space.model(z)
-        mirrors = beam_angles(model.optics, *jnp.asarray(pose))
-        return line_deg_per_step(model, SeenLine(jnp.asarray(pose), places, share), errors_rad, mirrors)
-
-    def slopes(z, errors, share):
-        with jax.enable_x64(True):
-            return np.asarray(traced(z, gears.root @ errors, share))
-
-    nothing = np.zeros(gears.size)
-    for one in (share, np.where(gears.on_tilt, 0.0, share), gears.share):
-        headlines = replace(gears, share=one).headlines(z, known.space, pose)
-        np.testing.assert_allclose(np.asarray(headlines.value)[:4], slopes(z, nothing, one), rtol=1e-12)
-        step = np.random.default_rng(3).standard_normal(known.size)
-        ends = [slopes(z + h * step[:PARAMETERS], h * step[PARAMETERS:], one) for h in (1e-5, -1e-5)]
-        wanted = (ends[0] - ends[1]) / 2e-5
-        # Central differences of angles near 1 rad in float64: 1e-16 / 1e-5 in 100 steps, some 1e-11 deg/step.
-        np.testing.assert_allclose(np.asarray(headlines.gradient)[:4] @ step, wanted, atol=1e-9)
-
-
-@pytest.mark.thorough
 def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_own_scales(real):
     """Assurance of designs equals the plan judged move by move, on gears whose errors are as large as drawn.
 
@@ -223,29 +184,6 @@ def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
     quick = information_of_looks(seen, picks, arranged.path, known.space, None, arranged.warm_minutes(known.rig))
     assert exact.shape == (known.size, known.size) and known.gears.size > 20
     assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
-
-
-def test_expected_ratio_is_that_of_dense_matrices(real):
-    """Errors integrated out of the looks beforehand, as fits do, leave the u of a line that columns of theirs leave.
-
-    By the matrices themselves: whitened looks, of which the errors are a part of the noise.
-    """
-    known, pool = real
-    seen = LookArrays(pool.looks, known, False).at(known.z, known.space)
-    rows = seen.rows[seen.seen][::7, :, :-2].reshape(-1, known.size)
-    at = sensitivity(WORST, known.z, known.space, known.rig.table, seen.mirror_angles_rad.mean(axis=0), known.gears)
-    by_columns = at.values(covariance_of(known.precision + rows.T @ rows))
-    columns, errors = rows[:, :PARAMETERS], rows[:, PARAMETERS:]
-    noise = np.eye(len(rows)) + errors @ errors.T
-    gain = np.linalg.solve(columns @ columns.T + noise, rows)
-    left = np.eye(known.size) - rows.T @ gain
-    assert by_columns == pytest.approx(
-        np.sqrt(np.einsum("qi,ij,qj->q", at.gradient, left, at.gradient).max()), rel=1e-6
-    )
-
-
-def test_perfect_gears_have_no_places(knowledge, pool):
-    assert knowledge.with_gears(pool.looks.steps) is knowledge and knowledge.gears is NO_PLACES
 
 
 @pytest.mark.parametrize(("ratio", "axis"), [("left", 0), ("up", 1)])

@@ -10,13 +10,9 @@ import pytest
 from support.coarse_planning import ROUNDING
 
 from tvsbayes.instrument.plan import plan_minutes
-from tvsbayes.planning.candidates import Positions
-from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
-    LookArrays,
-    Looks,
     Seen,
     arrange,
     covariance_of,
@@ -124,43 +120,3 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
                 whole = np.linalg.inv(covariance) - np.eye(PARAMETERS)
             whole = whole[:PARAMETERS, :PARAMETERS]
             assert np.abs(information - whole).max() < ROUNDING * np.abs(whole).max()
-
-
-STEPS = [[0, 0], [100, 20], [900, 0], [40, -30], [60, 400], [20, 20], [-30, 10]]
-SIDES = [[1, 1], [-1, 1], [1, 1], [1, -1], [-1, -1], [1, 1], [-1, 1]]
-
-
-@pytest.mark.parametrize(
-    ("block", "count"), [(None, 150), *(pytest.param(n, 3, marks=pytest.mark.slow) for n in (1, 5, 1000))]
-)
-def test_looks_and_instruments_keep_their_places_whatever_the_block(knowledge, monkeypatch, block, count):
-    """One by one, and in blocks that end within an instrument or hold all of them; those out of view with them.
-
-    Of seven looks the package's own blocks of 128 and 1024 pairs end within an instrument, and are compiled anyway.
-    """
-    looks = Looks(np.array(STEPS), np.array(SIDES), np.array([0, 1, 2, 0, 1, 0, 1]))
-    drawn = draw_instruments(knowledge, count, seed=1)
-    # The truth lies in another space where something is held fixed; visibility is evaluated in the common one.
-    z = drawn.z
-    rows = [row for row in (0, 1, 128 // 7, 256 // 7, 1024 // 7, count - 1) if row < count]
-    one_by_one = [LookArrays(looks, knowledge, False).at(z[row], knowledge.space) for row in rows]
-    if block is not None:
-        monkeypatch.setattr(LookArrays, "SHOWN", block)
-        monkeypatch.setattr(LookArrays, "IN_IMAGES", block)
-    arrays = LookArrays(looks, knowledge, False)
-    value = np.broadcast_to(np.asarray(knowledge.space.value), drawn.value.shape)
-    together = arrays.at_all(z, value)
-    for one, other in zip(one_by_one, (together[row] for row in rows), strict=True):
-        assert np.array_equal(one.seen, other.seen)
-        assert one.rows == pytest.approx(other.rows, rel=ROUNDING, abs=ROUNDING * np.abs(one.rows).max())
-        assert one.mirror_angles_rad == pytest.approx(other.mirror_angles_rad, rel=ROUNDING)
-    assert np.array_equal(arrays.in_images(z), together.seen) and together.seen.any() and not together.seen.all()
-
-
-def test_a_position_is_visible_to_the_share_of_instruments_that_see_it(knowledge):
-    z = draw_instruments(knowledge, 4, seed=1).z
-    positions = Positions(np.array([[0, 0], [240, 0], [900, 0]]), np.array([0, 0, 1]))
-    looks = Looks(positions.steps, np.ones((3, 2), dtype=int), positions.sheet)
-    shown = [LookArrays(looks, knowledge, False).at(point, knowledge.space).seen for point in z]
-    share = positions.visible(knowledge, z)
-    assert share == pytest.approx(np.mean(shown, axis=0), abs=1e-12) and share[2] == 0 < share[0]

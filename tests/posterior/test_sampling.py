@@ -8,23 +8,17 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from support.small_posterior import ROUNDING, SEED, SIGMAS, mapped_already, small_fit
+from support.small_posterior import ROUNDING, SEED, mapped_already, small_fit
 from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.inference.diagnosis import diagnose
-from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import DRAWING, sample, walking
 from tvsbayes.posterior.target import Target
 from tvsbayes.results.tiers import CHAIN
 
 LONG, SHORT, BLOCK = 96, 12, 6
-NON_NORMAL = 0.2
-"""Sds (and share of an sd) by which the posterior of the left ratio may differ from its Laplace approximation: the
-stop scatters, which widen it, have skewed posteriors; a chain of 190 steps shows 0.1 in both."""
-
-
 INTERRUPTED_CALL = 14
 """Of the density: after the rounds of importance sampling and some steps."""
 
@@ -183,12 +177,6 @@ def test_what_is_missing_when_the_time_is_over_is_reported(fitted, monkeypatch):
         assert word in missing
 
 
-@pytest.mark.thorough
-def test_a_chain_of_another_tier_is_not_resumed(fitted, long):
-    with pytest.raises(InputError, match="sampled from other data"):
-        stored_chain(long[1], fitted, SEED, "other")
-
-
 def test_a_linear_function_is_propagated(long):
     draws = long[0].by_name
     result = long[0].propagate(lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"])
@@ -207,17 +195,3 @@ def test_functions_of_another_shape_or_without_value_are_refused(long):
         long[0].propagate(lambda p: p["degrees_per_step.left"][1:])
     with pytest.raises(ValueError, match="no finite value"):
         long[0].propagate(lambda p: np.full_like(p["degrees_per_step.left"], np.nan))
-
-
-def test_a_constant_has_no_monte_carlo_error(long):
-    result = long[0].propagate(lambda p: np.full_like(p["degrees_per_step.left"], 2.5))
-    assert result.mean == 2.5 and result.sd == 0
-    assert result.mcse_mean == 0 and result.mcse_sd == 0 and np.all(result.mcse_interval95 == 0)
-
-
-def test_the_left_ratio_agrees_with_laplace(fitted, long):
-    laplace = fitted.draws.effective_deg_per_step[:, 0]
-    result = long[0].propagate(lambda p: p["effective_deg_per_step.left"])
-    assert result.mcse_mean < 0.15 * result.sd, "the chain is too short to tell"
-    assert abs(result.mean - laplace.mean()) < SIGMAS * result.mcse_mean + NON_NORMAL * laplace.std()
-    assert abs(result.sd - laplace.std()) < SIGMAS * result.mcse_sd + NON_NORMAL * laplace.std()

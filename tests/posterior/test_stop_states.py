@@ -51,27 +51,6 @@ def test_the_elimination_is_the_dense_cholesky_factor(seed):
         np.testing.assert_allclose(of_point, whitened, rtol=0, atol=atol)
 
 
-def test_what_states_leave_of_residuals_is_woodburys():
-    """X' C^-1 X with C = 1 + G T^2 G' written out."""
-    states = drawn_states(7)
-    generator = np.random.default_rng(8)
-    sd = np.exp(generator.normal(size=(1, len(states.constant))))
-    columns = generator.normal(size=(4 * SPOTS, 4))
-    white = Elimination.of(states, sd, states.gram[None, *states.overlapping]).whitened(states.load.T @ columns)[0]
-    scaled = states.load * sd[0]
-    covariance = np.eye(4 * SPOTS) + scaled @ scaled.T
-    dense = columns.T @ np.linalg.solve(covariance, columns)
-    left = columns.T @ columns - white.T @ white
-    rounding = 4 * SPOTS * ROUNDING * np.linalg.cond(covariance)
-    np.testing.assert_allclose(left, dense, rtol=0, atol=rounding * np.abs(columns.T @ columns).max())
-
-
-def test_no_states_take_nothing():
-    nothing = StopStates(np.zeros((8, 0)), np.zeros((0, 6)), np.zeros(0))
-    elimination = Elimination.of(nothing, np.zeros((3, 0)), np.zeros((3, 0)))
-    assert elimination.whitened(np.zeros((0, 2))).shape == (3, 0, 2)
-
-
 def test_states_of_a_campaign_give_the_covariance_of_its_filter():
     """Columns times their variances at the mode, against the filter's six states, which make the dense covariance."""
     fitted = small_fit()[0]

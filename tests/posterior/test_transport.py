@@ -29,8 +29,7 @@ from support.two_parameters import (
 from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.model.compiled import BATCH, in_batches
-from tvsbayes.posterior.plays import Cut
+from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import (
     BLOCK_ROWS,
@@ -53,21 +52,6 @@ def uncentred(path: Transport) -> Transport:
     return replace(path, narrow=0, bend=path.bend[:, :0, :0])
 
 
-@pytest.mark.parametrize("count", [1, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 6])
-def test_batches_give_what_one_call_gives(x64, count):
-    points = np.random.default_rng(6).normal(size=(count, 3))
-    sizes = []
-
-    def function(block):
-        sizes.append(block.shape)
-        return {"double": 2 * block, "first": block[:, 0] ** 2}
-
-    joined = in_batches(function, points)
-    assert set(sizes) == {(BATCH, 3)} and len(sizes) == -(-count // BATCH)
-    np.testing.assert_array_equal(joined["double"], 2 * points)
-    np.testing.assert_array_equal(joined["first"], points[:, 0] ** 2)
-
-
 def test_coordinates_are_ordered_by_the_variance_left_to_them():
     root = np.random.default_rng(7).normal(size=(9, 9)) * np.geomspace(1e-3, 1.0, 9)
     covariance = root @ root.T
@@ -79,12 +63,6 @@ def test_coordinates_are_ordered_by_the_variance_left_to_them():
         explained = cross * np.linalg.solve(covariance[np.ix_(before, before)], cross)
         left = np.diag(covariance)[after] - explained.sum(axis=0)
         assert np.argmax(left) == 0, place
-
-
-def test_no_coordinates_have_an_order():
-    """Where only the noise is estimated, nothing is left to whiten."""
-    order = by_width(np.zeros((0, 0)))
-    assert order.shape == (0,) and np.zeros(3)[order].shape == (0,)
 
 
 def test_to_w_undoes_the_map():
@@ -224,20 +202,6 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     assert target.invalid == 2 * len(without)
 
 
-def test_a_ratio_follows_the_degrees_of_a_backlash():
-    """Along the ridge of both the ratio is linear in b, and b = halfnorm.ppf(Phi(z)) by SciPy's own law."""
-    path = play_near_zero()
-    y = np.column_stack([np.linspace(-0.5, 3.0, 13), np.zeros(13)])
-    z = path.from_whitened(y)
-    play = stats.halfnorm.ppf(stats.norm.cdf(z[:, BACKLASH]))
-    lines = np.polynomial.polynomial.polyfit(y[:, 0], np.column_stack([play, z[:, RATIO]]), 1)
-    # SciPy's laws are good to 1e-12.
-    np.testing.assert_allclose(lines[0] + np.outer(y[:, 0], lines[1]), np.column_stack([play, z[:, RATIO]]), atol=1e-11)
-    np.testing.assert_allclose(path.to_whitened(z), y, atol=1e-11)
-    apart = path.from_whitened(y + np.array([0.0, 1.0])) - z
-    np.testing.assert_allclose(apart[:, RATIO], path.root[1, 1], rtol=1e-9)
-
-
 def test_the_map_of_a_play_near_zero_is_exact():
     """Measured below zero, where none is: a normal cut at zero, and what follows it. In w it is standard normal."""
     path = play_near_zero()
@@ -249,23 +213,6 @@ def test_the_map_of_a_play_near_zero_is_exact():
     # The mode is good to 1e-7, with slopes of 1 / sd = 12; laws of tails to 1e-9.
     assert np.ptp(density) < 1e-5, np.ptp(density)
     np.testing.assert_allclose(path.to_w(points.z), w, atol=1e-7)
-
-
-@pytest.mark.parametrize("bound", [-40.0, -1.0, 0.0, 5.0, 30.0])
-def test_a_cut_normal_is_scipys(bound):
-    free = np.linspace(-7.0, 7.0, 57)
-    cut = Cut(np.full(len(free), bound))
-    within = cut.within(free)
-    # SciPy's own law loses digits farther out.
-    good = np.abs(free) < 4.5
-    expected = stats.truncnorm(bound, np.inf).isf(stats.norm.sf(free[good]))
-    np.testing.assert_allclose(within[good], expected, rtol=1e-6, atol=1e-6)
-    assert np.all(np.diff(within) > 0) and np.all(within >= bound)
-    if bound <= 0:
-        np.testing.assert_allclose(cut.without(within)[good], free[good], atol=1e-6)
-    step = 1e-4
-    slope = (cut.within(free + step) - cut.within(free - step)) / (2 * step)
-    np.testing.assert_allclose(cut.log_slope(free, within)[good], np.log(slope[good]), atol=1e-3)
 
 
 def test_an_indefinite_precision_is_raised_and_the_others_stay():

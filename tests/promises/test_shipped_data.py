@@ -18,9 +18,8 @@ from tvsbayes.instrument.parameters import CREEP_NAMES, GEAR_ERROR_NAMES, LOOK_S
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, RigTable, read_rig
-from tvsbayes.instrument.stereo_pair import undistort
 from tvsbayes.twin.simulated_campaign import simulate
-from tvsbayes.twin.true_rig import draw_truth, read_truth
+from tvsbayes.twin.true_rig import read_truth
 
 DATA = shipped_data()
 TWINS = ("paper_twin", "grid_twin")
@@ -158,32 +157,6 @@ def test_mounted_and_nominal_rig():
         else:
             assert prior == default
     assert set(rig.sheets_mm) == {"d1", "d2", "d3"} and rig.sheets_mm["d2"] == 275.0
-
-
-def test_stereo_covariance_is_that_of_a_real_calibration():
-    """Full rank; fx and fy, left and right strongly correlated; a fraction of a px and of a mm."""
-    covariance = mounted().stereo.parameter_covariance
-    sd = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(sd, sd)
-    assert np.linalg.eigvalsh(correlation)[0] > 1e-6
-    assert correlation[0, 1] > 0.9 and correlation[9, 10] > 0.9, "fx with fy"
-    assert correlation[0, 9] > 0.8, "left fx with right fx"
-    assert abs(correlation[5, 8]) > 0.8, "k2 with k3"
-    assert 0.1 < sd[0] < 3.0 and 0.005 < sd[21] < 0.5
-
-
-def test_distortion_stays_invertible_over_the_image():
-    """For 200 drawn cameras the distortion grows out to the image corner."""
-    rig, rng = mounted(), np.random.default_rng(2)
-    corners = np.array([[0.0, 0.0], [1279.0, 0.0], [0.0, 719.0], [1279.0, 719.0]])
-    for _ in range(200):
-        stereo = draw_truth(rig, rng).stereo
-        for matrix, coefficients in ((stereo.M1, stereo.D1), (stereo.M2, stereo.D2)):
-            points = undistort(corners, matrix, coefficients)
-            assert np.isfinite(points).all()
-            k1, k2, _, _, k3 = coefficients
-            r2 = np.linspace(0, (points**2).sum(axis=1).max(), 50)
-            assert (1 + 3 * k1 * r2 + 5 * k2 * r2**2 + 7 * k3 * r2**3 > 0).all()
 
 
 def test_make_twins_writes_the_shipped_twins():

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jsonschema import Draft202012Validator
 from msgspec import structs
 from support.fit_documents import OLD, changed, kept, problems, schema_of
 from support.small_results import small_record, whole_summary
@@ -182,24 +181,6 @@ def test_the_schema_refuses(tmp_path, path, value):
         read_fit(file)
     # The message names the place, entries of a list by the list's key.
     assert error.value.column == ".".join(part for part in path.split("/") if not part.isdigit())
-
-
-@pytest.mark.parametrize("version", FIT_FORMATS)
-def test_a_schema_has_only_rules_that_are_checked(version):
-    """A keyword that JSON Schema does not define would be ignored silently."""
-    schema = schema_of({"format": version})
-    Draft202012Validator.check_schema(schema)
-    known = {*Draft202012Validator.VALIDATORS, "$schema", "$id", "$defs", "title", "description", "default"}
-
-    def unknown(rules: object) -> set[str]:
-        if not isinstance(rules, dict):
-            return set()
-        inner = [*rules.get("properties", {}).values(), *rules.get("$defs", {}).values(), *rules.get("anyOf", ())]
-        inner += [rules.get(name) for name in ("items", "additionalProperties", "propertyNames")]
-        return (set(rules) - known).union(*map(unknown, inner))
-
-    assert unknown(schema) == set()
-    assert unknown({"properties": {"a": {"items": {"minimun": 0}}}}) == {"minimun"}
 
 
 @pytest.mark.parametrize(("path", "value", "found"), [("noise/chi2", math.nan, '"NaN"'), ("command", "a\x00b", "")])

@@ -13,7 +13,7 @@ import pytest
 from support.commands import steps
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, Prior
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.statistics.gaussian_process import matern52
@@ -153,34 +153,6 @@ def test_drift_grows_with_the_root_of_time_and_restarts_at_a_homing():
     warm = drift_deg(time_s, first, 0.0, np.zeros(17), lambda hours: 0.1 * (1 - np.exp(-hours)))
     assert warm[7] == pytest.approx(0.1 * (1 - np.exp(-1.75)), abs=1e-15)
     assert warm[8] == 0.0 and warm[16] == pytest.approx(0.1 * (np.exp(-2.0) - np.exp(-4.0)), abs=1e-15)
-
-
-def test_drift_turns_the_mirrors_and_stands_in_the_truth(mounted_rig):
-    rig = geared(mounted_rig, transmission_error_deg=0.0, play_variation_deg=0.0, drift_deg_per_root_hour=2.0)
-    truth = draw_truth(rig, np.random.default_rng(10))
-    still = replace(truth, parameters={**truth.parameters, **{f"drift_deg_per_root_hour.{a}": 0.0 for a in AXES}})
-    one, other = (simulate(rig, sweep(), 3, drawn).truth for drawn in (truth, still))
-    moved = np.subtract(one.mirror_angles_deg, other.mirror_angles_deg)
-    assert moved == pytest.approx(np.array(one.drift_deg), abs=1e-12) and np.abs(moved[1:]).min() > 0
-    assert not np.any(other.drift_deg) and not np.any(one.drift_deg[0])
-
-
-def test_without_scales_nothing_changes(mounted_rig):
-    """All scales 0: the campaign of a rig with perfect gears, to the last bit; and its other draws are those of any."""
-    nothing = dict.fromkeys(SCALES, 0.0) | {"transmission_error_length_deg": 8.0}
-    zero, full = geared(mounted_rig, **nothing), geared(mounted_rig)
-    plain = simulate(zero, sweep(), 4, aperture=True)
-    truth = draw_truth(mounted_rig, np.random.default_rng(np.random.SeedSequence(4).spawn(1)[0]))
-    perfect = simulate(mounted_rig, sweep(), 4, truth.with_gears(), aperture=True)
-    assert plain.campaign.spots == perfect.campaign.spots and plain.campaign.moves == perfect.campaign.moves
-    assert plain.truth.mirror_angles_deg == perfect.truth.mirror_angles_deg
-    bent = simulate(full, sweep(), 4, aperture=True).truth
-    assert (
-        bent.stop_errors_deg == plain.truth.stop_errors_deg
-        and bent.mirror_angles_deg != perfect.truth.mirror_angles_deg
-    )
-    changed = {n for n, value in bent.parameters.items() if value != plain.truth.parameters[n]}
-    assert changed == {n for n in GEAR_ERROR_NAMES if n.split(".")[0] in SCALES and "length" not in n}
 
 
 def test_scales_alone_let_a_run_draw_the_errors(mounted_rig):

@@ -91,27 +91,6 @@ def test_play_vector():
     assert play(q, -0.15, 0.3) == pytest.approx(y[1:], abs=1e-13)
 
 
-def test_play_keeps_reversals_and_clears():
-    """After a reversal the output lags by b; after a run-up by nothing (classic sees k - b/N and k)."""
-    first = np.arange(4) == 0
-    y = transmission(np.array([0, -40, 0, 200]), first, np.full(4, 0.5), np.zeros(4), (0.06, 0.0), 0.5)
-    assert y[3] - y[2] == pytest.approx(200 * 0.06, abs=1e-12)
-    y = transmission(np.array([0, 200, 0, 200]), first, np.full(4, 0.5), np.zeros(4), (0.06, 0.0), 0.5)
-    assert y[3] - y[2] == pytest.approx(200 * 0.06 - 0.5, abs=1e-12)
-
-
-def test_first_rows_of_segments():
-    """The gear restarts at q = k n + h with the mean ratio; the approach decides the flank."""
-    first = np.array([True, False, True, False])
-    home = np.array([0.0, 0.0, 0.03, 0.03])
-    y = transmission(np.array([0, 100, 50, 60]), first, np.array([-0.5, 0, 0.5, 0]), home, (0.06, 0.002), 0.2)
-    # 100 steps to the left at 0.061 deg, less half the play.
-    assert y[:2] == pytest.approx([-0.1, 6.1 - 0.1], abs=1e-12)
-    assert y[2] == pytest.approx(50 * 0.06 + 0.03 + 0.1, abs=1e-12)
-    # Ten steps of 0.061 deg are 0.61 deg: play 0.2 deg is crossed first.
-    assert y[3] == pytest.approx(50 * 0.06 + 0.03 + 0.61 - 0.1, abs=1e-12)
-
-
 def test_stop_errors_persist_and_are_redrawn():
     """Held while the other axis moves or nothing does; redrawn by this axis' counter and by homing."""
     counters = np.array([0, 5, 5, 5, 4, 4, 4])
@@ -121,14 +100,3 @@ def test_stop_errors_persist_and_are_redrawn():
     held = stop_errors(counters, first, approach, draws, {"+": 0.1, "-": 0.01})
     both = np.sqrt((0.1**2 + 0.01**2) / 2)
     assert held == pytest.approx([0.1, 0.2, 0.2, 0.2, 0.05, 6 * both, 6 * both], abs=1e-15)
-
-
-def test_stop_errors_have_the_sd_of_their_direction():
-    """2000 moves to either side: sample sds within four standard errors of their own sd."""
-    counters = np.arange(4001) % 2
-    first = np.arange(4001) == 0
-    draws = np.random.default_rng(5).standard_normal(4001)
-    held = stop_errors(counters, first, ["left"] + [""] * 4000, draws, {"+": 0.15, "-": 0.02})
-    four_se = 4 / np.sqrt(2 * 2000)
-    assert np.std(held[1::2]) == pytest.approx(0.15, rel=four_se)
-    assert np.std(held[2::2]) == pytest.approx(0.02, rel=four_se)

@@ -16,11 +16,7 @@ from support.commands import steps
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.instrument.parameters import (
-    GEAR_ERROR_NAMES,
-    HARMONIC_NAMES,
-    LOOK_SCATTER_NAMES,
     STEREO_PARAMETER_NAMES,
-    Prior,
     names_of,
 )
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
@@ -69,16 +65,6 @@ def test_stop_error_is_redrawn_though_play_absorbs_the_move(fixed):
     assert tilt[0] == tilt[1] and len({tilt[1], tilt[2], tilt[3]}) == 3 and tilt[3] == tilt[4]
     psi = np.array(result.mirror_angles_deg)[:, 0] - pan
     assert psi[3] == psi[2] == psi[1] and psi[4] == pytest.approx(psi[3] + 0.06, abs=1e-12)
-
-
-def test_home_offsets(rig):
-    """None in the first segment; later ones scatter by the true rig's sd, which is drawn."""
-    plan = steps(*[("home", 0, 0)] * 400)
-    truth = simulate(rig, plan, 1).truth
-    offsets = np.array(truth.home_offsets_deg)
-    sds = [truth.parameters[f"home_sd_deg.{axis}"] for axis in ("pan", "tilt")]
-    assert np.array_equal(offsets[0], [0.0, 0.0]) and sds[0] != sds[1]
-    assert np.std(offsets[1:], axis=0) == pytest.approx(sds, rel=4 / np.sqrt(2 * 399))
 
 
 def test_homings_are_as_the_rig_states(rig):
@@ -170,29 +156,6 @@ def test_truth_round_trip(rig):
     assert again.effective_deg_per_step(run.campaign) == pytest.approx(document["effective_deg_per_step"], rel=1e-12)
 
 
-def test_transmission_error_leaves_every_other_draw_as_it_was(rig):
-    """The same rig, stop errors, sheets and noise, whose mirrors stand off by the error of the wheel."""
-    plan = small_plan()
-    rig = replace(rig, truth={**rig.truth, **{name: replace(rig.truth[name], u=0.0) for name in GEAR_ERROR_NAMES}})
-    names = [name for name in HARMONIC_NAMES if ".tilt." in name]
-    wobbling = replace(
-        rig,
-        table=replace(rig.table, harmonic_period_deg={"tilt": (360.0,)}),
-        truth={**rig.truth, **dict.fromkeys(names, Prior(0.0, 0.1))},
-    )
-    plain, error = simulate(rig, plan, 8).truth, simulate(wobbling, plan, 8).truth
-    assert {n for n in plain.parameters if plain.parameters[n] != error.parameters[n]} == set(names)
-    assert np.array_equal(plain.stereo.vector, error.stereo.vector)
-    assert plain.stop_errors_deg == error.stop_errors_deg and plain.home_offsets_deg == error.home_offsets_deg
-    shift = np.subtract(error.mirror_angles_deg, plain.mirror_angles_deg)
-    resting = np.subtract(plain.mirror_angles_deg, plain.stop_errors_deg)[:, 1]
-    wheel = np.radians(resting - plain.parameters["tilt_zero_deg"])
-    c1, s1, c2, s2 = (error.parameters[name] for name in names)
-    expected = c1 * np.cos(wheel) + s1 * np.sin(wheel) + c2 * np.cos(2 * wheel) + s2 * np.sin(2 * wheel)
-    assert shift[:, 1] == pytest.approx(expected, abs=1e-12) and np.abs(shift[:, 1]).max() > 0.01
-    assert not shift[:, 0].any()
-
-
 def test_looks_scatter_also_where_an_axis_stands(fixed):
     """Of one beam looked at 400 times, by 0.05 deg of pan alone, then of tilt; nothing else changes."""
     count = 400
@@ -210,23 +173,6 @@ def test_looks_scatter_also_where_an_axis_stands(fixed):
         # Of n normal numbers; neighbours are independent: each is another draw.
         assert np.sqrt(np.mean(sideways**2)) == pytest.approx(expected, rel=4 / np.sqrt(2 * count))
         assert len(np.unique(sideways)) == count
-
-
-def test_scatter_of_looks_leaves_the_drawn_rig_as_it_was(rig):
-    """Rigs of a seed are the same rigs, whatever their looks do; a truth.json without it has none."""
-    steady = replace(rig, truth={**rig.truth, **dict.fromkeys(LOOK_SCATTER_NAMES, Prior(0.0, 0.0, "half-normal"))})
-    both = []
-    for one in (rig, steady):
-        stream = np.random.default_rng(7)
-        both.append([draw_truth(one, stream) for _ in range(2)])
-    shaking, still = both
-    for one, two in zip(shaking, still, strict=True):
-        changed = {name for name in one.parameters if one.parameters[name] != two.parameters[name]}
-        assert changed == set(LOOK_SCATTER_NAMES)
-    document = simulate(rig, small_plan(), 8).truth.as_json(simulate(rig, small_plan(), 8).campaign)
-    parameters = {n: v for n, v in document["parameters"].items() if n not in LOOK_SCATTER_NAMES}
-    read = Truth.from_json({**document, "parameters": parameters}, rig.stereo)
-    assert [read.parameters[name] for name in LOOK_SCATTER_NAMES] == [0.0, 0.0]
 
 
 def test_true_transmission_error_needs_its_period(rig):
@@ -299,15 +245,6 @@ def test_aperture_reads_the_spot_with_its_zero(fixed, convention: str):
     # 36 readings: mean within four standard errors, sd within four of its own (1/sqrt(70) = 12 %).
     assert np.mean(error) == pytest.approx(0.0, abs=4 * 0.02 / 6)
     assert np.std(error, ddof=1) == pytest.approx(0.02, rel=4 * 0.12)
-
-
-def test_every_placement_is_a_new_one(fixed):
-    """The same target placed twice is not at the same depth."""
-    plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("look",), ("place", "d1"), ("look",))
-    spots = simulate(fixed, plan, 6, spot_sd_px=1e-9).campaign.spots
-    disparity = [spot.u_left_px - spot.u_right_px for spot in spots]
-    # 1 mm of depth at 175 mm is f B / Z^2 = 2.2 px of disparity; noise is 1e-9 px.
-    assert abs(disparity[0] - disparity[1]) < 1e-7 and abs(disparity[2] - disparity[0]) > 0.01
 
 
 def test_pixel_noise_is_stated_sd_times_pixel_scale(fixed):
