@@ -9,8 +9,14 @@ from support.pseudo_terminal import answered, needs_pseudo_terminals
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.counter_limits import CounterLimits
-from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
-from tvsbayes.positioner.grbl_messages import parse_greeting, parse_modes, parse_setting, parse_status
+from tvsbayes.positioner.grbl import (
+    GrblPositioner,
+    GrblSettings,
+    parse_greeting,
+    parse_modes,
+    parse_setting,
+    parse_status,
+)
 from tvsbayes.positioner.interface import PositionLost
 from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.serial_port import serial_opener

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tvsbayes.view.access import SECURITY_HEADERS, TOKEN_HEADER, Access
+from tvsbayes.view.live_server import SECURITY_HEADERS, TOKEN_HEADER, Access
 
 
 @pytest.fixture

@@ -22,8 +22,14 @@ from tvsbayes.errors import InputError
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name, read_campaign
 from tvsbayes.view import live_server
-from tvsbayes.view.access import SECURITY_HEADERS, TOKEN_HEADER
-from tvsbayes.view.live_server import PAGE_FILES, LivePage, connections_max, page_files
+from tvsbayes.view.live_server import (
+    PAGE_FILES,
+    SECURITY_HEADERS,
+    TOKEN_HEADER,
+    LivePage,
+    connections_max,
+    page_files,
+)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import shutil
 import statistics
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -56,10 +57,19 @@ class Check:
     found: str
     remedy: str = ""
 
-    @classmethod
-    def judged(cls, name: str, found: str, remedy: str) -> Check:
-        """Make a warning where there is a remedy, else "ok"."""
-        return cls(name, "warning" if remedy else "ok", found, remedy)
+
+class _Checks(list[Check]):
+    """Results in the order in which to remove their faults."""
+
+    def judge(self, name: str, found: str, remedy: str = "") -> None:
+        """Add a warning where there is a remedy, else "ok"."""
+        self.append(Check(name, "warning" if remedy else "ok", found, remedy))
+
+    def failed(self, name: str, error: TvsError) -> None:
+        """Add the fault of an error."""
+        remedy = error.remedy or ""
+        found = error.found or error.message.removesuffix(f"; {remedy}")
+        self.append(Check(name, "fault", found, remedy.removesuffix(SEE_DOCTOR) or "see the message"))
 
 
 def examine(
@@ -81,29 +91,24 @@ def examine(
         open_camera: replaces the rig file's cameras.
         clock: clock of the timings.
     """
-    checks = [_rig(rig), *_disk(folder, clock)]
-    positioner: Positioner | None = None
-    device_checks: list[Check] = []
-    try:
-        if open_positioner is None:
-            on_port = rig.positioner.get("driver", DEFAULT_DRIVER) in ON_PORTS
-            if on_port:
-                checks.append(_ports(rig))
-            if rig.positioner.get("port") or not on_port:
-                open_positioner = partial(positioner_of, rig)
-        if open_positioner is not None:
-            positioner, device_checks = _positioner(open_positioner, clock)
-        checks += device_checks
-        camera, device_checks = _camera(rig, open_camera, positioner, clock)
-        checks += device_checks
-        try:
-            checks.append(_laser(positioner, camera, laser))
-        finally:
-            if camera is not None:
-                camera.close()
-    finally:
-        if positioner is not None:
-            positioner.close()
+    checks = _Checks()
+    _rig(rig, checks)
+    _disk(folder, clock, checks)
+    if open_positioner is None:
+        on_port = rig.positioner.get("driver", DEFAULT_DRIVER) in ON_PORTS
+        if on_port:
+            _port(rig, checks)
+        if rig.positioner.get("port") or not on_port:
+            open_positioner = partial(positioner_of, rig)
+    with ExitStack() as stack:
+        positioner = None if open_positioner is None else _positioner(open_positioner, clock, checks, stack)
+        camera = _camera(rig, open_camera or partial(cameras_of, rig), positioner, clock, checks, stack)
+        if positioner is None or camera is None:
+            checks.append(Check("laser", "skipped", "needs positioner and cameras", "correct the faults above first"))
+        elif not laser:
+            checks.append(Check("laser", "skipped", "not requested", "run doctor with --laser, goggles on"))
+        else:
+            _laser(positioner, camera, checks)
     return checks
 
 
@@ -120,52 +125,46 @@ def contract(
     if rig.limits.unstated:
         found, remedy = f"{', '.join(rig.limits.unstated)} not stated", "state them in [positioner] of the rig file"
         return [Check("contract", "fault", found, remedy)]
-    ranges = [(low or 0, high or 0) for low, high in (rig.limits.steps[axis] for axis in AXES)]
-    (a, b), (c, d) = ranges
+    (a, b), (c, d) = ((low or 0, high or 0) for low, high in (rig.limits.steps[axis] for axis in AXES))
     quarter, three_quarters = ((a + k * (b - a) // 4, c + k * (d - c) // 4) for k in (1, 3))
-    beyond = b + 1, quarter[1]
-    stop = StopKey()
     broken: dict[str, list[str]] = {}
+    checks, stop = _Checks(), StopKey()
     # There is no look to finish: the first Ctrl-C interrupts, and the driver is closed.
     stop.requested = True
     size = rig.stereo_pair.image_width, rig.stereo_pair.image_height
     try:
         with stop:
             positioner = positioner_of(rig) if open_positioner is None else open_positioner()
-            broken["positioner"] = positioner_violations(positioner, [quarter, three_quarters], beyond)
+            broken["positioner"] = positioner_violations(positioner, [quarter, three_quarters], (b + 1, quarter[1]))
             camera = cameras_of(rig) if open_camera is None else open_camera()
             broken["cameras"] = camera_violations(camera, *size)
     except TvsError as error:
-        return [_failed("contract", error)]
+        checks.failed("contract", error)
+        return checks
     remedy = "the driver breaks a promise: see data/docs/instrument.md, Your own hardware"
-    return [
-        check
-        for name, sentences in broken.items()
-        for check in (
-            [Check(f"contract {name}", "fault", sentence, remedy) for sentence in sentences]
-            or [Check(f"contract {name}", "ok", "every promise is kept")]
-        )
-    ]
+    for name, sentences in broken.items():
+        checks += [Check(f"contract {name}", "fault", sentence, remedy) for sentence in sentences]
+        if not sentences:
+            checks.judge(f"contract {name}", "every promise is kept")
+    return checks
 
 
-def _rig(rig: Rig) -> Check:
-    missing = rig.limits.unstated
-    if missing:
+def _rig(rig: Rig, checks: _Checks) -> None:
+    if missing := rig.limits.unstated:
         remedy = "state them in [positioner]: without them the firmware's own limits hold"
-        return Check("limits", "warning", f"{', '.join(missing)} not stated", remedy)
-    if len(rig.sheets_mm) < 2:
-        return Check("limits", "warning", "fewer than two sheets", "name two depths in [sheets]")
-    return Check("limits", "ok", f"soft limits stated, {len(rig.sheets_mm)} sheets")
+        checks.judge("limits", f"{', '.join(missing)} not stated", remedy)
+    elif len(rig.sheets_mm) < 2:
+        checks.judge("limits", "fewer than two sheets", "name two depths in [sheets]")
+    else:
+        checks.judge("limits", f"soft limits stated, {len(rig.sheets_mm)} sheets")
 
 
-def _disk(folder: Path, clock: Clock) -> list[Check]:
+def _disk(folder: Path, clock: Clock, checks: _Checks) -> None:
     """Check free space and the duration of a flush."""
     while not folder.is_dir() and folder != folder.parent:
         folder = folder.parent
     try:
         free = shutil.disk_usage(folder).free
-        remedy = f"free at least {DISK_FREE_BYTES / 1e9:.0f} GB for 700 looks" * (free < DISK_FREE_BYTES)
-        room = Check.judged("disk", f"{free / 1e9:.1f} GB free", remedy)
         disk, path = Disk(), folder / f".tvsbayes-doctor-{os.getpid()}"
         start = clock.monotonic()
         descriptor = disk.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -177,44 +176,48 @@ def _disk(folder: Path, clock: Clock) -> list[Check]:
             path.unlink()
         seconds = clock.monotonic() - start
     except OSError as error:
-        found = escaped(error.strerror or str(error))
-        return [Check("disk", "fault", found, f"make {escaped(str(folder), 200)} writable, or name another folder")]
+        remedy = f"make {escaped(str(folder), 200)} writable, or name another folder"
+        checks.append(Check("disk", "fault", escaped(error.strerror or str(error)), remedy))
+        return
+    remedy = f"free at least {DISK_FREE_BYTES / 1e9:.0f} GB for 700 looks" * (free < DISK_FREE_BYTES)
+    checks.judge("disk", f"{free / 1e9:.1f} GB free", remedy)
     remedy = "write to a local disk, not to a network or a memory card" * (seconds > FLUSH_SLOW_S)
-    return [room, Check.judged("disk flush", f"{1000 * seconds:.1f} ms", remedy)]
+    checks.judge("disk flush", f"{1000 * seconds:.1f} ms", remedy)
 
 
-def _ports(rig: Rig) -> Check:
-    ports = serial_ports()
+def _port(rig: Rig, checks: _Checks) -> None:
+    ports, stated = serial_ports(), rig.positioner.get("port")
     listed = ", ".join(f"{p.name} ({p.description}{', Teensy' if p.teensy else ''})" for p in ports) or "none"
     listed = escaped(listed, 400)
-    stated_port = rig.positioner.get("port")
-    if not stated_port:
-        return Check("port", "fault", f"ports: {listed}", 'write port = "..." into [positioner] of the rig file')
-    if all(port.name != stated_port for port in ports) and not Path(str(stated_port)).exists():
+    shown = escaped(str(stated))
+    if not stated:
+        remedy = 'write port = "..." into [positioner] of the rig file'
+        checks.append(Check("port", "fault", f"ports: {listed}", remedy))
+    elif all(port.name != stated for port in ports) and not Path(str(stated)).exists():
         remedy = "plug the device in, or correct [positioner] port; on Linux join the group dialout"
-        return Check("port", "fault", f"{escaped(str(stated_port))} is not there; ports: {listed}", remedy)
-    return Check("port", "ok", escaped(str(stated_port)))
+        checks.append(Check("port", "fault", f"{shown} is not there; ports: {listed}", remedy))
+    else:
+        checks.judge("port", shown)
 
 
-def _failed(name: str, error: TvsError) -> Check:
-    remedy = error.remedy or ""
-    found = error.found or error.message.removesuffix(f"; {remedy}")
-    return Check(name, "fault", found, remedy.removesuffix(SEE_DOCTOR) or "see the message")
-
-
-def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tuple[Positioner | None, list[Check]]:
+def _positioner(
+    open_positioner: Callable[[], Positioner], clock: Clock, checks: _Checks, stack: ExitStack
+) -> Positioner | None:
     """Check firmware, state and round-trip time."""
     try:
         positioner = open_positioner()
     except TvsError as error:
-        return None, [_failed("firmware", error)]
+        checks.failed("firmware", error)
+        return None
+    stack.callback(positioner.close)
     version = escaped(positioner.identity.get("fw", "unknown"))
     unlike = version != FIRMWARE_VERSION and "driver" not in positioner.identity
     found = f"version {version}" + f", shipped is {FIRMWARE_VERSION}" * unlike
-    remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol" * unlike
-    checks = [Check.judged("firmware", found, remedy)]
+    checks.judge(
+        "firmware", found, "flash the firmware shipped with tvsbayes; this one speaks the same protocol" * unlike
+    )
     for warning in getattr(positioner, "warnings", ()):
-        checks.append(Check("positioner", "warning", warning, "see data/docs/instrument.md, Your own hardware"))
+        checks.judge("positioner", warning, "see data/docs/instrument.md, Your own hardware")
     times = []
     try:
         for _ in range(ROUND_TRIPS):
@@ -223,40 +226,38 @@ def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tupl
             times.append(clock.monotonic() - start)
         if state.laser_on:
             state = positioner.laser(False)
-            checks.append(Check("laser line", "warning", "it was on", "look for a program that left it on"))
-        checks.append(_switches(state))
-        remedy = "acquire homes by itself; for the laser check let a short plan run first" * (state.status != "idle")
-        checks.append(Check.judged("homing", state.status, remedy))
+            checks.judge("laser line", "it was on", "look for a program that left it on")
     except TvsError as error:
-        positioner.close()
-        return None, [*checks, _failed("positioner", error)]
-    trip, repeats = statistics.median(times), positioner.repeats
-    remedy = "use a short USB cable, away from motor wires; no hub" * (trip > ROUND_TRIP_SLOW_S or repeats > 0)
-    found = f"{1000 * trip:.1f} ms, {repeats} of {ROUND_TRIPS} repeated"
-    return positioner, [*checks, Check.judged("timing", found, remedy)]
-
-
-def _switches(state: DeviceState) -> Check:
-    """Report home and limit switches: pressed by hand, they show their wiring before any motion."""
+        checks.failed("positioner", error)
+        return None
+    # Pressed by hand, switches show their wiring before any motion.
     pairs = zip(AXES, state.home_pressed, state.limit_open, strict=True)
-    states = (
+    switches = (
         f"{axis}: home {'pressed' if home else 'free'}, limit {'open' if limit else 'closed'}"
         for axis, home, limit in pairs
     )
     remedy = "turn the axis back by hand; if it stands free, check the wire of its limit switches"
-    return Check.judged("switches", "; ".join(states), remedy * any(state.limit_open))
+    checks.judge("switches", "; ".join(switches), remedy * any(state.limit_open))
+    remedy = "acquire homes by itself; for the laser check let a short plan run first" * (state.status != "idle")
+    checks.judge("homing", state.status, remedy)
+    trip, repeats = statistics.median(times), positioner.repeats
+    remedy = "use a short USB cable, away from motor wires; no hub" * (trip > ROUND_TRIP_SLOW_S or repeats > 0)
+    checks.judge("timing", f"{1000 * trip:.1f} ms, {repeats} of {ROUND_TRIPS} repeated", remedy)
+    return positioner
 
 
 def _camera(
-    rig: Rig, open_camera: Callable[[], StereoCamera] | None, positioner: Positioner | None, clock: Clock
-) -> tuple[StereoCamera | None, list[Check]]:
+    rig: Rig,
+    open_camera: Callable[[], StereoCamera],
+    positioner: Positioner | None,
+    clock: Clock,
+    checks: _Checks,
+    stack: ExitStack,
+) -> StereoCamera | None:
     """Check opening, settings, time of a new pair, exposure and focus."""
-    size = rig.stereo_pair.image_width, rig.stereo_pair.image_height
     try:
-        camera = open_camera() if open_camera is not None else cameras_of(rig)
-    except TvsError as error:
-        return None, [_failed("cameras", error)]
-    try:
+        camera = open_camera()
+        stack.callback(camera.close)
         if positioner is not None:
             connect_trigger(positioner, camera)
         settings = camera.settings()
@@ -264,42 +265,36 @@ def _camera(
         image = camera.grab()
         seconds = clock.monotonic() - start
     except TvsError as error:
-        camera.close()
-        return None, [_failed("cameras", error)]
-    checks = [Check("cameras", "ok", f"two pictures of {size[0]} x {size[1]} px, a fresh pair in {seconds:.2f} s")]
+        checks.failed("cameras", error)
+        return None
+    size = f"{rig.stereo_pair.image_width} x {rig.stereo_pair.image_height} px"
+    checks.judge("cameras", f"two pictures of {size}, a fresh pair in {seconds:.2f} s")
     for warning in settings.warnings:
-        checks.append(Check("camera settings", "warning", warning, "fix it with the camera's own program"))
-    white = image.full_scale
-    checks += [*_picture("left", image.left, white), *_picture("right", image.right, white)]
-    return camera, checks
+        checks.judge("camera settings", warning, "fix it with the camera's own program")
+    for side, picture in (("left", image.left), ("right", image.right)):
+        _picture(side, picture, image.full_scale, checks)
+    return camera
 
 
-def _picture(side: str, picture: np.ndarray, white: int) -> list[Check]:
+def _picture(side: str, picture: np.ndarray, white: int, checks: _Checks) -> None:
     """Check exposure and focus of a picture without laser; `white` is the camera's full scale."""
     import cv2
 
     grey = cv2.cvtColor(in_grey_levels(picture, white), cv2.COLOR_BGR2GRAY)
     mean, clipped = float(grey.mean()), float((grey >= 250).mean())
-    found = f"mean {mean:.0f} of 255, {100 * clipped:.2f} % clipped"
     remedy = ""
     if clipped > CLIPPED_SHARE_MAX or mean > BRIGHT_MEAN_MAX:
         remedy = "darken the room or shorten the exposure: the spot must stand out"
     elif mean < DARK_MEAN_MIN:
         remedy = "take the cap off, or lengthen the exposure"
-    exposure = Check.judged(f"exposure {side}", found, remedy)
+    checks.judge(f"exposure {side}", f"mean {mean:.0f} of 255, {100 * clipped:.2f} % clipped", remedy)
     sharpness = float(cv2.Laplacian(grey.astype(np.float64), cv2.CV_64F).var())
-    blurred = "focus on the sheet with the checkerboard at its place, then calibrate again" * (
-        sharpness < SHARPNESS_MIN
-    )
-    return [exposure, Check.judged(f"focus {side}", f"Laplacian variance {sharpness:.1f}", blurred)]
+    remedy = "focus on the sheet with the checkerboard at its place, then calibrate again"
+    checks.judge(f"focus {side}", f"Laplacian variance {sharpness:.1f}", remedy * (sharpness < SHARPNESS_MIN))
 
 
-def _laser(positioner: Positioner | None, camera: StereoCamera | None, requested: bool) -> Check:
+def _laser(positioner: Positioner, camera: StereoCamera, checks: _Checks) -> None:
     """Check whether both cameras see the spot; the laser is off afterwards, whatever happens."""
-    if positioner is None or camera is None:
-        return Check("laser", "skipped", "needs positioner and cameras", "correct the faults above first")
-    if not requested:
-        return Check("laser", "skipped", "not requested", "run doctor with --laser, goggles on")
     stop = StopKey()
     # There is no look to finish: the first Ctrl-C interrupts.
     stop.requested = True
@@ -313,8 +308,9 @@ def _laser(positioner: Positioner | None, camera: StereoCamera | None, requested
                 stop.closing = True
                 positioner.laser(False)
     except TvsError as error:
-        return _failed("laser", error)
+        checks.failed("laser", error)
+        return
     rises = rises_dn(dark, lit)
     found = f"brightest pixel rises by {rises[0]} (left) and {rises[1]} (right) of 255"
     remedy = "put the sheet into both views; check the laser's supply, and that the lenses have no infrared filter"
-    return Check.judged("laser", found, remedy * (min(rises) < CHANGE_DN))
+    checks.judge("laser", found, remedy * (min(rises) < CHANGE_DN))

@@ -1,4 +1,4 @@
-"""A positioner on a GRBL board: pan is X, tilt is Y, spindle or coolant output switches the laser (`driver = "grbl"`).
+r"""A positioner on a GRBL board: pan is X, tilt is Y, spindle or coolant output switches the laser (`driver = "grbl"`).
 
 Counters are motor steps: machine position times `$100` (`$101`). The board's homing defines zero. GRBL 1.1 has no
 checksum, no sequence numbers and no boot id, so it promises less than this package's firmware. Lost steps are not found
@@ -6,36 +6,27 @@ at the next homing; a computer that crashes leaves the laser on, because no watc
 driver uses all that GRBL reports. Every order waits for its `ok`, arrival is read back, and `$G` reads back the laser's
 mode; a greeting in mid-run is a reset that has lost the counters, and an alarm ends the run.
 
+Lines end in CR LF; an order is answered by `ok` or `error:N`, `?` by `<State|MPos:x,y,z|...>`, and `ALARM:N` or a
+greeting is sent without a request. Positions are millimetres of machine coordinates with three decimals, or the unit
+that the user's settings call a millimetre; settings are `$n=value`.
+Source: https://github.com/gnea/grbl/wiki (Grbl v1.1 Interface, Configuration, Commands).
+
 Counters in motor steps; seconds where a name says `_s`. Time from a `Clock`, bytes from a `Link`.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from tvsbayes.errors import DeviceFault, entry_refusal, escaped
+from tvsbayes.errors import DeviceFault, InputError, entry_refusal, escaped
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.rig import driver_options
-from tvsbayes.positioner.grbl_messages import (
-    ALARMS,
-    ASK,
-    ERRORS,
-    HOLD,
-    LASER_ORDERS,
-    RESET,
-    BoardSettings,
-    Status,
-    number_of,
-    parse_greeting,
-    parse_modes,
-    parse_setting,
-    parse_status,
-)
 from tvsbayes.positioner.interface import Clock, HomeReport, Link, PositionLost, fault, opened, reason
 from tvsbayes.positioner.protocol import DeviceState
 from tvsbayes.positioner.protocol import Status as DeviceStatus
@@ -52,12 +43,143 @@ LINE_CHARS_MAX = 256
 NO_WATCHDOG = "a GRBL board has no watchdog: when this computer fails the laser stays on, unless something else cuts it"
 COUNTERS_MAX = 2_000_000
 """GRBL computes in single precision: beyond this the error of a position exceeds an eighth of a step."""
+STEPS_PER_MM_MAX = 500.0
+"""Positions are reported to 0.0005 mm: beyond this limit that is a quarter of a step and more."""
 OPTIONS = ("laser", "laser_power", "unwatched_laser")
 FOREIGN_KEYS = ("pan_home_steps", "tilt_home_steps", "acceleration_steps_per_s2", "laser_watchdog_s")
 """Entries of `[positioner]` that are settings of the board here ($23, $27, $120), or do not exist on it."""
 UNLIMITED = CounterLimits({axis: (None, None) for axis in AXES})
+RESET, HOLD, ASK = b"\x18", b"!", b"?"
+"""Reset is acted on as soon as it arrives: motion ends, spindle and coolant off. At rest the position is kept."""
+LASER_ORDERS = {"M3": "M5", "M4": "M5", "M7": "M9", "M8": "M9"}
+"""Orders that switch a laser on, with those that switch it off: spindle or coolant."""
 _MOVING = ("Run", "Home", "Jog", "Hold")
+_STATUS = re.compile(r"<([A-Za-z]+)(?::\d+)?\|(.*)>")
+_SETTING = re.compile(r"\$(\d{1,3})=(-?\d+(?:\.\d+)?)")
+_MODES = re.compile(r"\[GC:(.*)\]")
+_GREETING = re.compile(r"(Grbl|GrblHAL) (\S+) .*", re.IGNORECASE)
+ALARMS = {
+    1: "a hard limit was reached, the position is lost",
+    2: "the target lies outside the board's soft limits",
+    3: "reset in motion, the position is lost",
+    6: "homing was reset",
+    7: "the safety door opened while homing",
+    8: "homing could not clear the limit switch",
+    9: "homing did not find the limit switch",
+}
+ERRORS = {
+    5: "homing is not enabled ($22)",
+    8: "not while it moves",
+    9: "locked in alarm: home first",
+    10: "soft limits need homing",
+    15: "the target lies outside the board's travel",
+    20: "an order that this board does not know",
+    22: "no feed rate",
+}
 _refused = partial(entry_refusal, "positioner", "positioner")
+
+
+@dataclass(frozen=True)
+class Status:
+    """A status report.
+
+    Attributes:
+        state: name of the state on the board: "Idle", "Run", "Alarm".
+        position_mm: machine position (x, y).
+        pins: letters of active inputs; "XY" are the limit switches of both axes.
+    """
+
+    state: str
+    position_mm: tuple[float, float]
+    pins: str = ""
+
+
+def parse_status(line: str) -> Status | None:
+    """A status report; None for any other line, also one without machine position."""
+    match = _STATUS.fullmatch(line)
+    if match is None:
+        return None
+    fields = dict(field.partition(":")[::2] for field in match[2].split("|"))
+    try:
+        x, y = map(float, fields["MPos"].split(",")[:2])
+    except (KeyError, ValueError):
+        return None
+    return Status(match[1], (x, y), fields.get("Pn", ""))
+
+
+def parse_setting(line: str) -> tuple[int, float] | None:
+    """Number and value of a line of `$$`; None for any other."""
+    match = _SETTING.match(line)
+    return None if match is None else (int(match[1]), float(match[2]))
+
+
+def parse_modes(line: str) -> frozenset[str] | None:
+    """The modes in force, such as "G90" or "M5", from the answer to `$G`; None for any other line."""
+    match = _MODES.fullmatch(line)
+    return None if match is None else frozenset(match[1].split())
+
+
+def parse_greeting(line: str) -> str | None:
+    """Name and version of a board that has just started; None for any other line."""
+    match = _GREETING.fullmatch(line)
+    return None if match is None else f"{match[1]} {match[2]}"
+
+
+def number_of(line: str, kind: str) -> int | None:
+    """The number of `error:N` or `ALARM:N`; None for any other line."""
+    head, _, number = line.partition(":")
+    return int(number) if head == kind and number.isascii() and number.isdigit() and len(number) < 4 else None
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """The settings of `$$` on which this package depends.
+
+    Attributes:
+        steps_per_mm: steps per mm of pan (X) and tilt (Y).
+        rate_mm_per_min: top speeds of both axes.
+        power_max: `S` of full spindle power.
+        ramps_s: time of the slower axis to reach full speed and to stop again.
+    """
+
+    steps_per_mm: tuple[float, float]
+    rate_mm_per_min: tuple[float, float]
+    power_max: float
+    ramps_s: float
+
+    @classmethod
+    def of(cls, values: Mapping[int, float], laser: str) -> BoardSettings:
+        """Build from settings by number, checked against the requirements of positioning and of the laser's order.
+
+        Raises:
+            InputError: an unsuitable setting, with the required value.
+        """
+
+        def hold(number: int, valid: bool, allowed: str) -> None:
+            if not valid:
+                found = "nothing" if values.get(number) is None else f"{values[number]:g}"
+                remedy = f"set it with any GRBL sender (${number}=...), then connect again"
+                message = f"GRBL setting ${number}: found {found}; allowed: {allowed}; {remedy}"
+                place = f"${number}"
+                raise InputError("grbl-setting", message, column=place, found=found, allowed=allowed, remedy=remedy)
+
+        hold(1, values.get(1) == 255, "255: motors hold their place at rest")
+        hold(13, values.get(13) == 0, "0: reports in millimetres")
+        # grblHAL has more switches in the bits of $22; bit 0 enables homing.
+        hold(22, bool(int(values.get(22, 0)) & 1), "1: homing, without which counters mean nothing")
+        if laser in ("M3", "M4"):
+            hold(32, values.get(32) == 0, "0: no laser mode, in which light depends on the motion")
+        hold(10, bool(int(values.get(10, 0)) & 1), "an odd number, such as 1: machine positions in the status")
+        for number in (100, 101, 110, 111, 120, 121):
+            high = STEPS_PER_MM_MAX if number < 110 else 1e9
+            hold(number, 0 < values.get(number, 0) <= high, f"more than 0, at most {high:g}")
+        ramps_s = max(2 * values[110 + axis] / 60 / values[120 + axis] for axis in (0, 1))
+        return cls((values[100], values[101]), (values[110], values[111]), values.get(30, 1000.0), ramps_s)
+
+    def counters(self, position_mm: tuple[float, float]) -> tuple[int, int]:
+        """Motor steps of (pan, tilt) at a machine position."""
+        pan, tilt = (round(p * k) for p, k in zip(position_mm, self.steps_per_mm, strict=True))
+        return pan, tilt
 
 
 @dataclass(frozen=True)
@@ -90,20 +212,23 @@ class GrblSettings:
                 remedy = "remove it: ramps and home position are settings of the board, a watchdog it does not have"
                 raise _refused(key, str(table[key]), "no entry with a GRBL board", remedy)
         options = driver_options(table, "positioner", OPTIONS)
-        laser = str(options.get("laser", "M3"))
+        laser, power = str(options.get("laser", "M3")), options.get("laser_power")
+        speed, unwatched = table.get("speed_steps_per_s"), options.get("unwatched_laser", 0)
         if laser not in LASER_ORDERS:
             remedy = "name what switches the laser: M3 the spindle, M7 mist, M8 flood coolant"
             raise _refused("options.laser", escaped(laser), ", ".join(LASER_ORDERS), remedy)
-        speed, unwatched = table.get("speed_steps_per_s"), options.get("unwatched_laser", 0)
         # Any text is true in Python, also "false" and "no": it would enable the laser without consent.
         if unwatched not in (0, 1):
             remedy = (
                 "write true, without quotes, once something else cuts the light when the computer fails; else false"
             )
             raise _refused("options.unwatched_laser", escaped(str(unwatched)), "true or false (1 or 0)", remedy)
+        if power is not None and (isinstance(power, str) or not 0 <= power < math.inf):
+            remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
+            raise _refused("options.laser_power", escaped(str(power)), "a number of 0 or more", remedy)
         return cls(
             laser,
-            _laser_power(options.get("laser_power")),
+            None if power is None else float(power),
             bool(unwatched),
             CounterLimits.of(table),
             None if speed is None else float(speed),
@@ -126,8 +251,7 @@ class GrblPositioner:
     def __init__(self, open_link: Callable[[], Link], stated: GrblSettings | None = None, clock: Clock = time):
         self._settings, self._clock = stated or GrblSettings(), clock
         self._buffer, self._received = bytearray(), bytearray()
-        self._pending, self._homed, self._greeted, self._done = 0, False, False, 0
-        self._lit = False
+        self._pending, self._homed, self._greeted, self._lit, self._done = False, False, False, False, 0
         self._target: tuple[int, int] = (0, 0)
         self._status: Status | None = None
         self.repeats = 0
@@ -137,8 +261,7 @@ class GrblPositioner:
         self._link = opened(open_link)
         try:
             self.identity: dict[str, str] = {"fw": self._greeting(), "driver": "grbl"}
-            values: dict[int, float] = {}
-            self._order("$$", REPLY_S, lambda line: values.update([entry]) if (entry := parse_setting(line)) else None)
+            values = dict(filter(None, map(parse_setting, self._order("$$", REPLY_S))))
             self._board = BoardSettings.of(values, self._settings.laser)
             if (power := self._settings.laser_power or 0.0) > self._board.power_max:
                 # The board would apply full power.
@@ -173,9 +296,9 @@ class GrblPositioner:
                 raise fault("refused-limit", found, "correct the plan or the limits in [positioner]")
         if self._lit:
             self.laser(False)
-        start = self._status_report()
+        start = self._board.counters(self._status_report().position_mm)
         self._target = target
-        order, motion_s = self._motion_order(self._board.counters(start.position_mm), target)
+        order, motion_s = self._motion_order(start, target)
         self._order(order, REPLY_S)
         # The board sends its `ok` after completing all earlier orders.
         self._order("G4 P0.01", 5.0 + 2.0 * (motion_s + self._board.ramps_s))
@@ -187,22 +310,27 @@ class GrblPositioner:
             found = f"the board is at {reached}, ordered was {target}"
             raise fault("position", found, "home again; look for soft limits ($20) and feed hold")
         self._done += 1
-        return self._require_dark(self._state(status, laser_on=self._laser_on()))
+        return self._require_dark(self._state(status))
 
     def laser(self, on: bool) -> DeviceState:
         """See `Positioner.laser`."""
+        settings = self._settings
         if on:
             self._require_homed("light")
-            if not self._settings.unwatched:
+            if not settings.unwatched:
                 raise fault(
                     "laser",
                     "a GRBL board leaves the laser on when this computer fails",
                     "have something else cut it, then write unwatched_laser = true into [positioner.options]",
                 )
+        order = settings.laser if on else LASER_ORDERS[settings.laser]
+        if on and settings.laser in ("M3", "M4"):
+            power = self._board.power_max if settings.laser_power is None else settings.laser_power
+            order = f"{settings.laser} S{power:g}"
         # Set before the order: after an interruption it is unknown whether the order arrived.
         self._lit = self._lit or on
         try:
-            self._order(self._laser_order(on), REPLY_S)
+            self._order(order, REPLY_S)
             state = self.state()
         except DeviceFault:
             if not on:
@@ -218,8 +346,7 @@ class GrblPositioner:
 
     def state(self) -> DeviceState:
         """See `Positioner.state`."""
-        status = self._status_report()
-        return self._state(status, laser_on=self._laser_on())
+        return self._state(self._status_report())
 
     def close(self) -> None:
         """See `Positioner.close`; a soft reset ends motion and light at once."""
@@ -234,51 +361,37 @@ class GrblPositioner:
 
     def _greeting(self) -> str:
         """Reset the board, which ends motion and light, and read its name."""
-        self._greeted, self._pending = False, 0
+        self._greeted = self._pending = False
         self._received.clear()
         for attempt in range(GREETING_ATTEMPTS):
             # The empty line makes other firmware answer as well.
             self._write(RESET + b"\n" if attempt else RESET)
             deadline = self._clock.monotonic() + GREETING_S
             while (line := self._next_line(deadline)) is not None:
-                name = parse_greeting(line)
-                if name is not None:
-                    self._settle_line()
+                if (name := parse_greeting(line)) is not None:
+                    deadline = self._clock.monotonic() + POLL_S
+                    while self._next_line(deadline) is not None:
+                        # Lines after a greeting, such as the reminder to unlock.
+                        pass
                     self._greeted, self._lit = True, False
                     return name
         report = explained(bytes(self._received))
         found, remedy = f"no GRBL board answers: {report.found}", report.remedy
-        if b"!boot" in self._received or b"!nak" in self._received or b"<0 " in self._received:
+        if any(mark in self._received for mark in (b"!boot", b"!nak", b"<0 ")):
             found, remedy = f"our own firmware answers: {report.found}", 'write driver = "serial" into [positioner]'
         raise fault("no-answer", found, remedy)
 
-    def _settle_line(self) -> None:
-        """Skip the lines after a greeting, such as the reminder to unlock."""
-        deadline = self._clock.monotonic() + POLL_S
-        while self._next_line(deadline) is not None:
-            pass
-
-    def _laser_order(self, on: bool) -> str:
-        """The order that switches the laser on or off."""
-        settings = self._settings
-        if not on:
-            return LASER_ORDERS[settings.laser]
-        if settings.laser not in ("M3", "M4"):
-            return settings.laser
-        power = self._board.power_max if settings.laser_power is None else settings.laser_power
-        return f"{settings.laser} S{power:g}"
-
     def _motion_order(self, start: tuple[int, int], end: tuple[int, int]) -> tuple[str, float]:
         """The order of a motion in machine coordinates, and its longest duration without ramps, s."""
-        x, y = self._board.position_mm(end)
+        board, speed = self._board, self._settings.speed_steps_per_s
+        x, y = (n / k for n, k in zip(end, board.steps_per_mm, strict=True))
         steps = [abs(b - a) for a, b in zip(start, end, strict=True)]
-        rates = [r * k / 60 for r, k in zip(self._board.rate_mm_per_min, self._board.steps_per_mm, strict=True)]
-        speed = self._settings.speed_steps_per_s
+        rates = [r * k / 60 for r, k in zip(board.rate_mm_per_min, board.steps_per_mm, strict=True)]
         slowest = [rate if speed is None else min(rate, speed) for rate in rates]
         motion_s = max(n / rate for n, rate in zip(steps, slowest, strict=True))
         if speed is None or not motion_s:
             return f"G53 G0 X{x:.5f} Y{y:.5f}", motion_s
-        distance_mm = sum((n / k) ** 2 for n, k in zip(steps, self._board.steps_per_mm, strict=True)) ** 0.5
+        distance_mm = sum((n / k) ** 2 for n, k in zip(steps, board.steps_per_mm, strict=True)) ** 0.5
         return f"G53 G1 X{x:.5f} Y{y:.5f} F{60 * distance_mm / motion_s:.4f}", motion_s
 
     def _require_dark(self, state: DeviceState) -> DeviceState:
@@ -293,7 +406,12 @@ class GrblPositioner:
         if not self._homed:
             raise fault("refused-unhomed", f"{action} was ordered before homing", "home first")
 
-    def _state(self, status: Status, laser_on: bool) -> DeviceState:
+    def _state(self, status: Status) -> DeviceState:
+        modes = [report for line in self._order("$G", REPLY_S) if (report := parse_modes(line))]
+        if not modes:
+            raise fault("no-answer", "$G was answered without modes", "check the board's firmware: GRBL 1.1 is known")
+        # Both coolants may be on at once; M5 and M9 mean off.
+        laser_on = self._settings.laser in modes[-1]
         pan, tilt = self._board.counters(status.position_mm)
         word: DeviceStatus = "moving" if status.state in _MOVING else "alarm"
         if status.state == "Idle":
@@ -302,14 +420,6 @@ class GrblPositioner:
         # GRBL homes onto its limit switches: a pressed switch cannot be distinguished from a broken wire.
         pressed = int("X" in status.pins), int("Y" in status.pins)
         return DeviceState(0, word, pan, tilt, *self._target, self._done, laser_on, 0, 0, error, *pressed)
-
-    def _laser_on(self) -> bool:
-        reports: list[frozenset[str]] = []
-        self._order("$G", REPLY_S, lambda line: reports.append(report) if (report := parse_modes(line)) else None)
-        if not reports:
-            raise fault("no-answer", "$G was answered without modes", "check the board's firmware: GRBL 1.1 is known")
-        # Both coolants may be on at once; M5 and M9 mean off.
-        return self._settings.laser in reports[-1]
 
     def _status_report(self) -> Status:
         """Request a status report."""
@@ -324,38 +434,39 @@ class GrblPositioner:
                 return self._status
         raise self._no_answer("?")
 
-    def _order(self, order: str, timeout_s: float, on_line: Callable[[str], object] = lambda line: None) -> None:
-        """Send one line and wait for its `ok`; lines in between go to `on_line`."""
+    def _order(self, order: str, timeout_s: float) -> list[str]:
+        """Send one line and wait for its `ok`; returns the lines in between."""
         self._resynchronise()
         self._write(order.encode("ascii") + b"\n")
-        self._pending = 1
+        self._pending, lines = True, list[str]()
         deadline = self._clock.monotonic() + timeout_s
-        polls = timeout_s > REPLY_S
         while self._pending:
             now = self._clock.monotonic()
-            line = self._next_line(min(deadline, now + POLL_S) if polls else deadline)
+            line = self._next_line(min(deadline, now + POLL_S) if timeout_s > REPLY_S else deadline)
             if line is None:
                 if self._clock.monotonic() >= deadline:
                     self._give_up(order, timeout_s)
                 self._write(ASK)
-                continue
-            error = number_of(line, "error")
-            if line == "ok":
-                self._pending = 0
-            elif error is not None:
-                self._pending = 0
-                found = f"{order} was refused: error {error}, {ERRORS.get(error, 'see the GRBL manual')}"
-                raise fault(f"refused-{error}", found, "home first" if error == 9 else "see the GRBL manual")
+            elif self._is_answer(line):
+                if (error := number_of(line, "error")) is not None:
+                    found = f"{order} was refused: error {error}, {ERRORS.get(error, 'see the GRBL manual')}"
+                    raise fault(f"refused-{error}", found, "home first" if error == 9 else "see the GRBL manual")
             else:
                 self._handle_line(line)
-                on_line(line)
+                lines.append(line)
+        return lines
+
+    def _is_answer(self, line: str) -> bool:
+        """Whether a line ends the wait for an answer, as `ok` and errors do."""
+        answers = line == "ok" or number_of(line, "error") is not None
+        self._pending = self._pending and not answers
+        return answers
 
     def _resynchronise(self) -> None:
         """Wait for the answer to an interrupted order."""
         deadline = self._clock.monotonic() + REPLY_S
         while self._pending and (line := self._next_line(deadline)) is not None:
-            if line == "ok" or number_of(line, "error") is not None:
-                self._pending = 0
+            self._is_answer(line)
         if self._pending:
             self._write(RESET)
             raise self._no_answer("an order that was interrupted")
@@ -371,16 +482,13 @@ class GrblPositioner:
     def _no_answer(self, order: str) -> DeviceFault:
         report = explained(bytes(self._received))
         cause = "nothing was heard" if report.cause == "silence" else report.found
-        remedy = self._darkness_first("check cable and supply, then go on with --resume")
-        return fault("no-answer", f"no answer to {order}: {cause}", remedy)
+        return self._unreachable(
+            "no-answer", f"no answer to {order}: {cause}", "check cable and supply, then go on with --resume"
+        )
 
-    def _unplugged(self, error: OSError) -> DeviceFault:
-        remedy = self._darkness_first("plug it in, then go on with --resume: it homes again")
-        return fault("unplugged", f"the board is gone: {reason(error)}", remedy)
-
-    def _darkness_first(self, remedy: str) -> str:
-        """A remedy for a board that cannot be reached: it has no watchdog that switches the laser off."""
-        return f"cut the laser's supply, it may be on; {remedy}" if self._lit else remedy
+    def _unreachable(self, code: str, found: str, remedy: str) -> DeviceFault:
+        """A fault of a board that cannot be reached: it has no watchdog that switches the laser off."""
+        return fault(code, found, f"cut the laser's supply, it may be on; {remedy}" if self._lit else remedy)
 
     def _handle_line(self, line: str) -> None:
         """Store a status report; raise for an alarm and for a greeting, which means a reset."""
@@ -400,10 +508,14 @@ class GrblPositioner:
             )
 
     def _write(self, data: bytes) -> None:
+        self._on_line(lambda: self._link.write(data))
+
+    def _on_line[T](self, call: Callable[[], T]) -> T:
         try:
-            self._link.write(data)
+            return call()
         except OSError as error:
-            raise self._unplugged(error) from error
+            remedy = "plug it in, then go on with --resume: it homes again"
+            raise self._unreachable("unplugged", f"the board is gone: {reason(error)}", remedy) from error
 
     def _next_line(self, deadline_s: float) -> str | None:
         """The next line that is not empty, without its end; None if none is complete by the deadline."""
@@ -418,20 +530,7 @@ class GrblPositioner:
             left_s = deadline_s - self._clock.monotonic()
             if left_s <= 0:
                 return None
-            try:
-                data = self._link.read(left_s)
-            except OSError as error:
-                raise self._unplugged(error) from error
+            data = self._on_line(partial(self._link.read, left_s))
             self._buffer += data
             if not self._greeted:
                 self._received += data[: max(HEARD_BYTES_MAX - len(self._received), 0)]
-
-
-def _laser_power(entry: str | int | float | None) -> float | None:
-    """`S` of a spindle order in the rig file."""
-    if entry is None:
-        return None
-    if isinstance(entry, str) or not 0 <= entry < math.inf:
-        remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
-        raise _refused("options.laser_power", escaped(str(entry)), "a number of 0 or more", remedy)
-    return float(entry)

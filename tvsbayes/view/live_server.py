@@ -1,25 +1,33 @@
-"""The server of a run's page: on 127.0.0.1 only, in a separate thread, whose delay or failure does not affect the run.
+"""The page of a run: served on 127.0.0.1 only, in a separate thread, whose delay or failure does not affect the run.
+
+Only browsers with the page's link may read, and only from the page itself. The link's token stands after the #, which
+browsers do not send; the page sends it as a header with every request. There is no cookie: requests that another page
+causes in this browser carry no token (CSRF). The Host header reveals a foreign name that resolves to 127.0.0.1 (DNS
+rebinding), Origin and Sec-Fetch-Site reveal another page (Fetch Metadata, W3C). All requests, also for unknown paths,
+pass `Access` first; no path in a request is used as a path on the disk, and nothing can be written.
 
 The server shares the file descriptors of the run, so it keeps few connections, and none for long without a request.
+Tornado is an extra: it is imported once a page is served.
 """
 
 from __future__ import annotations
 
 import asyncio
+import hmac
+import json
+import re
+import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.view.access import HOSTS, Access
-
-if TYPE_CHECKING:
-    from tvsbayes.view.live_handlers import Watched
+from tvsbayes.instrument.campaign import CAMERAS
 
 HTML, CSS, SCRIPT = ("text/html; charset=utf-8", "text/css; charset=utf-8", "text/javascript; charset=utf-8")
 PAGE_FILES = {
@@ -30,6 +38,23 @@ PAGE_FILES = {
     "/live.js": ("live.js", SCRIPT),
 }
 """Paths of the page, with their files in `data/view` and MIME types."""
+PICTURE = re.compile(rf"/live/([0-9]{{1,10}})/({'|'.join(CAMERAS)})/(whole|spot)")
+HOSTS = ("127.0.0.1", "localhost")
+TOKEN_HEADER = "X-Tvsbayes-Token"
+TOKEN_BYTES = 32
+SECURITY_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+"""Headers of every answer. The policy lets the page load only from its own server: no request leaves the machine."""
 REQUEST_BYTES_MAX = 4096
 CONNECTIONS_MAX, DESCRIPTORS_SHARE = 64, 4
 """Largest number of open connections, also at most the process' limit of descriptors over the second number."""
@@ -41,6 +66,44 @@ PICTURES_S = 0.5
 """Further wait for the pictures that they fetch after it."""
 READER_S = 2.0
 """Time without a request after which a reader counts as gone."""
+Files = Mapping[str, tuple[bytes, str]]
+"""Content and MIME type of the page's own files, by path."""
+
+
+class Watched(Protocol):
+    """Interface of a run for its page; called by the server's thread, so no call may wait for the run."""
+
+    def document(self) -> dict[str, Any]:
+        """The newest snapshot as a JSON document."""
+
+    def picture(self, spot: int, camera: str, kind: str) -> bytes | None:
+        """JPEG of the last look: "whole", or "spot" for the region around it; None if there is none."""
+
+
+class Access:
+    """Token and address of the page on one port."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self._token = secrets.token_urlsafe(TOKEN_BYTES)
+
+    @property
+    def link(self) -> str:
+        """The address to open."""
+        return f"http://{HOSTS[0]}:{self.port}/#{self._token}"
+
+    def stranger(self, headers: Mapping[str, str]) -> str | None:
+        """Why a request with these headers is not from the page itself, None where it may be."""
+        hosts = [f"{host}:{self.port}" for host in HOSTS]
+        if headers.get("Host", "") not in hosts:
+            return "this server answers to 127.0.0.1 and localhost only"
+        origins = (None, *(f"http://{host}" for host in hosts))
+        foreign = headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none")
+        return "another page asked" if foreign or headers.get("Origin") not in origins else None
+
+    def knows(self, headers: Mapping[str, str]) -> bool:
+        """Whether a request carries the token; compared in a time independent of where they differ."""
+        return hmac.compare_digest(headers.get(TOKEN_HEADER, "").encode(errors="replace"), self._token.encode())
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
@@ -68,6 +131,55 @@ def connections_max() -> int:
     return CONNECTIONS_MAX if soft < 0 else max(2, min(CONNECTIONS_MAX, soft // DESCRIPTORS_SHARE))
 
 
+def _application(files: Files, access: Access, live: Watched, read: Callable[[int], None]) -> Any:
+    """The application that answers; `read` is called with the number of every snapshot that is sent."""
+    from tornado import web
+
+    class Page(web.RequestHandler):
+        def set_default_headers(self) -> None:
+            self.clear_header("Server")
+            for name, value in SECURITY_HEADERS.items():
+                self.set_header(name, value)
+
+        def prepare(self) -> None:
+            path, headers = self.request.path, self.request.headers
+            reason = access.stranger(headers)
+            # Files of the page contain no data of a run, and browsers cannot send the token's header for a script.
+            if reason is None and path not in files and not access.knows(headers):
+                reason = "without the token of its link: open the link that the terminal shows"
+            if reason is not None:
+                raise web.HTTPError(403, reason=reason)
+            if path not in files and path != "/live" and PICTURE.fullmatch(path) is None:
+                raise web.HTTPError(404)
+
+        def get(self) -> None:
+            path = self.request.path
+            if path in files:
+                content, kind = files[path]
+                self.send(kind, content)
+            elif asked := PICTURE.fullmatch(path):
+                picture = live.picture(int(asked[1]), asked[2], asked[3])
+                if picture is None:
+                    # A newer look has replaced it, which is not an error.
+                    self.set_status(204)
+                else:
+                    self.send("image/jpeg", picture)
+            else:
+                document = live.document()
+                self.send("application/json", json.dumps(document, allow_nan=False))
+                read(document["number"])
+
+        def write_error(self, status_code: int, **kwargs: Any) -> None:
+            # In words, without a traceback.
+            self.send("text/plain; charset=utf-8", f"{status_code}: {self._reason}\n")
+
+        def send(self, kind: str, content: str | bytes) -> None:
+            self.set_header("Content-Type", kind)
+            self.finish(content)
+
+    return web.Application([(".*", Page)], log_function=lambda handler: None)
+
+
 async def serving(live: Watched, port: int, started: Callable[[str], None], read: Callable[[int], None]) -> None:
     """Serve the page of a run on 127.0.0.1 until the task is cancelled.
 
@@ -84,7 +196,8 @@ async def serving(live: Watched, port: int, started: Callable[[str], None], read
     from tornado.httpserver import HTTPServer
     from tornado.iostream import IOStream
 
-    from tvsbayes.view.live_handlers import application
+    connections: list[IOStream] = []
+    most = connections_max()
 
     class Server(HTTPServer):
         """Closes the oldest connection where there are too many, so that new ones are served."""
@@ -96,8 +209,6 @@ async def serving(live: Watched, port: int, started: Callable[[str], None], read
             connections[:] = [*still, stream]
             super().handle_stream(stream, address)
 
-    connections: list[IOStream] = []
-    most = connections_max()
     try:
         listening = socket.create_server((HOSTS[0], port))
     except OSError as error:
@@ -107,7 +218,7 @@ async def serving(live: Watched, port: int, started: Callable[[str], None], read
     listening.setblocking(False)
     access = Access(listening.getsockname()[1])
     limits = {"max_body_size": REQUEST_BYTES_MAX, "idle_connection_timeout": IDLE_S, "body_timeout": IDLE_S}
-    server = Server(application(files, access, live, read), **limits)
+    server = Server(_application(files, access, live, read), **limits)
     server.add_sockets([listening])
     try:
         started(access.link)

@@ -18,7 +18,7 @@ from tvsbayes.instrument.campaign import CAMERAS, PIXELS
 from tvsbayes.report.page import rendered
 from tvsbayes.results.records import plain
 from tvsbayes.view.pictures import PagePicture
-from tvsbayes.view.scene import LookColumns, Looked, Scene, numbers_of
+from tvsbayes.view.scene import Looked, Scene
 from tvsbayes.view.shapes import PROBABILITY
 
 SCRIPTS = ("drawing.js", "columns.js", "plots.js", "rig.js", "page.js")
@@ -34,35 +34,24 @@ def packed(values: np.ndarray) -> dict[str, object]:
     return {"type": kind, "shape": list(values.shape), "base64": base64.b64encode(content).decode("ascii")}
 
 
-def _looks(looks: LookColumns) -> dict[str, object]:
-    """Pack the columns; residuals are computed in double precision."""
-    numbers = numbers_of(looks) | {"residual_px": looks.pixels_px - looks.predicted_px}
-    texts = {"target": list(looks.target), "status": list(looks.status), "direction": list(looks.direction)}
-    return {**{name: packed(values) for name, values in numbers.items()}, **texts}
-
-
-def _bare(values: np.ndarray) -> list[float] | None:
-    """A short list of numbers, None where they are unknown."""
-    return values.tolist() if np.isfinite(values).all() else None
-
-
 Pictures = Mapping[int, Mapping[str, PagePicture]]
 """Pictures by look and camera."""
 
 
 def _scene(shown: Scene, pictures: Pictures) -> dict[str, object]:
-    """The entry of one campaign."""
-    gears = [{**plain(band), "seen_steps": list(band.seen_steps)} for band in shown.gears]
+    """The entry of one campaign; residuals are computed in double precision."""
+    columns = {**vars(shown.looks), "residual_px": shown.looks.pixels_px - shown.looks.predicted_px}
+    origin_mm = shown.origin_mm.tolist() if np.isfinite(shown.origin_mm).all() else None
     return {
         "name": shown.name,
         "fitted": shown.fitted,
         "notes": list(shown.notes),
         "image_px": list(shown.image_px),
-        "looks": _looks(shown.looks),
+        "looks": {name: packed(v) if isinstance(v, np.ndarray) else list(v) for name, v in columns.items()},
         "pictures": {str(spot): plain(by_camera) for spot, by_camera in pictures.items()},
         "pictured": len(pictures),
-        "rig": {"cameras": plain(shown.cameras), "sheets": plain(shown.sheets), "origin_mm": _bare(shown.origin_mm)},
-        "gears": gears,
+        "rig": {"cameras": plain(shown.cameras), "sheets": plain(shown.sheets), "origin_mm": origin_mm},
+        "gears": [{**plain(band), "seen_steps": list(band.seen_steps)} for band in shown.gears],
         "parameters": plain(shown.parameters),
         "correlation": {"names": list(shown.correlated), "matrix": shown.correlation.round(4).tolist()},
     }

@@ -7,8 +7,9 @@ deg; counters in steps. Unknown values are NaN.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from tvsbayes.instrument.campaign import (
     CAMERAS,
     PIXELS,
     Campaign,
-    Spot,
     frame_name,
     ordered_spots,
     pixels_of,
@@ -36,7 +36,6 @@ from tvsbayes.results.comparison_record import Comparison
 from tvsbayes.results.estimates import StopResidual
 from tvsbayes.results.fit_record import FitRecord
 from tvsbayes.results.store import FIT
-from tvsbayes.statistics.intervals import WithSd
 from tvsbayes.view.laser_ways import Ways, laser_ways
 from tvsbayes.view.shapes import (
     PYRAMID_MM,
@@ -171,22 +170,27 @@ def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str]
         notes: remarks for the reader.
     """
     ways = _ways(campaign, fitted)
-    looks = _looks(campaign, ways, fitted)
+    looks = LookColumns(**_of_tables(campaign), **_of_rig(campaign, ways, fitted))
     seen_mm = looks.point_mm[np.isfinite(looks.point_mm).all(axis=1)]
     reach_mm = float(np.median(np.linalg.norm(seen_mm, axis=1))) if len(seen_mm) else 0.0
-    correlated, correlation = _correlation(fitted)
-    size = campaign.stereo_pair.image_width, campaign.stereo_pair.image_height
+    stated = campaign.rig.priors
+    parameters = [ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES]
+    correlated, correlation = (), np.zeros((0, 0))
+    if fitted is not None:
+        named = fitted.record.summary.named.items()
+        parameters = [ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction) for name, e in named]
+        correlated, correlation = _correlation(fitted.record)
     return Scene(
         name=campaign.title,
         fitted=fitted is not None,
         notes=tuple(notes),
-        image_px=size,
+        image_px=(campaign.stereo_pair.image_width, campaign.stereo_pair.image_height),
         looks=looks,
         cameras=pyramids(campaign.stereo_pair, PYRAMID_SHARE * reach_mm or PYRAMID_MM),
         sheets=sheets(looks.target, looks.point_mm),
         origin_mm=np.full(3, np.nan) if ways is None else np.asarray(ways.origin_mm)[:, 0],
         gears=() if fitted is None else fitted.gears,
-        parameters=_parameters(campaign, fitted),
+        parameters=tuple(parameters),
         correlated=correlated,
         correlation=correlation,
     )
@@ -205,118 +209,76 @@ def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
     return laser_ways(fit.z, turned, fit.space, fit.arrays)
 
 
+def _of_tables(campaign: Campaign) -> dict[str, Any]:
+    """Columns of looks from the tables and the folder."""
+    spots, frames = stereo_spots(campaign.spots), set[str]()
+    if campaign.path is not None and (campaign.path / "frames").is_dir():
+        frames = {f"frames/{path.name}" for path in (campaign.path / "frames").iterdir()}
+    at = [campaign.moves[spot.move] for spot in spots]
+    signs = {axis: rests_of(campaign.moves, axis) for axis in AXES}
+    counted = [spot.status == "ok" for spot in spots]
+    sds = [
+        [getattr(spot, f"s{name}") if ok else None for name in PIXELS] for spot, ok in zip(spots, counted, strict=True)
+    ]
+    return {
+        "spot": np.array([spot.spot for spot in spots], dtype=int),
+        "move": np.array([spot.move for spot in spots], dtype=int),
+        "target": tuple(spot.target for spot in spots),
+        "status": tuple(spot.status for spot in spots),
+        "direction": tuple(tuple(direction_of(a, signs[a][spot.move].sign) for a in AXES) for spot in spots),
+        "steps": np.array([(move.pan_steps, move.tilt_steps) for move in at], dtype=int).reshape(-1, 2),
+        "pictures": np.array([[frame_name(s.spot, c) in frames for c in CAMERAS] for s in spots], bool).reshape(-1, 2),
+        "sd_px": np.array(sds, dtype=float).reshape(-1, 4),
+    }
+
+
 _WAY_SHAPES = {"mirrors_mm": (0, 3), "normals": (0, 3), "end_mm": (3,), "predicted_px": (4,)}
 """Shapes of values of a look, where the campaign has no usable spot."""
 
 
-def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> LookColumns:
-    """Compute the columns."""
-    spots, count = stereo_spots(campaign.spots), len(campaign.spots)
-    row_of = {spot.spot: row for row, spot in enumerate(spots)}
-    used = ordered_spots(campaign)
+def _of_rig(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> dict[str, np.ndarray]:
+    """Columns of looks from the rig, stated or fitted: NaN where a look has no usable spot."""
+    count, used = len(campaign.spots), ordered_spots(campaign)
+    row_of = {spot.spot: row for row, spot in enumerate(campaign.spots)}
     rows = np.array([row_of[spot.spot] for spot in used], dtype=int)
-    laid = {name: np.full((count, *shape), np.nan) for name, shape in _WAY_SHAPES.items()}
-    if ways is not None:
-        for name in laid:
-            of_looks = np.moveaxis(np.asarray(getattr(ways, name)), -1, 0)
-            laid[name] = np.full((count, *of_looks.shape[1:]), np.nan)
-            laid[name][rows] = of_looks[: len(rows)]
-    point, covariance = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    pixels = np.full((count, 4), np.nan)
-    pixels[rows] = pixels_of(used)
-    suspect = np.zeros(count, dtype=bool)
-    scale = 1.0
+
+    def column(values: np.ndarray) -> np.ndarray:
+        laid = np.full((count, *values.shape[1:]), np.nan)
+        laid[rows] = values[: len(rows)]
+        return laid
+
+    columns = {
+        name: column(np.zeros((0, *shape)) if ways is None else np.moveaxis(np.asarray(getattr(ways, name)), -1, 0))
+        for name, shape in _WAY_SHAPES.items()
+    }
+    columns["pixels_px"] = column(pixels_of(used))
+    deviation, u = np.full((2, count, 2), np.nan)
+    suspect, scale = np.zeros(count, dtype=bool), 1.0
     if fitted is None:
         # Residuals of an unfitted rig would only show its mounting.
-        laid["predicted_px"][:] = np.nan
+        columns["predicted_px"][:] = np.nan
     else:
         scale = fitted.record.summary.parameters["pixel_scale"].value
         suspect[[row_of[spot] for spot in (*fitted.fit.suspect_spots, *fitted.fit.excluded_spots)]] = True
+        for stop in fitted.stops:
+            place = [row_of[spot] for spot in stop.spots], AXES.index(stop.axis)
+            deviation[place], u[place] = stop.deviation_deg, stop.u_deg
+    point, covariance = np.zeros((0, 3)), np.zeros((0, 3, 3))
     if used:
-        point[rows] = campaign.points_mm[rows]
-        noise = scale**2 * np.stack([spot.pixel_covariance() for spot in used])
-        covariance[rows] = point_covariance_mm2(campaign.stereo_pair, point[rows], noise)
-    deviation, u = _deviations(row_of, () if fitted is None else fitted.stops)
-    return LookColumns(
-        spot=np.array([spot.spot for spot in spots], dtype=int),
-        move=np.array([spot.move for spot in spots], dtype=int),
-        target=tuple(spot.target for spot in spots),
-        status=tuple(spot.status for spot in spots),
-        direction=_directions(campaign),
-        steps=_steps(campaign),
-        pictures=_pictures(campaign),
-        pixels_px=pixels,
-        sd_px=np.array([[_sd(spot, name) for name in PIXELS] for spot in spots]).reshape(-1, 4),
-        point_mm=point,
-        ellipsoid_mm=ellipsoid_axes_mm(covariance),
-        deviation_deg=deviation,
-        u_deg=u,
-        suspect=suspect,
-        **laid,
-    )
+        point = campaign.points_mm[rows]
+        noise = scale**2 * np.stack([spot.pixel_covariance() for spot in stereo_spots(used)])
+        covariance = point_covariance_mm2(campaign.stereo_pair, point, noise)
+    ellipsoid = ellipsoid_axes_mm(column(covariance))
+    seen = {"point_mm": column(point), "ellipsoid_mm": ellipsoid, "suspect": suspect}
+    return {**columns, **seen, "deviation_deg": deviation, "u_deg": u}
 
 
-def _sd(spot: Spot, pixel: str) -> float:
-    """Stated standard uncertainty of a pixel, px."""
-    sd = getattr(spot, f"s{pixel}")
-    return np.nan if sd is None or spot.status != "ok" else sd
-
-
-def _steps(campaign: Campaign) -> np.ndarray:
-    """Counters of the looks, shape (n, 2)."""
-    at = [campaign.moves[spot.move] for spot in campaign.spots]
-    return np.array([(move.pan_steps, move.tilt_steps) for move in at], dtype=int).reshape(-1, 2)
-
-
-def _directions(campaign: Campaign) -> tuple[tuple[str, str], ...]:
-    """Directions of approach of each axis, by look."""
-    by_axis = []
-    for axis in AXES:
-        rests = rests_of(campaign.moves, axis)
-        by_axis.append([direction_of(axis, rests[spot.move].sign) for spot in campaign.spots])
-    return tuple(zip(*by_axis, strict=True))
-
-
-def _pictures(campaign: Campaign) -> np.ndarray:
-    """Whether each picture is in the folder, shape (n, 2)."""
-    kept: set[str] = set()
-    if campaign.path is not None and (campaign.path / "frames").is_dir():
-        kept = {f"frames/{path.name}" for path in (campaign.path / "frames").iterdir()}
-    held = [[frame_name(spot.spot, camera) in kept for camera in CAMERAS] for spot in campaign.spots]
-    return np.array(held, dtype=bool).reshape(-1, 2)
-
-
-def _deviations(row_of: dict[int, int], stops: Sequence[StopResidual]) -> WithSd[np.ndarray]:
-    """Deviations of each look's stops, deg, shape (n, 2)."""
-    deviation, u = np.full((len(row_of), 2), np.nan), np.full((len(row_of), 2), np.nan)
-    for stop in stops:
-        rows = [row_of[spot] for spot in stop.spots]
-        deviation[rows, AXES.index(stop.axis)], u[rows, AXES.index(stop.axis)] = stop.deviation_deg, stop.u_deg
-    return WithSd(deviation, u)
-
-
-def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow, ...]:
-    """Parameters of the record, headlines first; else the stated priors."""
-    if fitted is None:
-        stated = campaign.rig.priors
-        return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES)
-    summary = fitted.record.summary
-    return tuple(ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction) for name, e in summary.named.items())
-
-
-def _correlation(fitted: Fitted | None) -> tuple[tuple[str, ...], np.ndarray]:
+def _correlation(record: FitRecord) -> tuple[tuple[str, ...], np.ndarray]:
     """Names and correlations of the estimated parameters, without those of the cameras."""
-    if fitted is None:
-        return (), np.zeros((0, 0))
-    names, matrix = fitted.record.covariance.names, np.asarray(fitted.record.covariance.matrix, dtype=float)
+    names, matrix = record.covariance.names, np.asarray(record.covariance.matrix, dtype=float)
     sds = np.sqrt(np.diag(matrix))
     kept = [k for k, name in enumerate(names) if sds[k] > 0 and not name.startswith("stereo.")]
     return tuple(names[k] for k in kept), matrix[np.ix_(kept, kept)] / np.outer(sds[kept], sds[kept])
-
-
-def numbers_of(looks: LookColumns) -> dict[str, np.ndarray]:
-    """The columns of looks that are arrays, by name."""
-    return {f.name: value for f in fields(looks) if isinstance(value := getattr(looks, f.name), np.ndarray)}
 
 
 NOT_FITTED = "no results: the rig is drawn as campaign.toml states it; `tvsbayes fit` adds residuals and the fitted rig"
@@ -326,8 +288,7 @@ NOT_OF_THESE = (
 )
 
 
-@dataclass(frozen=True)
-class StoredCampaign:
+class StoredCampaign(NamedTuple):
     """A campaign with its results; where these cannot be used, `fitted` is None and `note` gives the reason."""
 
     campaign: Campaign
@@ -366,8 +327,8 @@ def look_at(folder: Path, beside: Path | None = None, tell: Tell = no_output) ->
     """
     compile_for(tell)
     campaigns = [stored_campaign(one) for one in (folder, beside) if one is not None]
-    scenes = tuple(scene(one.campaign, one.fitted, [one.note] if one.note else []) for one in campaigns)
-    fits = [one.fitted.fit for one in campaigns if one.fitted is not None]
+    scenes = tuple(scene(campaign, fitted, [note] if note else []) for campaign, fitted, note in campaigns)
+    fits = [fitted.fit for _, fitted, _ in campaigns if fitted is not None]
     if len(fits) < 2:
         return Looked(scenes)
     from tvsbayes.comparison.changes import compare
