@@ -20,8 +20,8 @@ from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.firmware_model import Mechanics
 from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
-from tvsbayes.positioner.mechanics import Mechanics
 
 RIG = read_rig(RIG_FILE)
 

@@ -14,8 +14,8 @@ from tvsbayes.cameras.capture import CameraSettings, StereoImage
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.firmware_model import Mechanics
 from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
-from tvsbayes.positioner.mechanics import Mechanics
 
 TARGETS, FORBIDDEN = ((100, 20), (-37, -8), (0, 5)), (9_999, 0)
 

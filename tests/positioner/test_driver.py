@@ -10,9 +10,8 @@ import pytest
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.firmware_model import DeviceModel
+from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.interface import PositionLost
-from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import frame, parse_answer, request
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 2000}

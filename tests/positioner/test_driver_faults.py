@@ -16,7 +16,7 @@ import pytest
 from tvsbayes.acquisition.simulated_instrument import LATENCY_US, ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.mechanics import Mechanics
+from tvsbayes.positioner.firmware_model import Mechanics
 from tvsbayes.positioner.protocol import frame, unframe
 
 TARGETS = ((20, 6), (-9, 6), (14, -5))

@@ -9,6 +9,7 @@ from support.pseudo_terminal import answered, needs_pseudo_terminals
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.positioner.firmware_model import Mechanics
 from tvsbayes.positioner.grbl import (
     GrblPositioner,
     GrblSettings,
@@ -18,7 +19,6 @@ from tvsbayes.positioner.grbl import (
     parse_status,
 )
 from tvsbayes.positioner.interface import PositionLost
-from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.serial_port import serial_opener
 
 LIMITS = CounterLimits({"pan": (-500, 1000), "tilt": (-500, 500)})

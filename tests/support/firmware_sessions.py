@@ -8,8 +8,7 @@ from pathlib import Path
 
 from tvsbayes.positioner import firmware_folder
 from tvsbayes.positioner.emulated_board import BOARD, core_sources, cross_compile, missing_tools
-from tvsbayes.positioner.firmware_model import DeviceModel
-from tvsbayes.positioner.mechanics import Mechanics
+from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, Reply, frame, parse_answer, request
 
 FIRMWARE = firmware_folder()

@@ -29,7 +29,7 @@ from tvsbayes.files.images import in_grey_levels
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import DEFAULT_DRIVER, SEE_DOCTOR, Clock, Positioner
-from tvsbayes.positioner.protocol import FIRMWARE_VERSION, DeviceState
+from tvsbayes.positioner.protocol import FIRMWARE_VERSION
 from tvsbayes.positioner.serial_port import serial_ports
 
 ON_PORTS = ("serial", "grbl")

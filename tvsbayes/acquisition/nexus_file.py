@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,30 +74,34 @@ def write_nexus(folder: Path, path: Path) -> NexusSummary:
         raise refusal("occupied", file=shown_path, found="a file that is there", allowed="a new file", remedy=remedy)
     campaign = read_campaign(folder)
     records = read_journal(folder).records if (folder / LOG).is_file() else ()
+    frames = [frame for record in records for frame in record.frames]
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
-        _class(file, "NXroot", default="entry", creator="tvsbayes", h5py_version=h5py.__version__)
+        file.attrs.update(NX_class="NXroot", default="entry", creator="tvsbayes", h5py_version=h5py.__version__)
         entry = _group(file, "entry", "NXentry", default="looks")
         _entry(entry, campaign, records)
         _instrument(_group(entry, "instrument", "NXinstrument"), campaign)
-        _moves(_group(entry, "moves", "NXdata"), campaign)
-        _looks(_group(entry, "looks", "NXdata"), campaign, records)
-        pictures = _pictures(_group(entry, "pictures", "NXcollection"), records)
+        axes = {"signal": "pan_steps", "axes": ["time"], "auxiliary_signals": ["tilt_steps"]}
+        moves = _group(entry, "moves", "NXdata", **axes)
+        for column in MOVES.columns.values():
+            _column(moves, column, campaign.moves)
+        _looks(entry, campaign, records)
+        pictures = _group(entry, "pictures", "NXcollection")
+        what = "pictures in the campaign's folder: frames/ with the laser on, dark/ with it off"
+        _put(pictures, "description", what)
+        if frames:
+            _put(pictures, "file_name", [frame.name for frame in frames])
+            _put(pictures, "sha256", [frame.sha256 for frame in frames])
+            _put(pictures, "bytes", [frame.size for frame in frames])
         _files(_group(entry, "files", "NXcollection"), folder)
     write_atomically(path, buffer.getvalue())
     ok = sum(spot.status == "ok" for spot in campaign.spots)
-    return NexusSummary(len(campaign.moves), len(campaign.spots), ok, len(records), pictures)
-
-
-def _class(group: Any, name: str, **attributes: object) -> None:
-    group.attrs["NX_class"] = name
-    for key, value in attributes.items():
-        group.attrs[key] = value
+    return NexusSummary(len(campaign.moves), len(campaign.spots), ok, len(records), len(frames))
 
 
 def _group(parent: Any, name: str, nexus_class: str, **attributes: object) -> Any:
     group = parent.create_group(name)
-    _class(group, nexus_class, **attributes)
+    group.attrs.update(NX_class=nexus_class, **attributes)
     return group
 
 
@@ -107,10 +111,7 @@ def _put(group: Any, name: str, value: object, unit: str = "", **attributes: obj
 
     text = isinstance(value, str) or (isinstance(value, list) and all(isinstance(item, str) for item in value))
     data = group.create_dataset(name, data=value, dtype=h5py.string_dtype() if text else None)
-    if unit:
-        data.attrs["units"] = unit
-    for key, entry in attributes.items():
-        data.attrs[key] = entry
+    data.attrs.update({**({"units": unit} if unit else {}), **attributes})
 
 
 def _entry(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
@@ -156,19 +157,13 @@ def _instrument(instrument: Any, campaign: Campaign) -> None:
         _put(priors, name, prior.value, uncertainty=prior.u, distribution=prior.distribution)
 
 
-def _moves(group: Any, campaign: Campaign) -> None:
-    moves = campaign.moves
-    _class(group, "NXdata", signal="pan_steps", axes=["time"], auxiliary_signals=["tilt_steps"])
-    for column in MOVES.columns.values():
-        _column(group, column, moves)
-
-
-def _looks(group: Any, campaign: Campaign, records: Sequence[Record]) -> None:
+def _looks(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
     """Centroids with uncertainties; missing values are NaN, or -1 in columns of integers."""
     spots, moves = campaign.spots, campaign.moves
-    signals = [f"{coordinate}_{side}" for side in CAMERAS for coordinate in "uv"]
-    _class(group, "NXdata", signal=signals[0], axes=["spot"], auxiliary_signals=signals[1:])
-    times = _look_times(records)
+    signal, *others = (f"{coordinate}_{side}" for side in CAMERAS for coordinate in "uv")
+    group = _group(entry, "looks", "NXdata", signal=signal, axes=["spot"], auxiliary_signals=others)
+    events = [look for record in records if (look := event_of(record, Looked)) is not None]
+    times = {look.spot: look.time_s for look in events if look.time_s is not UNSET}
     _put(group, "time", [times.get(spot.spot, moves[spot.move].time_s) for spot in spots], "s")
     for axis in AXES:
         _put(group, f"{axis}_steps", [getattr(moves[spot.move], f"{axis}_steps") for spot in spots], "steps")
@@ -189,23 +184,6 @@ def _column(group: Any, column: Column, rows: Sequence[Move] | Sequence[Look]) -
         _put(group, name, np.array([np.nan if value is None else value for value in values], dtype=float), unit)
     else:
         _put(group, name, [NOTHING if value is None else value for value in values], unit)
-
-
-def _look_times(records: Sequence[Record]) -> Mapping[int, float]:
-    """Times of looks by spot, s."""
-    looks = [look for record in records if (look := event_of(record, Looked)) is not None]
-    return {look.spot: look.time_s for look in looks if look.time_s is not UNSET}
-
-
-def _pictures(group: Any, records: Sequence[Record]) -> int:
-    """Names and hashes of the pictures, which stay in the campaign's folder; returns their number."""
-    frames = [frame for record in records for frame in record.frames]
-    _put(group, "description", "pictures in the campaign's folder: frames/ with the laser on, dark/ with it off")
-    if frames:
-        _put(group, "file_name", [frame.name for frame in frames])
-        _put(group, "sha256", [frame.sha256 for frame in frames])
-        _put(group, "bytes", [frame.size for frame in frames])
-    return len(frames)
 
 
 def _files(group: Any, folder: Path) -> None:

@@ -24,8 +24,7 @@ from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.firmware_model import DeviceModel
-from tvsbayes.positioner.mechanics import Mechanics
+from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, device_settings
 from tvsbayes.twin.gear_errors import PERFECT, SECONDS_PER_HOUR, draw_gear_errors, zero_shift_deg
 from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
@@ -70,8 +69,7 @@ class SimulatedDevice:
 
     def power_on(self) -> None:
         """Start the device, also during a motion: counters, homing and settings are lost, the laser is switched off."""
-        for axis in (0, 1):
-            self.mechanics.flush(axis)
+        self.mechanics.flush_all()
         self.starts += 1
         self.model = DeviceModel(self.mechanics, self.first_boot + self.starts - 1, self.clock.now_us, self._send)
 

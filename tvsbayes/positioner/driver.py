@@ -167,28 +167,23 @@ class SerialPositioner:
         """See `Positioner.close`."""
         if self._link is None:
             return
+        exchange = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
         try:
-            if self._boot >= 0:
-                self._switch_off()
-            else:
+            if self._boot < 0:
                 # The device is not identified yet, but an earlier run may have left its laser on.
                 self._link.write(b"\n" + request(0, "L", 0))
                 self._link.read(NAK_S)
+            # Unnumbered, so that it is accepted even if another program has used later numbers.
+            elif exchange("L", 0, sequence=0).state.status == "moving":
+                # Interrupted in a motion: a blocked axis must not be driven on unattended. Numbered, so that the motion
+                # of another program continues.
+                exchange("STOP")
         except (DeviceFault, OSError):
             # The device's watchdog switches the laser off when requests stop.
             pass
         finally:
             self._link.close()
             self._link = None
-
-    def _switch_off(self) -> None:
-        """Laser off and motors at rest, with few attempts."""
-        exchange = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
-        # Unnumbered, so that it is accepted even if another program has used later numbers.
-        if exchange("L", 0, sequence=0).state.status == "moving":
-            # Interrupted in a motion: a blocked axis must not be driven on unattended. Numbered, so that the motion of
-            # another program continues.
-            exchange("STOP")
 
     def _drain(self) -> None:
         """Discard bytes that an earlier program left on the line."""
@@ -225,8 +220,6 @@ class SerialPositioner:
         if last_sequence is None:
             raise fault("firmware", f"firmware {firmware} names no last sequence", "flash the shipped firmware")
         self._sequence = max(self._sequence, last_sequence)
-        if self._sequence == SEQUENCE_MAX:
-            raise _sequence_exhausted(self._sequence)
         return reply
 
     def _command(self, *words: object) -> Reply:
@@ -278,7 +271,9 @@ class SerialPositioner:
         """Send one request until it is answered, and reconnect when the line is lost."""
         if sequence is None:
             if self._sequence == SEQUENCE_MAX:
-                raise _sequence_exhausted(self._sequence)
+                found = f"the device has used up its sequence numbers (the last one was {SEQUENCE_MAX})"
+                remedy = "unplug it and plug it in again: they restart with a reset; then home"
+                raise fault("sequence", found, remedy)
             self._sequence += 1
             sequence = self._sequence
         line = request(sequence, *map(str, words))
@@ -384,8 +379,3 @@ class SerialPositioner:
                 "positioner: another program has driven the device meanwhile",
                 remedy="close it, then go on with --resume: the device homes again",
             )
-
-
-def _sequence_exhausted(sequence: int) -> DeviceFault:
-    found = f"the device has used up its sequence numbers (the last one was {sequence})"
-    return fault("sequence", found, "unplug it and plug it in again: they restart with a reset; then home")

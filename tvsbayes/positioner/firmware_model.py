@@ -1,7 +1,8 @@
-"""Software model of a positioner: the firmware's state machine.
+"""Software model of a positioner: the firmware's state machine, and the motors and switches behind it.
 
 `DeviceModel` answers with the same bytes at the same microseconds as the C++ core in firmware/tvs_positioner;
-differential tests drive both. The moving parts are `mechanics.Mechanics`.
+differential tests drive both. `Mechanics` is hidden from it: the true positions, which can lose steps, and broken
+wires. Every stretch of motion in one sense is reported to a listener, which drives the twin's gears.
 
 Times are microseconds since start, positions motor steps (pan, tilt). The module neither sleeps nor reads a clock.
 """
@@ -10,9 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import (
     FIRMWARE_VERSION,
     REQUEST_CHARS_MAX,
@@ -43,7 +43,80 @@ HOME_READS, HOME_READ_US = 4, 500
 """Number of further readings of a home switch that must agree with the first, and their interval; rejects spikes."""
 LIMIT_OPEN_US = 5_000
 """Time for which a limit switch that opens at rest must stay open to count."""
+COMMANDS = ("ID", "?", "MA", "HOME", "STOP", "ABORT", "L", "TRIG", "GET", "SET")
 _NEVER = 2**63
+
+
+@dataclass
+class Mechanics:
+    """Motors, switches and laser of a simulated positioner.
+
+    Attributes:
+        home_steps: true position (pan, tilt) at and below which the home switch is pressed.
+        limit_steps: distance from 0 beyond which a limit switch opens.
+        limit_cut: whether the wire of an axis' limit switches is broken.
+        home_dead: whether the wire of an axis' home switch is broken: it never reads as pressed.
+        wrong_reads: next readings of an axis' home switch that are wrong: bounce, or a spike.
+        true_steps: positions of the motors; they start at 0, whatever the counters.
+        missing_steps: number of next steps that the motors lose.
+        laser_on: whether the laser emits.
+        lit: how often the laser was switched on.
+        trigger_on: whether the cameras' trigger line is high.
+        moved: called with axis and signed steps after every stretch of motion in one sense.
+        found_home: called with the axis when homing has found its switch, at `home_steps`.
+    """
+
+    home_steps: tuple[int, int] = (-1_200, -700)
+    limit_steps: int = 30_000
+    limit_cut: list[bool] = field(default_factory=lambda: [False, False])
+    home_dead: list[bool] = field(default_factory=lambda: [False, False])
+    wrong_reads: list[int] = field(default_factory=lambda: [0, 0])
+    true_steps: list[int] = field(default_factory=lambda: [0, 0])
+    missing_steps: list[int] = field(default_factory=lambda: [0, 0])
+    laser_on: bool = False
+    lit: int = 0
+    trigger_on: bool = False
+    moved: Callable[[int, int], None] | None = None
+    found_home: Callable[[int], None] | None = None
+    _stretch: list[int] = field(default_factory=lambda: [0, 0])
+
+    def switch_laser(self, on: bool) -> None:
+        """Set the laser's line high or low."""
+        self.lit += on and not self.laser_on
+        self.laser_on = on
+
+    def step(self, axis: int, sense: int) -> None:
+        """One pulse to a motor; `sense` is +1 or -1."""
+        if self.missing_steps[axis] > 0:
+            self.missing_steps[axis] -= 1
+            return
+        self.true_steps[axis] += sense
+        if self._stretch[axis] * sense < 0:
+            self.flush(axis)
+        self._stretch[axis] += sense
+
+    def flush(self, axis: int) -> None:
+        """Report the present stretch of motion to the listener."""
+        stretch, self._stretch[axis] = self._stretch[axis], 0
+        if stretch and self.moved is not None:
+            self.moved(axis, stretch)
+
+    def flush_all(self) -> None:
+        """Report the present stretches of both axes."""
+        for axis in (0, 1):
+            self.flush(axis)
+
+    def home_switch(self, axis: int) -> bool:
+        """Whether the home switch reads as pressed."""
+        pressed = not self.home_dead[axis] and self.true_steps[axis] <= self.home_steps[axis]
+        if self.wrong_reads[axis] == 0:
+            return pressed
+        self.wrong_reads[axis] -= 1
+        return not pressed
+
+    def limit_switch(self, axis: int) -> bool:
+        """Whether the limit circuit of an axis is open."""
+        return self.limit_cut[axis] or abs(self.true_steps[axis]) > self.limit_steps
 
 
 @dataclass
@@ -90,8 +163,8 @@ class DeviceModel:
         self._trigger_off_us = self._limit_due_us = _NEVER
         self._line = bytearray()
         self._overlong = False
-        self._set_laser(False)
-        self.mechanics.trigger_on = False
+        mechanics.switch_laser(False)
+        mechanics.trigger_on = False
         self._write(frame(f"!boot b={boot} fw={FIRMWARE_VERSION}"))
 
     @property
@@ -144,7 +217,7 @@ class DeviceModel:
         while True:
             (due_us, index), off_us = self._step_us(), self._laser_off_us()
             if off_us <= due_us and off_us <= now_us:
-                self._set_laser(False)
+                self.mechanics.switch_laser(False)
                 self._error = "watchdog"
             elif due_us > now_us:
                 break
@@ -157,7 +230,7 @@ class DeviceModel:
     def darkened(self) -> None:
         """Record that the board has switched the laser off because `loop` was late."""
         if self.mechanics.laser_on:
-            self._set_laser(False)
+            self.mechanics.switch_laser(False)
             self._error = "stall"
 
     def _laser_off_us(self) -> int:
@@ -229,33 +302,36 @@ class DeviceModel:
 
     def _command(self, sequence: int, words: list[str], now_us: int) -> tuple[str | None, str]:
         """Execute one command; return the reason of refusal or None, and further fields of the reply."""
-        name, arguments = words[0], words[1:]
-        counts = {"ID": 0, "?": 0, "MA": 2, "HOME": 0, "STOP": 0, "ABORT": 0, "L": 1, "TRIG": 1, "GET": 1, "SET": 2}
-        if name not in counts:
-            return "command", ""
-        if len(arguments) != counts[name]:
-            return "argument", ""
-        if name == "ID":
-            return None, f" fw={FIRMWARE_VERSION} proto={self._protocol} q={self._last_sequence}"
-        if name == "MA":
-            return self._move(sequence, arguments, now_us), ""
-        if name == "HOME":
-            return self._home(sequence, now_us), ""
-        if name == "STOP":
-            self._stop()
-        elif name == "ABORT":
-            self._halt("unhomed" if self._status == "unhomed" or self._homing else "alarm", "abort")
-        elif name == "L":
-            return self._laser(arguments[0]), ""
-        elif name == "TRIG":
-            return self._trigger(arguments[0], now_us), ""
-        elif name in ("GET", "SET"):
-            return self._setting(arguments)
+        match words:
+            case ["ID"]:
+                return None, f" fw={FIRMWARE_VERSION} proto={self._protocol} q={self._last_sequence}"
+            case ["MA", pan, tilt]:
+                return self._move(sequence, signed(pan), signed(tilt), now_us), ""
+            case ["HOME"]:
+                return self._home(sequence, now_us), ""
+            case ["STOP"]:
+                self._stop()
+            case ["ABORT"]:
+                self._halt("unhomed" if self._status == "unhomed" or self._homing else "alarm", "abort")
+            case ["L", argument]:
+                return self._laser(argument), ""
+            case ["TRIG", width]:
+                return self._trigger(unsigned(width), now_us), ""
+            case ["GET", name] if name in SETTINGS:
+                return None, f" v={self._settings[name]}"
+            case ["SET", name, text] if name in SETTINGS:
+                value, (low, high, _) = signed(text), SETTINGS[name]
+                if value is None or not low <= value <= high:
+                    return "argument", ""
+                if self._status == "moving":
+                    return "busy", ""
+                self._settings[name] = value
+                return None, f" v={value}"
+            case [name, *_] if words != ["?"]:
+                return "argument" if name in COMMANDS else "command", ""
         return None, ""
 
-    def _move(self, sequence: int, arguments: list[str], now_us: int) -> str | None:
-        targets = [signed(text) for text in arguments]
-        pan, tilt = targets
+    def _move(self, sequence: int, pan: int | None, tilt: int | None, now_us: int) -> str | None:
         if pan is None or tilt is None:
             return "argument"
         if self._status == "alarm":
@@ -278,38 +354,22 @@ class DeviceModel:
     def _laser(self, argument: str) -> str | None:
         if argument not in ("0", "1"):
             return "argument"
-        if argument == "1" and self._status == "alarm":
-            return "alarm"
-        if argument == "1" and (self._status == "unhomed" or self._homing):
-            return "unhomed"
         if argument == "1":
+            if self._status == "alarm":
+                return "alarm"
+            if self._status == "unhomed" or self._homing:
+                return "unhomed"
             self._error = "none"
-        self._set_laser(argument == "1")
+        self.mechanics.switch_laser(argument == "1")
         return None
 
-    def _trigger(self, argument: str, now_us: int) -> str | None:
-        width_us, (shortest, longest) = unsigned(argument), TRIGGER_US
+    def _trigger(self, width_us: int | None, now_us: int) -> str | None:
+        shortest, longest = TRIGGER_US
         if width_us is None or not shortest <= width_us <= longest:
             return "argument"
         self._trigger_off_us = now_us + width_us
         self.mechanics.trigger_on = True
         return None
-
-    def _setting(self, arguments: list[str]) -> tuple[str | None, str]:
-        name = arguments[0]
-        if name not in SETTINGS:
-            return "argument", ""
-        if len(arguments) == 2:
-            value, (low, high, _) = signed(arguments[1]), SETTINGS[name]
-            if value is None or not low <= value <= high:
-                return "argument", ""
-            if self._status == "moving":
-                return "busy", ""
-            self._settings[name] = value
-        return None, f" v={self._settings[name]}"
-
-    def _set_laser(self, on: bool) -> None:
-        self.mechanics.switch_laser(on)
 
     def _delay_us(self, level: int) -> int:
         speed = math.isqrt(START_SPEED**2 + 2 * self._settings["amax"] * level)
@@ -340,15 +400,11 @@ class DeviceModel:
         if any(axis.direction for axis in self._axes):
             return
         self._status = "idle"
-        self._flush()
+        self.mechanics.flush_all()
         if self._stopping:
             self._error = "stop"
         else:
             self._done_sequence = self._motion_sequence
-
-    def _flush(self) -> None:
-        for index in (0, 1):
-            self.mechanics.flush(index)
 
     def _stop(self) -> None:
         if self._homing:
@@ -364,8 +420,8 @@ class DeviceModel:
             axis.direction = 0
         self._homing = False
         self._status, self._error = status, error
-        self._set_laser(False)
-        self._flush()
+        self.mechanics.switch_laser(False)
+        self.mechanics.flush_all()
 
     def _home(self, sequence: int, now_us: int) -> str | None:
         if self._status == "moving":
@@ -373,7 +429,7 @@ class DeviceModel:
         self._homed_before = self._status == "idle"
         self._status, self._homing, self._stopping = "moving", True, False
         self._error, self._motion_sequence = "none", sequence
-        self._set_laser(False)
+        self.mechanics.switch_laser(False)
         self._home_one(0, now_us)
         return None
 
@@ -444,6 +500,6 @@ class DeviceModel:
             return self._home_one(1, now_us)
         self._homing = False
         self._status = "idle"
-        self._flush()
+        self.mechanics.flush_all()
         self._done_sequence = self._motion_sequence
         return None

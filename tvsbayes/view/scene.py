@@ -173,13 +173,7 @@ def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str]
     looks = LookColumns(**_of_tables(campaign), **_of_rig(campaign, ways, fitted))
     seen_mm = looks.point_mm[np.isfinite(looks.point_mm).all(axis=1)]
     reach_mm = float(np.median(np.linalg.norm(seen_mm, axis=1))) if len(seen_mm) else 0.0
-    stated = campaign.rig.priors
-    parameters = [ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES]
-    correlated, correlation = (), np.zeros((0, 0))
-    if fitted is not None:
-        named = fitted.record.summary.named.items()
-        parameters = [ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction) for name, e in named]
-        correlated, correlation = _correlation(fitted.record)
+    names, correlation = _correlation(fitted)
     return Scene(
         name=campaign.title,
         fitted=fitted is not None,
@@ -190,8 +184,8 @@ def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str]
         sheets=sheets(looks.target, looks.point_mm),
         origin_mm=np.full(3, np.nan) if ways is None else np.asarray(ways.origin_mm)[:, 0],
         gears=() if fitted is None else fitted.gears,
-        parameters=tuple(parameters),
-        correlated=correlated,
+        parameters=_parameters(campaign, fitted),
+        correlated=names,
         correlation=correlation,
     )
 
@@ -236,7 +230,7 @@ _WAY_SHAPES = {"mirrors_mm": (0, 3), "normals": (0, 3), "end_mm": (3,), "predict
 """Shapes of values of a look, where the campaign has no usable spot."""
 
 
-def _of_rig(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> dict[str, np.ndarray]:
+def _of_rig(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> dict[str, Any]:
     """Columns of looks from the rig, stated or fitted: NaN where a look has no usable spot."""
     count, used = len(campaign.spots), ordered_spots(campaign)
     row_of = {spot.spot: row for row, spot in enumerate(campaign.spots)}
@@ -273,9 +267,20 @@ def _of_rig(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> dic
     return {**columns, **seen, "deviation_deg": deviation, "u_deg": u}
 
 
-def _correlation(record: FitRecord) -> tuple[tuple[str, ...], np.ndarray]:
+def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow, ...]:
+    """Parameters of the record, headlines first; else the stated priors."""
+    if fitted is None:
+        stated = campaign.rig.priors
+        return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES)
+    named = fitted.record.summary.named.items()
+    return tuple(ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction) for name, e in named)
+
+
+def _correlation(fitted: Fitted | None) -> tuple[tuple[str, ...], np.ndarray]:
     """Names and correlations of the estimated parameters, without those of the cameras."""
-    names, matrix = record.covariance.names, np.asarray(record.covariance.matrix, dtype=float)
+    if fitted is None:
+        return (), np.zeros((0, 0))
+    names, matrix = fitted.record.covariance.names, np.asarray(fitted.record.covariance.matrix, dtype=float)
     sds = np.sqrt(np.diag(matrix))
     kept = [k for k, name in enumerate(names) if sds[k] > 0 and not name.startswith("stereo.")]
     return tuple(names[k] for k in kept), matrix[np.ix_(kept, kept)] / np.outer(sds[kept], sds[kept])
