@@ -134,6 +134,39 @@ def test_the_title_of_a_column_stays_its_name(tmp_path):
     assert 'read (") taken as read (arcsec)' in rows.lines[0]
 
 
+def test_homings_in_remarks_between_rows(tmp_path):
+    run = lines("{c} {v}\n")
+    rows = rows_of(
+        f"# cmd(mm) read(mm)\n# --- home ---\n{run}# lamp off\n# --- home again ---\n{run}# 5 5.1\n", tmp_path
+    )
+    assert [m["segment"] for m in rows.moves] == [0] * 11 + [1] * 11
+    assert [r["value"] for r in rows.readings] == READ * 2
+
+
+def test_units_that_lines_above_state_by_column(tmp_path):
+    errors = [round(1000 * (v - c), 1) for c, v in ROWS[:6]]
+    names = "Einheit Position: mm,,Abweichung: \u00b5m\n,,\nPosition,1\u2191,1\u2193\n"
+    text = names + sheet("", PLACES, errors, [e + 40 for e in errors]).lstrip()
+    rows = rows_of(text, tmp_path, Wishes(deviations=True))
+    assert rows.axis == {"command_unit": "mm"} and rows.unit == "mm"
+    assert [r["value"] for r in rows.readings] == pytest.approx(UP + [v + 0.04 for v in UP[::-1]])
+
+
+def test_deviations_come_first_where_readings_hardly_follow(tmp_path):
+    errors = [round(0.0098 * p + 0.2 * (k % 2), 2) for k, p in enumerate(PLACES)]
+    with pytest.raises(Question) as asked:
+        rows_of("Units: um\n\n" + sheet("Target (mm),Run 1 +,Run 1 -", PLACES, errors, errors), tmp_path)
+    assert asked.value.candidates[0].options == ("--deviations",)
+
+
+def test_cameras_counted_from_0_in_names(tmp_path):
+    (tmp_path / "t.csv").write_text(
+        "pan,tilt,cam0_x,cam0_y,cam1_x,cam1_y\n0,0,630,400,600,401\n100,0,640,400,610,401\n"
+    )
+    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), LookWishes()).looks
+    assert [(k["u_left_px"], k["v_right_px"]) for k in looks] == [(630, 401), (640, 401)]
+
+
 STATES = {
     "state": ("as found", "as left"),
     "Zustand": ("vorher", "nachher"),

@@ -13,8 +13,8 @@ from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import refused
 from tvsbayes.importing.cells import FieldCells
 from tvsbayes.importing.columns import columns_of, line_through
-from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, name_of, parse_unit, part_of_unit, plain
+from tvsbayes.importing.table import STATED, ForeignTable
+from tvsbayes.importing.words import Unit, name_of, parse_unit, part_of_unit, place_of, plain, words_of
 
 UNIT_SLOPE = 0.05
 """Largest deviation from 1 of the slope of readings over commands, where both are taken to be in one unit."""
@@ -101,23 +101,35 @@ def units_of(
         units[name] = unit
     if (unit := units["value"]) is not None and unit.kind == "voltage" and "value" not in wishes.units:
         raise cells.table.ask("volts", unit=unit.name, column=cells.columns["value"])
-    if units["value"] is None and (unit := unit_above(cells.table)) is not None:
-        units["value"] = unit
-        assumed.append(f"unit: {unit.name}, as a line above the names says; --unit value=mm says another")
+    for field_ in ("command", "value"):
+        if units[field_] is None and (unit := unit_above(cells.table, field_)) is not None:
+            units[field_] = unit
+            what, how = "unit" if field_ == "value" else field_, "as a line above the names says"
+            assumed.append(f"{what}: {unit.name}, {how}; --unit {field_}=mm says another")
     return units
 
 
-_ABOVE = re.compile(
-    r"(?:\b(?:in|en)|\b(?:unit|units|einheit|einheiten|unidad|unidades|unite|unites)\s*[:=])\s*(\S+)\s*$"
-)
-"""A unit at the end of a line: "all values in mm", "Unit: mm"."""
+_AT_END = re.compile(r"\b(?:in|en)\s+(?P<text>\S+)\s*$")
+"""A unit at the end of a line: "all values in mm"."""
 
 
-def unit_above(table: ForeignTable) -> Unit | None:
-    """The only unit of length or angle that lines above the names state for all readings."""
-    matches = [_ABOVE.search(plain(line)) for line in table.above]
-    units = {unit for match in matches if match and (unit := parse_unit(match[1])) is not None}
-    units = {unit for unit in units if unit.kind in ("length", "angle", "count")}
+def unit_above(table: ForeignTable, field: str) -> Unit | None:
+    """The only unit of length, angle or counts that lines above the names state for a field.
+
+    "Position: mm" is that of commands, "Deviation: um" that of readings, as are a unit or values of no name.
+    """
+    units = set[Unit]()
+    for line in table.above:
+        for match in (*STATED.finditer(line), *_AT_END.finditer(plain(line))):
+            unit, words = parse_unit(match["text"]), words_of(match.groupdict().get("name", ""))
+            of_command, of_reading, of_all = (
+                any(place_of(words, name) is not None for name in names)
+                for names in (("command", "position"), ("value", "deviation"), ("unit",))
+            )
+            of_field = of_command and not of_reading if field == "command" else of_reading or not of_command
+            is_said = of_command or of_reading or of_all or match.re is _AT_END
+            if is_said and of_field and unit and unit.kind in ("length", "angle", "count"):
+                units.add(unit)
     return units.pop() if len(units) == 1 else None
 
 
@@ -176,10 +188,12 @@ def _check_slope(
         return
     decades = float(np.log10(abs(slope)))
     said = {"column": cells.columns["value"], "slope": slope, "unit": unit.name, "of": command_unit.name}
-    if abs(decades) > SLOPE_DECADES and abs(decades - round(decades)) >= PART_DIGITS:
-        raise cells.table.ask("slope", **said)
-    if round(decades) and abs(decades - round(decades)) < PART_DIGITS:
-        raise cells.table.ask("parts-of-unit", each=(f"{10.0 ** -round(decades):g} {unit.name}", unit.name), **said)
+    near = abs(decades - round(decades)) < PART_DIGITS
+    parts = [f"{10.0 ** -round(decades):g} {unit.name}"] if near and round(decades) else []
+    if decades < -SLOPE_DECADES or (abs(decades) > SLOPE_DECADES and not near):
+        raise cells.table.ask("slope", each=parts, **said)
+    if parts:
+        raise cells.table.ask("parts-of-unit", each=(*parts, unit.name), **said)
 
 
 def rounded(number: float) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import datetime
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -130,7 +130,9 @@ def look_columns(table: ForeignTable, stated: Mapping[str, str]) -> Chooser:
         InputError: a field or column that does not exist is stated.
     """
     stated = table.named(stated)
-    chooser = Chooser.of(by_look(table, stated), stated, FIELDS, _role)
+    table = by_look(table, stated)
+    words = _names_counted(table)
+    chooser = Chooser.of(table, stated, FIELDS, lambda column: _role(column, words[column.name.text]))
     clocks = chooser.roles.get("time_s", []) if chooser.is_open("time_s") else []
     ask_of_t(chooser)
     kinds = {_kind_of_clock(table.columns[name]): name for name in clocks}
@@ -152,26 +154,31 @@ def by_look(table: ForeignTable, stated: Mapping[str, str]) -> ForeignTable:
     Raises:
         InputError: a look has no row of either camera, or no column says which camera a row is of.
     """
-    pixels = {text: found for text in table.columns if (found := _pixel_of(text))}
+    names = _names_counted(table)
+    pixels = {text: found for text, words in names.items() if (found := _pixel_of(words))}
     axes = list(pixels.values())
     several = {"u", "v"} - {*axes} or len({*axes}) != len(axes)
-    if several or {*stated, *map(field_of, table.columns)} & {*PIXELS}:
+    if several or {*stated, *(field_of(text, words) for text, words in names.items())} & {*PIXELS}:
         return table
-    sides = {text: _sides_of(cells) for text, cells in table.columns.items() if text not in pixels}
-    cameras = [text for text, found in sides.items() if {*found} == {"left", "right"}]
+    sides = {
+        text: {cell: _side_of(words) for cell, words in _counted_from_1(cells).items()}
+        for text, cells in table.columns.items()
+        if text not in pixels
+    }
+    cameras = [text for text, found in sides.items() if {*found.values()} == {"left", "right"}]
     # A target "left wall", a star "R Leo", sheets 1 and 2 are no cameras beside a column that is called so.
-    called = [text for text in cameras if place_of(words_of(text), "camera", WORDS) is not None]
+    called = [text for text in cameras if place_of(names[text], "camera", WORDS) is not None]
     cameras = called if len(called) == 1 else cameras
 
     def refuse(what: str) -> InputError:
         return refused("rows-of-cameras", table.file, line=table.first_line, lack=what, columns=list(pixels))
 
     if len(cameras) != 1:
-        of_cameras = any(place_of(words_of(text), "camera", WORDS) is not None for text in table.columns)
-        if all({*words_of(text)} & {*PLACES} for text in pixels) and not of_cameras:
+        of_cameras = any(place_of(words, "camera", WORDS) is not None for words in names.values())
+        if all({*names[text]} & {*PLACES} for text in pixels) and not of_cameras:
             return table
         raise refuse("pixels that no column gives to a camera")
-    camera = sides[cameras[0]]
+    camera = [sides[cameras[0]][cell] for cell in table.columns[cameras[0]]]
     others = [text for text in table.columns if text not in pixels and text != cameras[0]]
     pairs = list(zip(range(0, len(table) - 1, 2), range(1, len(table), 2), strict=True))
     same = all(
@@ -188,25 +195,30 @@ def by_look(table: ForeignTable, stated: Mapping[str, str]) -> ForeignTable:
     return replace(table, kind=kind, columns=columns, lines=tuple(table.lines[a] for a, _ in pairs))
 
 
-def _pixel_of(name: str) -> str:
+def _pixel_of(words: Sequence[str]) -> str:
     """Whether a column holds u or v, or their uncertainty su or sv, of a camera that it does not name."""
-    words = words_of(name)
     found = [c for c in ("u", "v", "left", "right", "spread", "distance") if place_of(words, c, WORDS) is not None]
     if not found or found[0] not in ("u", "v") or found[1:] not in ([], ["spread"]):
         return ""
     return f"{'s' * (len(found) == 2)}{found[0]}"
 
 
-def _sides_of(cells: Sequence[str]) -> list[str]:
-    """The camera of each row, "left" or "right"; "" where a cell names none or both. Of 0 and 1 the first is left."""
-    words = {cell: words_of(cell) for cell in {*cells}}
-    counted = {"0": "1", "1": "2"} if any("0" in own for own in words.values()) else {}
-    named = {}
-    for cell, own in words.items():
-        own = [counted.get(word, word) for word in own]
-        sides = [side for side in ("left", "right") if place_of(own, side, WORDS) is not None]
-        named[cell] = sides[0] if len(sides) == 1 else ""
-    return [named[cell] for cell in cells]
+def _counted_from_1(texts: Iterable[str], concepts: Sequence[str] = ()) -> dict[str, list[str]]:
+    """Words of each text; cameras that are counted from 0, beside a word of a concept, are counted from 1."""
+    words = {text: words_of(text) for text in texts}
+    zeros = [own for own in words.values() if "0" in own]
+    if any(not concepts or any(place_of(own, c, WORDS) is not None for c in concepts) for own in zeros):
+        words = {text: [{"0": "1", "1": "2"}.get(word, word) for word in own] for text, own in words.items()}
+    return words
+
+
+def _names_counted(table: ForeignTable) -> dict[str, list[str]]:
+    return _counted_from_1(table.columns, ("u", "v", "picture"))
+
+
+def _side_of(words: Sequence[str]) -> str:
+    sides = [side for side in ("left", "right") if place_of(words, side, WORDS) is not None]
+    return sides[0] if len(sides) == 1 else ""
 
 
 def _kind_of_clock(cells: Sequence[str]) -> str:
@@ -215,9 +227,9 @@ def _kind_of_clock(cells: Sequence[str]) -> str:
     return kinds.pop() if len(kinds) == 1 else ""
 
 
-def _role(column: Column) -> str | None:
+def _role(column: Column, words: Sequence[str]) -> str | None:
     """The field to which a column belongs; a reference that changes with every row counts no homings."""
-    role = field_of(column.name.text)
+    role = field_of(column.name.text, words)
     of_unit = column.name.unit.kind if column.name.unit else ""
     if of_unit == "temperature" and role in (None, "time_s"):
         return "temperature_degC"
@@ -228,9 +240,9 @@ def _role(column: Column) -> str | None:
     return role if role != "segment" or column.counts_homings or {*column.cells} <= _MARKS else None
 
 
-def field_of(name: str) -> str | None:
-    """The field to which a column belongs by its name."""
-    words = words_of(name)
+def field_of(name: str, words: Sequence[str] | None = None) -> str | None:
+    """The field to which a column belongs by its name, or by the words of it with cameras counted from 1."""
+    words = words_of(name) if words is None else words
 
     def has(*concepts: str) -> list[str]:
         return [concept for concept in concepts if place_of(words, concept, WORDS) is not None]

@@ -39,6 +39,8 @@ _GROUPS_OF = {mark: re.compile(rf"[+-]?[1-9][0-9]{{0,2}}(?:[{mark}][0-9]{{3}})+"
 """Whole numbers with a mark between thousands, by the mark."""
 _APOSTROPHES = re.compile("(?<=[0-9])['\u2019](?=[0-9]{3}(?![0-9]))")
 _WITH_UNIT = re.compile(r"([+-]?[0-9][0-9.,]{0,20}) ?([^\W\d]{1,6}|\u00b0)")
+STATED = re.compile(r"(?P<name>[^\W\d][^:=]*?)\s*[:=]\s*(?P<text>\S+)")
+"""What a cell or a line above the names states: "Unit: mm"."""
 _THIN = re.compile("(?<=[0-9])[\u00a0\u2007\u2009\u202f](?=[0-9])")
 
 
@@ -232,7 +234,9 @@ def _no_unit(text: str) -> bool:
 
 def _is_group_row(above: Sequence[str], names: Sequence[str]) -> bool:
     """Whether a row above the names groups them, as "Run 1,,Run 2,": cells with gaps between them."""
-    filled = [k for k, cell in enumerate(above) if cell]
+    filled = [k for k, cell in enumerate(above) if cell and not STATED.search(cell)]
+    if len(filled) < sum(map(bool, above)):
+        return False
     is_gapped = filled != list(range(len(filled)))
     return is_gapped and not any(map(is_number, above)) and filled[-1] < len(names)
 

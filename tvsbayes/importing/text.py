@@ -23,12 +23,15 @@ from tvsbayes.importing.table import (
     headed,
     is_number,
     names_first,
+    side_named,
 )
-from tvsbayes.importing.words import means
+from tvsbayes.importing.words import means, place_of, words_of
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """Separators in the order in which they are tried: a decimal comma must not be taken for one."""
 ROWS_TRIED = 50
+REMARKS_SHARE = 4
+"""Least number of rows for each remark between them, from which remarks are titles of those below."""
 REMARKS = ("#", "%", "!", "//")
 _MARKS = (
     (b"\xff\xfe\x00\x00", "utf-32", "UTF-32"),
@@ -74,6 +77,7 @@ def _text_rows(text: str, file: str) -> tuple[list[Row], str, list[tuple[int, st
     declared = next((line[4:5] for _, line in lines[:1] if line.lower().startswith("sep=")), None)
     remarks = [(n, line.strip()) for n, line in lines if _is_remark(line)]
     body = [(n, line) for n, line in lines if not _is_remark(line)][declared is not None :]
+    between = [Row(n, [line.strip("#%!/ -=*")]) for n, line in remarks if body and n > body[0][0] and _is_title(line)]
     remarks = [(n, line) for n, line in remarks if body and n < body[0][0]]
     if _is_markdown([line for _, line in body]):
         body, declared = _markdown_rows(lines), "|"
@@ -83,7 +87,17 @@ def _text_rows(text: str, file: str) -> tuple[list[Row], str, list[tuple[int, st
     if declared == '"':
         raise refused("separator", file, line=1)
     separator = declared or _separator([line for _, line in body])
-    return _divided(body, separator, file), separator, remarks
+    rows = _divided(body, separator, file)
+    if REMARKS_SHARE * len(between) <= len(rows):
+        rows = sorted([*rows, *between], key=lambda row: row.line)
+    return rows, separator, remarks
+
+
+def _is_title(remark: str) -> bool:
+    """Whether a remark between rows speaks of all below it: the axis homed, a run goes in a direction, a state."""
+    words = words_of(remark)
+    named = any(place_of(words, concept) is not None for concept in ("condition", "machine"))
+    return named or place_of(words, "homing") == 0 or bool(side_named(remark))
 
 
 def _is_remark(line: str) -> bool:
