@@ -13,7 +13,7 @@ from tvsbayes.importing.table import table_of
 def seconds(*texts: str, name: str = "time") -> tuple[list[float] | None, str]:
     """Seconds of a column, and what is said of it."""
     table, said = table_of("log.csv", "CSV", {name: texts}, range(2, len(texts) + 2)), list[str]()
-    return seconds_of(FieldCells(table, {"time_s": name}), said), "; ".join(said)
+    return seconds_of(FieldCells(table, {"time_s": name}, assumed=said)), "; ".join(said)
 
 
 @pytest.mark.parametrize(

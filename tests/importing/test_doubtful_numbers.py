@@ -7,10 +7,10 @@ import pytest
 
 from tvsbayes.errors import InputError, Question
 from tvsbayes.importing.axis import axis_rows
-from tvsbayes.importing.axis_units import Wishes
-from tvsbayes.importing.looks import LookWishes, look_columns, look_rows
+from tvsbayes.importing.cells import Wishes
+from tvsbayes.importing.looks import look_columns, look_rows
 from tvsbayes.importing.reader import read_foreign
-from tvsbayes.importing.sightings import SightingWishes, sighting_rows
+from tvsbayes.importing.sightings import sighting_rows
 
 PLACES = np.array([0.0, 10, 20, 30, 40, 50, 40, 30, 20, 10, 0])
 SIDES = np.r_[np.ones(6), -np.ones(5)]
@@ -95,7 +95,7 @@ def test_errors_of_directions_are_no_directions(tmp_path):
     rows = "".join(f"{p},{p},{0.001 * p},0.01\n" for p in range(0, 900, 100))
     (tmp_path / "t.csv").write_text(f"pan_steps,tilt_steps,az_err_deg,el_err_deg\n{rows}")
     with pytest.raises(InputError, match="no column that is surely azimuth_deg, elevation_deg"):
-        sighting_rows(read_foreign(tmp_path / "t.csv"), SightingWishes())
+        sighting_rows(read_foreign(tmp_path / "t.csv"), Wishes())
 
 
 @pytest.mark.parametrize("names", ["pan,tilt,camera,u,v", "pan,tilt,cam,x_px,y_px", "pan,tilt,Kamera,Spalte,Zeile"])
@@ -106,7 +106,7 @@ def test_a_row_for_each_camera_of_a_look(names, order, tmp_path):
 
     rows = [f"{pan},0,{camera},{pixels(pan, camera)}" for pan in (0, 100, 200) for camera in order]
     (tmp_path / "t.csv").write_text("\n".join([names, *rows, ""]))
-    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), LookWishes()).looks
+    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), Wishes()).looks
     assert [(k["u_left_px"], k["v_left_px"], k["u_right_px"]) for k in looks] == [
         (630 + 2 * pan, 400 + pan, 600 + 2 * pan) for pan in (0, 100, 200)
     ]

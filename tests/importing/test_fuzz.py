@@ -14,8 +14,9 @@ from support.damaged_files import damaged, few
 
 from tvsbayes.cli.axis_import import FileOptions, import_readings
 from tvsbayes.errors import InputError
+from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.reader import read_foreign
-from tvsbayes.importing.sightings import SightingWishes, sighting_rows
+from tvsbayes.importing.sightings import sighting_rows
 from tvsbayes.importing.workbook import CELLS_MAX
 from tvsbayes.single_axis.axis_campaign import read_axis
 
@@ -37,7 +38,7 @@ def imported(path, folder):
         assert error.remedy or error.message
         refused += 1
     try:
-        sighting_rows(read_foreign(path), SightingWishes())
+        sighting_rows(read_foreign(path), Wishes())
     except InputError:
         refused += 1
     return refused

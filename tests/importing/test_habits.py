@@ -6,8 +6,8 @@ import pytest
 
 from tvsbayes.errors import InputError, Question
 from tvsbayes.importing.axis import axis_rows
-from tvsbayes.importing.axis_units import Wishes
-from tvsbayes.importing.looks import LookWishes, look_columns, look_rows
+from tvsbayes.importing.cells import Wishes
+from tvsbayes.importing.looks import look_columns, look_rows
 from tvsbayes.importing.reader import read_foreign
 
 PLACES = [0, 10, 20, 30, 40, 50]
@@ -163,7 +163,7 @@ def test_cameras_counted_from_0_in_names(tmp_path):
     (tmp_path / "t.csv").write_text(
         "pan,tilt,cam0_x,cam0_y,cam1_x,cam1_y\n0,0,630,400,600,401\n100,0,640,400,610,401\n"
     )
-    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), LookWishes()).looks
+    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), Wishes()).looks
     assert [(k["u_left_px"], k["v_right_px"]) for k in looks] == [(630, 401), (640, 401)]
 
 
@@ -195,5 +195,5 @@ def test_a_target_beside_the_camera_of_a_row(cameras, targets, tmp_path):
         for camera in cameras
     ]
     (tmp_path / "t.csv").write_text("\n".join(["pan,tilt,target,camera,u,v", *rows, ""]))
-    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), LookWishes()).looks
+    looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), Wishes()).looks
     assert [(k["target"], k["u_left_px"], k["u_right_px"]) for k in looks] == [(t, 630, 600) for t in targets * 2]

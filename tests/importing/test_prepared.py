@@ -8,11 +8,11 @@ import pytest
 from tvsbayes.errors import InputError, Question
 from tvsbayes.importing import columns
 from tvsbayes.importing.axis import axis_rows
-from tvsbayes.importing.axis_units import Wishes
+from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.columns import line_through
-from tvsbayes.importing.looks import LookWishes, look_columns, look_rows
+from tvsbayes.importing.looks import look_columns, look_rows
 from tvsbayes.importing.reader import read_foreign
-from tvsbayes.importing.sightings import SightingWishes, sighting_rows
+from tvsbayes.importing.sightings import sighting_rows
 
 PLACES = np.array([0.0, 10, 20, 30, 40, 50, 40, 30, 20, 10, 0])
 READ = np.round(PLACES * 1.0002 - 0.02 * np.r_[np.ones(6), -np.ones(5)] + 0.003 * (np.arange(11) % 3), 4)
@@ -61,7 +61,7 @@ def test_a_look_is_good_where_both_cameras_are(tmp_path):
     left, right = (["0" if row == bad else "1" for row in range(11)] for bad in BAD)
     names = "pan_steps,tilt_steps,xl,yl,xr,yr,valid_l,valid_r"
     foreign = sheet(tmp_path, names, 100 * np.arange(11), [0] * 11, *pixels, left, right)
-    rows = look_rows(look_columns(foreign, {}), LookWishes())
+    rows = look_rows(look_columns(foreign, {}), Wishes())
     assert [k for k, look in enumerate(rows.looks) if look["status"] != "ok"] == [*BAD]
 
 
@@ -94,7 +94,7 @@ def test_a_spot_of_two_equal_numbers_is_none(tmp_path):
     for fill in (-1, 0, 65535):
         pixels = [np.where(np.isin(np.arange(11), BAD), fill, np.linspace(300, 500, 11) + 7 * k) for k in range(4)]
         foreign = sheet(tmp_path, "pan,tilt,xl,yl,xr,yr", 100 * np.arange(11), [0] * 11, *pixels)
-        rows = look_rows(look_columns(foreign, {}), LookWishes())
+        rows = look_rows(look_columns(foreign, {}), Wishes())
         assert {look["move"] for look in rows.looks if look["status"] == "ok"} == {*range(11)} - {*BAD}
 
 
@@ -303,7 +303,7 @@ FLAT = np.full(8, 5.5)
 
 
 def head(tmp_path, names: str, *columns):
-    return sighting_rows(sheet(tmp_path, names, *columns), SightingWishes())
+    return sighting_rows(sheet(tmp_path, names, *columns), Wishes())
 
 
 def test_elevations_from_the_zenith_and_angles_in_parts(tmp_path):
@@ -326,7 +326,7 @@ def test_directions_of_nothing_and_errors_are_no_directions(tmp_path):
     with pytest.raises(InputError, match="hardly change"):
         columns = {"azimuth_deg": "a", "elevation_deg": "b"}
         foreign = sheet(tmp_path, "az cmd (deg),el cmd (deg),a,b", PAN / 10 + 0.001, FLAT, AZIMUTH / 1000, FLAT / 1000)
-        sighting_rows(foreign, SightingWishes(columns, angle_unit="deg"))
+        sighting_rows(foreign, Wishes(columns, angle_unit="deg"))
 
 
 def test_counters_of_a_head_that_restart_are_refused(tmp_path):
@@ -366,15 +366,15 @@ def test_moves_of_two_axes_are_seen(tmp_path):
     pixels = [640 - 0.7 * PAN, 400 + FLAT, 320 - 0.7 * PAN, 400 + FLAT]
     foreign = sheet(tmp_path, "pan,tilt,xl,yl,xr,yr", moved, [0] * 8, *pixels)
     with pytest.raises(Question):
-        look_rows(look_columns(foreign, {}), LookWishes())
-    assert look_rows(look_columns(foreign, {}), LookWishes(relative=True)).moves[-1]["pan_steps"] == PAN[-1]
+        look_rows(look_columns(foreign, {}), Wishes())
+    assert look_rows(look_columns(foreign, {}), Wishes(relative=True)).moves[-1]["pan_steps"] == PAN[-1]
 
 
 def test_a_book_with_points_apart(tmp_path):
     rows = [f"{e},P{p},{(0, 0, 200, 0)[p - 1]},0" for e in (1, 2, 3) for p in (1, 2, 3, 4)]
     foreign = table(tmp_path, "Experiment,Point,Pan,Tilt", *rows)
     with pytest.raises(Question, match="lengths of moves"):
-        look_rows(look_columns(foreign, {}), LookWishes())
+        look_rows(look_columns(foreign, {}), Wishes())
 
 
 @pytest.mark.parametrize(
@@ -390,27 +390,27 @@ def test_other_than_pixels_are_refused(names, scale, match, tmp_path):
     pixels = [scale * (300.5 + 10 * np.arange(9) + 7 * k) for k in range(4)]
     foreign = sheet(tmp_path, f"pan,tilt,{names}", 100 * np.arange(9), [0] * 9, *pixels)
     with pytest.raises(InputError, match=match):
-        look_rows(look_columns(foreign, {}), LookWishes())
+        look_rows(look_columns(foreign, {}), Wishes())
 
 
 def test_pairs_and_unnamed_pixels(tmp_path):
     cells = [f"({300 + k}.5 {200 + k}.25)" for k in range(9)]
     foreign = sheet(tmp_path, "pan,tilt,left,right", 100 * np.arange(9), [0] * 9, cells, cells)
-    assert look_rows(look_columns(foreign, {}), LookWishes()).looks[2]["v_right_px"] == 202.25
+    assert look_rows(look_columns(foreign, {}), Wishes()).looks[2]["v_right_px"] == 202.25
     numbers = [300.5 + np.arange(9) + k for k in range(4)]
     unnamed = sheet(tmp_path, "pan,tilt,cx0,cy0,cx1,cy1", 100 * np.arange(9), [0] * 9, *numbers)
     with pytest.raises(Question, match="may be pixels"):
-        look_rows(look_columns(unnamed, {}), LookWishes())
+        look_rows(look_columns(unnamed, {}), Wishes())
     degrees = sheet(tmp_path, "pan_deg,tilt_deg,xl,yl,xr,yr", 6 * np.arange(9), [0] * 9, *numbers)
     with pytest.raises(Question, match="angles"):
-        look_rows(look_columns(degrees, {}), LookWishes())
+        look_rows(look_columns(degrees, {}), Wishes())
 
 
 def test_a_sheet_of_merged_cells(tmp_path):
     numbers = [300.5 + np.arange(9) + k for k in range(4)]
     sheets = ["near", "", "", "", "", "far", "", "", ""]
     foreign = sheet(tmp_path, "pan,tilt,sheet,xl,yl,xr,yr", 100 * np.arange(9), [0] * 9, sheets, *numbers)
-    rows = look_rows(look_columns(foreign, {}), LookWishes())
+    rows = look_rows(look_columns(foreign, {}), Wishes())
     assert [look["target"] for look in rows.looks] == ["near"] * 5 + ["far"] * 4
 
 

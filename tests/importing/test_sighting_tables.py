@@ -7,8 +7,9 @@ import math
 import pytest
 
 from tvsbayes.errors import InputError, Question
+from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.columns import Column
-from tvsbayes.importing.sightings import STEP_DEG, SightingWishes, field_of, sighting_rows
+from tvsbayes.importing.sightings import STEP_DEG, field_of, sighting_rows
 from tvsbayes.importing.table import table_of
 from tvsbayes.importing.words import name_of
 
@@ -18,7 +19,7 @@ STEPS = [(-9000, 100), (0, 2000), (9000, 4000), (25000, 6000), (41000, 8000)]
 
 def understood(columns, **wish):
     table = table_of("log.csv", "CSV", columns, range(2, 2 + len(next(iter(columns.values())))))
-    return sighting_rows(table, SightingWishes(**wish))
+    return sighting_rows(table, Wishes(**wish))
 
 
 @pytest.mark.parametrize(

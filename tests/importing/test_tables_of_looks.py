@@ -12,10 +12,10 @@ import pytest
 from support.small_campaign import small_campaign
 
 from tvsbayes.errors import InputError, Question
+from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.looks import (
     FIELDS,
     LookRows,
-    LookWishes,
     field_of,
     look_columns,
     look_rows,
@@ -41,22 +41,22 @@ def table_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> ForeignTabl
     return ForeignTable("t.csv", "drawn", tuple(range(2, 2 + len(rows))), dict(zip(names, cells, strict=True)))
 
 
-def read(table: ForeignTable, wishes: LookWishes | None = None, listed: int | None = None) -> Looks:
-    wishes = wishes or LookWishes()
+def read(table: ForeignTable, wishes: Wishes | None = None, listed: int | None = None) -> Looks:
+    wishes = wishes or Wishes()
     rows = look_rows(look_columns(table, wishes.columns), wishes, listed)
     moves = None if rows.moves is None else tuple(Move(**row) for row in rows.moves)
     spots = None if rows.looks is None else tuple(Spot(**row) for row in rows.looks)
     return Looks(moves, spots, rows.assumed, rows)
 
 
-def looks(*rows: str, header: str = HEADER, wishes: LookWishes | None = None, listed: int | None = None) -> Looks:
+def looks(*rows: str, header: str = HEADER, wishes: Wishes | None = None, listed: int | None = None) -> Looks:
     """Moves and looks of a table with these cells; - is an empty one."""
     cells = [["" if cell == "-" else cell for cell in row.split()] for row in rows]
     return read(table_of(header.split(), cells), wishes, listed)
 
 
 def test_rows_at_the_same_counters_are_looks_after_one_move():
-    result = looks(*LOOKS, wishes=LookWishes(approach=("left", "up")))
+    result = looks(*LOOKS, wishes=Wishes(approach=("left", "up")))
     assert [(m.move, m.pan_steps, m.tilt_steps, m.pan_approach) for m in result.moves] == [
         (0, 0, 0, "left"),
         (1, 200, 0, ""),
@@ -76,7 +76,7 @@ def test_notations_of_others():
     """Pixels from 1, radians, milliseconds, steps of each move, homings, good looks by 1 and 0."""
     header = "Pan Tilt XL YL XR YR B_rad t_ms home valid"
     rows = ("0 0 641 361 501 360 1.5 1000 1 1", "200 0 1 2 3 4 - 2500 1 0", "-150 5 1 2 3 4 0.5 4000 1 1")
-    result = looks(*rows, "10 0 5 6 7 8 0 5000 2 1", header=header, wishes=LookWishes(pixels_from=1, relative=True))
+    result = looks(*rows, "10 0 5 6 7 8 0 5000 2 1", header=header, wishes=Wishes(pixels_from=1, relative=True))
     assert [(m.segment, m.pan_steps, m.tilt_steps, m.time_s) for m in result.moves] == [
         (0, 0, 0, 1.0),
         (0, 200, 0, 2.5),
@@ -87,7 +87,7 @@ def test_notations_of_others():
     assert [s.u_left_px for s in result.spots] == [640.0, None, 0.0, 4.0]
     assert result.spots[1].status == "refused: 0"
     assert result.spots[0].aperture_deg == pytest.approx(math.degrees(1.5), abs=1e-12)
-    degrees = looks("0 0 1 1 1 1 1.5", header="Pan Tilt XL YL XR YR B_rad", wishes=LookWishes(angle_unit="deg"))
+    degrees = looks("0 0 1 1 1 1 1.5", header="Pan Tilt XL YL XR YR B_rad", wishes=Wishes(angle_unit="deg"))
     assert degrees.spots[0].aperture_deg == 1.5
 
 
@@ -328,12 +328,12 @@ def test_a_field_of_two_columns_is_asked():
         ("--column", "pan_steps=pan_pos"),
         ("--column", "pan_steps=pan_goal"),
     ]
-    assert read(table, LookWishes({"pan_steps": "pan_goal"})).moves[0].pan_steps == 1
+    assert read(table, Wishes({"pan_steps": "pan_goal"})).moves[0].pan_steps == 1
     with pytest.raises(InputError, match=r"tilt_steps, pan_steps \(pan_pos or pan_goal\); understood so far: nothing"):
-        read(table, LookWishes({"tilt_steps": ""}))
+        read(table, Wishes({"tilt_steps": ""}))
     for stated, match in (({"pan": "tilt"}, "did you mean|allowed: move"), ({"pan_steps": "Pan"}, "no such column")):
         with pytest.raises(InputError, match=match):
-            read(table, LookWishes(stated))
+            read(table, Wishes(stated))
 
 
 @pytest.mark.parametrize(
@@ -368,7 +368,7 @@ BOOKED = (
 
 
 def test_rows_of_a_lab_book_are_moves_and_looks_that_wait():
-    result = looks(*BOOKED, header=BOOK, wishes=LookWishes(relative=True, pictures=True))
+    result = looks(*BOOKED, header=BOOK, wishes=Wishes(relative=True, pictures=True))
     assert [(m.pan_steps, m.time_s) for m in result.moves] == [(0, 0.0), (10, 60.0), (210, 120.0), (10, 180.0)]
     assert [(s.spot, s.move, s.target, s.experiment, s.point, s.status) for s in result.spots] == [
         (1, 1, "d1", 1, 1, "undetected"),
@@ -401,7 +401,7 @@ def test_looks_are_kept_without_their_pictures():
     assert "status: 1 look left out by column State: bad 1" in result.assumed
     # A log of moves that names pictures lists no looks: `new --pictures` does.
     assert looks("0 0 a.png", "5 0 b.png", header="Pan Tilt File").spots is None
-    alone = looks("0 0 a.png", "5 0 -", header="Pan Tilt File", wishes=LookWishes(pictures=True))
+    alone = looks("0 0 a.png", "5 0 -", header="Pan Tilt File", wishes=Wishes(pictures=True))
     assert [(s.move, s.experiment) for s in alone.spots] == [(0, None)]
 
 

@@ -14,7 +14,8 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, read_bytes, write_folder
 from tvsbayes.files.documents import toml_line
 from tvsbayes.importing.asking import asked
-from tvsbayes.importing.axis import AxisRows, Wishes, axis_rows
+from tvsbayes.importing.axis import AxisRows, axis_rows
+from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.guide import (
     GuideRun,
     is_guide_log,

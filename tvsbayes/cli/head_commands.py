@@ -26,9 +26,10 @@ from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.head.first_priors import falls, first_priors
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.head.urdf import UNSAID, HeadModel, ratios_of
+from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.columns import table_document, table_lines
 from tvsbayes.importing.reader import read_foreign
-from tvsbayes.importing.sightings import FIELDS, SightingWishes, sighting_rows
+from tvsbayes.importing.sightings import FIELDS, sighting_rows
 from tvsbayes.importing.urdf import URDF_BYTES_MAX, HeadJoints, head_joints
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, input_hashes, read_campaign
@@ -113,7 +114,7 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
 
 
 def import_sightings(
-    file: Path, to: Path, sheet: str | None, wishes: SightingWishes, correction: Correction, encoders: str | None
+    file: Path, to: Path, sheet: str | None, wishes: Wishes, correction: Correction, encoders: str | None
 ) -> Import:
     """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
     table = read_foreign(file, sheet)

@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 COPY, URDF, POINTING, AXIS, SIGHTINGS, LOOKS = "copy", "urdf", "pointing", "axis", "sightings", "looks"
 """Kinds of files; --format names that of a telescope's table."""
 ENCODERS = ("output", "motor", "incremental")
+OF_ROWS = {
+    **{"coverage": "factor of u", "status_ok": "good status", "no_reading": "none read", "command_turn": "0: none"},
+    "deviation_sign": "-1: commanded less actual",
+}
+"""What --assume may state of the rows of an axis' table."""
 ANGLE_UNITS = ("deg", "rad", "mrad", "gon", "arcmin", "arcsec")
 KINDS_OF: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("column", "sheet"), (AXIS, SIGHTINGS, LOOKS)),
@@ -138,6 +143,7 @@ def import_(
     A campaign folder as FILE: a copy, corrected by the options that change its tables.
     """
     options = locals()
+    from tvsbayes.importing.cells import Wishes
     from tvsbayes.instrument.corrections import Correction, flipped_axis, shift_of
 
     o = SimpleNamespace(**options)
@@ -147,6 +153,7 @@ def import_(
     sides_of(approach)
     example = "u_left_px=XL; --column target= where the table has none"
     stated = dict(_named("--column", text, example) for text in o.column or ())
+    wishes = Wishes(stated, angle_unit=o.angles, relative=o.relative, approach=approach)
     flipped = tuple(dict.fromkeys(map(flipped_axis, o.flip or ())))
     correction = Correction(flipped, tuple(map(shift_of, o.shift_moves or ())), o.swap)
     task: Import | None
@@ -167,41 +174,39 @@ def import_(
         task = _pointing_table(o.file, o.to, o.encoders)
     elif kind_of_file == AXIS:
         from tvsbayes.cli.axis_import import KINDS, FileOptions, import_readings
-        from tvsbayes.importing.axis_units import Wishes
         from tvsbayes.importing.guide import ASSUMPTIONS
         from tvsbayes.importing.runs import ORDERS
 
-        of_tables = {"coverage": "factor of u", "status_ok": "good status"}
-        of_rows = {"no_reading": "none read", "command_turn": "0: none"}
-        of_rows |= {"deviation_sign": "-1: commanded less actual"}
-        assumed = _assumptions(o.assume, {**ASSUMPTIONS, **of_tables, **of_rows}, "declination_deg=45.9")
         check_word("--format", o.kind, ("auto", *KINDS), closest(o.kind, KINDS, "leave it out: it is in the file"))
         check_word("--runs", o.runs, ORDERS, f"write one of {', '.join(ORDERS)}")
+        assumed = _assumptions(o.assume, {**ASSUMPTIONS, **OF_ROWS}, "declination_deg=45.9")
         units = dict(_named("--unit", text, "value=um") for text in o.unit or ())
-        coverage, status_ok, *others = map(assumed.get, (*of_tables, *of_rows))
-        table = Wishes(
-            *(stated, units, o.deviations, o.counts_per_turn, o.runs, coverage, status_ok, o.relative, *others),
-        )
-        wish = FileOptions(o.kind, o.run, assumed, o.encoders, table)
+        of_axis: dict[str, Any] = {
+            "deviations": o.deviations,
+            "counts_per_turn": o.counts_per_turn,
+            "order": o.runs,
+            "units": units,
+        }
+        of_axis |= {name: number for name, number in assumed.items() if name in OF_ROWS}
+        wishes = replace(wishes, **of_axis)
+        wish = FileOptions(o.kind, o.run, assumed, o.encoders, wishes)
         task = import_readings(o.file, o.to, o.sheet, wish, yes=o.yes, as_json=o.as_json)
     elif kind_of_file == SIGHTINGS:
         from tvsbayes.cli.head_commands import import_sightings
-        from tvsbayes.importing.sightings import SightingWishes
 
         u_deg = _assumptions(o.assume, {"u_deg": "standard uncertainty"}, "u_deg=0.005").get("u_deg")
-        wishes = SightingWishes(stated, o.angles, o.relative, approach, u_deg)
+        wishes = replace(wishes, u_deg=u_deg)
         task = import_sightings(o.file, o.to, o.sheet, wishes, correction, o.encoders)
     else:
         from tvsbayes.cli.looks_import import import_looks
-        from tvsbayes.importing.looks import SD_PX, LookWishes
 
         interactive = not (o.yes or o.as_json) and is_interactive()
-        sd_px = SD_PX if o.sd_px is None else o.sd_px
-        looks = LookWishes(stated, o.pixels_from, o.angles, sd_px, o.relative, approach, o.pictures is not None)
+        sd_px = wishes.sd_px if o.sd_px is None else o.sd_px
+        wishes = replace(wishes, pixels_from=o.pixels_from, sd_px=sd_px, pictures=o.pictures is not None)
         globs = stated_globs(o.left, o.right, False)
         if o.pictures is None:
             refuse_options("for pictures", "add --pictures FOLDER, or leave it out", left=o.left, right=o.right)
-        task = import_looks(o.file, o.to, o.sheet, looks, correction, o.pictures, globs, interactive)
+        task = import_looks(o.file, o.to, o.sheet, wishes, correction, o.pictures, globs, interactive)
     if task is not None:
         task.carry_out(o.to, o.yes, o.as_json)
 

@@ -20,8 +20,9 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, new_folder, read_bytes
 from tvsbayes.files.documents import toml_line
 from tvsbayes.importing.asking import listed
+from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.columns import table_document, table_lines
-from tvsbayes.importing.looks import FIELDS, LookRows, LookWishes, look_columns, look_rows, open_fields
+from tvsbayes.importing.looks import FIELDS, LookRows, look_columns, look_rows, open_fields
 from tvsbayes.importing.reader import read_foreign
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.progress import Job
@@ -38,7 +39,7 @@ def import_looks(
     file: Path,
     to: Path,
     sheet: str | None,
-    wishes: LookWishes,
+    wishes: Wishes,
     correction: Correction,
     pictures: Path | None,
     globs: tuple[str, str] | None,

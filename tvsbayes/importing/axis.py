@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import fmean, median
 from typing import Any
@@ -20,8 +20,16 @@ import numpy as np
 from tvsbayes.errors import escaped
 from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
-from tvsbayes.importing.axis_units import Wishes, in_one_unit, is_expanded, rounded, shown_units, stated_unit, units_of
-from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of, temperatures_of
+from tvsbayes.importing.axis_units import (
+    NUMBER_MAX,
+    in_one_unit,
+    is_expanded,
+    rounded,
+    shown_units,
+    stated_unit,
+    units_of,
+)
+from tvsbayes.importing.cells import FieldCells, Wishes, homings_of, say_left_out, status_of, temperatures_of
 from tvsbayes.importing.clock import seconds_of, stamp_of
 from tvsbayes.importing.columns import (
     Understood,
@@ -37,8 +45,6 @@ from tvsbayes.importing.usable_rows import good_rows, resting_rows, without_fill
 from tvsbayes.importing.words import Unit, means, name_of, parse_unit, plain
 from tvsbayes.statistics.wrapped import turn_jumps
 
-NUMBER_MAX = 1e12
-"""Largest absolute command or reading."""
 TURN_TOLERANCE = 0.1
 """Largest deviation of a jump from whole turns by play and errors of gears, turns."""
 JUMP_SDS = 6.0
@@ -111,82 +117,90 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
         InputError: a cell is not a value of its field, or the table has no row or lacks a column.
     """
     table.require_rows()
-    wishes = replace(wishes, columns=table.named(wishes.columns))
+    wishes = wishes.named_in(table)
     runs = long_table(table, wishes.columns, wishes.order)
     settled = wishes.deviations is not None or wishes.relative or wishes.counts_per_turn is not None
     known = axis_columns(runs.table, runs.stated, wishes.deviations, settled=settled)
-    table, columns = runs.table, dict(known.columns)
-    assumed = [*runs.remarks, *known.remarks]
-    if wishes.relative:
-        table = _summed(table, columns)
-        assumed.append("command: summed up, because --relative says that each is the length of its move")
-    table = without_fills(good_rows(table, columns, wishes, assumed), columns, wishes, assumed)
-    table = without_strays(resting_rows(table, columns, wishes, assumed), columns, assumed)
-    cells, written = FieldCells(table, columns).with_plain(("command", "value", "u"), assumed)
-    units = units_of(cells, written, wishes, assumed)
+    cells = FieldCells(runs.table, known.columns, wishes, [*runs.remarks, *known.remarks])
+    for step in (_summed, good_rows, without_fills, resting_rows, without_strays):
+        cells = step(cells)
+    as_written = cells.table
+    cells, written = cells.with_plain("command", "value", "u")
+    units = units_of(cells, written)
+    commands, read, homings = _checked_numbers(cells, units["command"])
+    values, stated_u, unit = in_one_unit(cells, commands, read, units)
+    times_s = seconds_of(cells, stated_unit(cells, "time_s"))
+    homings_of(cells)
+    moves, move_of_row, said = _moves_of(cells, commands, values, times_s, homings)
+    readings = _readings_of(cells, values, stated_u, move_of_row)
+    cells.assumed.extend(said)
+    unread = sum(v is None and means(s, "good") for v, s in zip(values, cells.text("status"), strict=True))
+    if unread:
+        cells.assumed.append(f"status: {unread} row{'s' * (unread > 1)} called good without a reading: moves alone")
+    if "u" not in cells:
+        cells.assumed.append("u: none, so that the scatter of stops covers the readings' own")
+    readings, wrapped = unwrapped(moves, readings, folder_unit or unit, wishes.counts_per_turn)
+    cells.assumed.extend([*wrapped, *([EXPANDED_IS_COMMON] if is_expanded(cells) else [])])
+    shown = Understood(dict(cells.columns), tuple(dict.fromkeys((*known.unused, *runs.unused))))
+    of_commands, created = units["command"], stamp_of(cells.text("time_s")[0])
+    return AxisRows(
+        moves,
+        readings,
+        unit,
+        tuple(cells.assumed),
+        header={} if created is None else {"created": created},
+        axis={"command_unit": of_commands.text} if of_commands is not None and of_commands.kind in SCALES else {},
+        reference={"u_is": "common"} if is_expanded(cells) else {},
+        lines=tuple(table_lines(as_written, shown, FIELDS, shown_units(units, unit, cells))),
+        document=table_document(as_written, shown),
+    )
+
+
+def _summed(cells: FieldCells) -> FieldCells:
+    """The cells with positions in place of moves, from 0 at every homing, where the user says so."""
+    if not cells.wishes.relative:
+        return cells
+    plain, written = cells.with_plain("command", silent=True)
+    moves = [move or 0.0 for move in plain.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
+    unit = written["command"]
+    cells.assumed.append("command: summed up, because --relative says that each is the length of its move")
+    positions = map(repr, summed_up(moves, homings_of(cells, silent=True)))
+    return cells.with_texts("command", [f"{at} {unit.name}" if unit else at for at in positions])
+
+
+def _checked_numbers(cells: FieldCells, unit: Unit | None) -> tuple[list[float], list[float | None], list[bool]]:
+    """Commands, readings, and whether the axis homed before each row; asks where commands may be no positions."""
+    wishes, table = cells.wishes, cells.table
     commands = [command or 0.0 for command in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
     read = cells.numbers("value", -NUMBER_MAX, NUMBER_MAX, optional=True)
-    of_homings = list[str]()
-    homings = homings_of(cells, of_homings)
-    if "value" not in wishes.columns and name_of(columns["value"]).has("increment"):
-        raise refused("moved-readings", table.file, line=table.first_line, name=columns["value"])
+    homings = homings_of(cells, silent=True)
+    command, value = (name_of(cells.columns[name]) for name in ("command", "value"))
+    if "value" not in wishes.columns and value.has("increment"):
+        raise refused("moved-readings", table.file, line=table.first_line, name=value.text)
     stale = _stale(commands, read)
     if stale.any():
-        read = [None if old else value for value, old in zip(read, stale, strict=True)]
+        read = [None if old else number for number, old in zip(read, stale, strict=True)]
         how = "as an export of two series does: moves alone"
-        assumed.append(f"value: {stale.sum()} rows repeat the reading before a move, {how}")
-    commands = _through_the_seam(cells, commands, units["command"], wishes, assumed)
-    if (
-        not wishes.relative
-        and "command" not in wishes.columns
-        and (are_moves(commands, read, homings) or name_of(columns["command"]).has("increment"))
-    ):
-        raise table.ask("moves-or-positions", column=columns["command"], field="command")
-    given_u = [u or 0.0 for u in cells.numbers("u", 0.0, NUMBER_MAX, optional=True)]
-    values, stated_u, unit = in_one_unit(cells, commands, read, given_u, units, wishes, assumed)
-    times, statuses = seconds_of(cells, assumed, stated_unit(cells, "time_s", wishes)), cells.text("status")
-    assumed += of_homings
-    moves, move_of_row, said = _moves_of(cells, commands, values, times, homings, assumed)
-    readings, unread = list[dict[str, Any]](), 0
+        cells.assumed.append(f"value: {stale.sum()} rows repeat the reading before a move, {how}")
+    commands = _through_the_seam(cells, commands, unit)
+    if not wishes.relative and "command" not in wishes.columns:
+        if command.has("increment") or are_moves(commands, read, homings):
+            raise table.ask("moves-or-positions", column=command.text, field="command")
+    return commands, read, homings
+
+
+def _readings_of(
+    cells: FieldCells, values: Sequence[float | None], stated_u: Sequence[float], move_of_row: Sequence[int]
+) -> list[dict[str, Any]]:
+    """Rows of `readings.csv`: of all rows with a value or a bad status."""
+    readings, statuses = list[dict[str, Any]](), cells.text("status")
     for row, value in enumerate(values):
         if value is not None or (statuses[row] and not means(statuses[row], "good")):
             status = status_of(cells, row, {"value": value}, "reading")
             reading = {"reading": len(readings), "move": move_of_row[row], "value": value}
             readings.append({**reading, "u": stated_u[row], "status": status})
-        else:
-            unread += bool(statuses[row])
-    assumed += left_out(cells, statuses, "reading") + said
-    if unread:
-        assumed.append(f"status: {unread} row{'s' * (unread > 1)} called good without a reading: moves alone")
-    if "u" not in cells:
-        assumed.append("u: none, so that the scatter of stops covers the readings' own")
-    readings, wrapped = unwrapped(moves, readings, folder_unit or unit, wishes.counts_per_turn)
-    assumed += wrapped
-    shown = Understood(columns, tuple(dict.fromkeys((*known.unused, *runs.unused))))
-    lines, document = table_lines(table, shown, FIELDS, shown_units(units, unit, cells)), table_document(table, shown)
-    of_commands = units["command"]
-    axis = {} if of_commands is None or of_commands.kind not in SCALES else {"command_unit": of_commands.text}
-    reference = {"u_is": "common"} if is_expanded(cells, wishes) else {}
-    if reference:
-        assumed.append(EXPANDED_IS_COMMON)
-    created = stamp_of(cells.text("time_s")[0])
-    return AxisRows(
-        *(moves, readings, unit, tuple(assumed), (), {} if created is None else {"created": created}),
-        axis=axis,
-        reference=reference,
-        lines=tuple(lines),
-        document=document,
-    )
-
-
-def _summed(table: ForeignTable, columns: Mapping[str, str]) -> ForeignTable:
-    """The table with positions in place of moves, from 0 at every homing."""
-    cells, written = FieldCells(table, columns).with_plain(("command",), [])
-    moves = [move or 0.0 for move in cells.numbers("command", -NUMBER_MAX, NUMBER_MAX)]
-    positions = tuple(map(repr, summed_up(moves, homings_of(cells, []))))
-    unit = written["command"]
-    positions = tuple(f"{at} {unit.name}" for at in positions) if unit else positions
-    return replace(table, columns={**table.columns, columns["command"]: positions})
+    say_left_out(cells, statuses, "reading")
+    return readings
 
 
 def _stale(commands: Sequence[float], read: Sequence[float | None]) -> np.ndarray:
@@ -199,15 +213,13 @@ def _stale(commands: Sequence[float], read: Sequence[float | None]) -> np.ndarra
     return stale if staircase else np.zeros(len(command), bool)
 
 
-def _through_the_seam(
-    cells: FieldCells, commands: list[float], unit: Unit | None, wishes: Wishes, assumed: list[str]
-) -> list[float]:
+def _through_the_seam(cells: FieldCells, commands: list[float], unit: Unit | None) -> list[float]:
     """Commands of an angle that go on through a whole turn, where the user says so.
 
     Raises:
         Question: they jump across the seam, and the part of the circle that they leave out lies elsewhere.
     """
-    turn = wishes.command_turn
+    turn = cells.wishes.command_turn
     if turn is None and unit is not None and unit.kind == "angle":
         period = 360.0 / (unit.scale * unit.per_number)
         places = np.unique(np.mod(commands, period))
@@ -215,14 +227,14 @@ def _through_the_seam(
         jumps = np.flatnonzero(np.abs(np.diff(commands)) > 0.5 * period)
         # Across the largest gap the commands never go, so a jump that is not across it goes the short way.
         low, high = np.sort([commands[jumps[0]], commands[jumps[0] + 1]]) if len(jumps) else (0.0, 0.0)
-        gap = int(np.argmax(gaps))
-        inside = low < places[gap] + 0.5 * gaps[gap] < high or low < places[gap] + 0.5 * gaps[gap] - period < high
-        if len(jumps) and len(places) > 3 and gaps[gap] > SEAM_GAPS * np.median(gaps) and inside:
+        middle, gap = places[np.argmax(gaps)] + 0.5 * gaps.max(), gaps.max()
+        inside = low < middle < high or low < middle - period < high
+        if len(jumps) and len(places) > 3 and gap > SEAM_GAPS * np.median(gaps) and inside:
             said = {"before": commands[jumps[0]], "after": commands[jumps[0] + 1], "period": period}
             raise cells.table.ask("seam", unit=unit.name, **said)
     if not turn:
         return commands
-    assumed.append(f"command: whole turns of {turn:g} added, because --assume command_turn says so")
+    cells.assumed.append(f"command: whole turns of {turn:g} added, because --assume command_turn says so")
     return [rounded(c) for c in np.unwrap(commands, period=turn)]
 
 
@@ -233,15 +245,14 @@ def _moves_of(
     values: Sequence[float | None],
     times: Sequence[float] | None,
     homings: Sequence[bool],
-    assumed: list[str],
 ) -> tuple[list[dict[str, Any]], list[int], list[str]]:
-    """Moves, also those implied by a column of directions, the move of each row, and what was assumed of them.
+    """Moves, also those implied by a column of directions, the move of each row, and what is to be said of them.
 
     Times are those of the table, else the number of the move.
     """
     if times is None:
-        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
-    sides, temperatures = _sides(cells, commands, homings, assumed), temperatures_of(cells, assumed)
+        cells.assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
+    sides, temperatures = _sides(cells, commands, homings), temperatures_of(cells)
     _refuse_contrary(cells, commands, sides, homings)
     counts = [n for n in cells.table.columns if name_of(n).has("repeat") and n not in cells.columns.values()]
     repeat = cells.table.columns[counts[0]] if counts else [""] * len(commands)
@@ -280,11 +291,9 @@ def _moves_of(
         rows = f"{again} row{'s' * (again > 1)}"
         said.append(f"{rows} at the command before: read at that stop again, without a move")
     if inserted:
-        name, added = escaped(cells.columns["approach"]), f"{inserted} move{'s' * (inserted > 1)} added"
-        said.append(
-            f"{added}, {reach:.6g} past the stop, where column {name} states another side than the row before gives; "
-            "--column approach= takes sides from the order only"
-        )
+        added, name = f"{inserted} move{'s' * (inserted > 1)} added", cells.shown("approach")
+        where = f"where column {name} states another side than the row before gives"
+        said.append(f"{added}, {reach:.6g} past the stop, {where}; --column approach= takes sides from the order only")
     if "approach" not in cells:
         said.append("approach: unknown at the beginning of each segment")
     return moves, move_of_row, said
@@ -338,7 +347,7 @@ def _refuse_contrary(
         raise cells.ask("contrary", moved[0], "approach")
 
 
-def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool], assumed: list[str]) -> list[int]:
+def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]) -> list[int]:
     """Direction of each row: 1 forward, -1 backward, 0 unstated.
 
     The order of the commands decides the meaning of one or two unknown words.
@@ -363,7 +372,7 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
             sides |= known
             named = sorted(((escaped(word, 24), side) for word, side in known.items()), key=lambda item: -item[1])
             said = " and ".join(f"{word} {'forward' if side > 0 else 'backward'}" for word, side in named)
-            assumed.append(f"approach: {said.replace(' ', ' is ', 1)}, as the commands rise and fall")
+            cells.assumed.append(f"approach: {said.replace(' ', ' is ', 1)}, as the commands rise and fall")
             unknown = []
     for row, word in enumerate(words):
         if word in unknown:

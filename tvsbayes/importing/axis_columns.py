@@ -248,7 +248,7 @@ def _ask_whether_it_follows(chooser: Chooser) -> None:
             return
     if np.corrcoef(c, v)[0, 1] ** 2 < STRAY_R2:
         found = f"readings in column {escaped(names['value'])} that do not follow column {escaped(names['command'])}"
-        homed = homings_of(FieldCells(chooser.table, chooser.taken), [])
+        homed = homings_of(FieldCells(chooser.table, chooser.taken), silent=True)
         read = [None if np.isnan(v) else float(v) for v in value.values]
         if np.isfinite(command.values).all() and are_moves(command.values.tolist(), read, homed):
             raise chooser.table.ask("moves-or-positions", column=names["command"], field="command")

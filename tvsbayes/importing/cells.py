@@ -10,9 +10,11 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
+
+import numpy as np
 
 from tvsbayes.errors import InputError, Question, escaped
 from tvsbayes.files.csv_table import NUMBER
@@ -23,6 +25,8 @@ WORDS_SHOWN = 5
 """Largest number of status words in a message about excluded rows."""
 FLAGS = {"": False, "0": False, "false": False, "no": False, "1": True, "true": True, "yes": True}
 """Cells of a column that marks homings, in lower case."""
+SD_PX = 0.1
+"""Standard uncertainty of a centroid where a table states none; the fit estimates its scale."""
 _SEXAGESIMAL = re.compile(
     r"(?P<sign>[+-]?)\s*(?P<d>\d+)\s*(?:\u00b0|deg|d|:|\s)\s*(?P<m>\d{1,2}(?:\.\d+)?)\s*(?:['\u2032m:]|\s|$)\s*"
     r"(?:(?P<s>\d{1,2}(?:\.\d+)?)\s*(?:\"|''|\u2033|s)?)?"
@@ -106,70 +110,135 @@ def _fraction(cell: str) -> float | None:
 
 
 @dataclass(frozen=True)
+class Wishes:
+    """What the user states about a table.
+
+    Attributes:
+        columns: column by field, "" for none.
+        units: of an axis, unit by field, as text.
+        angle_unit: of sightings and apertures, unit of angles whose columns state none.
+        relative: whether commands or counters are the lengths of moves.
+        approach: of two axes, the side from which pan and tilt came to the first row; "unknown" where nobody wrote it.
+        deviations: whether readings are actual less commanded position.
+        deviation_sign: -1 where deviations are commanded less actual position.
+        counts_per_turn: counts after which readings restart; 0: nowhere.
+        order: order of runs beside each other, one of `runs.ORDERS`.
+        coverage: coverage factor of the column of uncertainties.
+        status_ok: number of a status that means a good row.
+        no_reading: number that stands for no reading.
+        command_turn: whole turn of commands that go on through it; 0: nowhere.
+        u_deg: standard uncertainty of a sighting where no column states it.
+        pixels_from: coordinate of the centre of the first pixel: 0, or 1 as in MATLAB.
+        sd_px: standard uncertainty of a centroid where no column states it.
+        pictures: whether the files that a lab book names are at hand.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    angle_unit: str | None = None
+    relative: bool = False
+    approach: tuple[str, str] = ("unknown", "unknown")
+    deviations: bool | None = None
+    deviation_sign: float | None = None
+    counts_per_turn: float | None = None
+    order: str | None = None
+    coverage: float | None = None
+    status_ok: float | None = None
+    no_reading: float | None = None
+    command_turn: float | None = None
+    u_deg: float | None = None
+    pixels_from: int = 0
+    sd_px: float = SD_PX
+    pictures: bool = False
+
+    def named_in(self, table: ForeignTable) -> Wishes:
+        """The same, with the names that a table has for its columns."""
+        return replace(self, columns=table.named(self.columns))
+
+
+@dataclass(frozen=True)
 class FieldCells:
-    """Cells of a table by field, and the options by which a question about them is answered."""
+    """Cells of a table by field, what the user states about them, and what is assumed of them, in words."""
 
     table: ForeignTable
     columns: Mapping[str, str]
+    wishes: Wishes = field(default_factory=Wishes)
+    assumed: list[str] = field(default_factory=list)
 
-    def __contains__(self, field: str) -> bool:
-        return field in self.columns
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
 
-    def text(self, field: str) -> list[str]:
+    def text(self, name: str) -> list[str]:
         """Cells of a field; empty where the table has no column for it."""
-        return list(self.table.columns[self.columns[field]]) if field in self else [""] * len(self.table)
+        return list(self.table.columns[self.columns[name]]) if name in self else [""] * len(self.table)
 
-    def with_plain(self, fields: Sequence[str], assumed: list[str]) -> tuple[FieldCells, dict[str, Unit | None]]:
+    def shown(self, name: str) -> str:
+        """The column of a field, safe to print."""
+        return escaped(self.columns[name])
+
+    def values(self, name: str) -> np.ndarray:
+        """Numbers of a field in any notation, nan for other cells."""
+        cells = plain_column(self.columns[name], self.text(name)).cells
+        return np.array([float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells])
+
+    def with_texts(self, name: str, texts: Sequence[str]) -> FieldCells:
+        """The same with other cells of a field."""
+        columns = {**self.table.columns, self.columns[name]: tuple(texts)}
+        return replace(self, table=replace(self.table, columns=columns))
+
+    def with_plain(self, *names: str, silent: bool = False) -> tuple[FieldCells, dict[str, Unit | None]]:
         """The cells with plain numbers in these fields, and the units that stood in them; notations are said."""
-        plain = {f: plain_column(self.columns[f], self.text(f)) for f in fields if f in self}
-        assumed += [column.remark for column in plain.values() if column.remark]
-        columns = {**self.table.columns, **{self.columns[f]: column.cells for f, column in plain.items()}}
-        units = {f: column.unit for f, column in plain.items()}
-        return replace(self, table=replace(self.table, columns=columns)), units
+        plain = {n: plain_column(self.columns[n], self.text(n)) for n in names if n in self}
+        self.assumed.extend(column.remark for column in plain.values() if column.remark and not silent)
+        cells = self
+        for name, column in plain.items():
+            cells = cells.with_texts(name, column.cells)
+        return cells, {name: column.unit for name, column in plain.items()}
 
-    def numbers(self, field: str, low: float, high: float, *, optional: bool = False) -> list[float | None]:
+    def numbers(self, name: str, low: float, high: float, *, optional: bool = False) -> list[float | None]:
         """Numbers of a field; None for an empty cell, where it may be empty.
 
         Raises:
             InputError: a cell is no number from `low` to `high`.
         """
         values: list[float | None] = []
-        for row, text in enumerate(self.text(field)):
-            cell = "" if means(text, "empty") else text
-            value = float(cell) if NUMBER.fullmatch(cell) else math.nan
+        for row, text in enumerate(self.text(name)):
+            is_number = NUMBER.fullmatch(text) is not None
+            cell = text if is_number or not means(text, "empty") else ""
+            value = float(cell) if is_number else math.nan
             if not (low <= value <= high or (optional and not cell)):
-                allowed = f"a number from {low:g} to {high:g} for {field}"
-                raise self.refuse(row, field, allowed, "correct the cell, or name another column")
+                allowed = f"a number from {low:g} to {high:g} for {name}"
+                raise self.refuse(row, name, allowed, "correct the cell, or name another column")
             values.append(value if cell else None)
         return values
 
-    def scaled(self, field: str, unit: Unit, low: float, high: float) -> list[float | None]:
+    def scaled(self, name: str, unit: Unit, low: float, high: float) -> list[float | None]:
         """Numbers of a field, from `low` to `high` in the base unit of the one in which they are written."""
         scale = unit.scale * unit.per_number
-        return [None if v is None else scale * v for v in self.numbers(field, low / scale, high / scale, optional=True)]
+        return [None if v is None else scale * v for v in self.numbers(name, low / scale, high / scale, optional=True)]
 
     def whole(
-        self, field: str, low: int, high: int, *, optional: bool = False, remedy: str = "correct the cell"
+        self, name: str, low: int, high: int, *, optional: bool = False, remedy: str = "correct the cell"
     ) -> list[int | None]:
         """Whole numbers of a field; "200.0" is one."""
-        values = self.numbers(field, low, high, optional=optional)
+        values = self.numbers(name, low, high, optional=optional)
         for row, value in enumerate(values):
             if value is not None and not value.is_integer():
-                raise self.refuse(row, field, f"a whole number for {field}", remedy)
+                raise self.refuse(row, name, f"a whole number for {name}", remedy)
         return [None if value is None else int(value) for value in values]
 
-    def ask(self, what: str, row: int, field: str, **values: Any) -> Question:
+    def ask(self, what: str, row: int, name: str, **values: Any) -> Question:
         """A question about one cell."""
-        column = self.columns[field]
+        column = self.columns[name]
         said = {"line": self.table.lines[row], "at": column, "cell": self.table.columns[column][row]}
         return self.table.ask(what, **said, **values)
 
-    def refuse(self, row: int, field: str, allowed: str, remedy: str) -> InputError:
+    def refuse(self, row: int, name: str, allowed: str, remedy: str) -> InputError:
         """The error of one cell."""
-        return self.table.refuse(row, self.columns[field], allowed, remedy)
+        return self.table.refuse(row, self.columns[name], allowed, remedy)
 
 
-def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]:
+def temperatures_of(cells: FieldCells) -> list[float | None]:
     """Temperature of every row, deg C, from degrees Fahrenheit or kelvins where the column's name says so."""
     if "temperature_degC" not in cells:
         return [None] * len(cells.table)
@@ -179,7 +248,7 @@ def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]
         zero = 32.0 if unit.name == "degF" else 273.15
         temperatures = [None if value is None else unit.scale * (value - zero) for value in temperatures]
         words = {"degF": "degrees of Fahrenheit", "K": "kelvins"}[unit.name]
-        assumed.append(f"temperature: {words}, as the column's name says, turned into deg C")
+        cells.assumed.append(f"temperature: {words}, as the column's name says, turned into deg C")
     return temperatures
 
 
@@ -188,7 +257,7 @@ def mark_of(cell: str) -> str:
     return cell.lower().removeprefix("+")
 
 
-def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
+def homings_of(cells: FieldCells, *, silent: bool = False) -> list[bool]:
     """Whether the axes homed before each row but the first, which always begins a segment.
 
     Numbers of segments change at a homing. Where all cells are 0 or 1 and a 0 follows a 1, they are marks instead: each
@@ -201,24 +270,21 @@ def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
     are_marks = None not in flags and any(previous and not current for previous, current in pairwise(flags))
     changes = map(bool, flags[1:]) if are_marks else (previous != current for previous, current in pairwise(words))
     homings = [False, *changes]
-    count, name = sum(homings), escaped(cells.columns["segment"])
-    how = "at each 1" if are_marks else "where it changes"
-    assumed.append(f"segment: {count} homing{'s' * (count != 1)} after the first row, by column {name} {how}")
+    if not silent:
+        count, how = sum(homings), "at each 1" if are_marks else "where it changes"
+        said = f"segment: {count} homing{'s' * (count != 1)} after the first row"
+        cells.assumed.append(f"{said}, by column {cells.shown('segment')} {how}")
     return homings
 
 
 # --- status ----------------------------------------------------------------------------------------------------------
-def left_out(cells: FieldCells, statuses: Sequence[str], noun: str) -> list[str]:
-    """A sentence on the rows excluded by a column of statuses: an unknown word may mean that the row is good."""
+def say_left_out(cells: FieldCells, statuses: Sequence[str], noun: str) -> None:
+    """Say which rows a column of statuses excludes: an unknown word may mean that the row is good."""
     counts = Counter(escaped(text, 24) for text in statuses if text.strip() and not means(text, "good"))
-    if not counts:
-        return []
-    listed = [f"{text} {count}" for text, count in counts.most_common(WORDS_SHOWN)]
-    words = ", ".join(listed) + " ..." * (len(counts) > WORDS_SHOWN)
-    count = sum(counts.values())
-    return [
-        f"status: {count} {noun}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {words}"
-    ]
+    words = ", ".join(f"{text} {count}" for text, count in counts.most_common(WORDS_SHOWN))
+    if count := counts.total():
+        rows, more = f"{count} {noun}{'s' * (count != 1)}", " ..." * (len(counts) > WORDS_SHOWN)
+        cells.assumed.append(f"status: {rows} left out by column {cells.shown('status')}: {words}{more}")
 
 
 def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], noun: str) -> str:
@@ -230,12 +296,12 @@ def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], n
         values: by field; a row that is ok has all of them.
         noun: word for a row.
     """
-    text = cells.text("status")[row]
+    text = cells.table.columns[cells.columns["status"]][row] if "status" in cells else ""
     if means(text, "good") or not text.strip():
-        for field, value in values.items():
+        for name, value in values.items():
             if value is None:
                 allowed = f"a number where the {noun} is ok"
-                raise cells.refuse(row, field, allowed, "complete the cell, or its status")
+                raise cells.refuse(row, name, allowed, "complete the cell, or its status")
         return "ok"
     return readable(f"refused: {text}" if means(text, "bad") else text, "refused:", 200) or "refused"
 

@@ -154,7 +154,7 @@ def _are_days(times: np.ndarray) -> bool:
     return len(steps) > 0 and bool(np.all((low <= times) & (times <= high))) and 0 < np.median(steps) < SHORTEST_S
 
 
-def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) -> list[float] | None:
+def seconds_of(cells: FieldCells, unit: Unit | None = None) -> list[float] | None:
     """Seconds of every row: numbers in the unit of the column's name or the given one, dates with times, times of day.
 
     A clock set back from summer time, as one with a zone is not, is set forward again, once.
@@ -185,26 +185,26 @@ def seconds_of(cells: FieldCells, assumed: list[str], unit: Unit | None = None) 
     of_epoch = [scale for least, scale in EPOCH_SCALES.items() if times.max(initial=0.0) >= least]
     if is_day:
         times_s = DAY_S * (times - times[0])
-        assumed.append("time_s: days, as of a Julian date or a spreadsheet, so seconds since the first row")
+        cells.assumed.append("time_s: days, as of a Julian date or a spreadsheet, so seconds since the first row")
     elif not is_number:
         times_s = times - times[0]
         of_minutes = "hours and minutes, so " * all(len(cell) <= 5 for cell in texts)
-        assumed.append(f"time_s: {of_minutes}seconds since the first row")
+        cells.assumed.append(f"time_s: {of_minutes}seconds since the first row")
     elif unit is None and of_epoch:
         # Epochs in ns need more digits than a float has.
         times_s = [of_epoch[0] * float(Decimal(cell) - Decimal(texts[0])) for cell in texts]
-        assumed.append(f"time_s: counted in {of_epoch[0]:g} s since 1970, so seconds since the first row")
+        cells.assumed.append(f"time_s: counted in {of_epoch[0]:g} s since 1970, so seconds since the first row")
     else:
         times_s = times * (unit.scale if unit is not None and unit.kind == "time" else 1.0)
         if unit is None and len(times) and SPREADSHEET_DAYS[0] <= times.min() and times.max() <= SPREADSHEET_DAYS[1]:
             said = "time_s: in s, though spreadsheets count days by such numbers; a column of days is named Time (d)"
-            assumed.append(said)
+            cells.assumed.append(said)
     seconds, backs = forward(map(float, times_s), repeat("time_s"))
     for back in backs:
         is_dated = not is_number and not any(map(_ZONE.search, texts)) and date_time(texts[0]) is not None
         if not is_dated or back.added_s != SUMMER_TIME_S or len(backs) > 1:
             raise cells.ask("clock-back", back.row, "time_s", back=back.back_s)
-        assumed.append(f"time_s: {back.text(cells.table.lines[back.row])}")
+        cells.assumed.append(f"time_s: {back.text(cells.table.lines[back.row])}")
     return seconds
 
 

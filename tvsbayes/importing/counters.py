@@ -6,7 +6,7 @@ Successive rows at the same counters belong to one move.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,39 +27,16 @@ moves: play leaves less."""
 Pair = tuple[int, int]
 
 
-class RowMoves(NamedTuple):
-    """Rows of `moves.csv`, and the number of the move of every row of the table."""
-
-    moves: list[dict[str, Any]]
-    move_of_row: list[int]
-
-
-def moves_of_rows(
-    cells: FieldCells,
-    counters: Sequence[Pair],
-    assumed: list[str],
-    *,
-    relative: bool = False,
-    approach: tuple[str, str] = ("unknown", "unknown"),
-) -> RowMoves:
-    """Derive the moves of a table with counters.
-
-    Args:
-        cells: cells of the table by field.
-        counters: pan and tilt of every row, steps.
-        assumed: sentences, to which assumptions are added.
-        relative: whether counters are the steps of each move.
-        approach: side from which pan and tilt came to the first row, where no column says it.
+def moves_of_rows(cells: FieldCells, counters: Sequence[Pair]) -> tuple[list[dict[str, Any]], list[int]]:
+    """Moves of a table with counters of pan and tilt, steps, and the number of the move of every row.
 
     Raises:
         InputError: a cell is not a value of its field.
     """
-    numbers = cells.text("move") if "move" in cells else None
-    homings, times_s = homings_of(cells, assumed), seconds_of(cells, assumed)
-    temperatures = temperatures_of(cells, assumed)
-    sides = list(zip(*map(_approaches, [cells] * len(AXES), AXES, approach), strict=True))
-    moves: list[dict[str, Any]] = []
-    move_of_row: list[int] = []
+    relative, numbers = cells.wishes.relative, cells.text("move") if "move" in cells else None
+    homings, times_s, temperatures = homings_of(cells), seconds_of(cells), temperatures_of(cells)
+    sides = list(zip(*map(_approaches, [cells] * len(AXES), AXES, cells.wishes.approach), strict=True))
+    moves, move_of_row = list[dict[str, Any]](), list[int]()
     at, segment = (0, 0), 0
     for row, (pair, homed) in enumerate(zip(counters, homings, strict=True)):
         segment += homed
@@ -77,12 +54,13 @@ def moves_of_rows(
             raise cells.refuse(row, COUNTERS[pair[1] != at[1]], allowed, remedy)
         move_of_row.append(len(moves) - 1)
     if times_s is None:
-        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
-    if "pan_approach" not in cells and "unknown" in approach:
-        assumed.append("approach: unknown; say how the axes came to the first row, --pan-approach left or right ...")
+        cells.assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
+    if "pan_approach" not in cells and "unknown" in cells.wishes.approach:
+        how = "say how the axes came to the first row, --pan-approach left or right ..."
+        cells.assumed.append(f"approach: unknown; {how}")
     if relative:
-        assumed.append("counters: summed up, because --relative says that each is the steps of its move")
-    return RowMoves(moves, move_of_row)
+        cells.assumed.append("counters: summed up, because --relative says that each is the steps of its move")
+    return moves, move_of_row
 
 
 def whole_counters(cells: FieldCells) -> list[Pair]:

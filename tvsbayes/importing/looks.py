@@ -10,17 +10,17 @@ from __future__ import annotations
 import datetime
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_kind import ID_MAX
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
-from tvsbayes.importing.cells import FieldCells, homings_of, left_out, readable, status_of
+from tvsbayes.importing.cells import FieldCells, Wishes, homings_of, readable, say_left_out, status_of
 from tvsbayes.importing.clock import date_time, joined_clock, stamp_of, time_of_day
 from tvsbayes.importing.columns import Chooser, Column, Understood, ask_of_t, columns_of, missing_columns
-from tvsbayes.importing.counters import AXES, COUNTERS, are_moves, moves_of_rows, whole_counters
+from tvsbayes.importing.counters import AXES, COUNTERS, Pair, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.prepared import continued
 from tvsbayes.importing.table import ForeignTable
@@ -39,8 +39,6 @@ BOOKED = (*PICTURES, "direction")
 """Fields of a lab book alone."""
 FIELDS = (*MOVE_FIELDS, *LOOK_FIELDS, *BOOKED)
 """All fields that a table can have."""
-SD_PX = 0.1
-"""Standard uncertainty of a centroid where a table states none; the fit estimates its scale."""
 PIXEL_MAX, SD_MIN, SD_MAX, APERTURE_MAX_DEG, CORRELATION_MAX, POINT_MAX = 1e6, 1e-4, 100.0, 360.0, 0.999999, 4
 FILLS = (4095.0, 32767.0, 65535.0)
 """Largest numbers of 12, 15 and 16 bits, which programs write for no spot."""
@@ -70,29 +68,6 @@ PLACES = ("x", "y")
 _MARKS = {"", *"01", "true", "false", "True", "False", "TRUE", "FALSE"}
 _LABELLED = re.compile(r"\A[^\W\d]+[ _.#-]*([0-9]{1,9})\Z")
 """A number behind a word: P1, exp 07."""
-
-
-@dataclass(frozen=True)
-class LookWishes:
-    """What the user states about a table of moves and looks.
-
-    Attributes:
-        columns: column by field, "" for none.
-        pixels_from: coordinate of the centre of the first pixel: 0, or 1 as in MATLAB.
-        angle_unit: unit of aperture readings; None: that of the column's name, else deg.
-        sd_px: standard uncertainty of a centroid where no column states it.
-        relative: whether counters are the steps of each move.
-        approach: side from which pan and tilt came to the first row; "unknown" where it was not recorded.
-        pictures: whether the files that the table names are at hand.
-    """
-
-    columns: Mapping[str, str] = field(default_factory=dict)
-    pixels_from: int = 0
-    angle_unit: str | None = None
-    sd_px: float = SD_PX
-    relative: bool = False
-    approach: tuple[str, str] = ("unknown", "unknown")
-    pictures: bool = False
 
 
 @dataclass(frozen=True)
@@ -319,7 +294,7 @@ def _by_distance(chooser: Chooser) -> str | None:
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
-def look_rows(chooser: Chooser, wishes: LookWishes, moves_listed: int | None = None) -> LookRows:
+def look_rows(chooser: Chooser, wishes: Wishes, moves_listed: int | None = None) -> LookRows:
     """Derive moves and looks from a table.
 
     Args:
@@ -331,7 +306,7 @@ def look_rows(chooser: Chooser, wishes: LookWishes, moves_listed: int | None = N
         Question: a field of two columns; times that step back.
         InputError: no column for a needed field, a cell is not a value of its field, or the moves of looks are unknown.
     """
-    table, assumed = chooser.table, list[str]()
+    table = chooser.table
     _check_open(chooser, moves_listed is not None)
     table.require_rows()
     if (distance := _by_distance(chooser)) is not None:
@@ -343,87 +318,76 @@ def look_rows(chooser: Chooser, wishes: LookWishes, moves_listed: int | None = N
         named = [name for name in BOOKED if name in columns and name not in wishes.columns]
         is_book = not seen and {*FOUR_POINT} <= {*columns}
         unused += [columns.pop(name) for name in named if not is_book or name == "direction"]
-    cells = FieldCells(table, columns)
-    moves, aperture = None, _aperture_unit(cells, wishes)
+    cells = FieldCells(table, columns, wishes)
+    moves, aperture = None, _aperture_unit(cells)
+    is_book = not seen and ({*FOUR_POINT} <= {*columns} or any(name in columns for name in PICTURES))
     if all(name in cells for name in COUNTERS):
         counters = whole_counters(cells)
-        _refuse_other_pixels(cells, wishes)
-        _ask_of_counters(cells, counters, wishes)
-        rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
-        moves, move_of_row = rows.moves, rows.move_of_row
+        _refuse_other_pixels(cells)
+        _ask_of_counters(cells, counters)
+        moves, move_of_row = moves_of_rows(cells, counters)
+        if seen or is_book:
+            what = "pixels" if seen else "a point or a picture"
+            text = f"moves: those of the table; rows without {what} are moves without a look, which play remembers too"
+            cells.assumed.insert(len(cells.assumed) - wishes.relative, text)
+        else:
+            _say_renumbered(cells, move_of_row)
     else:
         move_of_row = _listed_moves(cells, moves_listed or 0)
-    book = not seen and ({*FOUR_POINT} <= {*columns} or any(name in columns for name in PICTURES))
-    if moves is not None and (seen or book):
-        what = "pixels" if seen else "a point or a picture"
-        text = f"moves: those of the table; rows without {what} are moves without a look, which play remembers too"
-        assumed.insert(len(assumed) - wishes.relative, text)
-    elif moves is not None:
-        assumed += _renumbered(cells, move_of_row)
-    looks: dict[int, dict[str, Any]] = (
-        _looks(cells, move_of_row, wishes, aperture, assumed, seen) if seen or book else {}
-    )
+    looks = _looks(cells, move_of_row, aperture, seen) if seen or is_book else {}
     if distance is not None:
-        assumed.append(
-            f"target: every value of {escaped(distance)} is one placement of the sheet; --column target= says no"
-        )
+        how = "is one placement of the sheet; --column target= says no"
+        cells.assumed.append(f"target: every value of {escaped(distance)} {how}")
     files = {columns[name]: cells.text(name) for name in PICTURES if name in cells}
     if files and not wishes.pictures:
-        names = ", ".join(map(escaped, files))
-        assumed.append(
-            f"pictures: {names} names them; --pictures FOLDER brings them into frames/, for `tvsbayes detect`"
-        )
-    units = {**dict.fromkeys(PIXELS, f"px from {wishes.pixels_from}"), **dict.fromkeys(PIXEL_SDS, "px")}
+        how = "--pictures FOLDER brings them into frames/, for `tvsbayes detect`"
+        cells.assumed.append(f"pictures: {', '.join(map(escaped, files))} names them; {how}")
+    unit, directions = name_of(columns.get("time_s", "")).unit, cells.text("direction")
+    units = dict.fromkeys(PIXELS, f"px from {wishes.pixels_from}") | dict.fromkeys(PIXEL_SDS, "px")
     units |= {**dict.fromkeys(COUNTERS, "steps"), "aperture_deg": aperture.name}
-    unit = name_of(columns.get("time_s", "")).unit
     units["time_s"] = unit.name if unit is not None and unit.kind == "time" else "s"
-    directions = cells.text("direction")
     return LookRows(
         moves,
-        list(looks.values()) if seen or book else None,
+        list(looks.values()) if seen or is_book else None,
         [tuple(column[row].strip() for column in files.values()) for row in looks] if files else [],
         [directions[row] for row in looks],
         [table.lines[row] for row in looks],
         stamp_of(cells.text("time_s")[0]) if moves is not None else None,
-        tuple(assumed),
+        tuple(cells.assumed),
         Understood({name: columns[name] for name in FIELDS if name in columns}, tuple(unused)),
         units,
     )
 
 
-def _refuse_other_pixels(cells: FieldCells, wishes: LookWishes) -> None:
+def _refuse_other_pixels(cells: FieldCells) -> None:
     """Refuse centres in another unit, of pictures that were turned, or as shares of the picture."""
     for pixel in PIXELS:
         text = cells.columns.get(pixel, "")
-        if not text or pixel in wishes.columns:
+        if not text or pixel in cells.wishes.columns:
             continue
         name, values = name_of(text), [v for v in cells.numbers(pixel, -PIXEL_MAX, PIXEL_MAX, optional=True) if v]
-        unit = name.unit if name.unit and name.unit.kind in ("length", "angle") else None
-        shares = len(values) >= SHARE_MIN and all(v % 1 and abs(v) < 1 for v in values)
-        turned = place_of(name.words, "rectified", WORDS) is not None
-        upward = place_of(name.words, "upward", WORDS) is not None
         kinds = {
-            unit.name if unit else "": unit,
-            "shares of the picture": shares,
-            "a rectified picture": turned,
-            "rows from the bottom": upward,
+            name.unit.name if name.unit else "": name.unit is not None and name.unit.kind in ("length", "angle"),
+            "shares of the picture": len(values) >= SHARE_MIN and all(v % 1 and abs(v) < 1 for v in values),
+            "a rectified picture": place_of(name.words, "rectified", WORDS) is not None,
+            "rows from the bottom": place_of(name.words, "upward", WORDS) is not None,
         }
         if what := next((word for word, is_one in kinds.items() if is_one), ""):
             said = {"name": text, "of": what, "field": pixel}
             raise refused("other-pixels", cells.table.file, line=cells.table.first_line, **said)
 
 
-def _ask_of_counters(cells: FieldCells, counters: Sequence[tuple[int, int]], wishes: LookWishes) -> None:
+def _ask_of_counters(cells: FieldCells, counters: Sequence[Pair]) -> None:
     """Ask where counters are angles by their names, or lengths of moves by what was seen."""
-    if {*COUNTERS} & {*wishes.columns}:
+    if {*COUNTERS} & {*cells.wishes.columns}:
         return
     names = {name: cells.columns[name] for name in COUNTERS}
     angles = [name for name, text in names.items() if (unit := name_of(text).unit) and unit.kind == "angle"]
     if angles:
         raise cells.table.ask("angles-of-motors", column=names[angles[0]], field=angles[0])
-    if wishes.relative:
+    if cells.wishes.relative:
         return
-    homings = homings_of(cells, [])
+    homings = homings_of(cells, silent=True)
     seen = [cells.numbers(name, -PIXEL_MAX, PIXEL_MAX, optional=True) if name in cells else [] for name in PIXELS[:2]]
     for k, counter in enumerate(COUNTERS):
         moved = seen[k] and are_moves([pair[k] for pair in counters], seen[k], homings)
@@ -431,7 +395,7 @@ def _ask_of_counters(cells: FieldCells, counters: Sequence[tuple[int, int]], wis
             raise cells.table.ask("moves-or-positions", column=names[counter], field=counter)
 
 
-def _points_apart(cells: FieldCells, counters: Sequence[tuple[int, int]]) -> bool:
+def _points_apart(cells: FieldCells, counters: Sequence[Pair]) -> bool:
     """Whether points 3 and 4 of every experiment, at one position, have two counters, the second of which is 0."""
     if not {*FOUR_POINT} <= {*cells.columns}:
         return False
@@ -440,9 +404,9 @@ def _points_apart(cells: FieldCells, counters: Sequence[tuple[int, int]]) -> boo
     return bool(fourth) and all(counters[k] == (0, 0) != counters[k - 1] for k in fourth)
 
 
-def _aperture_unit(cells: FieldCells, wishes: LookWishes) -> Unit:
-    named = name_of(cells.columns.get("aperture_deg", "")).unit
-    unit = named if wishes.angle_unit is None else unit_named(wishes.angle_unit)
+def _aperture_unit(cells: FieldCells) -> Unit:
+    stated, named = cells.wishes.angle_unit, name_of(cells.columns.get("aperture_deg", "")).unit
+    unit = unit_named(stated) if stated else named
     return unit if unit is not None and unit.kind == "angle" else unit_named("deg")
 
 
@@ -461,50 +425,36 @@ def _listed_moves(cells: FieldCells, known: int) -> list[int]:
     return numbers
 
 
-def _renumbered(cells: FieldCells, move_of_row: Sequence[int]) -> list[str]:
-    """A note where a table without looks numbers its moves differently from `moves.csv`, by which pictures pair."""
+def _say_renumbered(cells: FieldCells, move_of_row: Sequence[int]) -> None:
+    """Say where a table without looks numbers its moves differently from `moves.csv`, by which pictures pair."""
     role = "move" if "move" in cells else "spot"
-    if role not in cells:
-        return []
     numbers = [float(cell) if NUMBER.fullmatch(cell) else None for cell in cells.text(role)]
     differing = [row for row, number in enumerate(numbers) if number is not None and number != move_of_row[row]]
-    if not differing:
-        return []
-    name, row = escaped(cells.columns[role]), differing[0]
-    count = f"{len(differing)} of {len(numbers)} rows"
-    example = f"{name} {escaped(cells.text(role)[row])} is move {move_of_row[row]}"
-    consequence = f"pictures are paired by the move, not by {name}"
-    return [f"move: counted from 0, not as {name} does in {count}: {example}; {consequence}"]
+    if differing:
+        name, row = cells.shown(role), differing[0]
+        count = f"{len(differing)} of {len(numbers)} rows"
+        example = f"{name} {escaped(cells.text(role)[row])} is move {move_of_row[row]}"
+        consequence = f"pictures are paired by the move, not by {name}"
+        cells.assumed.append(f"move: counted from 0, not as {name} does in {count}: {example}; {consequence}")
 
 
-def _looks(
-    cells: FieldCells,
-    move_of_row: Sequence[int],
-    wishes: LookWishes,
-    aperture: Unit,
-    assumed: list[str],
-    seen: bool,
-) -> dict[int, dict[str, Any]]:
+def _looks(cells: FieldCells, move_of_row: Sequence[int], aperture: Unit, seen: bool) -> dict[int, dict[str, Any]]:
     """The looks of a table by row, with centres or waiting for pictures; the other rows are moves without a look."""
-    pixels = _centres(cells, assumed)
+    pixels, sd_px = _centres(cells), cells.wishes.sd_px
     sds = {name: cells.numbers(name, -SD_MAX, SD_MAX, optional=True) for name in PIXEL_SDS if name in cells}
     if seen and len(sds) < len(PIXEL_SDS):
-        text = f"standard uncertainty of a centroid: {wishes.sd_px:g} px; --sd-px states another"
-        assumed.append(text if sds else f"{text}, the fit finds the scale")
-    numbers = cells.whole("spot", 0, ID_MAX, optional=True)
-    statuses, remarks = cells.text("status"), list[str]()
+        text = f"standard uncertainty of a centroid: {sd_px:g} px; --sd-px states another"
+        cells.assumed.append(text if sds else f"{text}, the fit finds the scale")
+    numbers, statuses, remarks = cells.whole("spot", 0, ID_MAX, optional=True), cells.text("status"), list[str]()
     four = _four_point(cells, remarks, not seen)
     waiting = [four.get("point", []), *(cells.text(name) for name in PICTURES if name in cells)]
-    if seen:
-        marks = zip(*pixels.values(), statuses, strict=True)
-        rows = [row for row, mark in enumerate(marks) if any(value not in (None, "") for value in mark)]
-    else:
-        rows = [row for row, mark in enumerate(zip(*filter(None, waiting), strict=True)) if any(mark)]
+    marks = zip(*(*pixels.values(), statuses) if seen else filter(None, waiting), strict=True)
+    rows = [row for row, mark in enumerate(marks) if any(value not in (None, "") for value in mark)]
     given = [numbers[row] for row in rows]
     unique = None not in given and len({*given}) == len(given)
     if "spot" in cells and not unique:
-        assumed.append("spot: numbers are missing or repeated, so looks are numbered by their rows")
-    assumed += remarks
+        cells.assumed.append("spot: numbers are missing or repeated, so looks are numbered by their rows")
+    cells.assumed.extend(remarks)
     values: dict[str, Sequence[Any]] = dict(four)
     for name in (name for name in CORRELATIONS if name in cells):
         values[name] = [v or 0.0 for v in cells.numbers(name, -CORRELATION_MAX, CORRELATION_MAX, optional=True)]
@@ -513,29 +463,27 @@ def _looks(
     if targets and targets[0] and 2 * targets.count("") > len(targets) and len({*targets}) > 2:
         # Merged cells: the name of a sheet stands in its first row alone.
         targets = list(continued(targets))
-        assumed.append("target: rows without one are of the sheet above them")
+        cells.assumed.append("target: rows without one are of the sheet above them")
     for row in rows:
-        centre = {name: column[row] for name, column in pixels.items()}
-        word = statuses[row].strip()
-        if seen:
-            status = "no centre in the table" if None in centre.values() and not word else None
-        else:
-            status = UNDETECTED if means(statuses[row], "good") or word.lower() in ("", UNDETECTED) else None
+        centre, word = {name: column[row] for name, column in pixels.items()}, statuses[row].strip()
+        waits = not seen and (means(word, "good") or word.lower() in ("", UNDETECTED))
+        status = "no centre in the table" if seen and None in centre.values() and not word else UNDETECTED * waits
         status = status or status_of(cells, row, centre if seen else {}, "look")
         look: dict[str, Any] = {"spot": numbers[row] if unique else row, "move": move_of_row[row]}
         look |= {"target": readable(targets[row], "sheet", 100), "aperture_deg": readings[row], "status": status}
         look |= {name: column[row] for name, column in values.items()}
         if status == "ok":
-            look |= {name: value - wishes.pixels_from for name, value in centre.items() if value is not None}
-            look |= {name: _sd_px(cells, row, name, sds[name]) if name in sds else wishes.sd_px for name in PIXEL_SDS}
+            pixels_from = cells.wishes.pixels_from
+            look |= {name: value - pixels_from for name, value in centre.items() if value is not None}
+            look |= {name: _sd_px(cells, row, name, sds[name]) if name in sds else sd_px for name in PIXEL_SDS}
         looks[row] = look
     if "status" in cells:
         of_looks = statuses if seen else [statuses[r] for r in rows if statuses[r].strip().lower() != UNDETECTED]
-        assumed += left_out(cells, of_looks, "look")
+        say_left_out(cells, of_looks, "look")
     return looks
 
 
-def _centres(cells: FieldCells, assumed: list[str]) -> dict[str, list[float | None]]:
+def _centres(cells: FieldCells) -> dict[str, list[float | None]]:
     """Pixels by field; none where a camera's two are one number that programs write for no spot."""
     pixels = {name: cells.numbers(name, -PIXEL_MAX, PIXEL_MAX, optional=True) for name in PIXELS}
     empty = set[int]()
@@ -546,7 +494,7 @@ def _centres(cells: FieldCells, assumed: list[str]) -> dict[str, list[float | No
                 empty.add(row)
     if empty:
         count = f"{len(empty)} look{'s' * (len(empty) > 1)}"
-        assumed.append(f"centres: none in {count} whose two pixels of a camera are one number, as -1 or 0")
+        cells.assumed.append(f"centres: none in {count} whose two pixels of a camera are one number, as -1 or 0")
     return pixels
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ import numpy as np
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
-from tvsbayes.importing.cells import FieldCells, homings_of, left_out, status_of
+from tvsbayes.importing.cells import FieldCells, Wishes, homings_of, say_left_out, status_of
 from tvsbayes.importing.columns import Chooser, Column, Understood, ask_of_t, columns_of, restarts
-from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, are_moves, moves_of_rows, whole_counters
+from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, Pair, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import Unit, name_of, place_of, unit_named
@@ -53,25 +53,6 @@ LIMITS_DEG = {
 
 
 @dataclass(frozen=True)
-class SightingWishes:
-    """What the user states about a table of sightings.
-
-    Attributes:
-        columns: column by field, "" for none.
-        angle_unit: "deg" or "rad" of angles whose columns state none.
-        relative: whether counters are the steps of each move.
-        approach: side from which pan and tilt came to the first row.
-        u_deg: standard uncertainty of a sighting where no column states it.
-    """
-
-    columns: Mapping[str, str] = field(default_factory=dict)
-    angle_unit: str | None = None
-    relative: bool = False
-    approach: tuple[str, str] = ("unknown", "unknown")
-    u_deg: float | None = None
-
-
-@dataclass(frozen=True)
 class SightingRows:
     """A head's tables as plain rows.
 
@@ -92,7 +73,7 @@ class SightingRows:
     units: Mapping[str, str]
 
 
-def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
+def sighting_rows(table: ForeignTable, wishes: Wishes) -> SightingRows:
     """Derive moves and sightings from a table.
 
     Raises:
@@ -100,42 +81,41 @@ def sighting_rows(table: ForeignTable, wishes: SightingWishes) -> SightingRows:
         InputError: a cell is not a value of its field, the table has no row or lacks a column.
     """
     table.require_rows()
-    wishes = replace(wishes, columns=table.named(wishes.columns))
+    wishes = wishes.named_in(table)
     known = sighting_columns(table, wishes.columns)
-    assumed = list(known.remarks)
-    cells, written = FieldCells(table, known.columns).with_plain((*NEEDED, "u_deg"), assumed)
-    units = _units(cells, columns_of(table), written, wishes, assumed)
+    cells, written = FieldCells(table, known.columns, wishes, [*known.remarks]).with_plain(*NEEDED, "u_deg")
+    units = _units(cells, columns_of(table), written)
     of_encoders = [name for name in COUNTERS if name in units]
-    counters = _counters(cells, units, assumed)
-    rows = moves_of_rows(cells, counters, assumed, relative=wishes.relative, approach=wishes.approach)
+    counters = _counters(cells, units)
+    moves, move_of_row = moves_of_rows(cells, counters)
     limits = LIMITS_DEG | ({"elevation_deg": (0.0, 2 * ELEVATION_MAX_DEG)} if from_zenith(cells) else {})
     angles = {name: cells.scaled(name, units[name], *ends) for name, ends in limits.items() if name in cells}
     if from_zenith(cells):
         angles["elevation_deg"] = [None if z is None else ELEVATION_MAX_DEG - z for z in angles["elevation_deg"]]
-        assumed.append(f"elevation_deg: 90 deg less column {escaped(known.columns['elevation_deg'])}, from the zenith")
-    _without_directions(counters, angles, assumed)
+        cells.assumed.append(f"elevation_deg: 90 deg less column {cells.shown('elevation_deg')}, from the zenith")
+    _without_directions(cells, counters, angles)
     if not wishes.relative and not {*COUNTERS} & {*wishes.columns}:
         _ask_whether_moves(cells, counters, angles, of_encoders)
     if "u_deg" not in cells:
         u = U_DEG if wishes.u_deg is None else wishes.u_deg
         angles["u_deg"] = [u] * len(table)
         how = "; --assume u_deg=NUMBER states another, and the fit finds the scale"
-        assumed.append(f"standard uncertainty of a sighting: {u:g} deg{how}")
-    elif (coverage := columns_of(table)[known.columns["u_deg"]].name.coverage) is not None:
+        cells.assumed.append(f"standard uncertainty of a sighting: {u:g} deg{how}")
+    elif (coverage := name_of(known.columns["u_deg"]).coverage) is not None:
         angles["u_deg"] = [None if u is None else u / coverage for u in angles["u_deg"]]
-        assumed.append(f"u_deg: column {escaped(known.columns['u_deg'])} is an expanded uncertainty, over {coverage:g}")
+        cells.assumed.append(f"u_deg: column {cells.shown('u_deg')} is an expanded uncertainty, over {coverage:g}")
     statuses, sightings = cells.text("status"), list[dict[str, Any]]()
     for row in range(len(table)):
         values = {name: column[row] for name, column in angles.items()}
         if not statuses[row] and all(values[name] is None for name in ANGLES):
             continue
         status = status_of(cells, row, values, "sighting")
-        sightings.append({"sighting": row, "move": rows.move_of_row[row], **values, "status": status})
-    assumed += left_out(cells, statuses, "sighting")
+        sightings.append({"sighting": row, "move": move_of_row[row], **values, "status": status})
+    say_left_out(cells, statuses, "sighting")
     encoders = frozenset(AXES[COUNTERS.index(name)] for name in of_encoders)
-    shown = {name: unit.name for name, unit in units.items()}
-    shown = {**dict.fromkeys(COUNTERS, "steps"), **shown, **({"time_s": "s"} if "time_s" in cells else {})}
-    return SightingRows(rows.moves, sightings, encoders, tuple(assumed), known, shown)
+    shown = dict.fromkeys(COUNTERS, "steps") | {name: unit.name for name, unit in units.items()}
+    shown |= {"time_s": "s"} if "time_s" in cells else {}
+    return SightingRows(moves, sightings, encoders, tuple(cells.assumed), known, shown)
 
 
 def from_zenith(cells: FieldCells) -> bool:
@@ -145,9 +125,7 @@ def from_zenith(cells: FieldCells) -> bool:
     return is_v or place_of(column.words, "zenith") is not None
 
 
-def _without_directions(
-    counters: Sequence[tuple[int, int]], angles: dict[str, list[float | None]], assumed: list[str]
-) -> None:
+def _without_directions(cells: FieldCells, counters: Sequence[Pair], angles: dict[str, list[float | None]]) -> None:
     """Leave out directions whose two angles are one number far from all others, as 0 where nothing was found."""
     pairs = list(zip(*(angles[name] for name in ANGLES), strict=True))
     alike = [azimuth is not None and azimuth == elevation for azimuth, elevation in pairs]
@@ -162,17 +140,19 @@ def _without_directions(
         for name in ANGLES:
             angles[name][row] = None
     if rows:
-        assumed.append(f"directions: none in {len(rows)} rows whose two angles are one number, far from all others")
+        cells.assumed.append(
+            f"directions: none in {len(rows)} rows whose two angles are one number, far from all others"
+        )
 
 
 def _ask_whether_moves(
     cells: FieldCells,
-    counters: Sequence[tuple[int, int]],
+    counters: Sequence[Pair],
     angles: Mapping[str, Sequence[float | None]],
     encoders: Sequence[str],
 ) -> None:
     """Ask where directions follow the sum of the counters, or are far too small for them."""
-    homings = homings_of(cells, [])
+    homings = homings_of(cells, silent=True)
     for k, angle in enumerate(ANGLES):
         pairs = [(STEP_DEG * p[k], v) for p, v in zip(counters, angles[angle], strict=True) if v is not None]
         span = [float(np.ptp(column)) for column in zip(*pairs, strict=True)] if len(pairs) > FOUND_MIN else [0.0]
@@ -273,15 +253,9 @@ def field_of(column: Column) -> str | None:
     return "status" if name.has("status") else None
 
 
-def _units(
-    cells: FieldCells,
-    known: Mapping[str, Column],
-    written: Mapping[str, Unit | None],
-    wishes: SightingWishes,
-    assumed: list[str],
-) -> dict[str, Unit]:
+def _units(cells: FieldCells, known: Mapping[str, Column], written: Mapping[str, Unit | None]) -> dict[str, Unit]:
     """Units of angles by field; whole counters have none."""
-    stated = None if wishes.angle_unit is None else unit_named(wishes.angle_unit)
+    stated = unit_named(cells.wishes.angle_unit) if cells.wishes.angle_unit else None
     units: dict[str, Unit] = {}
     for name in (*ANGLES, *COUNTERS, "u_deg"):
         if name not in cells:
@@ -309,7 +283,9 @@ def _units(
                 raise cells.table.ask("angles", each=possible, first=first, column=column.name.text)
             if unit is None:
                 unit = unit_named("deg")
-                assumed.append(f"angles: no unit in column {escaped(column.name.text)}, so deg; --angles says another")
+                cells.assumed.append(
+                    f"angles: no unit in column {escaped(column.name.text)}, so deg; --angles says another"
+                )
         if unit is not None:
             units[name] = unit
     return units
@@ -335,7 +311,7 @@ def _possible_units(cells: FieldCells) -> list[str]:
     return ["rad", "deg"] if in_rad else ["deg"] if in_deg else larger or ["deg"]
 
 
-def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) -> list[tuple[int, int]]:
+def _counters(cells: FieldCells, units: Mapping[str, Unit]) -> list[Pair]:
     """Counters of every row, with angles of encoders in steps of `STEP_DEG`."""
     if not units.keys() & {*COUNTERS}:
         return whole_counters(cells)
@@ -348,5 +324,5 @@ def _counters(cells: FieldCells, units: Mapping[str, Unit], assumed: list[str]) 
         limit = COUNTER_MAX / scale
         columns.append([round(scale * (v or 0.0)) for v in cells.numbers(name, -limit, limit)])
         how = f"as they stand, without whole turns, in steps of {STEP_DEG:g} deg"
-        assumed.append(f"{name}: angles in {unit.name} {how}")
+        cells.assumed.append(f"{name}: angles in {unit.name} {how}")
     return list(zip(*columns, strict=True))

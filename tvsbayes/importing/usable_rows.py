@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,11 +10,10 @@ import numpy as np
 
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.axis_units import Wishes
-from tvsbayes.importing.columns import columns_of, fill_values, line_through
+from tvsbayes.importing.cells import FieldCells
+from tvsbayes.importing.columns import columns_of, fill_values, first_values, line_through
 from tvsbayes.importing.prepared import continued
-from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import means, name_of, place_of, words_of
+from tvsbayes.importing.words import means, name_of
 
 ROWS_MIN = 4
 """Rows of one command, in the median of all commands, from which a table is telemetry."""
@@ -41,61 +40,55 @@ STATUS_SHARE = 0.5
 """Share of rows from which a status of numbers leaves out too many without a question."""
 
 
-def good_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
-    """The table with a status that can be one: it leaves some readings, and its 0 and 1 say which is good."""
-    if "status" not in columns:
-        return table
-    name = columns["status"]
-    cells = table.columns[name]
+def good_rows(cells: FieldCells) -> FieldCells:
+    """The rows with a status that can be one: it leaves some readings, and its 0 and 1 say which is good."""
+    if "status" not in cells:
+        return cells
+    wishes, texts = cells.wishes, cells.text("status")
+    numbers = [float(text) if NUMBER.fullmatch(text) else None for text in texts]
     if wishes.status_ok is not None:
-        good = [
-            "ok" if NUMBER.fullmatch(cell) and float(cell) == wishes.status_ok else cell and f"status {cell}"
-            for cell in cells
-        ]
-        return replace(table, columns={**table.columns, name: tuple(good)})
-    bad = [bool(cell.strip()) and not means(cell, "good") for cell in cells]
+        pairs = zip(numbers, texts, strict=True)
+        good = ["ok" if number == wishes.status_ok else text and f"status {text}" for number, text in pairs]
+        return cells.with_texts("status", good)
+    bad = [bool(text.strip()) and not means(text, "good") for text in texts]
+    codes = {number for number in numbers if number is not None}
     if "status" in wishes.columns or not any(bad):
-        return table
-    codes = {float(cell) for cell in cells if NUMBER.fullmatch(cell)}
+        return cells
     if all(bad) and len(codes) < 2:
-        assumed.append(f"status: column {escaped(name)} would leave out every reading, so it is none")
-        del columns["status"]
-        return table
-    coded = all(NUMBER.fullmatch(cell) or not cell for cell in cells)
-    if coded and sum(bad) >= STATUS_SHARE * len(cells):
-        known = columns_of(table)
-        said = {"column": name, "bad": sum(bad), "rows": len(cells)}
-        raise table.ask("status", each=sorted(codes), first={name: known[name].first}, **said)
-    return table
+        cells.assumed.append(f"status: column {cells.shown('status')} would leave out every reading, so it is none")
+        return replace(cells, columns={name: text for name, text in cells.columns.items() if name != "status"})
+    coded = all(number is not None or not text for number, text in zip(numbers, texts, strict=True))
+    if coded and sum(bad) >= STATUS_SHARE * len(texts):
+        name = cells.columns["status"]
+        said = {"column": name, "bad": sum(bad), "rows": len(texts)}
+        raise cells.table.ask("status", each=sorted(codes), first={name: first_values(texts)}, **said)
+    return cells
 
 
-def without_fills(table: ForeignTable, columns: Mapping[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
-    """The table without numbers that stand for no reading; asks where some may."""
-    name = columns["value"]
-    command, value = (columns_of(table)[columns[field_]].values for field_ in ("command", "value"))
-    if wishes.no_reading is not None:
-        cells = tuple("" if v == wishes.no_reading else c for v, c in zip(value, table.columns[name], strict=True))
-        count = sum(v == wishes.no_reading for v in value)
-        assumed.append(f"value: {count} cells of {wishes.no_reading:g} are empty, because --assume no_reading says so")
-        return replace(table, columns={**table.columns, name: cells})
-    if "value" not in wishes.columns:
-        statuses = table.columns[columns["status"]] if "status" in columns else ()
-        good = [not cell.strip() or means(cell, "good") for cell in statuses]
-        for fill in fill_values(command, np.where(good, value, np.nan) if good else value):
-            rows = [table.lines[k] for k in np.flatnonzero(value == fill)]
-            raise table.ask("no-reading", fill=fill, column=name, rows=rows)
-    return table
+def without_fills(cells: FieldCells) -> FieldCells:
+    """The rows without numbers that stand for no reading; asks where some may."""
+    value, fill = cells.values("value"), cells.wishes.no_reading
+    if fill is not None:
+        how = f"{sum(value == fill)} cells of {fill:g} are empty, because --assume no_reading says so"
+        cells.assumed.append(f"value: {how}")
+        pairs = zip(value, cells.text("value"), strict=True)
+        return cells.with_texts("value", ["" if number == fill else text for number, text in pairs])
+    if "value" not in cells.wishes.columns:
+        good = [not text.strip() or means(text, "good") for text in cells.text("status")]
+        for fill in fill_values(cells.values("command"), np.where(good, value, np.nan)):
+            rows = [cells.table.lines[k] for k in np.flatnonzero(value == fill)]
+            raise cells.table.ask("no-reading", fill=fill, column=cells.columns["value"], rows=rows)
+    return cells
 
 
-def without_strays(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) -> ForeignTable:
-    """The table without readings of lines in pairs that are far from their own command, on the way to the next one.
+def without_strays(cells: FieldCells) -> FieldCells:
+    """The rows without readings of lines in pairs that are far from their own command, on the way to the next one.
 
     Two lines were lost in a row: a reading and the command after it.
     """
-    known = columns_of(table)
-    command, value = (known[columns[name]].values for name in ("command", "value"))
-    if not table.kind.startswith(PAIRS) or len(value) < STRAY_MIN or not np.isfinite([command, value]).all():
-        return table
+    command, value = cells.values("command"), cells.values("value")
+    if not cells.table.kind.startswith(PAIRS) or len(value) < STRAY_MIN or not np.isfinite([command, value]).all():
+        return cells
     slope, off = line_through(command, value)
     off = off - np.median(off)
     noise = float(np.median(np.abs(off)))
@@ -104,41 +97,38 @@ def without_strays(table: ForeignTable, columns: Mapping[str, str], assumed: lis
     of_next = ((off * ahead > 0) & (np.abs(off) < np.abs(ahead))) | (np.abs(np.abs(off) - step) < 0.1 * step)
     strays = np.flatnonzero((np.abs(off) > STRAY_MADS * noise) & of_next)
     if not len(strays) or len(strays) > STRAY_SHARE * len(value):
-        return table
-    lines = ", ".join(str(table.lines[row]) for row in strays)
-    assumed.append(f"value: left out in line {lines}, where a reading is that of a later command: lines lost")
-    name = columns["value"]
-    cells = tuple("" if row in strays else cell for row, cell in enumerate(table.columns[name]))
-    return replace(table, columns={**table.columns, name: cells})
+        return cells
+    lines = ", ".join(str(cells.table.lines[row]) for row in strays)
+    cells.assumed.append(f"value: left out in line {lines}, where a reading is that of a later command: lines lost")
+    return cells.with_texts("value", ["" if k in strays else text for k, text in enumerate(cells.text("value"))])
 
 
-def resting_rows(table: ForeignTable, columns: dict[str, str], wishes: Wishes, assumed: list[str]) -> ForeignTable:
+def resting_rows(cells: FieldCells) -> FieldCells:
     """The rows at which the axis rests: by a column that says so, else by the readings of each command."""
-    if wishes.columns.get("moving") == "":
-        return table
-    known = columns_of(table)
-    command, value = (known[columns[name]].values for name in ("command", "value"))
+    table, columns = cells.table, dict(cells.columns)
+    if cells.wishes.columns.get("moving") == "":
+        return cells
     if "moving" in columns:
         name = columns.pop("moving")
-        is_resting = place_of(words_of(name), "resting") is not None
-        is_speed = name_of(name).has("speed")
-        says_yes = known[name].values != 0 if is_speed else np.array([means(c, "good") for c in table.columns[name]])
-        rests, how = says_yes == is_resting, f"column {escaped(name)}"
+        is_resting, is_speed = (name_of(name).has(concept) for concept in ("resting", "speed"))
+        says_yes = [means(text, "good") for text in table.columns[name]]
+        rests = (cells.values("moving") != 0 if is_speed else np.array(says_yes)) == is_resting
+        how = f"column {escaped(name)}"
     else:
-        sides = table.columns[columns["approach"]] if "approach" in columns else ()
         # Where no side is stated that before goes on.
-        told = continued([next((w for w in ("forward", "backward") if means(cell, w)), "") for cell in sides])
-        runs = [column.cells for column in known.values() if column.name.has("repeat") and column.whole]
-        rests, how = at_rest(command, value, [part for part in (told, *runs) if part]), "the readings of each command"
+        told = [next((w for w in ("forward", "backward") if means(text, w)), "") for text in cells.text("approach")]
+        known = columns_of(table).values()
+        runs = [column.cells for column in known if column.name.has("repeat") and column.whole]
+        rests = at_rest(cells.values("command"), cells.values("value"), [continued(told), *runs])
+        how = "the readings of each command"
+    cells = replace(cells, columns=columns)
     if rests.all() or not rests.any():
-        return table
-    moved = int((~rests).sum())
-    assumed.append(
-        f"rest: {moved} of {len(rests)} rows left out, where the axis still moved by {how}; --column moving= keeps them"
-    )
+        return cells
+    moved = f"{int((~rests).sum())} of {len(rests)} rows left out, where the axis still moved"
+    cells.assumed.append(f"rest: {moved} by {how}; --column moving= keeps them")
     keep = np.flatnonzero(rests)
-    cells = {name: tuple(column[k] for k in keep) for name, column in table.columns.items()}
-    return replace(table, columns=cells, lines=tuple(table.lines[k] for k in keep))
+    texts = {name: tuple(column[k] for k in keep) for name, column in table.columns.items()}
+    return replace(cells, table=replace(table, columns=texts, lines=tuple(table.lines[k] for k in keep)))
 
 
 # --- rest ------------------------------------------------------------------------------------------------------------
