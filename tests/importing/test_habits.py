@@ -167,6 +167,78 @@ def test_cameras_counted_from_0_in_names(tmp_path):
     assert [(k["u_left_px"], k["v_right_px"]) for k in looks] == [(630, 401), (640, 401)]
 
 
+RISING = [p for p in PLACES for _ in range(2)]
+PAIRED = [v for pair in zip(UP, DOWN, strict=True) for v in pair]
+ERRORS = [round(1000 * (v - c), 1) for c, v in zip(PLACES, UP, strict=True)]
+NAMED = {
+    "a step that counts rows beside a goto": (sheet("step,goto (mm),dial (mm)", range(1, 13), COMMANDS, READ), {}),
+    "a current position": (sheet("SetpointPosition\tCurrentPosition", COMMANDS, READ).replace(",", "\t"), {}),
+    "MOV beside POS?": (sheet("MOV 1,POS? 1,Interferometer", COMMANDS, [c + 0.0002 for c in COMMANDS], READ), {}),
+    "a temperature called T": (
+        sheet("target_mm,laser_mm,T_scale_C", COMMANDS, READ, [20 + 0.1 * k for k in range(12)]),
+        {},
+    ),
+    "one unit behind all names": ("# x_cmd x_meas [mm]\n" + lines("{c} {v}\n") + "# break\n", {}),
+    "runs that the user orders": (sheet("Cote (mm);A1;R1", PLACES, UP, DOWN).replace(",", ";"), {"order": "alternate"}),
+    "runs called moving": (sheet("X (mm),moving left,moving right", PLACES, UP, DOWN), {"order": "alternate"}),
+    "units of targets and errors": (
+        "Units,mm\nTarget units,mm\nError units,\u00b5m\n\n"
+        + sheet("Target,Run 1 (+),Run 1 (-)", PLACES, ERRORS, [e + 40 for e in ERRORS]),
+        {"deviations": True},
+    ),
+    "units of readings and positions": (
+        "Messwerte in \u00b5m, Position in mm\n" + sheet("Position,Messwert", COMMANDS, [1000 * v for v in READ]),
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("habit", NAMED)
+def test_columns_and_units_by_what_the_file_says(habit, tmp_path):
+    text, stated = NAMED[habit]
+    rows = rows_of(text, tmp_path, Wishes(**stated))
+    commands = [rows.moves[r["move"]]["command"] for r in rows.readings]
+    scale = 1000 if rows.unit == "um" else 1
+    assert commands == COMMANDS and [r["value"] / scale for r in rows.readings] == pytest.approx(READ)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("Anfahrt von", ("unten", "oben")), ("approach from", ("-", "+")), ("from", ("below", "above")), ("dir", "+-")],
+)
+def test_a_side_is_where_the_axis_came_from(name, words, tmp_path):
+    rows = rows_of(sheet(f"target (mm),{name},measured (mm)", RISING, [*words] * 6, PAIRED), tmp_path)
+    commands = [move["command"] for move in rows.moves]
+    assert [commands[r["move"]] > commands[r["move"] - 1] for r in rows.readings[1:]] == [False, True] * 5 + [False]
+
+
+@pytest.mark.parametrize("words", [("andata", "ritorno"), ("edestakaisin", "takaisin")])
+def test_two_words_that_follow_the_commands_are_sides(words, tmp_path):
+    rows = rows_of(sheet("vaihe,target (mm),measured (mm)", marked(*words), COMMANDS, READ), tmp_path)
+    assert len(rows.readings) == 12 == len(rows.moves) - 1 and rows.moves[0]["approach"] == "forward"
+
+
+def test_minutes_beside_degrees_are_minutes_of_arc(tmp_path):
+    rows = rows_of("steps,deg,min\n0,0,2.5\n500,1,1.0\n1000,2,3.5\n1500,3,2.0\n", tmp_path)
+    assert [r["value"] for r in rows.readings] == pytest.approx([2.5 / 60, 1 + 1 / 60, 2 + 3.5 / 60, 3 + 2 / 60])
+
+
+def test_a_deviation_beside_other_readings_is_offered(tmp_path):
+    pitch, yaw = [0.002 * c for c in COMMANDS], [0.004 * c + 0.01 for c in COMMANDS]
+    text = sheet("Position,Linear Error (um),Pitch (arcsec),Yaw (arcsec)", COMMANDS, ERRORS + ERRORS[::-1], pitch, yaw)
+    with pytest.raises(Question) as asked:
+        rows_of(text, tmp_path)
+    options = ("--column", "value=Linear Error (um)", "--deviations")
+    assert options in [candidate.options for candidate in asked.value.candidates]
+
+
+def test_a_block_for_each_camera_is_refused(tmp_path):
+    block = lines("{c} 0 6{c} 400\n")
+    (tmp_path / "t.csv").write_text(f"# left camera\n# pan tilt x y\n{block}# right camera\n{block}")
+    with pytest.raises(InputError, match="left camera, right camera under titles"):
+        read_foreign(tmp_path / "t.csv")
+
+
 STATES = {
     "state": ("as found", "as left"),
     "Zustand": ("vorher", "nachher"),

@@ -42,7 +42,7 @@ from tvsbayes.importing.counters import are_moves, summed_up
 from tvsbayes.importing.runs import long_table
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.usable_rows import good_rows, resting_rows, without_fills, without_strays
-from tvsbayes.importing.words import Unit, means, name_of, parse_unit, plain
+from tvsbayes.importing.words import Unit, means, name_of, parse_unit, place_of, plain, words_of
 from tvsbayes.statistics.wrapped import turn_jumps
 
 TURN_TOLERANCE = 0.1
@@ -347,12 +347,20 @@ def _refuse_contrary(
         raise cells.ask("contrary", moved[0], "approach")
 
 
+def _coming_from(text: str) -> str:
+    """The direction of a side: "-" and "unten" are where a rising axis came from."""
+    known = any(means(f"von {text}", side) for side in ("forward", "backward"))
+    return {"+": "-", "-": "+", "+1": "-1", "-1": "+1"}.get(text, f"von {text}" if known else text)
+
+
 def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]) -> list[int]:
     """Direction of each row: 1 forward, -1 backward, 0 unstated.
 
     The order of the commands decides the meaning of one or two unknown words.
     """
     texts = cells.text("approach")
+    if "approach" in cells and place_of(words_of(cells.columns["approach"]), "from") is not None:
+        texts = [_coming_from(text) for text in texts]
     words = [plain(text).strip() or text.strip() for text in texts]
     sides = {
         word: 1 if means(text, "forward") else -1 if means(text, "backward") else 0

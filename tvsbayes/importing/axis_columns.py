@@ -51,6 +51,8 @@ STOPPED_SHARE = 0.2
 """Least share of rows of either kind in a column of speeds that says where the axis moves."""
 MACHINES_MAX, MACHINE_ROWS = 8, 3
 """Largest number of axes or readers in a table, and fewest rows of each."""
+SIDE_ROWS = 3
+"""Fewest rows of either direction that show what its word means."""
 STRAY_ROWS, STRAY_R2 = 6, 0.5
 """Least number of readings, and largest squared correlation with the commands, of readings that go their own way."""
 DEVIATIONS, POSITIONS = "--deviations", "--positions"
@@ -121,7 +123,8 @@ def _role(column: Column) -> str:
         return "speed"
     if name.has("status", "excluded") and not kind and not column.numeric and not name.has("command", "value"):
         return "status"
-    if name.has("aside") or kind in ("other", "voltage"):
+    is_current = name.place("aside") is not None and name.place("aside") == name.place("value")
+    if (name.has("aside") and not is_current) or kind in ("other", "voltage"):
         return "aside"
     if kind == "time" or (name.is_time and not kind):
         return "time_s"
@@ -189,6 +192,7 @@ def _take_others(chooser: Chooser) -> None:
     known, remarks = chooser.known, chooser.remarks
     for name in ("segment", "approach", "status"):
         chooser.take(name)
+    chooser.take("approach", _by_steps(chooser))
     temperatures = chooser.roles.get("temperature_degC", [])
     if len(temperatures) > 1 and chooser.is_open("temperature_degC"):
         remarks.append(f"temperature: none of {listed(temperatures)}; --column temperature_degC=NAME takes one")
@@ -217,6 +221,18 @@ def _take_others(chooser: Chooser) -> None:
     else:
         ask_of_t(chooser)
     chooser.take("time_s", clocks, what="that could be the clock")
+
+
+def _by_steps(chooser: Chooser) -> list[str]:
+    """Columns of two words, one where the commands rise and one where they fall: sides in a language of nobody."""
+    steps, found = np.diff(chooser.known[chooser.taken["command"]].values), list[str]()
+    for text in chooser.understood().unused:
+        cells = np.array(chooser.known[text].cells)[1:]
+        ways = [{*np.sign(steps[(cells == word) & (steps != 0)])} for word in {*cells}]
+        enough = min((np.sum((cells == word) & (steps != 0)) for word in {*cells}), default=0) >= SIDE_ROWS
+        if enough and sorted(map(list, ways)) == [[-1.0], [1.0]] and not any(map(NUMBER.fullmatch, {*cells})):
+            found.append(text)
+    return found
 
 
 def _ask_which_is_round(chooser: Chooser) -> None:
@@ -283,6 +299,9 @@ def _take_command(chooser: Chooser) -> None:
         return
     strong, weak, others = (roles.get(role, []) for role in ("command", "position", ""))
     readings = roles.get("value", []) or ([taken["value"]] if "value" in taken else [])
+    if len(numbers := [name for name in strong if not counts_rows(chooser.known[name].cells)]) == 1:
+        # "step" 1, 2, 3 ... beside "goto".
+        strong = numbers
     pool = strong or weak or others
     if len(strong) > 1:
         found = f"{len(strong)} columns that could be the command ({listed(strong)})"
@@ -337,7 +356,8 @@ def _take_value(chooser: Chooser, deviations: bool | None) -> None:
         counted = {tuple(word for word in known[name].name.words if not word.isdigit()) for name in pool}
         first = {name: known[name].first for name in pool}
         runs = [Candidate(meaning, ("--runs", order), first) for order, meaning in ORDERED.items()]
-        answers = [chooser.answer({"value": name}) for name in pool]
+        answers = [chooser.answer({"value": n}, DEVIATIONS) for n in differences if known[n].numeric]
+        answers = [*(chooser.answer({"value": name}) for name in pool), *answers]
         are_runs = len(counted) == 1 and all(known[name].name.numbers for name in pool)
         are_runs = are_runs or all(follows(command, known[name]) for name in pool)
         raise chooser.ask(found, [*answers[:3], *runs] if are_runs else answers)

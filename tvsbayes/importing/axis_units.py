@@ -73,28 +73,33 @@ def units_of(cells: FieldCells, written: Mapping[str, Unit | None]) -> dict[str,
     return units
 
 
-_AT_END = re.compile(r"\b(?:in|en)\s+(?P<text>\S+)\s*$")
-"""A unit at the end of a line: "all values in mm"."""
+_SAID = (
+    STATED,
+    re.compile(r"(?P<name>[^,;:=]*?)\b(?:in|en)\s+(?P<text>[^\s,;]+)"),
+    re.compile(r"(?P<name>[^,;:=]*\b(?:units?|einheit(?:en)?|unidad(?:es)?|unites?))\s+(?P<text>\S+)\s*$"),
+)
+"""Units that a line states: "Unit: mm", "all values in mm", "readings in um, positions in mm", "Error units mm"."""
 
 
 def unit_above(table: ForeignTable, field: str) -> Unit | None:
-    """The only unit of length, angle or counts that lines above the names state for a field.
+    """The only unit of length, angle or counts that lines above the names state for a field, else for all values.
 
-    "Position: mm" is that of commands, "Deviation: um" that of readings, as are a unit or values of no name.
+    "Position: mm" is that of commands, "Deviation: um" that of readings.
     """
-    units = set[Unit]()
+    units: dict[str, set[Unit]] = {"command": set(), "value": set(), "": set()}
     for line in table.above:
-        for match in (*STATED.finditer(line), *_AT_END.finditer(plain(line))):
-            unit, words = parse_unit(match["text"]), words_of(match.groupdict().get("name", ""))
-            of_command, of_reading, of_all = (
-                any(place_of(words, name) is not None for name in names)
-                for names in (("command", "position"), ("value", "deviation"), ("unit",))
-            )
-            of_field = of_command and not of_reading if field == "command" else of_reading or not of_command
-            is_said = of_command or of_reading or of_all or match.re is _AT_END
-            if is_said and of_field and unit and unit.kind in ("length", "angle", "count"):
-                units.add(unit)
-    return units.pop() if len(units) == 1 else None
+        for form in _SAID:
+            for match in form.finditer(line if form is STATED else plain(line)):
+                unit, words = parse_unit(match["text"]), words_of(match["name"])
+                of_reading, of_command, of_all = (
+                    any(place_of(words, name) is not None for name in names)
+                    for names in (("value", "deviation"), ("command", "position"), ("unit",))
+                )
+                of = "value" if of_reading else "command" if of_command else ""
+                if (of or of_all or form is not STATED) and unit and unit.kind in ("length", "angle", "count"):
+                    units[of].add(unit)
+    found = units[field] or (units[""] if field == "value" else set())
+    return found.pop() if len(found) == 1 else None
 
 
 def in_one_unit(

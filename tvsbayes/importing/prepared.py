@@ -19,7 +19,7 @@ from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import means, name_of, parse_unit, place_of, words_of
 
 _PARTS = re.compile(
-    r"(?P<stem>.+?)[ _.]*[\[(]?(?:(?P<d>d|deg|degr.s|\u00b0|grad)|(?P<m>m|min|minuten|minutes|arcmin|'|\u2032)"
+    r"(?P<stem>.*?)[ _.]*[\[(]?(?:(?P<d>d|deg|degr.s|\u00b0|grad)|(?P<m>m|min|minuten|minutes|arcmin|'|\u2032)"
     r"|(?P<s>s|sec|sekunden|secondes|seconds|arcsec|\"|''|\u2033))[\])]?$",
     re.IGNORECASE,
 )
@@ -245,7 +245,11 @@ def _joined_angles(table: ForeignTable) -> ForeignTable:
         if any(not 0 <= float(cell) < 60 for cells in parts[1:] for cell in cells if cell):
             continue
         degrees = ["" if "" in cells else _degrees(cells) for cells in zip(*parts, strict=True)]
-        name = f"{found[0]['stem']} (deg)"  # type: ignore[index]
+        stem = found[0]["stem"]  # type: ignore[index]
+        if not stem and all(a <= b for a, b in pairwise(map(float, filter(None, parts[1])))):
+            # Times in minutes.
+            continue
+        name = f"{stem or 'angle'} (deg)"
         columns = {name if n == text else n: degrees if n == text else c for n, c in columns.items()}
         columns = {n: c for n, c in columns.items() if n not in texts[at + 1 : at + size]}
         joined[text] = name

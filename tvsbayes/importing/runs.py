@@ -148,7 +148,7 @@ def long_table(table: ForeignTable, stated: Mapping[str, str], order: str | None
 
 def _turned(table: ForeignTable, runs: list[Run], remarks: list[str]) -> list[Run]:
     """Runs to the right and left with the side that lags as the forward one: play holds the reading back."""
-    if not any(run.name.has("clockwise", "counterclockwise") for run in runs):
+    if not any(run.side and run.name.has("clockwise", "counterclockwise") for run in runs):
         return runs
     means = {
         side: fmean(float(cell) for run in runs if run.side == side for cell in table.columns[run.name.text] if cell)
@@ -228,7 +228,8 @@ def _runs(table: ForeignTable, units: Mapping[str, Unit | None], *, stated: bool
 def _in_columns(table: ForeignTable, stated: Mapping[str, str]) -> list[Run]:
     """All columns that follow the commands, as runs in the order of the columns, where the user says that they are."""
     known = {text: column for text, column in columns_of(table).items() if _numeric(column.cells)}
-    known = {text: column for text, column in known.items() if not column.name.has(*_NEVER) and not column.name.is_u}
+    never = ("aside", "statistic", "temperature", "time", "index")
+    known = {text: column for text, column in known.items() if not column.name.has(*never) and not column.name.is_u}
     commands = [text for text, column in known.items() if column.name.has("command")] or list(known)
     command = known.get(stated.get("command") or next(iter(commands), ""))
     runs = list[Run]()

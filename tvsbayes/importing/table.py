@@ -364,7 +364,7 @@ def _without_titles(
         sides.append(side)
     body = [(row, of) for row, of in zip(rows, sides, strict=True) if row.line not in titles]
     are_runs = all(of for _, of in body) and len({of for _, of in body}) > 1
-    if not are_runs and (blocks := _blocks([*above[-1:], *titles.values()])):
+    if not are_runs and (blocks := _blocks(above, [*titles.values()])):
         raise refused("several-machines", file, line=min(titles), where="under titles", machines=blocks)
     named = ", ".join(f'"{escaped(text, 30)}"' for text in list(titles.values())[:3]) + " ..." * (len(titles) > 3)
     # "Cote" of numbers is a dimension, "C\u00f4t\u00e9" of words a side.
@@ -376,14 +376,16 @@ def _without_titles(
     return [*names, "direction"], [Row(row.line, [*row.cells, of]) for row, of in body], note
 
 
-def _blocks(titles: Sequence[str]) -> list[str]:
+def _blocks(above: Sequence[str], titles: Sequence[str]) -> list[str]:
     """Titles of rows of several axes, or in several conditions: alike but for a word or number, and none of a run."""
-    words = [words_of(title) for title in titles]
-    for a, b in pairwise(words):
-        alike = len(a) == len(b) and sum(x != y for x, y in zip(a, b, strict=True)) == 1
+    lines = [line.strip("#%!/ -=*") for line in above]
+    first = [line for line in lines[:-1] if place_of(words_of(line), "machine") is not None] + lines[-1:]
+    for one, other in (*((line, titles[0]) for line in first), *pairwise(titles)):
+        a, b = words_of(one), words_of(other)
+        alike = len(a) == len(b) > 1 and sum(x != y for x, y in zip(a, b, strict=True)) == 1
         conditions = all(place_of(own, "condition") is not None for own in (a, b)) and a != b
-        if (alike and len(a) > 1 and place_of(a, "run") is None and place_of(a, "repeat") is None) or conditions:
-            return list(titles)
+        if (alike and place_of(a, "run") is None and place_of(a, "repeat") is None) or conditions:
+            return [*([one] if one not in titles else []), *titles]
     return []
 
 

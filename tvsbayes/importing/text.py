@@ -25,7 +25,7 @@ from tvsbayes.importing.table import (
     names_first,
     side_named,
 )
-from tvsbayes.importing.words import means, place_of, words_of
+from tvsbayes.importing.words import means, parse_unit, place_of, words_of
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """Separators in the order in which they are tried: a decimal comma must not be taken for one."""
@@ -182,14 +182,16 @@ def _names_in_remark(remarks: Sequence[tuple[int, str]], rows: Sequence[Row], se
         return None
     width = filled_width(rows[0].cells)
     for line, remark in reversed(remarks):
-        # "#L" begins the names of SPEC files.
+        # "#L" begins the names of SPEC files; "x_cmd x_read [mm]" has one unit for all.
         content = re.sub(r"^(?:[#%!]|//)+(?:L(?=\s))?\s*", "", remark)
-        for divide in (separator, "\t", ",", ";", "  ", None):
-            cells = [
-                cell.strip() for cell in (content.split(divide) if divide != "  " else re.split(r"\s{2,}", content))
-            ]
-            if len(cells) == width > 1 and all(cells) and not any(map(is_number, cells)):
-                return Row(line, cells)
+        common = re.search(r"\s*([(\[][^()\[\]]+[)\]])$", content)
+        bare = content[: common.start()] if common and parse_unit(common[1].strip("()[] ")) else content
+        for names, unit in ((content, ""), (bare, f" {common[1]}" if common else "")):
+            for divide in (separator, "\t", ",", ";", "  ", None):
+                cells = re.split(r"\s{2,}", names) if divide == "  " else names.split(divide)
+                cells = [cell.strip() for cell in cells]
+                if len(cells) == width > 1 and all(cells) and not any(map(is_number, cells)):
+                    return Row(line, [f"{cell}{unit}" for cell in cells])
     return None
 
 

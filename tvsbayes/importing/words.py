@@ -378,7 +378,8 @@ def _may_end(unit: Unit, word: str, before: Sequence[str]) -> bool:
         # "Rev 1" is a run, "Measured rev" a number of revolutions.
         return any(place_of(before, concept) is not None for concept in ("command", "value", "position"))
     if unit.kind == "temperature":
-        return place_of(before, "temperature") is not None or word in ("celsius", "kelvin", "fahrenheit", "degc")
+        named = place_of(before, "temperature") is not None or before[:1] == ["t"]
+        return named or word in ("celsius", "kelvin", "fahrenheit", "degc")
     if unit.kind == "time" and len(word) < 2:
         return place_of(before, "time") is not None or place_of(before, "hour-angle") is not None
     return True
