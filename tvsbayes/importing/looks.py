@@ -316,8 +316,8 @@ def look_rows(chooser: Chooser, wishes: Wishes, moves_listed: int | None = None)
     if seen or not wishes.pictures:
         # Pictures of looks with centres are of no use here.
         named = [name for name in BOOKED if name in columns and name not in wishes.columns]
-        is_book = not seen and {*FOUR_POINT} <= {*columns}
-        unused += [columns.pop(name) for name in named if not is_book or name == "direction"]
+        numbered = not seen and {*FOUR_POINT} <= {*columns}
+        unused += [columns.pop(name) for name in named if not numbered or name == "direction"]
     cells = FieldCells(table, columns, wishes)
     moves, aperture = None, _aperture_unit(cells)
     is_book = not seen and ({*FOUR_POINT} <= {*columns} or any(name in columns for name in PICTURES))
