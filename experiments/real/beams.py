@@ -91,7 +91,7 @@ def draw(beams: Sequence[Beam]) -> None:
             small = cv2.resize(grey, (160, round(160 * grey.shape[0] / grey.shape[1])), interpolation=cv2.INTER_AREA)
             axes.imshow(np.sqrt(small), cmap="inferno")
             if beam.whole.status == "ok":
-                axes.plot(*(beam.whole.located.centre_px * 160 / grey.shape[1]), "+", color="cyan", markersize=9)
+                axes.plot(*(beam.whole.located[0] * 160 / grey.shape[1]), "+", color="cyan", markersize=9)
             ((parts, _),) = beam.statuses.most_common(1)
             end = f", RMS z {beam.rms:.2f}" if beam.z.size else f", parts {parts}" * (parts != beam.whole.status)
             axes.set_title(f"{beam.name}: {beam.whole.status}{end}", fontsize=7)
@@ -104,8 +104,8 @@ def row(beam: Beam) -> str:
     height, width = beam.picture.shape[:2]
     cells = [beam.name, str(bits), f"{width} x {height}", beam.whole.status]
     if beam.whole.status == "ok":
-        pairs = (beam.whole.axes_px, ".1f"), (beam.whole.located.centre_px, ".3f")
-        pairs += ((np.sqrt(np.diag(beam.whole.located.covariance_px2)), ".4f"),)
+        pairs = (beam.whole.axes_px, ".1f"), (beam.whole.located[0], ".3f")
+        pairs += ((np.sqrt(np.diag(beam.whole.located[1])), ".4f"),)
         cells += [f"{u:{form}}, {v:{form}}" for (u, v), form in pairs]
     else:
         cells += ["", "", ""]

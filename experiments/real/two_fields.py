@@ -16,7 +16,6 @@ import numpy as np
 from experiments.common.clock import timed
 from experiments.common.command_line import print_only
 from experiments.real.beams import BEAMS, deviations, parts_of
-from tvsbayes.cameras.alternate_lines import shift_of_lines
 from tvsbayes.cameras.spot_fit import Centre, centre_of, fit_spot, measured_noise, widened
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.cameras.spot_window import Patch, patch_around
@@ -38,8 +37,8 @@ def bare(picture: np.ndarray, noise: SpotNoise | None = None) -> Centre:
     """The centre without what alternate lines add; by its own noise where none is given."""
     patch: Patch | str = patch_around(in_grey_levels(picture))
     if noise is None and not isinstance(patch, str):
-        measured = measured_noise(patch)
-        patch, noise = replace(patch, background_variance=measured.background_dn2), measured.noise
+        noise, background = measured_noise(patch)
+        patch = replace(patch, background_variance=background)
     return centre_of(patch, noise or SpotNoise())
 
 
@@ -83,20 +82,21 @@ def real_rows() -> None:
         spot = bare(picture)
         if spot.status != "ok" or spot.lines_px is None:
             continue
-        shift, sds = spot.lines_px[0], np.sqrt(np.diag(spot.located.covariance_px2))
+        centre_px, covariance = spot.located
+        shift, sds = spot.lines_px[0], np.sqrt(np.diag(covariance))
         # Two halves; the first's deviation from their mean is minus half of odd less even.
         halves = -np.sqrt(2) * deviations(parts_of(picture, 2, 1))[0]
-        cells = [path.stem, f"{100 * gain_of_odd_rows(picture, spot.located.centre_px):.1f} %"]
+        cells = [path.stem, f"{100 * gain_of_odd_rows(picture, centre_px):.1f} %"]
         cells += [f"{shift[0]:+.3f}, {shift[1]:+.3f}", f"{halves[0]:+.1f}, {halves[1]:+.1f}"]
         cells += [", ".join(f"{z:+.1f}" for z in shift / sds / 2), f"{sds[1]:.4f}"]
         for by in MOVED_PX:
             one = bare(with_moved_rows(picture, by))
-            after = widened([one])
+            (after,), lines = widened([one])
             if one.status != "ok" or one.lines_px is None:
                 cells.append(one.status)
                 continue
-            u = np.sqrt(after.centres[0].located.covariance_px2[1, 1])
-            cells.append(f"{one.lines_px[0][1] - shift[1]:.3f}, u {u:.3f}" + (", said" if after.lines else ""))
+            u = np.sqrt(after.located[1][1, 1])
+            cells.append(f"{one.lines_px[0][1] - shift[1]:.3f}, u {u:.3f}" + (", said" if lines else ""))
         print("| " + " | ".join(cells) + " |")
 
 
@@ -114,8 +114,8 @@ def twin_row() -> None:
         spot = bare(picture, SpotNoise(Sensor().gain_dn_per_electron, contrast))
         if spot.status == "ok" and spot.lines_px is not None:
             good += 1
-            widened_spots += bool(widened([spot]).lines)
-            inverse = np.linalg.inv(4 * spot.located.covariance_px2)
+            widened_spots += bool(widened([spot])[1])
+            inverse = np.linalg.inv(4 * spot.located[1])
             chi2.append((number % 2, float(np.einsum("ki,ij,kj->", spot.lines_px, inverse, spot.lines_px)) / 4))
     of_mono = np.mean([value for mono, value in chi2 if mono])
     of_colour = np.mean([value for mono, value in chi2 if not mono])
@@ -142,7 +142,7 @@ def costs() -> None:
     pictures = [render_spot(mark, 1280, 720, Scene(), Sensor(), (24, k, 0)) for k in range(4)]
     files = [cv2.imencode(".png", picture)[1] for picture in pictures]
     patches = [patch for picture in pictures if not isinstance(patch := patch_around(picture), str)]
-    fits = [(patch, fitted) for patch in patches if (fitted := fit_spot(patch, noise)) is not None]
+    fits = [fitted for patch in patches if (fitted := fit_spot(patch, noise)) is not None]
 
     def whole() -> None:
         for number in range(TIMED):
@@ -150,9 +150,9 @@ def costs() -> None:
 
     def looking() -> None:
         for number in range(TIMED):
-            patch, fitted = fits[number % len(fits)]
-            shift = shift_of_lines(patch, fitted.jacobian, fitted.weights, fitted.residual)
-            widened([Centre("ok", fitted.centre_px, np.eye(2), lines_px=shift)])
+            # Anew, without its cached gains.
+            fitted = replace(fits[number % len(fits)])
+            widened([Centre("ok", fitted.centre_px, np.eye(2), lines_px=fitted.shift_of_lines())])
 
     all_s, own_s = (min(timed(job)[1]["cpu_s"] for _ in range(3)) / TIMED for job in (whole, looking))
     print(f"\nA picture of 1280 x 720 px, a spot of 2.5 px: {1e3 * all_s:.1f} ms of CPU decoded, found and fitted,")

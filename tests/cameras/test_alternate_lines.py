@@ -7,9 +7,8 @@ import pytest
 from support.drawn_spots import oval, picture, small_pair
 from support.written_rows import move_row, spot_row
 
-from tvsbayes.cameras.alternate_lines import EXCESS_MIN, widening
 from tvsbayes.cameras.detection import detect
-from tvsbayes.cameras.spot_fit import Centre, centre_of, find_spot, widened
+from tvsbayes.cameras.spot_fit import LINES_EXCESS_MIN, Centre, centre_of, find_spot, widened
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.cameras.spot_window import patch_around
 from tvsbayes.files.images import in_grey_levels, png_bytes
@@ -74,30 +73,34 @@ def test_good_pictures_are_unchanged():
         assert (find_spot(frame, noise).covariance_px2 == without.covariance_px2).all()
 
 
+def spots_of(shifts: np.ndarray, covariance: np.ndarray) -> list[Centre]:
+    return [Centre("ok", PLACE, covariance, lines_px=shift) for shift in shifts]
+
+
 def test_small_common_differences_are_detected_over_all_looks():
     """One alone is insignificant; 40 of mean square 9 are significant, 40 of 2.25 are within the noise's error."""
-    covariances = [np.diag([0.01, 0.04])] * 40
-    rng = np.random.default_rng(7)
-    signs = rng.choice([-1.0, 1.0], (40, 2, 2))
+    covariance = np.diag([0.01, 0.04])
+    signs = np.random.default_rng(7).choice([-1.0, 1.0], (40, 2, 2))
     for size, expected in ((3.0, 40), (1.5, 0)):
         shifts = signs * size * 2 * np.array([0.1, 0.2])
         shifts[:, 1] = 0.0
-        result = widening(list(shifts), covariances)
-        assert [(one.lines, one.spots) for one in result.lines] == ([("rows", 40)] if expected else [])
+        centres, lines = widened(spots_of(shifts, covariance))
+        assert [(one.lines, one.spots) for one in lines] == ([("rows", 40)] if expected else [])
+        added = np.array([one.covariance_px2 for one in centres]) - covariance
         if expected:
-            np.testing.assert_allclose(result.added_px2[3], np.outer(shifts[3, 0], shifts[3, 0]) / 12, rtol=1e-12)
+            np.testing.assert_allclose(added[3], np.outer(shifts[3, 0], shifts[3, 0]) / 12, rtol=1e-12, atol=1e-15)
         else:
-            assert not result.added_px2.any()
-    assert 2.25 < EXCESS_MIN < 9
-    assert widened([Centre("no-spot")]).lines == ()
+            assert not added.any()
+    assert 2.25 < LINES_EXCESS_MIN < 9
+    assert widened([Centre("no-spot")]) == ([Centre("no-spot")], ())
 
 
 def test_a_shift_in_one_look_widens_that_look():
-    shifts = [np.zeros((2, 2))] * 30
-    shifts[4] = np.array([[0.0, 0.0], [2.0, 0.0]])
-    result = widening(shifts, [0.01 * np.eye(2)] * 30)
-    assert [(one.lines, one.spots, one.apart_px) for one in result.lines] == [("columns", 1, 2.0)]
-    assert np.flatnonzero(result.added_px2.any(axis=(1, 2))).tolist() == [4]
+    shifts = np.zeros((30, 2, 2))
+    shifts[4] = [[0.0, 0.0], [2.0, 0.0]]
+    centres, lines = widened(spots_of(shifts, 0.01 * np.eye(2)))
+    assert [(one.lines, one.spots, one.apart_px) for one in lines] == [("columns", 1, 2.0)]
+    assert [k for k, one in enumerate(centres) if (one.covariance_px2 != 0.01 * np.eye(2)).any()] == [4]
 
 
 def test_detect_names_the_camera_that_reads_in_fields(tmp_path):

@@ -29,16 +29,10 @@ below which as dark, smallest gain."""
 _CELL = 8
 
 
-def _autocorrelation(kernel: np.ndarray) -> np.ndarray:
-    padded = np.pad(kernel, 2)
-    return np.array([[np.sum(kernel * padded[i : i + 3, j : j + 3]) for j in range(5)] for i in range(5)])
-
-
-# Correlation of grey pixels after bilinear demosaicing: mean over red, blue and green sites.
-_CORRELATION = (
-    _autocorrelation(np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 16)
-    + _autocorrelation(np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 8)
-) / 2
+# Correlation of grey pixels after bilinear demosaicing: mean over red and blue sites, whose kernel is
+# (1 2 1; 2 4 2; 1 2 1) / 16, and green ones, (0 1 0; 1 4 1; 0 1 0) / 8.
+_GREEN = [[0, 0, 1, 0, 0], [0, 2, 8, 2, 0], [1, 8, 20, 8, 1], [0, 2, 8, 2, 0], [0, 0, 1, 0, 0]]
+_CORRELATION = (np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]) / 256 + np.array(_GREEN) / 64) / 2
 _LAGS = np.maximum(_CELL - np.abs(np.arange(-2, 3)), 0)
 _CELL_VARIANCE = float(np.sum(_CORRELATION * np.outer(_LAGS, _LAGS))) / _CELL**4
 """Variance of the mean of a cell for unit noise per photosite."""
@@ -95,18 +89,10 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
     return SpotNoise(gain_dn, float(weights.sum(axis=0) @ contrasts), tuple(shape.tolist()))
 
 
-@dataclass(frozen=True)
-class PixelNoise:
-    """The noise of one picture from its own pixels, and the variance of a photosite without light, DN^2."""
-
-    noise: SpotNoise
-    background_dn2: float
-
-
 def pixel_noise(
     residual: np.ndarray, signal: np.ndarray, usable: np.ndarray, background: float, mono: bool
-) -> PixelNoise:
-    """Estimate gain and contrast of one picture from second differences of a fit's residuals, by signal.
+) -> tuple[SpotNoise, float]:
+    """The noise of one picture from second differences of a fit's residuals, and its variance without light, DN^2.
 
     Differences over 1 px (3 px in demosaiced pictures) contain the noise of pixels and the finest grain of speckle, and
     little of a beam's rings and fringes. Only the scatter between looks shows a coarser grain.
@@ -122,34 +108,27 @@ def pixel_noise(
 
     lag, single = (1, 1.0) if mono else (3, float(_CORRELATION[2, 2]))
     rows = []
-    for axis in (0, 1):
-        length = residual.shape[axis]
-        if length <= 2 * lag:
-            continue
+    for axis, length in enumerate(residual.shape):
         parts = [np.arange(k * lag, length - (2 - k) * lag) for k in range(3)]
         earlier, middle, later = (np.take(residual, part, axis) for part in parts)
         inside = np.logical_and.reduce([np.take(usable, part, axis) for part in parts])
         # Variance of one value minus half of two others: 1 + 1/4 + 1/4.
-        rows.append(
-            np.stack(
-                ((middle - (earlier + later) / 2)[inside] ** 2 / 1.5 / single, np.take(signal, parts[1], axis)[inside])
-            )
-        )
-    squares, light = np.hstack(rows) if rows else np.empty((2, 0))
+        squares = (middle - (earlier + later) / 2)[inside] ** 2 / 1.5 / single
+        rows.append(np.stack((squares, np.take(signal, parts[1], axis)[inside])))
+    squares, light = np.hstack(rows)
     if len(light) < OWN_PIXELS_MIN:
-        return PixelNoise(SpotNoise(), background)
+        return SpotNoise(), background
     dark = squares[light < OWN_DARK_SHARE * light.max()]
     if len(dark) >= OWN_PIXELS_MIN:
         background = max(float(dark.mean()), DEEP_VARIANCE_MIN)
     order = np.argsort(light)
     bins = np.array_split(order[light[order] > OWN_SHARE * light.max()], OWN_BINS)
-    level = np.array([light[part].mean() for part in bins])
-    mean = np.array([squares[part].mean() for part in bins])
+    level, mean = (np.array([values[part].mean() for part in bins]) for values in (light, squares))
     # The means have equal relative errors, so relative residuals are minimised.
     weight = 1 / np.maximum(mean, 1e-12)
     excess = np.maximum(mean - background, 0.0)
     gain, contrast2 = nnls(np.column_stack((level, level**2)) * weight[:, None], excess * weight)[0]
-    return PixelNoise(SpotNoise(max(float(gain), OWN_GAIN_MIN_DN), float(np.sqrt(contrast2))), background)
+    return SpotNoise(max(float(gain), OWN_GAIN_MIN_DN), float(np.sqrt(contrast2))), background
 
 
 def mean_noise(noises: Sequence[SpotNoise]) -> SpotNoise:
@@ -157,11 +136,6 @@ def mean_noise(noises: Sequence[SpotNoise]) -> SpotNoise:
     gain = float(np.mean([noise.gain_dn for noise in noises]))
     contrast = float(np.sqrt(np.mean([noise.speckle_contrast**2 for noise in noises])))
     return SpotNoise(gain, contrast, tuple(np.median([noise.skew for noise in noises], axis=0).tolist()))
-
-
-def is_mono(picture: np.ndarray) -> bool:
-    """Whether the three channels are equal: a monochrome camera, or a grey picture saved as colour."""
-    return bool((picture[..., 0] == picture[..., 1]).all() and (picture[..., 0] == picture[..., 2]).all())
 
 
 def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> float:

@@ -12,7 +12,7 @@ from math import pi, sqrt
 
 import numpy as np
 
-from tvsbayes.cameras.spot_noise import background_variance, grey_of, is_mono
+from tvsbayes.cameras.spot_noise import background_variance, grey_of
 
 CLIPPED_DN = 250
 """A channel at or above this counts as clipped: white balance and JPEG leave full wells slightly below 255."""
@@ -128,7 +128,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
         raw=grey,
         usable=block_means(usable.astype(np.float32), block) == 1,
         block=block,
-        mono=is_mono(window),
+        mono=bool((window == window[..., :1]).all()),
         corner=(int(left), int(top)),
         start_px=start,
         start_sd_px=max(sd, 1.0),
