@@ -146,7 +146,7 @@ def test_mirrored_corner_orders_are_corrected(monkeypatch):
         return original(grey, board).reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
 
     monkeypatch.setattr(boards, "_find_classic", mirrored)
-    np.testing.assert_array_equal(boards.find_corners(grey, BOARD).px, straight)
+    np.testing.assert_array_equal(boards.find_corners(grey, BOARD)[0], straight)
 
 
 def test_colours_decide_for_an_inverted_camera(tmp_path):

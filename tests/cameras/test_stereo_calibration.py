@@ -16,16 +16,9 @@ from support.drawn_boards import PAIR, POSES, pictures, write_pair
 
 from experiments.cameras.stereo_coverage import calibrate, chi2
 from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
-from tvsbayes.cameras.board_errors import _corner_slopes
+from tvsbayes.cameras.board_errors import corner_slopes, correlation_factor
 from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
-from tvsbayes.cameras.bundle_adjustment import (
-    RESTARTS_MAX,
-    BoardArrays,
-    _descents,
-    _End,
-    bundle_adjustment,
-    correlation_factor,
-)
+from tvsbayes.cameras.bundle_adjustment import RESTARTS_MAX, BoardArrays, _ends, bundle_adjustment
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
 from tvsbayes.cameras.stereo_start import camera_start
 from tvsbayes.cli.main import run
@@ -33,6 +26,7 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import parse_stereo, read_stereo, stereo_bytes
+from tvsbayes.model.descent import Linear
 
 MOUNTED = shipped_data() / "rigs" / "mounted"
 OPENCV_PAIRS = Path("/usr/share/doc/opencv-doc/examples/data")
@@ -104,7 +98,7 @@ def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
         views = []
         for k, scene in enumerate(drawn):
             view = corners_of(scene, f"{k:02d}", rng)
-            moved = np.einsum("qca,ca->cq", _corner_slopes(view, BOARD, scene.stereo), away)
+            moved = np.einsum("qca,ca->cq", corner_slopes(view, BOARD, scene.stereo), away)
             views.append(replace(view, left=view.left + moved[:, :2], right=view.right + moved[:, 2:]))
         result = calibrate_stereo(views, BOARD, SIZE)
         # 155 displacements determine their sd to 6 %; three of them, and the noise of the corners.
@@ -379,8 +373,8 @@ def test_correlation_factor_is_the_design_effect(shared):
     noise = np.sqrt(shared) * np.repeat(rng.standard_normal(count), each)
     noise += np.sqrt(1 - shared) * rng.standard_normal(count * each)
     residuals = noise - noise.mean()
-    views = np.repeat(np.arange(count), each)
-    factor = correlation_factor(np.ones((count * each, 1)), residuals, views, float(residuals.std()))
+    basis = np.full((count, each, 1), (count * each) ** -0.5)
+    factor = correlation_factor(basis, residuals.reshape(count, each), float(residuals.std()))
     # A sum of 200 squares scatters by sqrt(2 / 200) = 10 %.
     assert abs(factor / (1 + (each - 1) * shared) - 1) < 0.4
 
@@ -482,10 +476,10 @@ def test_command_warns_of_an_implausible_import(ask, capsys, tmp_path):
 @pytest.mark.parametrize("falls", [0, 1, RESTARTS_MAX, RESTARTS_MAX + 1])
 def test_the_accepted_end_was_repeated(monkeypatch, falls):
     """Every descent ends lower than the one before: the last end is compared with another one."""
-    ends = [_End(np.full(24, float(k)), np.full(8, 0.5 ** min(k, falls)), np.zeros((8, 24))) for k in range(9)]
+    ends = [Linear(np.full(24, float(k)), np.full(8, 0.5 ** min(k, falls)), np.zeros((8, 24))) for k in range(9)]
     following = iter(ends[1:])
     monkeypatch.setattr("tvsbayes.cameras.bundle_adjustment._descended", lambda z, arrays: next(following))
     arrays = BoardArrays(*map(jnp.zeros, [(3, 1), (1, 4, 1), (1, 4, 1), (1, 6), 24, (24, 24)]))
-    *_, end, again = _descents(ends[0], arrays, np.ones(24, bool), 4)
+    end, again = _ends(ends[0], arrays, np.ones(24, bool), 4)
     reached = min(falls, RESTARTS_MAX)
-    assert (end.z[0], again.z[0]) == (reached, reached + 1)
+    assert (end.point[0], again.point[0]) == (reached, reached + 1)

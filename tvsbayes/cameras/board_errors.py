@@ -1,9 +1,9 @@
-"""The effect of an imperfect board on a calibration: corners displaced by micrometres, equally in all views.
+"""Errors that corners share: those of one picture, and those of an imperfect board, displaced equally in all views.
 
-Printed and glued boards have such errors. All pictures agree, so the residuals of single views do not show them, but
-the mean residual of each corner over all views does. The estimate stays that of least squares with a perfect grid. Its
-covariance gets the effect of independent displacements of the corners, of the size found in the residuals. mm, px; z
-are the whitened coordinates of `bundle_adjustment`.
+Printed and glued boards are no perfect grids, by micrometres. All pictures agree, so the residuals of single views do
+not show it, but the mean residual of each corner over all views does. The estimate stays that of least squares with a
+perfect grid. Its covariance gets the effect of independent displacements of the corners, of the size found in the
+residuals. mm, px; z are the whitened coordinates of `bundle_adjustment`.
 """
 
 from __future__ import annotations
@@ -13,18 +13,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag, null_space
 
 from tvsbayes.cameras.boards import Board, View
-from tvsbayes.cameras.bundle_adjustment import Adjustment, correlation_factor
-from tvsbayes.cameras.stereo_start import pose_of
+from tvsbayes.cameras.bundle_adjustment import Adjustment
+from tvsbayes.cameras.stereo_start import composed, pose_of, relative_pose
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 
 PRIOR_SHARE = 2e-3
 """Scale of the half-normal prior of a corner's displacement, one coordinate, over the pitch; 0.05 mm for 25 mm."""
 CORNERS_MAX = 200
 """Largest number of corners, spread evenly over the board, used to estimate the size of all displacements."""
-STEP_SHARE = 1e-3
-"""Step of the differences over the pitch; projections are smooth over whole squares."""
 SIZES = np.linspace(0, 5, 501)
 """Grid of displacements, in scales of the prior."""
 
@@ -36,7 +35,7 @@ class BoardErrors:
     Attributes:
         sd_mm: sd of one coordinate of one corner: root of the posterior mean of its square.
         covariance: (24, 24), its effect on the cameras' parameters.
-        correlation_factor: for further common errors of a view, see `bundle_adjustment.correlation_factor`.
+        correlation_factor: for further common errors of a view, see `correlation_factor`.
     """
 
     sd_mm: float
@@ -55,44 +54,57 @@ def board_errors(adjustment: Adjustment, views: Sequence[View], board: Board, st
     """
     visible = np.isfinite(adjustment.residuals_px)
     residuals = np.where(visible, adjustment.residuals_px, 0.0)
-    slopes = np.stack([_corner_slopes(view, board, stereo) for view in views]) * visible[..., None]
+    slopes = np.stack([corner_slopes(view, board, stereo) for view in views]) * visible[..., None]
     # Orthonormal columns: each is a change of z with a sum of squares of 1 px^2.
     free = adjustment.root.shape[1]
     flat = np.linalg.qr(adjustment.jacobian.reshape(-1, free))
     basis = np.reshape(flat.Q, adjustment.jacobian.shape)
-    projections = np.einsum("kqcp,kqca->kpca", basis, slopes, optimize=True)
-    total = projections.sum(axis=0).reshape(free, -1)
+    projections = np.einsum("kqcp,kqca->kpca", basis, slopes, optimize=True).reshape(len(views), free, -1)
+    total = projections.sum(axis=0)
     variance = _variance(residuals, slopes, total, board, adjustment)
-    by_z = np.linalg.solve(flat.R, total)
-    by_parameter = adjustment.root @ by_z
-    share = np.einsum("kqcp,kqcr->kpr", basis, basis, optimize=True)
-    scores = projections.reshape(len(views), free, -1) - share @ total
-    seen = visible.ravel()
+    by_parameter = adjustment.root @ np.linalg.solve(flat.R, total)
+    scores = projections - np.einsum("kqcp,kqcr->kpr", basis, basis, optimize=True) @ total
     factor = correlation_factor(
-        adjustment.jacobian.reshape(-1, free)[seen],
-        residuals.ravel()[seen],
-        np.repeat(np.arange(len(visible)), visible[0].size)[seen],
+        basis.reshape(len(views), -1, free),
+        residuals.reshape(len(views), -1),
         adjustment.noise_sd_px,
         explained=variance * float(np.sum(scores**2)),
     )
     return BoardErrors(float(np.sqrt(variance)), variance * by_parameter @ by_parameter.T, factor)
 
 
-def _corner_slopes(view: View, board: Board, stereo: Stereo) -> np.ndarray:
+def correlation_factor(basis: np.ndarray, residuals: np.ndarray, noise_sd: float, explained: float = 0.0) -> float:
+    """Ratio of the scores of whole views to those expected for independent corners; at least 1.
+
+    Corner errors of one picture have common causes (light, defocus, a lens that deviates from the model, a bent board):
+    they are not independent, and (J^T J)^-1 s^2 is then too small. The score of view i, J_i^T r_i, shows this. In
+    coordinates where J^T J = 1, independent errors give the sum of |J_i^T r_i|^2 the expectation
+    s^2 (p - sum_i tr (J_i^T J_i)^2), where the second term is due to the fit. The ratio scales the covariance: the
+    cluster-robust variance of Liang and Zeger (1986) reduced to one number, since a dozen views cannot determine a
+    24 x 24 matrix. Errors common to ALL views are not detected: see `board_errors`.
+
+    Args:
+        basis: (views, coordinates, p), J in such coordinates: orthonormal columns over all views; 0 where unseen.
+        residuals: (views, coordinates), 0 where unseen.
+        noise_sd: s, the standard deviation of one coordinate.
+        explained: expectation of the scores' squares due to other known causes.
+    """
+    score = np.sum(np.einsum("knp,kn->kp", basis, residuals) ** 2)
+    lost = np.sum(np.einsum("knp,knr->kpr", basis, basis, optimize=True) ** 2)
+    expected = noise_sd**2 * (basis.shape[2] - lost)
+    return max(1.0, float((score - explained) / expected)) if expected > 1e-3 * noise_sd**2 else 1.0
+
+
+def corner_slopes(view: View, board: Board, stereo: Stereo) -> np.ndarray:
     """Derivative (4, corners, 3) of a view's pixels by the positions of the corners on the board, px/mm."""
-    pose = pose_of(view, board, stereo)
-    r_left, t_left = rotation_matrix(pose[:3]), pose[3:]
-    step = STEP_SHARE * board.pitch_mm
-    slopes = np.zeros((4, board.corners, 3))
-    for side, (matrix, distortion) in enumerate(((stereo.M1, stereo.D1), (stereo.M2, stereo.D2))):
-        r, t = (stereo.R @ r_left, stereo.R @ t_left + stereo.T) if side else (r_left, t_left)
-        for axis in range(3):
-            pixels = (
-                cv2.projectPoints(board.points_mm + sign * step * np.eye(3)[axis], r, t, matrix, distortion)[0]
-                for sign in (1, -1)
-            )
-            slopes[2 * side : 2 * side + 2, :, axis] = np.reshape(next(pixels) - next(pixels), (-1, 2)).T / (2 * step)
-    return slopes
+    left = pose_of(view, board, stereo)
+    right = composed(left, relative_pose(stereo))
+    slopes = []
+    for pose, matrix, distortion in ((left, stereo.M1, stereo.D1), (right, stereo.M2, stereo.D2)):
+        by_shift = cv2.projectPoints(board.points_mm, pose[:3], pose[3:], matrix, distortion)[1][:, 3:6]
+        # A corner moves in the camera's axes as the board would, turned.
+        slopes.append((by_shift @ rotation_matrix(pose[:3])).reshape(-1, 2, 3).transpose(1, 0, 2))
+    return np.concatenate(slopes)
 
 
 def _variance(residuals: np.ndarray, slopes: np.ndarray, total: np.ndarray, board: Board, fit: Adjustment) -> float:
@@ -103,18 +115,15 @@ def _variance(residuals: np.ndarray, slopes: np.ndarray, total: np.ndarray, boar
     out: they belong to poses and pitch.
     """
     chosen = np.unique(np.linspace(0, board.corners - 1, CORNERS_MAX).astype(int))
-    count = 3 * len(chosen)
-    chosen_slopes, fixed = slopes[:, :, chosen], total.reshape(len(total), -1, 3)[:, chosen].reshape(-1, count)
-    blocks = np.einsum("kqca,kqcb->cab", chosen_slopes, chosen_slopes, optimize=True)
-    gram = np.zeros((len(chosen), 3, len(chosen), 3))
-    gram[np.arange(len(chosen)), :, np.arange(len(chosen)), :] = blocks
+    slopes, fixed = slopes[:, :, chosen], total.reshape(len(total), -1, 3)[:, chosen].reshape(len(total), -1)
+    blocks = np.einsum("kqca,kqcb->cab", slopes, slopes, optimize=True)
     # The projection on the cameras' parameters is subtracted.
-    gram = gram.reshape(count, count) - fixed.T @ fixed
-    products = -np.einsum("kqca,kqc->ca", chosen_slopes, residuals[:, :, chosen], optimize=True).ravel()
+    gram = block_diag(*blocks) - fixed.T @ fixed
+    products = -np.einsum("kqca,kqc->ca", slopes, residuals[:, :, chosen], optimize=True).ravel()
     points = board.points_mm[chosen]
-    motions = [np.tile(axis, (len(chosen), 1)) for axis in np.eye(3)]
-    motions += [np.cross(axis, points) for axis in np.eye(3)] + [points]
-    free = np.linalg.svd(np.stack([motion.ravel() for motion in motions]))[2][7:].T
+    motions = [*(np.tile(axis, (len(points), 1)) for axis in np.eye(3)), points]
+    motions += [np.cross(axis, points) for axis in np.eye(3)]
+    free = null_space(np.reshape(motions, (7, -1)))
     gains, directions = np.linalg.eigh(free.T @ gram @ free)
     visible = gains > 1e-6 * gains[-1]
     gains, energy = gains[visible], ((products @ free) @ directions[:, visible]) ** 2 / gains[visible]

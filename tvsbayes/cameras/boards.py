@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -26,6 +26,8 @@ from tvsbayes.cameras.marker_boards import (
     fitted_markers,
     marker_board_corners,
     marker_counts,
+    min_distance,
+    refined_corners,
     spread,
 )
 from tvsbayes.cameras.picture_pairs import (
@@ -108,10 +110,7 @@ class Board:
         Raises:
             InputError: another text, or impossible values.
         """
-        match = _BOARD_SIZE.fullmatch(size.strip())
-        if match is None:
-            raise _bad_option("--board", escaped(size), "COLUMNSxROWS of inner corners", "write for example 9x6")
-        return cls(int(match[1]), int(match[2]), pitch_mm, pitch_u_mm)
+        return cls(*_counts("--board", size, "inner corners", "9x6"), pitch_mm, pitch_u_mm)
 
     @classmethod
     def with_markers(
@@ -122,10 +121,7 @@ class Board:
         Raises:
             InputError: another text, no such dictionary, or impossible values.
         """
-        match = _BOARD_SIZE.fullmatch(squares.strip())
-        if match is None:
-            raise _bad_option("--charuco", escaped(squares), "COLUMNSxROWS of squares", "write for example 15x10")
-        columns, rows = int(match[1]), int(match[2])
+        columns, rows = _counts("--charuco", squares, "squares", "15x10")
         # A board refuses such a pitch below.
         share = None if marker_mm is None or not pitch_mm > 0 else marker_mm / pitch_mm
         name = dictionary.strip().removeprefix("DICT_")
@@ -143,15 +139,17 @@ class Board:
         return np.column_stack([self.pitch_mm * grid, np.zeros(self.corners)])
 
 
+def _counts(option: str, text: str, counted: str, example: str) -> tuple[int, int]:
+    """Columns and rows of a text such as "9x6"."""
+    match = _BOARD_SIZE.fullmatch(text.strip())
+    if match is None:
+        raise _bad_option(option, escaped(text), f"COLUMNSxROWS of {counted}", f"write for example {example}")
+    return int(match[1]), int(match[2])
+
+
 def _bad_option(option: str, found: str, allowed: str, remedy: str) -> InputError:
-    return InputError(
-        "usage",
-        f"{option}: found {found}; allowed: {allowed}",
-        column=option,
-        found=found,
-        allowed=allowed,
-        remedy=remedy,
-    )
+    message = f"{option}: found {found}; allowed: {allowed}"
+    return InputError("usage", message, column=option, found=found, allowed=allowed, remedy=remedy)
 
 
 @dataclass(frozen=True)
@@ -195,18 +193,12 @@ class Views:
     right_image_size: Size | None = None
 
 
-class Corners(NamedTuple):
-    """Inner corners (corners, 2), px, in right-handed order (the sense of the image's x, y), and by which finder."""
-
-    px: np.ndarray
-    by_fallback: bool
-
-
-def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> Corners | None:
-    """Inner corners of a board in one picture.
+def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> tuple[np.ndarray, bool] | None:
+    """Inner corners (corners, 2) of a board in one picture, px, and whether only the other finder found them.
 
     `classic` is findChessboardCorners refined by cornerSubPix, `sector` findChessboardCornersSB (Duda and Frese
-    2018, sector based; slower). Where one fails, the other is tried.
+    2018, sector based; slower). Where one fails, the other is tried. The order of the corners is right-handed, in the
+    sense of the image's x and y.
 
     Args:
         grey: (height, width) uint8.
@@ -214,11 +206,11 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
         finder: the finder tried first.
 
     Returns:
-        The corners; None where neither finds them.
+        None where neither finds them.
     """
     if board.markers is not None:
         marker_corners = marker_board_corners(grey, board.markers)
-        return None if marker_corners is None else Corners(marker_corners, False)
+        return None if marker_corners is None else (marker_corners, False)
     for method in (finder, "sector" if finder == "classic" else "classic"):
         corners = _find_classic(grey, board) if method == "classic" else _find_sector(grey, board)
         if corners is None or not np.isfinite(corners).all():
@@ -228,13 +220,22 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
         # Every picture shows the front of the board, so the order has the same sense in all pictures.
         if along[0] * across[1] - along[1] * across[0] < 0:
             grid = grid[:, ::-1]
-        return Corners(grid.reshape(-1, 2), method != finder)
+        return grid.reshape(-1, 2), method != finder
     return None
 
 
 def _find_classic(grey: np.ndarray, board: Board) -> np.ndarray | None:
     corners = _all_corners(board, *cv2.findChessboardCorners(grey, (board.columns, board.rows)))
-    return None if corners is None else _refined(grey, corners.astype(np.float32), board)
+    return None if corners is None else _refined(grey, corners, board)
+
+
+def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
+    flags, small = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY, shrunk(grey)
+    corners = _all_corners(board, *cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags))
+    if corners is None or small is grey:
+        return corners
+    scale = np.array(grey.shape[::-1]) / small.shape[::-1]
+    return _refined(grey, (corners + 0.5) * scale - 0.5, board)
 
 
 def _all_corners(board: Board, detected: bool, corners: np.ndarray | None) -> np.ndarray | None:
@@ -245,37 +246,29 @@ def _all_corners(board: Board, detected: bool, corners: np.ndarray | None) -> np
 
 def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
     """Corners (n, 2) by cornerSubPix, with a window that depends on their distances."""
-    grid = corners.reshape(board.rows, board.columns, 2)
-    nearest = min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
+    corners = corners.astype(np.float32)
+    nearest = min_distance(corners.reshape(board.rows, board.columns, 2))
     half = int(np.clip(round(REFINING_SHARE * nearest), REFINING_HALF_MIN, REFINING_HALF_MAX))
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     # cornerSubPix returns a corner unchanged, wrong by pixels, where its search leaves the window (boards at a steep
     # angle). The window is then widened, up to the neighbours, whose distance is itself known to pixels only.
     for size in range(half, max(half + 1, int(WIDEST_SHARE * nearest)) + 1):
-        refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (size, size), (-1, -1), criteria)
-        refined = np.asarray(refined).reshape(-1, 2)
-        if (refined != corners).any(axis=1).all():
+        found = refined_corners(grey, corners, size)
+        if (found != corners).any(axis=1).all():
             break
-    return refined.astype(float)
+    return found.astype(float)
 
 
-def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    small = shrunk(grey)
-    corners = _all_corners(board, *cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags))
-    if corners is None or small is grey:
-        return corners
-    scale = np.array(grey.shape[::-1]) / small.shape[::-1]
-    return _refined(grey, ((corners + 0.5) * scale - 0.5).astype(np.float32), board)
+def quarter_turns(board: Board) -> tuple[int, ...]:
+    """Turns of the board in its plane, in quarters, after which it may look the same."""
+    if board.markers is not None:
+        return (0,)
+    return (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
 
 
 def corner_orders(board: Board) -> list[np.ndarray]:
-    """Possible orders of corners: unchanged, half turns, for square boards quarter turns."""
+    """Possible orders of corners, by `quarter_turns`."""
     index = np.arange(board.corners).reshape(board.rows, board.columns)
-    if board.markers is not None:
-        return [index.ravel()]
-    quarters = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
-    return [np.rot90(index, quarter).ravel() for quarter in quarters]
+    return [np.rot90(index, quarter).ravel() for quarter in quarter_turns(board)]
 
 
 def _first_is_bright(grey: np.ndarray, corners: np.ndarray, board: Board) -> bool:
@@ -283,7 +276,7 @@ def _first_is_bright(grey: np.ndarray, corners: np.ndarray, board: Board) -> boo
     grid = corners.reshape(board.rows, board.columns, 2)
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     u, v = np.clip(np.rint(middles).astype(int), 0, np.array(grey.shape[::-1]) - 1).transpose(2, 0, 1)
-    signs = 1 - 2 * (np.add.outer(np.arange(board.rows - 1), np.arange(board.columns - 1)) % 2)
+    signs = 1 - 2 * (np.indices(u.shape).sum(axis=0) % 2)
     values = grey[v, u].astype(float)
     return bool(np.sum(signs * (values - values.mean())) > 0)
 
@@ -293,8 +286,8 @@ class _Detected:
     """Corners of one picture; `colours[k]` states whether the first square is bright in the k-th of `corner_orders`."""
 
     corners: np.ndarray
-    colours: tuple[bool, ...]
     by_fallback: bool
+    colours: tuple[bool, ...]
 
 
 def _turn_of_right(left: _Detected, right: _Detected, board: Board) -> int:
@@ -303,12 +296,15 @@ def _turn_of_right(left: _Detected, right: _Detected, board: Board) -> int:
     The colours decide where a turned board looks different (one of columns and rows odd, one even). Otherwise the
     relative rotation of the cameras is assumed to be less than half of the board's symmetry angle.
     """
-    grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in corner_orders(board)]
-    candidates = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
-    grid = left.corners.reshape(board.rows, board.columns, 2)
-    along = (grid[:, -1] - grid[:, 0]).mean(0)
-    rows_px = [(candidate[:, -1] - candidate[:, 0]).mean(0) for candidate in grids]
-    return max(candidates, key=lambda k: float(along @ rows_px[k]) / max(float(np.linalg.norm(rows_px[k])), 1e-12))
+
+    def along(corners: np.ndarray) -> np.ndarray:
+        grid = corners.reshape(board.rows, board.columns, 2)
+        row = (grid[:, -1] - grid[:, 0]).mean(0)
+        return row / max(float(np.linalg.norm(row)), 1e-12)
+
+    rows = [along(right.corners[order]) for order in corner_orders(board)]
+    alike = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]]
+    return max(alike or range(len(rows)), key=lambda k: float(along(left.corners) @ rows[k]))
 
 
 def find_views(
@@ -342,59 +338,51 @@ def find_views(
     if board.markers is not None:
         greys = [part for picture in sample for part in _greys(picture, pictures).values()]
         board = replace(board, markers=fitted_markers(greys, board.markers))
-    if len(used) > len(sample) and not _any_board(sample, pictures, board, finder):
+    # A search of all pictures would take minutes.
+    batches = (sample[k : k + SAMPLE_BATCH] for k in range(0, len(sample), SAMPLE_BATCH))
+    if len(used) > len(sample) and not any(
+        detection for batch in batches for found in _detections(batch, pictures, board, finder) for detection in found
+    ):
         raise _no_board_error(sample, pictures, board)
-    boards: dict[str, dict[str, _Detected]] = {}
+    shown: dict[tuple[str, str], _Detected] = {}
     names: dict[tuple[str, str], str] = {}
-    boardless, fallback = [], []
-    for count, (picture, detections) in enumerate(
+    without_board, by_fallback = [], []
+    for count, (picture, found) in enumerate(
         zip(used, _detections(used, pictures, board, finder), strict=True), start=1
     ):
         advance(count / len(used))
-        for side, detection in detections.items():
+        for side, detection in zip(picture.sides, found, strict=True):
             name = picture.path.relative_to(pictures.folder).as_posix()
             name += f" ({side})" if len(picture.sides) > 1 else ""
             names[picture.view, side] = name
             if detection is None:
-                boardless.append(name)
-                continue
-            boards.setdefault(picture.view, {})[side] = detection
-            if detection.by_fallback:
-                fallback.append(name)
-    if not boards:
+                without_board.append(name)
+            else:
+                shown[picture.view, side] = detection
+                by_fallback += [name] * detection.by_fallback
+    if not shown:
         raise _no_board_error(sample, pictures, board)
     views, reordered = [], []
-    for name in sorted(boards, key=natural_order):
-        left, right = (boards[name].get(side) for side in CAMERAS)
-        corners = None if right is None else right.corners
-        if left is not None and right is not None:
-            turn = _turn_of_right(left, right, board)
-            corners = right.corners[corner_orders(board)[turn]]
-            reordered += [name] * (turn != 0)
-        corners = None if corners is None else scaled_px(corners, usual["right"], usual["left"])
-        views.append(View(name, None if left is None else left.corners, corners))
-    unpaired = [n for (view, side), n in names.items() if (view, CAMERAS[side == "left"]) not in names]
+    for name in sorted({view for view, _ in shown}, key=natural_order):
+        left, right = (shown.get((name, side)) for side in CAMERAS)
+        turn = 0 if left is None or right is None else _turn_of_right(left, right, board)
+        reordered += [name] * (turn != 0)
+        right_px = None if right is None else right.corners[corner_orders(board)[turn]]
+        right_px = None if right_px is None else scaled_px(right_px, usual["right"], usual["left"])
+        views.append(View(name, None if left is None else left.corners, right_px))
+    unpaired = [name for (view, side), name in names.items() if (view, CAMERAS[side == "left"]) not in names]
     return Views(
         views=tuple(views),
         image_width=usual["left"][0],
         image_height=usual["left"][1],
         unpaired=tuple(sorted(unpaired, key=natural_order)),
         unnamed=pictures.unnamed,
-        without_board=tuple(boardless),
+        without_board=tuple(without_board),
         other_size=tuple(path.as_posix() for path in pictures.other_size),
         right_image_size=None if usual["right"] == usual["left"] else usual["right"],
-        by_fallback=tuple(fallback),
+        by_fallback=tuple(by_fallback),
         reordered=tuple(reordered),
     )
-
-
-def _any_board(sample: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder) -> bool:
-    """Whether a picture of the sample shows the board; a search of all pictures would take minutes."""
-    for k in range(0, len(sample), SAMPLE_BATCH):
-        batch = _detections(sample[k : k + SAMPLE_BATCH], pictures, board, finder)
-        if any(detection is not None for detections in batch for detection in detections.values()):
-            return True
-    return False
 
 
 def _no_board_error(sample: Sequence[Picture], pictures: PictureFolder, board: Board) -> NothingToEstimate:
@@ -463,36 +451,35 @@ def _check_sizes(pictures: PictureFolder) -> None:
 
 def _detections(
     sample: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder
-) -> Iterator[dict[str, _Detected | None]]:
-    """The board in each picture, by camera."""
+) -> Iterator[list[_Detected | None]]:
+    """The board in each picture, by its cameras."""
 
-    def detect(picture: Picture) -> dict[str, _Detected | None] | InputError:
+    def detected(grey: np.ndarray) -> _Detected | None:
+        found = find_corners(grey, board, finder)
+        if found is None:
+            return None
+        if board.markers is not None:
+            return _Detected(*found, (True,))
+        return _Detected(
+            *found, tuple(_first_is_bright(grey, found[0][order], board) for order in corner_orders(board))
+        )
+
+    def detect(picture: Picture) -> list[_Detected | None] | InputError:
         try:
-            return {side: _detection(part, board, finder) for side, part in _greys(picture, pictures).items()}
+            return [detected(grey) for grey in _greys(picture, pictures).values()]
         except InputError as error:
             return error
 
     parallel = PIXELS_MAX // max(len(p.sides) * math.prod(pictures.sizes[p]) for p in sample)
     with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, parallel))) as pool:
         refused = []
-        for detections in pool.map(detect, sample):
-            if isinstance(detections, InputError):
-                refused.append(detections)
+        for found in pool.map(detect, sample):
+            if isinstance(found, InputError):
+                refused.append(found)
             else:
-                yield detections
+                yield found
     if refused:
         raise all_of(refused)
-
-
-def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detected | None:
-    result = find_corners(grey, board, finder)
-    if result is None:
-        return None
-    corners, by_fallback = result
-    if board.markers is not None:
-        return _Detected(corners, (True,), by_fallback)
-    colours = tuple(_first_is_bright(grey, corners[turn], board) for turn in corner_orders(board))
-    return _Detected(corners, colours, by_fallback)
 
 
 def shrunk(grey: np.ndarray) -> np.ndarray:
@@ -518,36 +505,37 @@ def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> Rea
         columns: inner corners of the board along one side.
         rows: inner corners along the other side.
     """
-    stated = (max(columns, rows), min(columns, rows))
+    long, short = max(columns, rows), min(columns, rows)
     boards = Counter(size for grey in pictures if (size := inner_corners(grey)) is not None)
     if boards:
-        (long, short), count = boards.most_common(1)[0]
-        listed = ", ".join(f"{a}x{b}" for a, b in boards)
-        if (
-            len(boards) > 1
-            and 2 * count <= boards.total()
-            and all(a <= stated[0] and b <= stated[1] for a, b in boards)
-        ):
+        (columns, rows), count = boards.most_common(1)[0]
+        inside = all(a <= long and b <= short for a, b in boards)
+        if len(boards) > 1 and 2 * count <= boards.total() and inside:
+            listed = ", ".join(f"{a}x{b}" for a, b in boards)
             return Reason(
-                f"parts of a board are seen, {listed} inner corners of {stated[0]}x{stated[1]}: partly outside?",
+                f"parts of a board are seen, {listed} inner corners of {long}x{short}: partly outside?",
                 "hold the whole board into both pictures; or is it smaller: count where four squares meet",
             )
-        remedy = f"--board {long}x{short}? count where four squares meet, not the squares"
-        return Reason(f"{long}x{short} inner corners are seen in {count} of {len(pictures)} pictures", remedy)
-    levels = [float(grey.mean()) for grey in pictures]
-    if float(np.median(levels)) < DARK_DN:
-        remedy = "more light, or a longer exposure"
-        return Reason(f"the pictures are dark, mean grey level {np.median(levels):.0f} of 255", remedy)
-    clipped = [float((grey >= 254).mean()) for grey in pictures]
-    if float(np.median(levels)) > BRIGHT_DN or float(np.median(clipped)) > CLIPPED_SHARE:
-        remedy = "less light, or a shorter exposure"
-        return Reason(f"the pictures are overexposed, {100 * np.median(clipped):.0f} % of the pixels are white", remedy)
-    if float(np.median([_sharpness(grey) for grey in pictures])) < BLURRED_SHARE:
-        return Reason("the pictures are blurred: no edge is in focus", "focus, and hold the board still")
-    remedy = (
-        "check --board (inner corners, one less than squares), sharpness and light; a ruled or printed white margin "
+        return Reason(
+            f"{columns}x{rows} inner corners are seen in {count} of {len(pictures)} pictures",
+            f"--board {columns}x{rows}? count where four squares meet, not the squares",
+        )
+    level, white, sharpness = (
+        float(np.median([measure(grey) for grey in pictures]))
+        for measure in (np.mean, lambda grey: (grey >= 254).mean(), _sharpness)
     )
-    return Reason("no checkerboard of any size is seen", remedy + "around the board helps")
+    if level < DARK_DN:
+        return Reason(f"the pictures are dark, mean grey level {level:.0f} of 255", "more light, or a longer exposure")
+    if level > BRIGHT_DN or white > CLIPPED_SHARE:
+        found = f"the pictures are overexposed, {100 * white:.0f} % of the pixels are white"
+        return Reason(found, "less light, or a shorter exposure")
+    if sharpness < BLURRED_SHARE:
+        return Reason("the pictures are blurred: no edge is in focus", "focus, and hold the board still")
+    return Reason(
+        "no checkerboard of any size is seen",
+        "check --board (inner corners, one less than squares), sharpness and light; a ruled or printed white margin "
+        "around the board helps",
+    )
 
 
 def _sharpness(grey: np.ndarray) -> float:

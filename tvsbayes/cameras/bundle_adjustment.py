@@ -26,7 +26,7 @@ from tvsbayes.cameras.boards import Board, View
 from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.model.compiled import compiled, placed
-from tvsbayes.model.descent import descend
+from tvsbayes.model.descent import Linear, descend
 from tvsbayes.model.geometry import CV_FROM_S, StereoCameras, project, rotation_matrix
 from tvsbayes.statistics.least_squares import LinearResidual, least_squares_covariance, linear_residual
 
@@ -139,17 +139,10 @@ def reduced_residuals(z: Float[Array, "24"], arrays: BoardArrays) -> Float[Array
     return (residuals - jnp.einsum("vrp,vps,vs->vr", by_pose, gain, residuals)).ravel()
 
 
-class _Linear(eqx.Module):
-    """`reduced_residuals` and their Jacobian at a point."""
-
-    residuals: Float[Array, " residuals"]
-    jacobian: Float[Array, "residuals 24"]
-
-
-@compiled(_Linear)
-def _linearised(z: Float[Array, "24"], arrays: BoardArrays) -> _Linear:
+@compiled(Linear)
+def _linearised(z: Float[Array, "24"], arrays: BoardArrays) -> Linear:
     linear = linear_residual(reduced_residuals, z, arrays)
-    return _Linear(jnp.asarray(linear.value), jnp.asarray(linear.jacobian))
+    return Linear(z, jnp.asarray(linear.value), jnp.asarray(linear.jacobian))
 
 
 @dataclass(frozen=True)
@@ -174,36 +167,6 @@ class Adjustment:
     dof: int
     jacobian: np.ndarray
     root: np.ndarray
-
-
-def correlation_factor(
-    jacobian: np.ndarray, residuals: np.ndarray, views: np.ndarray, noise_sd: float, explained: float = 0.0
-) -> float:
-    """Ratio of the scores of whole views to those expected for independent corners; at least 1.
-
-    Corner errors of one picture have common causes (light, defocus, a lens that deviates from the model, a bent board):
-    they are not independent, and (J^T J)^-1 s^2 is then too small. The score of view i, J_i^T r_i, shows this. In
-    coordinates where J^T J = 1, independent errors give the sum of |J_i^T r_i|^2 the expectation
-    s^2 (p - sum_i tr (J_i^T J_i)^2), where the second term is due to the fit. The ratio scales the covariance: the
-    cluster-robust variance of Liang and Zeger (1986) reduced to one number, since a dozen views cannot determine a
-    24 x 24 matrix. Errors common to ALL views are not detected: see `board_errors`.
-
-    Args:
-        jacobian: (residuals, p), of full rank.
-        residuals: (residuals,).
-        views: (residuals,), number of the view of each, from 0.
-        noise_sd: s, the standard deviation of one coordinate.
-        explained: expectation of the scores' squares due to other known causes.
-    """
-    q, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
-    count = int(views.max()) + 1
-    score, lost = 0.0, 0.0
-    for view in range(count):
-        rows = q[views == view]
-        score += float(np.sum((rows.T @ residuals[views == view]) ** 2))
-        lost += float(np.sum((rows.T @ rows) ** 2))
-    expected = noise_sd**2 * (q.shape[1] - lost)
-    return max(1.0, (score - explained) / expected) if expected > 1e-3 * noise_sd**2 else 1.0
 
 
 def bundle_adjustment(
@@ -235,10 +198,11 @@ def bundle_adjustment(
     root = np.zeros((24, 24))
     root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
     arrays = replace(arrays, root=placed(root))
-    *_, end, again = _descents(_descended(zero, arrays), arrays, free, dof)
-    noise_sd = end.noise_sd(dof)
-    jacobian, residuals = end.jacobian[kept][:, free], end.residuals[kept]
-    _check_minimum(jacobian, residuals, (again.z - end.z)[free], noise_sd)
+    end, again = _ends(_descended(zero, arrays), arrays, free, dof)
+    noise_sd = _noise_sd(end, dof)
+    all_slopes = np.where(kept[:, None], end.jacobian, 0.0)[:, free]
+    jacobian, residuals = all_slopes[kept], np.asarray(end.value)[kept]
+    _check_minimum(jacobian, residuals, np.asarray(again.point - end.point)[free], noise_sd)
     try:
         z_covariance = least_squares_covariance(jacobian)
     except np.linalg.LinAlgError as error:
@@ -246,12 +210,12 @@ def bundle_adjustment(
     residuals_px = np.full(visible.shape, np.nan)
     residuals_px[visible] = residuals
     return Adjustment(
-        vector=start + root @ end.z,
+        vector=start + root @ end.point,
         covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
         residuals_px=residuals_px[: len(views), :, : board.corners],
         noise_sd_px=noise_sd,
         dof=dof,
-        jacobian=(end.jacobian[:, free] * kept[:, None]).reshape(*visible.shape, -1)[: len(views), :, : board.corners],
+        jacobian=all_slopes.reshape(*visible.shape, -1)[: len(views), :, : board.corners],
         root=root[:, free],
     )
 
@@ -296,46 +260,38 @@ def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, difference: np.n
         )
 
 
-@dataclass(frozen=True)
-class _End:
-    """The end point of a descent: coordinates z (24,), residuals and Jacobian."""
-
-    z: np.ndarray
-    residuals: np.ndarray
-    jacobian: np.ndarray
-
-    def noise_sd(self, dof: int) -> float:
-        """Standard deviation of one residual, px."""
-        return math.sqrt(float(self.residuals @ self.residuals) / dof)
-
-
-def _descents(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> list[_End]:
-    """A first end point, and those of repetitions from starts near the end before, up to one that is not lower."""
-    ends = [end, _repeated(end, arrays, free, dof)]
-    for _ in range(RESTARTS_MAX):
-        if not ends[-1].noise_sd(dof) < (1 - LOWER_SHARE) * ends[-2].noise_sd(dof):
-            break
-        # The last end but one is always repeated: compared with itself it would seem confirmed.
-        ends.append(_repeated(ends[-1], arrays, free, dof))
-    return ends
-
-
-def _repeated(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> _End:
-    """The end of a descent from a start near another end."""
+def _ends(end: Linear, arrays: BoardArrays, free: np.ndarray, dof: int) -> tuple[Linear, Linear]:
+    """The lowest end of repeated descents, and the end of a repetition from a start near it."""
     # Alternating signs, so that the shift of one parameter does not cancel that of another.
-    shift = RESTART_SD * end.noise_sd(dof) * np.where(np.arange(24) % 2, -1.0, 1.0) * free
-    return _descended(end.z + shift, arrays)
+    direction = RESTART_SD * np.where(np.arange(24) % 2, -1.0, 1.0) * free
+
+    def repeated(end: Linear) -> Linear:
+        return _descended(end.point + _noise_sd(end, dof) * direction, arrays)
+
+    again = repeated(end)
+    for _ in range(RESTARTS_MAX):
+        if not _noise_sd(again, dof) < (1 - LOWER_SHARE) * _noise_sd(end, dof):
+            break
+        # A lower end is repeated too: compared with itself it would seem confirmed.
+        end, again = again, repeated(again)
+    return end, again
 
 
-def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
+def _noise_sd(end: Linear, dof: int) -> float:
+    """Standard deviation of one residual, px."""
+    return math.sqrt(float(end.value @ end.value) / dof)
+
+
+def _descended(z: np.ndarray, arrays: BoardArrays) -> Linear:
     """The end of Levenberg-Marquardt steps."""
 
     def linearised(at: np.ndarray) -> LinearResidual:
         linear = _linearised(at, arrays)
-        residuals, jacobian = np.asarray(linear.residuals), np.asarray(linear.jacobian)
-        return LinearResidual(residuals, jacobian, _End(at, residuals, jacobian))
+        residuals, jacobian = np.asarray(linear.value), np.asarray(linear.jacobian)
+        return LinearResidual(residuals, jacobian, Linear(at, residuals, jacobian))
 
-    return descend(linearised, z, TOLERANCE, STEPS_MAX).also
+    end: Linear = descend(linearised, z, TOLERANCE, STEPS_MAX).also
+    return end
 
 
 def undetermined(reason: str) -> NothingToEstimate:

@@ -288,8 +288,8 @@ def detect(
     for side, own in zip(CAMERAS, found, strict=True):
         if method == "fit":
             detector.noise[side] = _final_noise(detector.noise[side], own, speckle_contrast)
-        own, lines[side] = widened([centre.under(detector.noise[side]) for centre in own])
-        centres.append([centre.scaled(sizes[side], sizes["left"]) for centre in own])
+        wide, lines[side] = widened([centre.under(detector.noise[side]) for centre in own])
+        centres.append([centre.scaled(sizes[side], sizes["left"]) for centre in wide])
     pairs = dict(zip(present, zip(*centres, strict=True), strict=True))
     for row, pair in pairs.items():
         spots[row] = _row(spots[row], pair)
@@ -365,7 +365,8 @@ class _Detector:
     def centres(self, looks: Sequence[Spot], progress: Show | None) -> list[tuple[Centre, ...]]:
         """Centres of the left camera, and of the right one."""
         deep_looks = len(looks) if self.frames.largest(looks[0]) else 0
-        pilots = [] if self.rectified else np.unique(np.linspace(0, len(looks) - 1, PILOT_LOOKS_MAX).astype(int))
+        count = 0 if self.rectified else PILOT_LOOKS_MAX
+        pilots = np.unique(np.linspace(0, len(looks) - 1, count).astype(int))
         with Job({LEVELLING: deep_looks, LEARNING: len(pilots), DETECTING: len(looks)}, progress) as job:
             job.begin(LEVELLING)
             largest = 0

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -65,51 +64,47 @@ class Markers:
 
     def board(self, squares: tuple[int, int] | None = None) -> cv2.aruco.CharucoBoard:
         """OpenCV's board, in units of a square."""
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
-        board = cv2.aruco.CharucoBoard(squares or self.squares, 1.0, self.share or SHARE_DEFAULT, dictionary)
+        share, dictionary = self.share or SHARE_DEFAULT, _dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(squares or self.squares, 1.0, share, dictionary)
         board.setLegacyPattern(self.legacy)
         return board
 
 
-@dataclass(frozen=True)
-class _Detected:
+def _markers(grey: np.ndarray, dictionary: str) -> tuple[np.ndarray, np.ndarray]:
     """Markers of a picture: corners (n, 4, 2) px and numbers (n,)."""
-
-    corners_px: np.ndarray
-    numbers: np.ndarray
-
-
-def _markers(grey: np.ndarray, dictionary: str) -> _Detected:
-    dictionary_of_markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
-    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of_markers).detectMarkers(grey)
-    if numbers is None or not len(numbers):
-        return _Detected(np.zeros((0, 4, 2)), np.zeros(0, int))
-    return _Detected(np.array(corners, float).reshape(-1, 4, 2), np.ravel(numbers))
+    corners, numbers, _ = cv2.aruco.ArucoDetector(_dictionary(dictionary)).detectMarkers(grey)
+    return np.reshape(np.array(corners, float), (-1, 4, 2)), np.zeros(0, int) if numbers is None else np.ravel(numbers)
 
 
-class _PlaneFit(NamedTuple):
-    """Rms deviation of markers' centres from those of a board, and the markers' side, in squares."""
-
-    rms: float
-    side: float
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
 
 
-def _plane_fit(detected: _Detected, board: cv2.aruco.CharucoBoard) -> _PlaneFit | None:
-    """The fit of the markers of a picture to those of a board; None for too few."""
+def _plane_fits(
+    detected: Sequence[tuple[np.ndarray, np.ndarray]], board: cv2.aruco.CharucoBoard
+) -> tuple[float, float] | None:
+    """Rms deviation of markers' centres from those of a board, and the markers' side, in squares: medians of pictures.
+
+    None where no picture has enough markers.
+    """
     places = np.array([np.asarray(four, float)[:, :2] for four in board.getObjPoints()])
-    on_board = detected.numbers < len(places)
-    if on_board.sum() < MARKERS_MIN:
-        return None
-    centres, corners = places[detected.numbers[on_board]].mean(axis=1), detected.corners_px[on_board]
-    # The map from pixels to squares uses the centres alone.
-    plane, _ = cv2.findHomography(corners.mean(axis=1), centres)
-    if plane is None or not np.isfinite(plane).all():
-        return None
-    parts = (cv2.perspectiveTransform(part.reshape(-1, 1, 2), plane) for part in (corners.mean(axis=1), corners))
-    back, flat = (np.reshape(part_squares, (-1, 2)) for part_squares in parts)
-    rms = float(np.sqrt(np.mean(np.sum((back - centres) ** 2, axis=1))))
-    sides = np.linalg.norm(flat.reshape(-1, 4, 2) - np.roll(flat.reshape(-1, 4, 2), 1, axis=1), axis=2)
-    return _PlaneFit(rms, float(np.median(sides)))
+    fits = []
+    for corners, numbers in detected:
+        on_board = numbers < len(places)
+        if on_board.sum() < MARKERS_MIN:
+            continue
+        corners, centres = corners[on_board], places[numbers[on_board]].mean(axis=1)
+        # The map from pixels to squares uses the centres alone.
+        plane, _ = cv2.findHomography(corners.mean(axis=1), centres)
+        if plane is None or not np.isfinite(plane).all():
+            continue
+        back, flat = (
+            np.reshape(cv2.perspectiveTransform(part.reshape(-1, 1, 2), plane), part.shape)
+            for part in (corners.mean(axis=1), corners)
+        )
+        sides = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)
+        fits.append((np.sqrt(np.mean(np.sum((back - centres) ** 2, axis=1))), np.median(sides)))
+    return tuple(np.median(fits, axis=0).tolist()) if fits else None
 
 
 def fitted_markers(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
@@ -123,37 +118,34 @@ def fitted_markers(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
         NothingToEstimate: the markers are arranged otherwise than on that board, or are of another dictionary.
     """
     detected = [_markers(grey, markers.dictionary) for grey in pictures]
-    fits = {}
-    for legacy in (markers.legacy, not markers.legacy):
-        board = replace(markers, legacy=legacy).board()
-        fits[legacy] = [fit for markers_seen in detected if (fit := _plane_fit(markers_seen, board)) is not None]
-    best = min(fits, key=lambda legacy: np.median([fit.rms for fit in fits[legacy]] or [np.inf]))
-    if not fits[best]:
+    candidates = [replace(markers, legacy=legacy) for legacy in (markers.legacy, not markers.legacy)]
+    fits = [(fit, own) for own in candidates if (fit := _plane_fits(detected, own.board())) is not None]
+    if not fits:
         _refuse_other_markers(spread(pictures), markers)
         return replace(markers, share=markers.share or SHARE_DEFAULT)
-    if np.median([fit.rms for fit in fits[best]]) > MISFIT_SQUARES:
+    (misfit, side), best = min(fits, key=lambda fit: fit[0][0])
+    if misfit > MISFIT_SQUARES:
         raise _other_board(detected, markers)
-    share = markers.share or float(np.clip(np.median([fit.side for fit in fits[best]]), 0.2, 0.98))
-    return replace(markers, legacy=best, share=share)
+    return replace(best, share=markers.share or float(np.clip(side, 0.2, 0.98)))
 
 
-def _other_board(detected: Sequence[_Detected], markers: Markers) -> NothingToEstimate:
+def _other_board(detected: Sequence[tuple[np.ndarray, np.ndarray]], markers: Markers) -> NothingToEstimate:
     """The refusal of a board with another arrangement of markers, with the number of squares that matches."""
-    stated = f"{markers.squares[0]}x{markers.squares[1]}"
+    count = 1 + max(int(numbers.max(initial=0)) for _, numbers in detected)
     misfits: dict[int, float] = {}
     for columns in range(3, SQUARES_MAX + 1):
-        rows = -(-2 * (1 + max(int(markers_seen.numbers.max(initial=0)) for markers_seen in detected)) // columns)
+        rows = -(-2 * count // columns)
         for legacy in (False, True):
             board = replace(markers, legacy=legacy).board((columns, max(3, rows + rows % 2)))
-            fits = [fit.rms for markers_seen in detected if (fit := _plane_fit(markers_seen, board)) is not None]
-            misfits[columns] = min(misfits.get(columns, np.inf), float(np.median(fits)) if fits else np.inf)
+            misfit, _ = _plane_fits(detected, board) or (np.inf, 0.0)
+            misfits[columns] = min(misfits.get(columns, np.inf), misfit)
     best = min(misfits, key=lambda columns: misfits[columns])
     remedy = "count squares, columns x rows, with the first marker at the upper left"
     if misfits[best] <= MISFIT_SQUARES:
         remedy = f"markers stand as on a board of {best} squares across: --charuco {best}xROWS; {remedy}"
     return NothingToEstimate(
         "no-board",
-        f"the markers do not stand as on a board of {stated} squares",
+        f"the markers do not stand as on a board of {markers.squares[0]}x{markers.squares[1]} squares",
         allowed="the board in the pictures",
         remedy=remedy,
     )
@@ -169,7 +161,7 @@ def marker_counts(pictures: Sequence[np.ndarray]) -> Counter[str]:
     """Numbers of markers in the pictures by dictionary, up to the first dictionary with enough in all."""
     counted: Counter[str] = Counter()
     for name in WIDEST_DICTIONARIES:
-        counted[name] = sum(len(_markers(grey, name).numbers) for grey in pictures)
+        counted[name] = sum(len(_markers(grey, name)[1]) for grey in pictures)
         if counted[name] >= MARKERS_MIN * len(pictures):
             break
     return counted
@@ -180,7 +172,7 @@ def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> N
 
     False detections are common for dictionaries with few bits.
     """
-    matching = sum(len(_markers(grey, markers.dictionary).numbers) for grey in pictures)
+    matching = sum(len(_markers(grey, markers.dictionary)[1]) for grey in pictures)
     name, count = marker_counts(pictures).most_common(1)[0]
     if matching >= max(1, count):
         return
@@ -205,17 +197,26 @@ def marker_board_corners(grey: np.ndarray, markers: Markers) -> np.ndarray | Non
         return None
     corners = np.full((rows * columns, 2), np.nan)
     corners[np.ravel(numbers)] = np.asarray(detected, float).reshape(-1, 2)
-    grid = corners.reshape(rows, columns, 2)
-    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
-    if not any(np.isfinite(step).any() for step in steps):
+    nearest = min_distance(corners.reshape(rows, columns, 2))
+    if not np.isfinite(nearest):
         return None
-    nearest = min(float(np.nanmin(step)) for step in steps if np.isfinite(step).any())
     gap = nearest * (1 - (markers.share or SHARE_DEFAULT)) / 2
-    half = int(np.clip(round(GAP_SHARE * gap), 2, 11))
     seen = np.isfinite(corners[:, 0])
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    start = corners[seen].astype(np.float32).reshape(-1, 1, 2)
-    corners[seen] = np.reshape(cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), criteria), (-1, 2))
+    half = int(np.clip(round(GAP_SHARE * gap), 2, 11))
+    corners[seen] = refined_corners(grey, corners[seen].astype(np.float32), half)
     seen_rows, seen_columns = np.nonzero(np.isfinite(corners[:, 0]).reshape(rows, columns))
     enough = len(seen_rows) >= CORNERS_MIN and min(len(set(seen_rows)), len(set(seen_columns))) >= LINES_MIN
     return corners if enough else None
+
+
+def min_distance(grid: np.ndarray) -> float:
+    """Smallest distance of neighbours in a grid of corners (rows, columns, 2); infinite where none are known."""
+    steps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=2).ravel() for axis in (0, 1)])
+    return float(steps[np.isfinite(steps)].min(initial=np.inf))
+
+
+def refined_corners(grey: np.ndarray, corners: np.ndarray, half: int) -> np.ndarray:
+    """Corners (n, 2) of float32 by cornerSubPix in a window of 2 half + 1 pixels."""
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    found = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
+    return np.asarray(found).reshape(-1, 2)

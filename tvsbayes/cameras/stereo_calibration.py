@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -126,44 +126,35 @@ class StereoCalibration:
 
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes stereo --json`, without the paths of written files."""
-        total = np.sqrt(np.diag(self.stereo.parameter_covariance))
-        parts = {
-            "sd": total,
-            "sd_independent_corners": np.sqrt(np.diag(self.covariance_independent)),
-            "sd_board": np.sqrt(np.diag(self.covariance_board)),
-            "sd_pitch": np.sqrt(np.diag(self.covariance_pitch)),
+        covariances = {
+            "sd": self.stereo.parameter_covariance,
+            "sd_independent_corners": self.covariance_independent,
+            "sd_board": self.covariance_board,
+            "sd_pitch": self.covariance_pitch,
         }
-        vector = self.stereo.vector
+        sds = {key: np.sqrt(np.diag(covariance)).tolist() for key, covariance in covariances.items()}
+        values = zip(STEREO_PARAMETER_NAMES, self.stereo.vector.tolist(), strict=True)
         lists = ("unpaired", "without_board", "other_size", "by_fallback")
         return {
             "image_width": self.stereo.image_width,
             "image_height": self.stereo.image_height,
-            "board": {
-                "columns": self.board.columns,
-                "rows": self.board.rows,
-                "pitch_mm": self.board.pitch_mm,
-                "pitch_u_mm": self.board.pitch_u_mm,
-            },
+            "board": {key: getattr(self.board, key) for key in ("columns", "rows", "pitch_mm", "pitch_u_mm")},
             "pairs": self.pairs,
             "single_views": len(self.views) - self.pairs,
             "rms_px": self.stereo.rms_px,
-            "left_rms_px": self.left_rms_px,
-            "right_rms_px": self.right_rms_px,
-            "alone_rms_px": self.alone_rms_px,
+            **{key: getattr(self, key) for key in ("left_rms_px", "right_rms_px", "alone_rms_px")},
             "noise": {"sd_px": self.noise_sd_px, "dof": self.dof, "correlation_factor": self.correlation_factor},
             "parameters": {
-                name: {"value": float(vector[k]), **{key: float(sds[k]) for key, sds in parts.items()}}
-                for k, name in enumerate(STEREO_PARAMETER_NAMES)
+                name: {"value": value, **{key: own[k] for key, own in sds.items()}}
+                for k, (name, value) in enumerate(values)
             },
             "board_error_mm": self.board_error_mm,
             "baseline_mm": {"value": float(np.linalg.norm(self.stereo.T)), "sd": self.baseline_sd_mm},
             "triangulated_pitch_mm": {"mean": self.triangulated_pitch_mm.value, "sd": self.triangulated_pitch_mm.sd},
             "coverage": self.coverage,
             "views": [vars(view) for view in self.views],
-            "outliers": list(self.outliers),
-            "excluded": list(self.excluded),
-            "reordered": list(self.reordered),
-            **{key: list(getattr(self.pictures, key)) if self.pictures is not None else [] for key in lists},
+            **{key: list(getattr(self, key)) for key in ("outliers", "excluded", "reordered")},
+            **{key: [] if self.pictures is None else list(getattr(self.pictures, key)) for key in lists},
             "warnings": list(self.warnings),
             "assumed": self.stereo.assumed,
             "seconds": self.seconds,
@@ -201,22 +192,24 @@ def calibrate_stereo(
         NotConverged: no minimum was found.
     """
     start_s = time.perf_counter()
-    adjusted = _adjust_views(views, board, size, fix_k3, robust)
-    adjustment = adjusted.adjustment
+    start, adjustment, outliers, excluded = _adjust_views(views, board, size, fix_k3, robust)
     pitch = np.zeros((24, 24))
     # Pixels determine only angles: all lengths, including T, are proportional to the pitch.
     shift = adjustment.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
     pitch[21:, 21:] = np.outer(shift, shift)
     stereo = Stereo.of_vector(adjustment.vector, size, _rms(adjustment.residuals_px))
-    errors = board_errors(adjustment, adjusted.views, board, stereo)
+    errors = board_errors(adjustment, start.views, board, stereo)
     covariance = errors.correlation_factor * adjustment.covariance + errors.covariance + pitch
-    right_size = None if pictures is None else pictures.right_image_size
-    stereo = replace(stereo, parameter_covariance=0.5 * (covariance + covariance.T), right_image_size=right_size)
-    poses = [pose_of(view, board, stereo) for view in adjusted.views]
+    stereo = replace(
+        stereo,
+        parameter_covariance=0.5 * (covariance + covariance.T),
+        right_image_size=None if pictures is None else pictures.right_image_size,
+    )
+    poses = [pose_of(view, board, stereo) for view in start.views]
     result = StereoCalibration(
         stereo=stereo,
         board=board,
-        views=tuple(_view_reports(adjusted, poses)),
+        views=tuple(map(_view_report, start.views, adjustment.residuals_px, poses, outliers)),
         left_rms_px=_rms(adjustment.residuals_px[:, :2]),
         right_rms_px=_rms(adjustment.residuals_px[:, 2:]),
         noise_sd_px=adjustment.noise_sd_px,
@@ -226,54 +219,34 @@ def calibrate_stereo(
         board_error_mm=errors.sd_mm,
         covariance_board=errors.covariance,
         covariance_pitch=pitch,
-        coverage={side: _coverage([getattr(v, side) for v in adjusted.views], size) for side in CAMERAS},
-        triangulated_pitch_mm=_triangulated_pitch(adjusted.views, board, stereo),
+        coverage={side: _coverage([getattr(view, side) for view in start.views], size) for side in CAMERAS},
+        triangulated_pitch_mm=_triangulated_pitch(start.views, board, stereo),
         pictures=pictures,
-        excluded=adjusted.excluded,
-        reordered=_reordered(pictures, adjusted.turned),
-        alone_rms_px=adjusted.alone_rms_px,
+        excluded=excluded,
+        reordered=_reordered(pictures, start.turned),
+        alone_rms_px=start.alone_rms_px,
         warnings=(),
         seconds={"adjustment": time.perf_counter() - start_s},
     )
     return replace(result, warnings=tuple(_plausibility(result, poses)))
 
 
-@dataclass(frozen=True)
-class _Adjusted:
-    """A bundle adjustment and its choice of views.
+def _adjust_views(
+    views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool, robust: bool
+) -> tuple[Start, Adjustment, np.ndarray, tuple[str, ...]]:
+    """The adjustment of all consistent views, its start, its outlying views, and the names of those left out.
 
-    Attributes:
-        adjustment: the result.
-        views: used views, right corners in the agreed order.
-        outliers: mask of the outliers among them.
-        excluded: names of views left out.
-        turned: names of views with reordered right corners.
-        alone_rms_px: rms over corners with each camera calibrated alone.
+    With `robust` it is repeated once without outliers.
     """
-
-    adjustment: Adjustment
-    views: Sequence[View]
-    outliers: np.ndarray
-    excluded: tuple[str, ...]
-    turned: tuple[str, ...]
-    alone_rms_px: float
-
-
-def _adjust_views(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool, robust: bool) -> _Adjusted:
-    """The adjustment of all consistent views; with `robust` repeated once without outliers."""
-    views = [view for view in views if view.left is not None or view.right is not None]
     free = np.ones(24, bool)
     free[[8, 17]] = not fix_k3
-    excluded: list[str] = []
-    start = start_of(views, board, size, fix_k3)
-    leave_out, turned = start.mismatched, start.turned
+    start = start_of([v for v in views if v.left is not None or v.right is not None], board, size, fix_k3)
+    leave_out, turned, excluded = start.mismatched, start.turned, []
     while True:
-        views = list(start.views)
         if leave_out.any():
-            excluded += [view.name for view, left_out in zip(views, leave_out, strict=True) if left_out]
-            views = [view for view, left_out in zip(views, leave_out, strict=True) if not left_out]
-            start = start_of(views, board, size, fix_k3)
-            views = list(start.views)
+            marked = list(zip(start.views, leave_out, strict=True))
+            excluded += [view.name for view, left_out in marked if left_out]
+            start = start_of([view for view, left_out in marked if not left_out], board, size, fix_k3)
         adjustment = _lowest_adjustment(start, board, size, free)
         pair_rms = _rms(adjustment.residuals_px)
         if pair_rms > max(CONTRADICTION_RATIO * start.alone_rms_px, CONTRADICTION_PX):
@@ -281,7 +254,7 @@ def _adjust_views(views: Sequence[View], board: Board, size: tuple[int, int], fi
             raise pairs_disagree(f"together they miss by {pair_rms:.2f} px, {alone}")
         outliers = _outliers(adjustment)
         if not (robust and outliers.any()):
-            return _Adjusted(adjustment, views, outliers, tuple(excluded), turned, start.alone_rms_px)
+            return replace(start, turned=turned), adjustment, outliers, tuple(excluded)
         leave_out, robust = outliers, False
 
 
@@ -345,22 +318,15 @@ def _outliers(adjustment: Adjustment) -> np.ndarray:
     return logs > middle + OUTLIER_Z * spread
 
 
-def _normal(pose: np.ndarray) -> np.ndarray:
-    return rotation_matrix(pose[:3])[:, 2]
-
-
-def _view_reports(adjusted: _Adjusted, poses: Sequence[np.ndarray]) -> Iterator[ViewReport]:
-    for view, residuals, pose, outlier in zip(
-        adjusted.views, adjusted.adjustment.residuals_px, poses, adjusted.outliers, strict=True
-    ):
-        yield ViewReport(
-            view.name,
-            None if view.left is None else _rms(residuals[:2]),
-            None if view.right is None else _rms(residuals[2:]),
-            float(np.linalg.norm(pose[3:])),
-            math.degrees(math.acos(min(1.0, abs(float(_normal(pose)[2]))))),
-            bool(outlier),
-        )
+def _view_report(view: View, residuals_px: np.ndarray, pose: np.ndarray, outlier: bool) -> ViewReport:
+    return ViewReport(
+        view.name,
+        None if view.left is None else _rms(residuals_px[:2]),
+        None if view.right is None else _rms(residuals_px[2:]),
+        float(np.linalg.norm(pose[3:])),
+        math.degrees(math.acos(min(1.0, abs(float(rotation_matrix(pose[:3])[2, 2]))))),
+        bool(outlier),
+    )
 
 
 def _coverage(corners: Sequence[np.ndarray | None], size: tuple[int, int]) -> float:
@@ -401,46 +367,61 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
 
 def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> list[str]:
     """Warnings about views and result, in words."""
-    warnings = []
-    if result.pairs < VIEWS_ADVISED:
-        warnings.append(f"few views: {result.pairs} pairs; errors fall until about {VIEWS_ADVISED}, take 15 to 25")
-    normals = np.array([_normal(pose) for pose in poses])
-    spread = math.degrees(math.acos(min(1.0, float(np.abs(normals @ normals.T).min()))))
-    if spread < TILT_ADVISED_DEG:
-        warnings.append(
-            f"all boards are nearly parallel (within {spread:.0f} deg): focal length and distance are not "
-            "separated; tilt the board by 30 to 45 deg about both axes"
-        )
-    elif max(view.tilt_deg for view in result.views) < TILT_ADVISED_DEG:
-        warnings.append("no tilt: no board leans more than 15 deg; tilt it by 30 to 45 deg about both axes")
-    for side, share in result.coverage.items():
-        if share < COVERAGE_ADVISED:
-            warnings.append(
-                f"poor coverage: boards fill {100 * share:.0f} % of the {side} image; outside, the distortion is "
-                "extrapolated: hold the board into every corner of the image"
-            )
-    if result.noise_sd_px > CORNER_SD_ADVISED_PX:
-        warnings.append(
-            f"corners miss by {result.noise_sd_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
-            "pictures not of one moment, a bent board, or a lens that five coefficients do not describe"
-        )
-    if result.stereo.rms_px > PAIR_RMS_RATIO * result.alone_rms_px and result.noise_sd_px > PAIR_RMS_MIN_PX:
-        warnings.append(
-            f"the pair misses by {result.stereo.rms_px:.2f} px, each camera by itself by {result.alone_rms_px:.2f}: "
-            "look for pictures not of one moment, or cameras that moved against each other"
-        )
-    warnings += pair_doubts(result.stereo)
-    mean, sd = result.triangulated_pitch_mm
-    if abs(mean / result.board.pitch_mm - 1) > 0.01:
-        warnings.append(f"triangulated squares measure {mean:.3f} mm (sd {sd:.3f}), not {result.board.pitch_mm:g}")
-    if result.board.pitch_u_mm == 0:
-        warnings.append("the pitch is taken as exact: state its standard uncertainty with --pitch-u-mm")
-    if result.excluded:
-        warnings.append(
-            f"left out, since the two pictures contradict the rest: {escaped(', '.join(result.excluded), 400)}"
-        )
+    normals = np.array([rotation_matrix(pose[:3])[:, 2] for pose in poses])
+    spread_deg = math.degrees(math.acos(min(1.0, float(np.abs(normals @ normals.T).min()))))
+    tilt_deg = max(view.tilt_deg for view in result.views)
+    noise_px, pair_px, alone_px = result.noise_sd_px, result.stereo.rms_px, result.alone_rms_px
+    board, (pitch_mm, pitch_sd_mm) = result.board, result.triangulated_pitch_mm
     outlying = [view.name for view in result.views if view.outlier]
-    if outlying:
-        names = escaped(", ".join(outlying), 400)
-        warnings.append(f"outlying views: {names}; look at their pictures, or leave them out with --robust")
-    return warnings
+    remarks = [
+        (
+            result.pairs < VIEWS_ADVISED,
+            f"few views: {result.pairs} pairs; errors fall until about {VIEWS_ADVISED}, take 15 to 25",
+        ),
+        (
+            spread_deg < TILT_ADVISED_DEG,
+            f"all boards are nearly parallel (within {spread_deg:.0f} deg): focal length and distance are not "
+            "separated; tilt the board by 30 to 45 deg about both axes",
+        ),
+        (
+            tilt_deg < TILT_ADVISED_DEG <= spread_deg,
+            "no tilt: no board leans more than 15 deg; tilt it by 30 to 45 deg about both axes",
+        ),
+        *(
+            (
+                share < COVERAGE_ADVISED,
+                f"poor coverage: boards fill {100 * share:.0f} % of the {side} image; outside, the distortion is "
+                "extrapolated: hold the board into every corner of the image",
+            )
+            for side, share in result.coverage.items()
+        ),
+        (
+            noise_px > CORNER_SD_ADVISED_PX,
+            f"corners miss by {noise_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
+            "pictures not of one moment, a bent board, or a lens that five coefficients do not describe",
+        ),
+        (
+            pair_px > PAIR_RMS_RATIO * alone_px and noise_px > PAIR_RMS_MIN_PX,
+            f"the pair misses by {pair_px:.2f} px, each camera by itself by {alone_px:.2f}: "
+            "look for pictures not of one moment, or cameras that moved against each other",
+        ),
+        *((True, doubt) for doubt in pair_doubts(result.stereo)),
+        (
+            abs(pitch_mm / board.pitch_mm - 1) > 0.01,
+            f"triangulated squares measure {pitch_mm:.3f} mm (sd {pitch_sd_mm:.3f}), not {board.pitch_mm:g}",
+        ),
+        (
+            board.pitch_u_mm == 0,
+            "the pitch is taken as exact: state its standard uncertainty with --pitch-u-mm",
+        ),
+        (
+            bool(result.excluded),
+            f"left out, since the two pictures contradict the rest: {escaped(', '.join(result.excluded), 400)}",
+        ),
+        (
+            bool(outlying),
+            f"outlying views: {escaped(', '.join(outlying), 400)}; look at their pictures, or leave them out with "
+            "--robust",
+        ),
+    ]
+    return [text for applies, text in remarks if applies]

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import cv2
 import numpy as np
 
-from tvsbayes.cameras.boards import Board, View, corner_orders
+from tvsbayes.cameras.boards import Board, View, corner_orders, quarter_turns
 from tvsbayes.cameras.bundle_adjustment import undetermined
 from tvsbayes.errors import NothingToEstimate, escaped
 from tvsbayes.instrument.campaign import CAMERAS
@@ -77,35 +78,36 @@ def start_of(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3:
     Raises:
         NothingToEstimate: too few views of a camera, no pair, pairs that disagree, or no start that OpenCV can find.
     """
-    cameras = []
-    for side in CAMERAS:
-        corners = {k: getattr(v, side) for k, v in enumerate(views) if getattr(v, side) is not None}
-        cameras.append(camera_start(corners, board, size, side, fix_k3))
-    left, right = cameras
-    relative = _relation(views, board, left, right, MISMATCH_SHARE * size[0])
-    limit = max(MISMATCH_RATIO * relative.usual_px, MISMATCH_SHARE * size[0])
-    mismatched = [k for k, miss in relative.misses.items() if miss > limit]
-    if relative.usual_px > DISAGREE_SHARE * size[0]:
-        agreeing = [
-            escaped(views[k].name, 40) for k, miss in relative.misses.items() if miss <= MISMATCH_SHARE * size[0]
-        ]
-        reason = f"most of the {len(relative.misses)} pairs miss by {relative.usual_px:.0f} px and more"
+    left, right = (
+        camera_start(
+            {k: corners for k, view in enumerate(views) if (corners := getattr(view, side)) is not None},
+            *(board, size, side, fix_k3),
+        )
+        for side in CAMERAS
+    )
+    near_px = MISMATCH_SHARE * size[0]
+    relation = _relation(views, board, left, right, near_px)
+    if relation.usual_px > DISAGREE_SHARE * size[0]:
+        agreeing = [escaped(views[k].name, 40) for k, miss in relation.misses.items() if miss <= near_px]
+        reason = f"most of the {len(relation.misses)} pairs miss by {relation.usual_px:.0f} px and more"
         raise pairs_disagree(reason + (f"; only {', '.join(agreeing)} agree" if len(agreeing) > 1 else ""))
-    rotation, shift = rotation_matrix(relative.pose[:3]), relative.pose[3:]
-    poses, agreed, turned = [], list(views), []
-    for k, view in enumerate(views):
-        poses.append(left.poses[k] if k in left.poses else left_pose(right.poses[k], rotation, shift))
-        if relative.orders.get(k, 0) and k not in mismatched:
-            assert view.right is not None
-            agreed[k] = replace(view, right=view.right[corner_orders(board)[relative.orders[k]]])
-            turned.append(view.name)
+    limit_px = max(MISMATCH_RATIO * relation.usual_px, near_px)
+    mismatched = [relation.misses.get(k, 0.0) > limit_px for k in range(len(views))]
+    to_left, orders = inverse(relation.pose), corner_orders(board)
+    agreed, turned = list(views), []
+    for k, order in relation.orders.items():
+        if order and not mismatched[k]:
+            agreed[k] = replace(views[k], right=_seen(views[k].right)[orders[order]])
+            turned.append(views[k].name)
     return Start(
-        vector=np.concatenate([left.vector, right.vector, relative.pose]),
-        poses=np.array(poses),
+        vector=np.concatenate([left.vector, right.vector, relation.pose]),
+        poses=np.array(
+            [left.poses[k] if k in left.poses else composed(right.poses[k], to_left) for k in range(len(views))]
+        ),
         views=tuple(agreed),
         turned=tuple(turned),
-        mismatched=np.isin(np.arange(len(views)), mismatched),
-        alone_rms_px=math.sqrt((left.rms_px**2 + right.rms_px**2) / 2),
+        mismatched=np.array(mismatched),
+        alone_rms_px=math.hypot(left.rms_px, right.rms_px) / math.sqrt(2),
     )
 
 
@@ -134,11 +136,9 @@ def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool
     vector = replace(pair, M1=M1, D1=np.ravel(D1)[:5], M2=M2, D2=np.ravel(D2)[:5], R=R, T=np.ravel(T)).vector
     if not np.isfinite(vector).all():
         raise undetermined("OpenCV found no finite pair")
+    found = {k: np.concatenate([np.ravel(t), np.ravel(s)]) for k, t, s in zip(both, turns, shifts, strict=True)}
     calibrated = pair.with_vector(vector)
-    board_poses = {k: np.concatenate([np.ravel(t), np.ravel(s)]) for k, t, s in zip(both, turns, shifts, strict=True)}
-    poses = [
-        board_poses[k] if k in board_poses else pose_of(view, board, calibrated) for k, view in enumerate(start.views)
-    ]
+    poses = [found[k] if k in found else pose_of(view, board, calibrated) for k, view in enumerate(start.views)]
     return replace(start, vector=vector, poses=np.array(poses))
 
 
@@ -161,7 +161,11 @@ def pairs_disagree(reason: str) -> NothingToEstimate:
 def camera_start(
     corners: dict[int, np.ndarray], board: Board, size: tuple[int, int], side: str, fix_k3: bool
 ) -> CameraStart:
-    """Zhang's method (cv2.calibrateCamera) on some views, then a pose for each."""
+    """Zhang's method (cv2.calibrateCamera) on some views, then a pose for each.
+
+    Raises:
+        NothingToEstimate: too few views, or OpenCV finds no solution.
+    """
     if len(corners) < VIEWS_MIN:
         raise NothingToEstimate(
             "few-views",
@@ -169,52 +173,39 @@ def camera_start(
             remedy="check --board (inner corners: where four squares meet), that the whole board is in the picture, "
             "sharpness and light; take 15 to 25 views",
         )
-    keys = sorted(corners)
-    chosen = _spread(keys)
-    points = [board.points_mm[visible_corners(corners[k])].astype(np.float32) for k in chosen]
-    pixels = [np.ascontiguousarray(corners[k][visible_corners(corners[k])], np.float32) for k in chosen]
-    start = _zhang(points, pixels, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
+    chosen = [corners[k] for k in _spread(sorted(corners))]
+    points = [board.points_mm[visible_corners(pixels)].astype(np.float32) for pixels in chosen]
+    pixels_px = [np.ascontiguousarray(pixels[visible_corners(pixels)], np.float32) for pixels in chosen]
+
+    def zhang(flags: int, first: CameraStart | None = None) -> CameraStart:
+        guess = (None, None) if first is None else (first.matrix.copy(), first.distortion.copy())
+        try:
+            rms, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels_px, size, *guess, flags=flags)
+        except cv2.error as error:
+            found = f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})"
+            raise undetermined(found) from error
+        matrix, distortion = np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5]
+        if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
+            raise undetermined(f"OpenCV found no finite start for the {side} camera")
+        return CameraStart(matrix, distortion, {}, float(rms))
+
+    k3 = cv2.CALIB_FIX_K3 if fix_k3 else 0
+    start = zhang(k3)
     if start.rms_px > DOUBTFUL_START_PX:
         # Wide lenses have local minima: fit k1 alone first, then all coefficients from there.
         simple = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_PRINCIPAL_POINT
-        first = _zhang(points, pixels, size, side, simple)
-        flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
-        start = min(start, _zhang(points, pixels, size, side, flags, first), key=lambda candidate: candidate.rms_px)
-    matrix, distortion = start.matrix, start.distortion
-    poses = {k: board_pose(corners[k], board, matrix, distortion) for k in keys}
+        again = zhang(cv2.CALIB_USE_INTRINSIC_GUESS | k3, zhang(simple))
+        start = min(start, again, key=lambda candidate: candidate.rms_px)
+    poses = {k: board_pose(corners[k], board, start.matrix, start.distortion) for k in sorted(corners)}
     return replace(start, poses=poses)
-
-
-def _zhang(
-    points: Sequence[np.ndarray],
-    pixels: Sequence[np.ndarray],
-    size: tuple[int, int],
-    side: str,
-    flags: int,
-    first: CameraStart | None = None,
-) -> CameraStart:
-    """cv2.calibrateCamera under `flags`, from `first` where given; no poses.
-
-    Raises:
-        NothingToEstimate: OpenCV finds no solution.
-    """
-    matrix, distortion = (None, None) if first is None else (first.matrix.copy(), first.distortion.copy())
-    try:
-        rms, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels, size, matrix, distortion, flags=flags)
-    except cv2.error as error:
-        raise undetermined(f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})") from error
-    matrix, distortion = np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5]
-    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
-        raise undetermined(f"OpenCV found no finite start for the {side} camera")
-    return CameraStart(matrix, distortion, {}, float(rms))
 
 
 @dataclass(frozen=True)
 class _Relation:
-    """The relative pose of the cameras: R and T, (6,), and its residuals.
+    """The relative pose of the cameras, (6,), and what it leaves of each pair.
 
     Attributes:
-        pose: rotation vector and translation.
+        pose: left to right camera: R and T.
         misses: rms distance of the right corners from those predicted from the left ones, px, by pair.
         orders: the best of `corner_orders` for the right corners, by pair.
     """
@@ -243,46 +234,35 @@ def _relation(views: Sequence[View], board: Board, left: CameraStart, right: Cam
             "no view shows the board to both cameras",
             remedy="name the pictures of one moment alike: left01.png and right01.png",
         )
-    orders = corner_orders(board)
-    turns = np.linalg.lstsq(board.points_mm[:, :2], np.hstack([board.points_mm[order, :2] for order in orders]))[0]
+    # In another order, corner i is another corner of the board, i.e. the board is turned in its plane.
+    turns = [np.array([0, 0, quarter * math.pi / 2, 0, 0, 0]) for quarter in quarter_turns(board)]
+    ordered = {k: np.stack([_seen(views[k].right)[order] for order in corner_orders(board)]) for k in pairs}
 
-    def relative(k: int, order: int) -> np.ndarray:
-        # In another order, corner i is another corner of the board, i.e. the board is turned in its plane.
-        turn = np.eye(3)
-        turn[:2, :2] = turns[:, 2 * order : 2 * order + 2].T
-        rotation = rotation_matrix(right.poses[k][:3]) @ turn @ rotation_matrix(left.poses[k][:3]).T
-        return np.concatenate([rotation_vector(rotation), right.poses[k][3:] - rotation @ left.poses[k][3:]])
+    def relative(k: int, order: int = 0) -> np.ndarray:
+        return composed(inverse(left.poses[k]), turns[order], right.poses[k])
 
-    def judge(pose: np.ndarray) -> _Relation:
-        misses, nearest = {}, {}
+    def judged(pose: np.ndarray) -> _Relation:
+        misses, orders = {}, {}
         for k in pairs:
-            by_order = _misses(views[k], board, left.poses[k], pose, right)
-            nearest[k] = int(np.argmin(by_order))
-            misses[k] = float(by_order[nearest[k]])
-        return _Relation(pose, misses, nearest)
+            predicted = composed(left.poses[k], pose)
+            pixels = cv2.projectPoints(board.points_mm, predicted[:3], predicted[3:], right.matrix, right.distortion)[0]
+            squares = np.sum((ordered[k] - np.reshape(pixels, (-1, 2))) ** 2, axis=2)
+            by_order = np.sqrt(np.nanmean(squares, axis=1))
+            orders[k] = int(np.argmin(by_order))
+            misses[k] = float(by_order[orders[k]])
+        return _Relation(pose, misses, orders)
 
-    agreed = judge(_median_pose([relative(k, 0) for k in pairs]))
+    def median(poses: Sequence[np.ndarray]) -> np.ndarray:
+        rotation = np.median([rotation_matrix(pose[:3]) for pose in poses], axis=0)
+        return np.concatenate([rotation_vector(rotation), np.median([pose[3:] for pose in poses], axis=0)])
+
+    agreed = judged(median([relative(k) for k in pairs]))
     if agreed.usual_px > limit_px and len(pairs) > 2:
-        tried = (judge(relative(k, order)) for k in _spread(pairs) for order in range(len(orders)))
-        best = min(tried, key=lambda r: r.usual_px)
-        near = [k for k in pairs if best.misses[k] <= best.usual_px]
-        agreed = min(best, judge(_median_pose([relative(k, best.orders[k]) for k in near])), key=lambda r: r.usual_px)
+        tried = (judged(relative(k, order)) for k in _spread(pairs) for order in range(len(turns)))
+        best = min(tried, key=lambda relation: relation.usual_px)
+        near = [relative(k, best.orders[k]) for k in pairs if best.misses[k] <= best.usual_px]
+        agreed = min(best, judged(median(near)), key=lambda relation: relation.usual_px)
     return agreed
-
-
-def _median_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
-    rotation = np.median([rotation_matrix(pose[:3]) for pose in poses], axis=0)
-    return np.concatenate([rotation_vector(rotation), np.median([pose[3:] for pose in poses], axis=0)])
-
-
-def _misses(view: View, board: Board, pose: np.ndarray, relation: np.ndarray, right: CameraStart) -> np.ndarray:
-    """Rms distance of the right corners from those predicted from a board's left pose, px, by corner order."""
-    rotation, shift = rotation_matrix(relation[:3]), relation[3:]
-    predicted = rotation_vector(rotation @ rotation_matrix(pose[:3])), rotation @ pose[3:] + shift
-    pixels, _ = cv2.projectPoints(board.points_mm, *predicted, right.matrix, right.distortion)
-    assert view.right is not None
-    ordered = np.stack([view.right[order] for order in corner_orders(board)])
-    return np.sqrt(np.nanmean(np.sum((ordered - np.reshape(pixels, (-1, 2))) ** 2, axis=2), axis=1))
 
 
 def board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
@@ -301,14 +281,27 @@ def pose_of(view: View, board: Board, stereo: Stereo) -> np.ndarray:
     """Board to left camera, from the left camera's picture where it shows the board."""
     if view.left is not None:
         return board_pose(view.left, board, stereo.M1, stereo.D1)
-    assert view.right is not None
-    return left_pose(board_pose(view.right, board, stereo.M2, stereo.D2), stereo.R, stereo.T)
+    return composed(board_pose(_seen(view.right), board, stereo.M2, stereo.D2), inverse(relative_pose(stereo)))
 
 
-def left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Board to left camera from board to right camera; `turn` is R, `shift` T."""
-    rotation = rotation_vector(turn.T @ rotation_matrix(right_pose[:3]))
-    return np.concatenate([rotation, turn.T @ (right_pose[3:] - shift)])
+def relative_pose(stereo: Stereo) -> np.ndarray:
+    """Left to right camera, (6,)."""
+    return stereo.vector[18:]
+
+
+def composed(*poses: np.ndarray) -> np.ndarray:
+    """The pose (6,) of one frame in another through those between, the first first."""
+
+    def after(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        turn, shift, *_ = cv2.composeRT(first[:3], first[3:], second[:3], second[3:])
+        return np.concatenate([np.ravel(turn), np.ravel(shift)])
+
+    return reduce(after, poses)
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """The way back of a pose (6,)."""
+    return np.concatenate([-pose[:3], -rotation_matrix(pose[:3]).T @ pose[3:]])
 
 
 def visible_corners(*corners: np.ndarray | None) -> np.ndarray:
@@ -319,3 +312,8 @@ def visible_corners(*corners: np.ndarray | None) -> np.ndarray:
 def pixels_of(corners: np.ndarray) -> np.ndarray:
     """Corners (corners, 2) in the form that all versions of OpenCV accept: contiguous, of rank 3."""
     return np.ascontiguousarray(corners, float).reshape(-1, 1, 2)
+
+
+def _seen(corners: np.ndarray | None) -> np.ndarray:
+    assert corners is not None
+    return corners
