@@ -83,7 +83,7 @@ def test_pairs_in_the_folder_come_before_those_below(tmp_path):
     drawn(tmp_path / "old", "left1.png", "right1.png")
     found = read_folder(tmp_path, 100, 100)
     assert [picture.path.relative_to(tmp_path).as_posix() for picture in found.used] == ["left1.png", "right1.png"]
-    assert found.unnamed == ("old/left1.png", "old/right1.png")
+    assert found.left_out() == ("old/left1.png", "old/right1.png")
 
 
 DIRECTIONS = ("left", "right", "up", "down")

@@ -352,8 +352,7 @@ def find_views(
     ):
         advance(count / len(used))
         for side, detection in zip(picture.sides, found, strict=True):
-            name = picture.path.relative_to(pictures.folder).as_posix()
-            name += f" ({side})" if len(picture.sides) > 1 else ""
+            name = picture.name + (f" ({side})" if len(picture.sides) > 1 else "")
             names[picture.view, side] = name
             if detection is None:
                 without_board.append(name)
@@ -376,9 +375,9 @@ def find_views(
         image_width=usual["left"][0],
         image_height=usual["left"][1],
         unpaired=tuple(sorted(unpaired, key=natural_order)),
-        unnamed=pictures.unnamed,
+        unnamed=pictures.left_out(),
         without_board=tuple(without_board),
-        other_size=tuple(path.as_posix() for path in pictures.other_size),
+        other_size=pictures.other_size,
         right_image_size=None if usual["right"] == usual["left"] else usual["right"],
         by_fallback=tuple(by_fallback),
         reordered=tuple(reordered),

@@ -20,7 +20,7 @@ from tvsbayes.cameras.picture_pairs import (
     Pairing,
     Picture,
     Size,
-    direction_of,
+    directions_in,
     is_experiment,
     natural_order,
     read_folder,
@@ -139,15 +139,10 @@ def views_of(folder: Path, *, swap: bool = False, globs: tuple[str, str] | None 
     return ViewedFolder(
         views=tuple(View(n, (complete[n]["left"], complete[n]["right"])) for n in sorted(complete, key=natural_order)),
         image_sizes=dict(pictures.usual),
-        unpaired=tuple(
-            p.path.relative_to(pictures.folder).as_posix()
-            for pair in by_view.values()
-            if len(pair) == 1
-            for p in pair.values()
-        ),
-        unnamed=pictures.unnamed,
-        other_size=tuple(path.as_posix() for path in pictures.other_size),
-        unread=pictures.left_out(*OTHER_SUFFIXES),
+        unpaired=tuple(p.name for pair in by_view.values() if len(pair) == 1 for p in pair.values()),
+        unnamed=pictures.left_out(),
+        other_size=pictures.other_size,
+        unread=pictures.left_out(OTHER_SUFFIXES),
     )
 
 
@@ -215,8 +210,7 @@ def _are_experiments(views: Sequence[View], slot: int, names: Sequence[str]) -> 
     """Whether numbers that repeat are those of experiments, by the word before them or a direction beside them."""
     if len({view.numbers[slot] for view in views}) == len(views):
         return False
-    directed = any(direction_of(word) for name in names for word in re.findall("[a-z]+", name.lower()))
-    return directed or any(view.is_of_experiment(slot) for view in views)
+    return any(map(directions_in, names)) or any(view.is_of_experiment(slot) for view in views)
 
 
 def _question(view: View, number: int) -> InputError:

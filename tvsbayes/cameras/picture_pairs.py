@@ -13,14 +13,14 @@ import re
 import tomllib
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from itertools import takewhile
+from functools import cache
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import NamedTuple
 
-from tvsbayes.errors import Candidate, InputError, all_of, escaped, listed, question, refusal
+from tvsbayes.errors import Candidate, InputError, Question, all_of, escaped, listed, question, refusal
 from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size
 from tvsbayes.importing.words import vocabulary
@@ -49,11 +49,17 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 
 @dataclass(frozen=True)
 class Picture:
-    """A file, and the cameras of its equal-width parts from left to right."""
+    """A file, by its name below a folder, and the cameras of its equal-width parts from left to right."""
 
     view: str
-    path: Path
+    folder: Path
+    name: str
     sides: tuple[str, ...]
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.folder / self.name
 
 
 @dataclass(frozen=True)
@@ -103,21 +109,15 @@ class PictureFolder:
         return [p for p, size in self.sizes.items() if all(size == self.usual[side] for side in p.sides)]
 
     @property
-    def other_size(self) -> list[Path]:
+    def other_size(self) -> tuple[str, ...]:
         """Files of another size than most, relative to the folder."""
         used = set(self.used)
-        return [picture.path.relative_to(self.folder) for picture in self.sizes if picture not in used]
+        return tuple(picture.name for picture in self.sizes if picture not in used)
 
-    def left_out(self, *suffixes: str) -> tuple[str, ...]:
-        """Files of these kinds that belong to no camera, relative to the folder, in order."""
-        known = {picture.path for picture in self.sizes}
-        names = [name for name in file_names(self.folder) if name.lower().endswith(suffixes)]
-        return tuple(sorted((name for name in names if self.folder / name not in known), key=natural_order))
-
-    @property
-    def unnamed(self) -> tuple[str, ...]:
-        """Pictures without a camera, or in folders below a folder with pairs."""
-        return self.left_out(*SUFFIXES)
+    def left_out(self, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[str, ...]:
+        """Files of these kinds without a camera, or in folders below a folder with pairs, relative to the folder."""
+        known = {picture.name for picture in self.sizes}
+        return tuple(name for name in picture_names(self.folder, suffixes) if name not in known)
 
 
 def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_NAMED) -> PictureFolder:
@@ -148,12 +148,10 @@ def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_
             sizes[picture] = width // len(picture.sides), height
     if refused:
         raise all_of(refused)
-    if pairing.asks and pairing.globs is None and all(len(picture.sides) == 1 for picture in sizes):
-        wide = [picture for picture, (width, height) in sizes.items() if width >= SIDE_BY_SIDE_RATIO * height]
-        if wide and len(wide) == len(sizes):
-            raise _question(
-                folder, {p.path.relative_to(folder).as_posix(): Key(p.view, p.sides[0]) for p in wide}, True
-            )
+    if pairing.asks and pairing.globs is None and sizes:
+        wide = all(width >= SIDE_BY_SIDE_RATIO * height for width, height in sizes.values())
+        if wide and all(len(picture.sides) == 1 for picture in sizes):
+            raise _question(folder, {p.name: Key(p.view, p.sides[0]) for p in sizes}, wide=True)
     usual: dict[str, Size] = {}
     for side in CAMERAS:
         counts = Counter(size for picture, size in sizes.items() if side in picture.sides)
@@ -178,57 +176,66 @@ def paired_pictures(folder: Path, most: int, pairing: Pairing = AS_NAMED) -> lis
         Question: `pairing.asks`, and pairs would be guessed.
     """
     folder = Path(folder)
-    refuse = partial(refusal, file=escaped(str(folder), 200))
+    place = escaped(str(folder), 200)
     if pairing.globs is not None or pairing.in_order:
-        return _stated_pairs(folder, pairing, most, refuse)
-    names = sorted(file_names(folder), key=natural_order)
-    images = [name for name in names if name.lower().endswith(SUFFIXES)]
-    others = [name for name in names if name.lower().endswith(OTHER_SUFFIXES)]
-    if not images and others:
+        return _stated_pairs(folder, pairing, most, place)
+    images = picture_names(folder)
+    if not images and (others := picture_names(folder, OTHER_SUFFIXES)):
         found = f"{len(others)} pictures such as {escaped(others[0], 100)}"
         remedy = "convert them without loss, for example: mogrify -format png *" + Path(others[0]).suffix
-        raise refuse("image", found=found, allowed="PNG or JPEG", remedy=remedy)
+        raise refusal("image", file=place, found=found, allowed="PNG or JPEG", remedy=remedy)
     direct = [name for name in images if "/" not in name]
-    for group in dict.fromkeys((tuple(direct), tuple(images))):
-        named = named_cameras(group, pairing.sides)
-        if _pairs(named):
-            break
+    named = named_cameras(direct, pairing.sides)
+    if not _complete(named) and len(direct) < len(images):
+        named = named_cameras(images, pairing.sides)
     if len(named or images) > most:
         found, remedy = f"{len(named or images)} pictures", "move those that are not needed elsewhere"
-        raise refuse("size", found=found, allowed=f"at most {most}", remedy=remedy)
-    _refuse_twice(named, refuse)
-    if _pairs(named):
+        raise refusal("size", file=place, found=found, allowed=f"at most {most}", remedy=remedy)
+    by_key: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, key in named.items():
+        by_key[key[:2]].append(name)
+    twice = [" and ".join(escaped(name, 80) for name in own) for own in by_key.values() if len(own) > 1]
+    if twice:
+        found = f"{listed(twice, DUPLICATES_SHOWN)}: two pictures of one camera and view"
+        remedy = "keep one file per camera and view"
+        raise refusal("duplicate", file=place, found=found, allowed="one", remedy=remedy)
+    if _complete(named):
         return _pictures(folder, named)
     guessed = _guessed(images, named, pairing)
     if guessed and pairing.asks:
         raise _question(folder, guessed)
-    if guessed:
-        return _pictures(folder, guessed)
-    # Of one camera alone, or each of both: the size decides.
-    if named and len(named) == len(images):
-        return _pictures(folder, named)
-    return [Picture(_stem(name), folder / name, pairing.sides) for name in images]
+    # Without a guess of one camera alone, or each of both: the size decides.
+    if guessed or (named and len(named) == len(images)):
+        return _pictures(folder, guessed or named)
+    return [Picture(_stem(name), folder, name, pairing.sides) for name in images]
 
 
-def file_names(folder: Path, below: str = "", depth: int = 0) -> Iterator[str]:
-    """Files of a folder and its subfolders, relative to the outermost; hidden ones and links to folders are left out.
+def picture_names(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> list[str]:
+    """Files of these kinds in a folder and its subfolders, relative to it, in natural order.
+
+    Hidden ones and links to folders are left out.
 
     Raises:
-        InputError: the outermost folder cannot be read.
+        InputError: the folder cannot be read.
     """
-    try:
-        entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
-    except OSError as error:
-        if below:
-            return
-        found, allowed = escaped(error.strerror or str(error)), "a readable folder"
-        remedy, place = "name the folder of the pictures", escaped(str(folder), 200)
-        raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
-    for entry in entries:
-        if not entry.is_dir(follow_symlinks=False):
-            yield below + entry.name
-        elif depth < DEPTH_MAX:
-            yield from file_names(Path(entry.path), f"{below}{entry.name}/", depth + 1)
+
+    def found_in(folder: Path, below: str, depth: int) -> Iterator[str]:
+        try:
+            entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
+        except OSError as error:
+            if below:
+                return
+            found, allowed = escaped(error.strerror or str(error)), "a readable folder"
+            remedy, place = "name the folder of the pictures", escaped(str(folder), 200)
+            raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                if depth < DEPTH_MAX:
+                    yield from found_in(Path(entry.path), f"{below}{entry.name}/", depth + 1)
+            elif entry.name.lower().endswith(suffixes):
+                yield below + entry.name
+
+    return sorted(found_in(folder, "", 0), key=natural_order)
 
 
 # --- words of cameras in a name --------------------------------------------------------------------------------------
@@ -272,11 +279,6 @@ def _words() -> dict[str, frozenset[str]]:
     return {name: frozenset(" ".join(languages.values()).split()) for name, languages in content.items()}
 
 
-def _plain(name: str) -> str:
-    """A name without accents."""
-    return "".join(letter for letter in unicodedata.normalize("NFKD", name) if not unicodedata.combining(letter))
-
-
 def _stem(name: str) -> str:
     return name[: name.rindex(".")]
 
@@ -305,22 +307,25 @@ def direction_of(word: str) -> str:
     return next((name for name in (*CAMERAS, "up", "down") if word in _words()[name]), "")
 
 
-def _marks(path: str, numbered: frozenset[str]) -> list[_Mark]:
+def directions_in(text: str) -> list[str]:
+    """Directions of motion among the words of a text."""
+    return [way for word in re.findall("[a-z]+", text.lower()) if (way := direction_of(word))]
+
+
+def _marks(path: str, numbered: frozenset[str]) -> Iterator[_Mark]:
     """The words of cameras in a path without suffix; `numbered` words make a camera of the number behind them."""
-    words, marks, start = _words(), [], 0
+    words, start = _words(), 0
     parts = path.split("/")
     for depth, part in zip(range(len(parts), 0, -1), parts, strict=True):
         tokens = list(_TOKENS.finditer(part))
         plain = [token.group().lower() for token in tokens]
-
-        def is_beside(k: int, tokens: Sequence[re.Match[str]] = tokens, part: str = part) -> bool:
-            """Whether only separators stand between a token and the next."""
-            return k + 1 < len(tokens) and not part[tokens[k].end() : tokens[k + 1].start()].strip(" _.-")
-
+        # The word behind each, where only separators stand between.
+        gaps = (part[before.end() : after.start()].strip(" _.-") for before, after in pairwise(tokens))
+        behind = ["" if gap else word for gap, word in zip(gaps, plain[1:], strict=True)] + [""]
         k, inner = 0, 0
         while k < len(tokens):
-            word, size, rank, side, number = plain[k], 1, 0, _side_of(plain[k]), False
-            after = plain[k + 1] if is_beside(k) else ""
+            word, after, size, rank, number = plain[k], behind[k], 1, 0, False
+            side = _side_of(word)
             if word in numbered and after.isdigit():
                 side, size, rank, number = after, 2, CAMERA, True
             elif word in words["camera"] and _side_of(after):
@@ -341,10 +346,9 @@ def _marks(path: str, numbered: frozenset[str]) -> list[_Mark]:
                 place = f"{inner}" if inside else "last" if k else "first"
                 inner += inside
                 span = start + tokens[k].start(), start + tokens[k + size - 1].end()
-                marks.append(_Mark((depth, place, number), side, rank, *span))
+                yield _Mark((depth, place, number), side, rank, *span)
             k += size
         start += len(part) + 1
-    return marks
 
 
 def named_cameras(
@@ -357,33 +361,33 @@ def named_cameras(
         sides: cameras of the smaller and the larger number.
         numbered: words that make a camera of the number behind them; None: camera and its translations.
     """
-    paths = {name: _plain(_stem(name)) for name in names}
     numbered = _words()["camera"] if numbered is None else numbered
-    marks = {name: _marks(path, numbered) for name, path in paths.items()}
-    found: dict[tuple[int, str, bool], list[_Mark]] = defaultdict(list)
+    # Without accents.
+    letters = {name: unicodedata.normalize("NFKD", _stem(name)) for name in names}
+    paths = {name: "".join(c for c in path if not unicodedata.combining(c)) for name, path in letters.items()}
+    marks = {name: list(_marks(path, numbered)) for name, path in paths.items()}
+    by_slot: dict[tuple[int, str, bool], list[_Mark]] = defaultdict(list)
     for mark in (mark for own in marks.values() for mark in own):
-        found[mark.slot].append(mark)
+        by_slot[mark.slot].append(mark)
     side_of: dict[tuple[int, str, bool], dict[str, str]] = {}
-    ranks: dict[tuple[int, str, bool], int] = {}
-    for slot, own in found.items():
+    for slot, own in by_slot.items():
         values = {mark.side for mark in own if mark.side}
+        directions = any(not mark.side and mark.rank == DIRECTION for mark in own)
+        side_of[slot] = {} if directions else {side: side for side in values}
         if slot[2]:
             two = sorted({*map(int, values)})
             side_of[slot] = {value: sides[two.index(int(value))] for value in values} if len(two) == 2 else {}
-        else:
-            directions = any(not mark.side and mark.rank == DIRECTION for mark in own)
-            side_of[slot] = {} if directions else {side: side for side in values}
-        ranks[slot] = BESIDE_LETTERS if any(mark.rank == BESIDE_LETTERS for mark in own) else CAMERA
     telling = {slot for slot, of in side_of.items() if len({*of.values()}) == 2}
-    chosen: dict[str, _Mark] = {}
-    for name, own in marks.items():
-        usable = [mark for mark in own if mark.side and side_of[mark.slot]]
-        usable = [mark for mark in usable if mark.slot in telling] or usable
-        if usable:
-            chosen[name] = max(usable, key=lambda m: (min(m.rank, ranks[m.slot]), -m.slot[0], m.start))
+    weak = {mark.slot for own in by_slot.values() for mark in own if mark.rank == BESIDE_LETTERS}
+
+    def worth(mark: _Mark) -> tuple[bool, int, int, int]:
+        return mark.slot in telling, BESIDE_LETTERS if mark.slot in weak else mark.rank, -mark.slot[0], mark.start
+
+    usable = {name: [mark for mark in own if mark.side and side_of[mark.slot]] for name, own in marks.items()}
+    chosen = {name: max(own, key=worth) for name, own in usable.items() if own}
     camera = {name: side_of[mark.slot][mark.side] for name, mark in chosen.items()}
     # Another word that agrees in every file says the camera once more: stereoLeft/imageL0.
-    contradicted = {
+    agreeing = telling - {
         mark.slot
         for name, own in marks.items()
         for mark in own
@@ -391,63 +395,58 @@ def named_cameras(
     }
     keys = {}
     for name, mark in chosen.items():
-        again = [m for m in marks[name] if m.side and m.slot in telling - contradicted]
-        shown = _without(paths[name], {mark, *again})
-        keys[name] = Key(re.sub(r"\*[ _.-]+", "*", shown), camera[name], shown.replace("*", "").strip("/"))
+        path = paths[name]
+        # * for the marks and the separators before them.
+        for m in sorted({mark, *(m for m in marks[name] if m.side and m.slot in agreeing)}, key=lambda m: -m.start):
+            path = path[: m.start].rstrip(" _.-") + "*" + path[m.end :]
+        keys[name] = Key(re.sub(r"\*[ _.-]+", "*", path), camera[name], path.replace("*", "").strip("/"))
     return keys
 
 
-def _without(path: str, marks: set[_Mark]) -> str:
-    """A path with * for its marks and the separators before them."""
-    for mark in sorted(marks, key=lambda mark: -mark.start):
-        path = path[: mark.start].rstrip(" _.-") + "*" + path[mark.end :]
-    return path
+def _by_camera(named: Named) -> list[list[str]]:
+    """Names of the pictures of the left and of the right camera."""
+    return [[name for name, key in named.items() if key.side == side] for side in CAMERAS]
 
 
-def _pairs(named: Named) -> int:
-    """Number of views with pictures of both cameras."""
-    return sum(count == 2 for count in Counter(view for view, _ in {key[:2] for key in named.values()}).values())
-
-
-def _refuse_twice(named: Named, refuse: Callable[..., InputError]) -> None:
-    """Refuse two files of one camera and view, by name."""
-    names: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for name, key in named.items():
-        names[key[:2]].append(name)
-    twice = [" and ".join(escaped(name, 80) for name in own) for own in names.values() if len(own) > 1]
-    if twice:
-        found = f"{listed(twice, DUPLICATES_SHOWN)}: two pictures of one camera and view"
-        raise refuse("duplicate", found=found, allowed="one", remedy="keep one file per camera and view")
+def _complete(named: Named) -> set[str]:
+    """Views with pictures of both cameras."""
+    left, right = ({named[name].view for name in names} for names in _by_camera(named))
+    return left & right
 
 
 def _pictures(folder: Path, named: Named) -> list[Picture]:
     """The pictures of views, each view under the name of its last picture where that is no other's."""
     names = {key.view: key.name or key.view for key in named.values()}
     shared = len({*names.values()}) < len(names)
-    return [Picture(key.view if shared else names[key.view], folder / name, (key.side,)) for name, key in named.items()]
+    return [Picture(key.view if shared else names[key.view], folder, name, (key.side,)) for name, key in named.items()]
 
 
-# --- guesses and questions -------------------------------------------------------------------------------------------
+# --- guesses, questions, and pairs that the user states --------------------------------------------------------------
+def _of_two_folders(names: Sequence[str], sides: tuple[str, str]) -> dict[str, str]:
+    """The camera of each file where they lie in two folders; else empty."""
+    folders = sorted({name.rpartition("/")[0] for name in names}, key=natural_order)
+    if len(folders) != 2:
+        return {}
+    return {name: sides[folders.index(name.rpartition("/")[0])] for name in names}
+
+
 def _guessed(images: Sequence[str], named: Named, pairing: Pairing) -> dict[str, Key]:
     """Pairs by a number, by two folders, or in the order of the names of known cameras; empty without any."""
     stems = {name: _stem(name) for name in images}
     last = {name: match for name, stem in stems.items() if (match := re.search(r"[_-]0*([0-9]{1,9})$", stem))}
     numbers = sorted({int(match[1]) for match in last.values()})
-    folders = sorted({stem.rpartition("/")[0] for stem in stems.values()}, key=natural_order)
+    of_folder = _of_two_folders(images, pairing.sides)
     guesses = [named_cameras(images, pairing.sides, _words()["perhaps"] | _words()["camera"])]
     if len(numbers) == 2:
-        of_number = dict(zip(numbers, pairing.sides, strict=True))
-        guesses.append({n: Key(stems[n][: m.start()], of_number[int(m[1])]) for n, m in last.items()})
-    if len(folders) == 2 and not any(
-        direction_of(word) for name in folders for word in re.findall("[a-z]+", name.lower())
-    ):
-        of_folder = dict(zip(folders, pairing.sides, strict=True))
-        parts = {name: stem.rpartition("/") for name, stem in stems.items()}
-        guesses.append({name: Key(part[2], of_folder[part[0]]) for name, part in parts.items()})
+        guesses.append(
+            {n: Key(stems[n][: m.start()], pairing.sides[numbers.index(int(m[1]))]) for n, m in last.items()}
+        )
+    if not any(directions_in(name.rpartition("/")[0]) for name in of_folder):
+        guesses.append({name: Key(stems[name].rpartition("/")[2], side) for name, side in of_folder.items()})
     for guess in guesses:
-        if _pairs(guess) >= NUMBERED_PAIRS_MIN:
+        if len(_complete(guess)) >= NUMBERED_PAIRS_MIN:
             return guess
-    left, right = ([name for name, key in named.items() if key.side == side] for side in CAMERAS)
+    left, right = _by_camera(named)
     return _in_order((left, right)) if len(left) == len(right) >= NUMBERED_PAIRS_MIN else {}
 
 
@@ -462,23 +461,22 @@ def _in_order(groups: Sequence[Sequence[str]]) -> dict[str, Key]:
     }
 
 
-def _question(folder: Path, guessed: Named, wide: bool = False) -> InputError:
+def _question(folder: Path, guessed: Named, wide: bool = False) -> Question:
     """The question which pictures are the left camera's, with the patterns that answer it."""
-    cameras = Counter(view for view, _ in {key[:2] for key in guessed.values()})
-    complete = {name: key for name, key in guessed.items() if wide or cameras[key.view] == 2}
-    groups = [[name for name, key in complete.items() if key.side == side] for side in CAMERAS]
+    complete = _complete(guessed)
+    groups = _by_camera({name: key for name, key in guessed.items() if wide or key.view in complete})
     globs = [_glob(folder, own) for own in groups]
     first = [escaped(own[0], 80) if own else "none" for own in groups]
     pattern = f"**/*{Path(first[0]).suffix}"
-    both = Candidate("each holds the images of both", ("--left", pattern, "--right", pattern))
     answers = [
-        Candidate(f"{first[k]} is the left camera's", ("--left", globs[k], "--right", globs[1 - k])) for k in (0, 1)
+        Candidate(f"{first[0]} is the left camera's", ("--left", globs[0], "--right", globs[1])),
+        Candidate(f"{first[1]} is the left camera's", ("--left", globs[1], "--right", globs[0])),
+        Candidate("each holds the images of both", ("--left", pattern, "--right", pattern)),
     ]
     found = f"names that do not say which camera took {first[0]} and which {first[1]}, or which belong together"
     if wide:
         found = f"{first[0]} and {first[1]}, twice as wide as high: of two cameras each, or of one"
-        answers = answers[:1]
-    answers.append(both)
+        del answers[1]
     allowed = f"{NAMING}; or patterns of both cameras, whose pictures then pair in the order of their names"
     return question(file=escaped(str(folder), 200), found=found, allowed=allowed, candidates=answers)
 
@@ -502,38 +500,35 @@ def _matched(folder: Path, glob: str) -> list[str]:
     if Path(glob).is_absolute() or ".." in Path(glob).parts:
         return []
     try:
-        return [path.relative_to(folder).as_posix() for path in folder.glob(glob) if path.is_file()]
+        names = [path.relative_to(folder).as_posix() for path in folder.glob(glob) if path.is_file()]
     except ValueError:
         # An empty pattern, or ** beside other letters.
         return []
+    return sorted(names, key=natural_order)
 
 
-def _stated_pairs(folder: Path, pairing: Pairing, most: int, refuse: Callable[..., InputError]) -> list[Picture]:
+def _stated_pairs(folder: Path, pairing: Pairing, most: int, place: str) -> list[Picture]:
     """Pair pictures in the order of their names, the first of one camera with the first of the other.
 
     The cameras are those of two patterns, else of the names, else of two folders. One pattern for both says that each
     picture holds both.
     """
     if pairing.globs is not None:
-        matches = [_matched(folder, glob) for glob in pairing.globs]
-        groups = [sorted(names, key=natural_order) for names in matches]
-        if pairing.globs[0] == pairing.globs[1] and groups and groups[0]:
-            return [Picture(_stem(name), folder / name, pairing.sides) for name in groups[0]]
+        groups = [_matched(folder, glob) for glob in pairing.globs]
+        if pairing.globs[0] == pairing.globs[1] and groups[0]:
+            return [Picture(_stem(name), folder, name, pairing.sides) for name in groups[0]]
     else:
-        names = sorted((n for n in file_names(folder) if n.lower().endswith(SUFFIXES)), key=natural_order)
-        named: Mapping[str, Key] = named_cameras(names, pairing.sides)
-        folders = sorted({name.rpartition("/")[0] for name in names}, key=natural_order)
-        if not named and len(folders) == 2:
-            of_folder = dict(zip(folders, pairing.sides, strict=True))
-            named = {name: Key(name, of_folder[name.rpartition("/")[0]]) for name in names}
-        groups = [[name for name, key in named.items() if key.side == side] for side in CAMERAS]
-    counts = [len(group) for group in groups]
-    if len(groups) < 2 or not all(counts):
-        found = f"{' and '.join(str(count) for count in counts) or 'no'} pictures of the left and the right camera"
+        names = picture_names(folder)
+        of_folder = _of_two_folders(names, pairing.sides)
+        named = named_cameras(names, pairing.sides)
+        groups = _by_camera(named or {name: Key(name, side) for name, side in of_folder.items()})
+    left, right = map(len, groups)
+    if not (left and right):
+        found = f"{left} and {right} pictures of the left and the right camera"
         remedy = 'name them: --left "cam_a/*.png" --right "cam_b/*.png"'
-        raise refuse("no-pictures", found=found, allowed="pictures of two cameras", remedy=remedy)
-    if counts[0] != counts[1] or sum(counts) > most:
-        found, allowed = f"{counts[0]} left and {counts[1]} right pictures", f"as many of both, together {most} at most"
+        raise refusal("no-pictures", file=place, found=found, allowed="pictures of two cameras", remedy=remedy)
+    if left != right or left + right > most:
+        found, allowed = f"{left} left and {right} right pictures", f"as many of both, together {most} at most"
         remedy = "take out those without their counterpart: pictures are paired by their order"
-        raise refuse("size", found=found, allowed=allowed, remedy=remedy)
+        raise refusal("size", file=place, found=found, allowed=allowed, remedy=remedy)
     return _pictures(folder, _in_order(groups))

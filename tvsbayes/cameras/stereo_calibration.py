@@ -367,61 +367,46 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
 
 def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> list[str]:
     """Warnings about views and result, in words."""
+    warnings = []
+    if result.pairs < VIEWS_ADVISED:
+        warnings.append(f"few views: {result.pairs} pairs; errors fall until about {VIEWS_ADVISED}, take 15 to 25")
     normals = np.array([rotation_matrix(pose[:3])[:, 2] for pose in poses])
-    spread_deg = math.degrees(math.acos(min(1.0, float(np.abs(normals @ normals.T).min()))))
-    tilt_deg = max(view.tilt_deg for view in result.views)
-    noise_px, pair_px, alone_px = result.noise_sd_px, result.stereo.rms_px, result.alone_rms_px
-    board, (pitch_mm, pitch_sd_mm) = result.board, result.triangulated_pitch_mm
-    outlying = [view.name for view in result.views if view.outlier]
-    remarks = [
-        (
-            result.pairs < VIEWS_ADVISED,
-            f"few views: {result.pairs} pairs; errors fall until about {VIEWS_ADVISED}, take 15 to 25",
-        ),
-        (
-            spread_deg < TILT_ADVISED_DEG,
-            f"all boards are nearly parallel (within {spread_deg:.0f} deg): focal length and distance are not "
-            "separated; tilt the board by 30 to 45 deg about both axes",
-        ),
-        (
-            tilt_deg < TILT_ADVISED_DEG <= spread_deg,
-            "no tilt: no board leans more than 15 deg; tilt it by 30 to 45 deg about both axes",
-        ),
-        *(
-            (
-                share < COVERAGE_ADVISED,
+    spread = math.degrees(math.acos(min(1.0, float(np.abs(normals @ normals.T).min()))))
+    if spread < TILT_ADVISED_DEG:
+        warnings.append(
+            f"all boards are nearly parallel (within {spread:.0f} deg): focal length and distance are not "
+            "separated; tilt the board by 30 to 45 deg about both axes"
+        )
+    elif max(view.tilt_deg for view in result.views) < TILT_ADVISED_DEG:
+        warnings.append("no tilt: no board leans more than 15 deg; tilt it by 30 to 45 deg about both axes")
+    for side, share in result.coverage.items():
+        if share < COVERAGE_ADVISED:
+            warnings.append(
                 f"poor coverage: boards fill {100 * share:.0f} % of the {side} image; outside, the distortion is "
-                "extrapolated: hold the board into every corner of the image",
+                "extrapolated: hold the board into every corner of the image"
             )
-            for side, share in result.coverage.items()
-        ),
-        (
-            noise_px > CORNER_SD_ADVISED_PX,
-            f"corners miss by {noise_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
-            "pictures not of one moment, a bent board, or a lens that five coefficients do not describe",
-        ),
-        (
-            pair_px > PAIR_RMS_RATIO * alone_px and noise_px > PAIR_RMS_MIN_PX,
-            f"the pair misses by {pair_px:.2f} px, each camera by itself by {alone_px:.2f}: "
-            "look for pictures not of one moment, or cameras that moved against each other",
-        ),
-        *((True, doubt) for doubt in pair_doubts(result.stereo)),
-        (
-            abs(pitch_mm / board.pitch_mm - 1) > 0.01,
-            f"triangulated squares measure {pitch_mm:.3f} mm (sd {pitch_sd_mm:.3f}), not {board.pitch_mm:g}",
-        ),
-        (
-            board.pitch_u_mm == 0,
-            "the pitch is taken as exact: state its standard uncertainty with --pitch-u-mm",
-        ),
-        (
-            bool(result.excluded),
-            f"left out, since the two pictures contradict the rest: {escaped(', '.join(result.excluded), 400)}",
-        ),
-        (
-            bool(outlying),
-            f"outlying views: {escaped(', '.join(outlying), 400)}; look at their pictures, or leave them out with "
-            "--robust",
-        ),
-    ]
-    return [text for applies, text in remarks if applies]
+    if result.noise_sd_px > CORNER_SD_ADVISED_PX:
+        warnings.append(
+            f"corners miss by {result.noise_sd_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
+            "pictures not of one moment, a bent board, or a lens that five coefficients do not describe"
+        )
+    if result.stereo.rms_px > PAIR_RMS_RATIO * result.alone_rms_px and result.noise_sd_px > PAIR_RMS_MIN_PX:
+        warnings.append(
+            f"the pair misses by {result.stereo.rms_px:.2f} px, each camera by itself by {result.alone_rms_px:.2f}: "
+            "look for pictures not of one moment, or cameras that moved against each other"
+        )
+    warnings += pair_doubts(result.stereo)
+    mean, sd = result.triangulated_pitch_mm
+    if abs(mean / result.board.pitch_mm - 1) > 0.01:
+        warnings.append(f"triangulated squares measure {mean:.3f} mm (sd {sd:.3f}), not {result.board.pitch_mm:g}")
+    if result.board.pitch_u_mm == 0:
+        warnings.append("the pitch is taken as exact: state its standard uncertainty with --pitch-u-mm")
+    if result.excluded:
+        warnings.append(
+            f"left out, since the two pictures contradict the rest: {escaped(', '.join(result.excluded), 400)}"
+        )
+    outlying = [view.name for view in result.views if view.outlier]
+    if outlying:
+        names = escaped(", ".join(outlying), 400)
+        warnings.append(f"outlying views: {names}; look at their pictures, or leave them out with --robust")
+    return warnings
