@@ -103,8 +103,6 @@ def shared_lengths():
     """Lengths that many tests share: no campaign here has more spots, and functions of tests look at padding too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 512)
-        # Boards of 24 and of 54 corners fill one length.
-        patch.setattr("tvsbayes.cameras.bundle_adjustment.CORNERS_PER_BUCKET", 64)
         yield
 
 

@@ -58,7 +58,7 @@ def test_information_is_that_of_the_bundle_adjustment(mounted):
         left, right = (pixels + 1e-3 * rng.standard_normal(pixels.shape) for pixels in corners(mounted, pose))
         views.append(View(f"{k}", left, right))
     done = bundle_adjustment(views, BOARD, mounted.vector, np.array(poses), np.ones(24, bool))
-    whole = np.sum([view_information(mounted, BOARD, pose).together for pose in poses], axis=0)
+    whole = view_information(mounted, BOARD, poses)[0].sum(axis=0)
     covariance, expected = np.linalg.inv(whole), done.covariance / done.noise_sd_px**2
     sds = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(covariance / np.outer(sds, sds), expected / np.outer(sds, sds), atol=1e-4)

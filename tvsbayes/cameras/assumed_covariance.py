@@ -10,13 +10,13 @@ order of `STEREO_PARAMETER_NAMES`.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from tvsbayes.cameras.boards import Board
+from tvsbayes.cameras.bundle_adjustment import projected
 from tvsbayes.errors import InputError, refusal
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_vector
@@ -187,9 +187,8 @@ def _one_view_covariance(stereo: Stereo, board: Board, fixed_intrinsics: bool | 
     """
     covariances = []
     for poses in placed_boards(stereo, board).values():
-        views = [view_information(stereo, board, pose) for pose in poses]
-        if len(views) >= POSES_MIN:
-            together, alone = (np.mean(informations, axis=0) for informations in zip(*views, strict=True))
+        if len(poses) >= POSES_MIN:
+            together, alone = (np.mean(views, axis=0) for views in view_information(stereo, board, poses))
             if fixed_intrinsics is not True:
                 covariances.append(_inverse(together))
             if fixed_intrinsics is not False:
@@ -228,55 +227,33 @@ def _no_common_view() -> InputError:
     )
 
 
-class ViewInformation(NamedTuple):
-    """Information of one view about the cameras for corners of 1 px, with the board's pose eliminated, 1/px^2.
-
-    Attributes:
-        together: information on the pair, (24, 24).
-        alone: information on each camera from its own picture and its own eliminated pose, (18, 18) in two blocks.
-    """
-
-    together: np.ndarray
-    alone: np.ndarray
-
-
-def view_information(stereo: Stereo, board: Board, pose: np.ndarray) -> ViewInformation:
-    """The information of one view of a board.
+def view_information(stereo: Stereo, board: Board, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Information of views about the cameras for corners of 1 px, with each board's pose eliminated, 1/px^2.
 
     Args:
         stereo: the cameras.
         board: the board.
-        pose: board to left camera, (6,): Rodrigues vector, mm.
+        poses: board to left camera, (views, 6): Rodrigues vector, mm.
+
+    Returns:
+        That of each view on the pair, (views, 24, 24), and on each camera from its own picture with its own eliminated
+        pose, (views, 18, 18) in two blocks.
     """
-    rotation, translation = np.asarray(pose[:3], float), np.asarray(pose[3:], float)
-    r_relative, t_relative = rotation_vector(stereo.R), np.asarray(stereo.T, float).ravel()
-    left = cv2.projectPoints(board.points_mm, rotation, translation, stereo.M1, stereo.D1)[1]
-    # The right camera sees the composed pose; composeRT gives its derivatives by both.
-    r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = cv2.composeRT(rotation, translation, r_relative, t_relative)
-    right = cv2.projectPoints(board.points_mm, r, t, stereo.M2, stereo.D2)[1]
-
-    def chained(slopes: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
-        return np.hstack([right[:, :3] @ a + right[:, 3:6] @ b for a, b in slopes])
-
-    zeros = np.zeros((len(left), 9))
-    cameras = np.block(
-        [
-            [left[:, 6:15], zeros, np.zeros((len(left), 6))],
-            [zeros, right[:, 6:15], chained(((r_r2, t_r2), (r_t2, t_t2)))],
-        ]
-    )
-    poses = np.vstack([left[:, :6], chained(((r_r1, t_r1), (r_t1, t_t1)))])
-    alone = np.zeros((18, 18))
-    for side, slopes in enumerate((left, right)):
-        alone[9 * side : 9 * side + 9, 9 * side : 9 * side + 9] = _schur_complement(slopes[:, 6:15], slopes[:, :6])
-    return ViewInformation(_schur_complement(cameras, poses), alone)
+    of_pair = projected(board.points_mm, np.reshape(poses, (-1, 6)), stereo)
+    together = _schur_complement(of_pair.by_cameras, of_pair.by_pose)
+    alone = np.zeros((len(together), 18, 18))
+    for own, picture in ((slice(9), slice(2)), (slice(9, 18), slice(2, 4))):
+        # To a camera by itself a board is placed by the same six numbers, whatever its frame.
+        alone[:, own, own] = _schur_complement(of_pair.by_cameras[:, picture, :, own], of_pair.by_pose[:, picture])
+    return together, alone
 
 
 def _schur_complement(columns: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
-    """Schur complement of the normal matrix: information of some columns with the nuisance columns eliminated."""
+    """Schur complement of each view's normal matrix: information of some columns with the nuisance ones eliminated."""
+    columns, nuisance = (part.reshape(len(part), -1, part.shape[-1]) for part in (columns, nuisance))
     q, _ = np.linalg.qr(nuisance)
-    rest = columns - q @ (q.T @ columns)
-    return rest.T @ rest
+    rest = columns - q @ (q.transpose(0, 2, 1) @ columns)
+    return rest.transpose(0, 2, 1) @ rest
 
 
 def placed_boards(stereo: Stereo, board: Board) -> dict[str, list[np.ndarray]]:
@@ -312,13 +289,8 @@ def placed_boards(stereo: Stereo, board: Board) -> dict[str, list[np.ndarray]]:
 def _sees_whole(stereo: Stereo, board: Board, turn: np.ndarray, shift: np.ndarray) -> bool:
     """Whether both cameras see every corner of a board."""
     left = board.points_mm @ rotation_matrix(turn).T + shift
-    for points, matrix, distortion in (
-        (left, stereo.M1, stereo.D1),
-        (left @ stereo.R.T + stereo.T, stereo.M2, stereo.D2),
-    ):
-        if not (points[:, 2] > 0).all():
-            return False
-        pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
-        if not ((pixels > -0.5) & (pixels < [stereo.image_width - 0.5, stereo.image_height - 0.5])).all():
-            return False
-    return True
+    if (left[:, 2] <= 0).any() or ((left @ stereo.R.T + stereo.T)[:, 2] <= 0).any():
+        return False
+    u, v = projected(board.points_mm, np.append(turn, shift)[None], stereo).pixels.reshape(2, 2, -1).swapaxes(0, 1)
+    inside = (u > -0.5) & (u < stereo.image_width - 0.5) & (v > -0.5) & (v < stereo.image_height - 0.5)
+    return bool(inside.all())

@@ -8,17 +8,14 @@ residuals. mm, px; z are the whitened coordinates of `bundle_adjustment`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.linalg import block_diag, null_space
 
-from tvsbayes.cameras.boards import Board, View
-from tvsbayes.cameras.bundle_adjustment import Adjustment
-from tvsbayes.cameras.stereo_start import composed, pose_of, relative_pose
-from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
+from tvsbayes.cameras.boards import Board
+from tvsbayes.cameras.bundle_adjustment import Adjustment, projected
+from tvsbayes.instrument.stereo_pair import Stereo
 
 PRIOR_SHARE = 2e-3
 """Scale of the half-normal prior of a corner's displacement, one coordinate, over the pitch; 0.05 mm for 25 mm."""
@@ -43,30 +40,30 @@ class BoardErrors:
     correlation_factor: float
 
 
-def board_errors(adjustment: Adjustment, views: Sequence[View], board: Board, stereo: Stereo) -> BoardErrors:
+def board_errors(adjustment: Adjustment, poses: np.ndarray, board: Board, stereo: Stereo) -> BoardErrors:
     """Estimate the displacements of the board's corners from residuals, and their effect on the covariance.
 
     Args:
-        adjustment: the adjustment of `views`.
-        views: the views, in its order.
-        board: the board in the views.
+        adjustment: the adjustment of some views.
+        poses: of the board in these views, to left camera, (views, 6).
+        board: the board.
         stereo: the adjusted pair.
     """
     visible = np.isfinite(adjustment.residuals_px)
     residuals = np.where(visible, adjustment.residuals_px, 0.0)
-    slopes = np.stack([corner_slopes(view, board, stereo) for view in views]) * visible[..., None]
+    slopes = projected(board.points_mm, poses, stereo).by_corner * visible[..., None]
     # Orthonormal columns: each is a change of z with a sum of squares of 1 px^2.
     free = adjustment.root.shape[1]
     flat = np.linalg.qr(adjustment.jacobian.reshape(-1, free))
     basis = np.reshape(flat.Q, adjustment.jacobian.shape)
-    projections = np.einsum("kqcp,kqca->kpca", basis, slopes, optimize=True).reshape(len(views), free, -1)
+    projections = np.einsum("kqcp,kqca->kpca", basis, slopes, optimize=True).reshape(len(poses), free, -1)
     total = projections.sum(axis=0)
     variance = _variance(residuals, slopes, total, board, adjustment)
     by_parameter = adjustment.root @ np.linalg.solve(flat.R, total)
     scores = projections - np.einsum("kqcp,kqcr->kpr", basis, basis, optimize=True) @ total
     factor = correlation_factor(
-        basis.reshape(len(views), -1, free),
-        residuals.reshape(len(views), -1),
+        basis.reshape(len(poses), -1, free),
+        residuals.reshape(len(poses), -1),
         adjustment.noise_sd_px,
         explained=variance * float(np.sum(scores**2)),
     )
@@ -93,18 +90,6 @@ def correlation_factor(basis: np.ndarray, residuals: np.ndarray, noise_sd: float
     lost = np.sum(np.einsum("knp,knr->kpr", basis, basis, optimize=True) ** 2)
     expected = noise_sd**2 * (basis.shape[2] - lost)
     return max(1.0, float((score - explained) / expected)) if expected > 1e-3 * noise_sd**2 else 1.0
-
-
-def corner_slopes(view: View, board: Board, stereo: Stereo) -> np.ndarray:
-    """Derivative (4, corners, 3) of a view's pixels by the positions of the corners on the board, px/mm."""
-    left = pose_of(view, board, stereo)
-    right = composed(left, relative_pose(stereo))
-    slopes = []
-    for pose, matrix, distortion in ((left, stereo.M1, stereo.D1), (right, stereo.M2, stereo.D2)):
-        by_shift = cv2.projectPoints(board.points_mm, pose[:3], pose[3:], matrix, distortion)[1][:, 3:6]
-        # A corner moves in the camera's axes as the board would, turned.
-        slopes.append((by_shift @ rotation_matrix(pose[:3])).reshape(-1, 2, 3).transpose(1, 0, 2))
-    return np.concatenate(slopes)
 
 
 def _variance(residuals: np.ndarray, slopes: np.ndarray, total: np.ndarray, board: Board, fit: Adjustment) -> float:

@@ -198,14 +198,14 @@ def calibrate_stereo(
     shift = adjustment.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
     pitch[21:, 21:] = np.outer(shift, shift)
     stereo = Stereo.of_vector(adjustment.vector, size, _rms(adjustment.residuals_px))
-    errors = board_errors(adjustment, start.views, board, stereo)
+    poses = np.array([pose_of(view, board, stereo) for view in start.views])
+    errors = board_errors(adjustment, poses, board, stereo)
     covariance = errors.correlation_factor * adjustment.covariance + errors.covariance + pitch
     stereo = replace(
         stereo,
         parameter_covariance=0.5 * (covariance + covariance.T),
         right_image_size=None if pictures is None else pictures.right_image_size,
     )
-    poses = [pose_of(view, board, stereo) for view in start.views]
     result = StereoCalibration(
         stereo=stereo,
         board=board,
@@ -365,7 +365,7 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
     return WithSd(float(lengths.mean()), float(lengths.std(ddof=1)))
 
 
-def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> list[str]:
+def _plausibility(result: StereoCalibration, poses: np.ndarray) -> list[str]:
     """Warnings about views and result, in words."""
     warnings = []
     if result.pairs < VIEWS_ADVISED:

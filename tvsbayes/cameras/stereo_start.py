@@ -178,9 +178,9 @@ def camera_start(
     pixels_px = [np.ascontiguousarray(pixels[visible_corners(pixels)], np.float32) for pixels in chosen]
 
     def zhang(flags: int, first: CameraStart | None = None) -> CameraStart:
-        guess = (None, None) if first is None else (first.matrix.copy(), first.distortion.copy())
+        matrix, distortion = (None, None) if first is None else (first.matrix.copy(), first.distortion.copy())
         try:
-            rms, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels_px, size, *guess, flags=flags)
+            rms, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels_px, size, matrix, distortion, flags=flags)
         except cv2.error as error:
             found = f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})"
             raise undetermined(found) from error

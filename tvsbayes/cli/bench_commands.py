@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli.app import Json, finish, finite, missing_options, option_of, refuse_options, report_line
+from tvsbayes.cli.app import Json, finish, finite, missing_options, option_of, refuse_options
 from tvsbayes.cli.begin_commands import stated_globs
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
@@ -21,7 +21,6 @@ from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import make_folder, require_writable, write_atomically
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
-from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
     from tvsbayes.cameras.assumed_covariance import Provenance
@@ -131,7 +130,6 @@ def stereo(
         from tvsbayes.cameras.stereo_calibration import calibrate_folder
         from tvsbayes.report.command_text import stereo_calibration_text
 
-        compile_for(report_line)
         pairing = _pairing(pair, left, right, swap)
         kind: Finder = "sector" if finder == "sector" else "classic"
         with waiting() as progress:
