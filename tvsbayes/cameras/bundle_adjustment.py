@@ -179,7 +179,7 @@ def reduced_residuals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (views, 4, corners) with every board at its optimum, px, and their derivatives (..., 24).
 
-    The derivative by the cameras is (1 - P) J of the full problem: the effect of a change of the cameras with the boards readjusted.
+    The derivative is (1 - P) J of the full problem: the effect of a change of the cameras with boards readjusted.
 
     Args:
         vector: the 24 parameters.
