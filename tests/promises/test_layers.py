@@ -43,7 +43,7 @@ BESIDE_THE_TWIN = {"calibration", "metrology", "results", "inference", *MODEL}
 JAX_FREE_PACKAGES = (
     *("errors", "progress", "display", "files", "importing", "instrument", "head", "calibration", "metrology"),
     *("results", "inference", "single_axis", "twin", "coordinates", "compensation", "positioner", "acquisition"),
-    "report",
+    *("cameras", "report"),
 )
 JAX_FREE_MODULES = (
     *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),

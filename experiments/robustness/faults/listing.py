@@ -256,7 +256,7 @@ FAULTS = (
     Fault("any pair of spots passes the epipolar test", "epipolar_refused", Returns("value & False"),
           "test_a_pair_off_its_epipolar_lines_is_refused"),
     Fault("the stereo calibration divides by n instead of n - p", "bundle_adjustment.bundle_adjustment",
-          Local("dof", "int(kept.sum())"), "test_degrees_of_freedom_are_coordinates_less_unknowns"),
+          Local("dof", "int(seen.sum())"), "test_degrees_of_freedom_are_coordinates_less_unknowns"),
     # Outputs and plans.
     Fault("an output replaces whatever file is there", "app.check_output", Call("require_own", "None"),
           "test_a_page_replaces_pages_only"),
