@@ -40,6 +40,8 @@ FREE = (
     (r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b", "ID"),
     (r"\b[\d.]+ (s|min|seconds)\b", "SECONDS"),
     (r'"(seconds|cpu_s|wall_s|elapsed_s)": [\d.e-]+', r'"\1": SECONDS'),
+    (r'"command": "tvsbayes [^"]*"|Command: tvsbayes write \S+', "COMMAND"),
+    (r"\b[0-9A-F]{12}\b|sha256-[\w+/=]+", "HASH"),
 )
 """What two runs of one tree have otherwise."""
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
@@ -235,7 +237,9 @@ def compare(arguments: argparse.Namespace) -> None:
             moved += 1
             continue
         a, b = lines_of(before / name), lines_of(after / name)
-        if len(a) == len(b) and all(x == y or same(x, y) for x, y in zip(a, b, strict=True)):
+        if len(a) == len(b):
+            b = [x if x == y or same(x, y) else y for x, y in zip(a, b, strict=True)]
+        if a == b:
             continue
         moved += 1
         changes = [line[:200] for line in difflib.unified_diff(a, b, lineterm="", n=0)][2:]
