@@ -68,8 +68,8 @@ def deviations(spots: Sequence[Centre]) -> np.ndarray:
     ok = [one.located for one in spots if one.status == "ok"]
     if len(ok) < 2:
         return np.empty((0, 2))
-    centres = np.array([one.centre_px for one in ok])
-    sds = np.sqrt([np.diag(one.covariance_px2) for one in ok])
+    centres = np.array([centre for centre, _ in ok])
+    sds = np.sqrt([np.diag(covariance) for _, covariance in ok])
     return (centres - centres.mean(axis=0)) / sds
 
 
