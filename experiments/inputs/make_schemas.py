@@ -20,7 +20,7 @@ from tvsbayes.results.compensation_record import (
 from tvsbayes.results.fit_record import Provenance, fit_schema
 from tvsbayes.results.records import schema_of
 from tvsbayes.results.watch_record import Watch, WatchPlan
-from tvsbayes.single_axis.axis_record import AxisInputs, axis_fit_schema
+from tvsbayes.single_axis.axis_summary import AxisInputs, axis_fit_schema
 
 FOLDER = ROOT / "data" / "schemas"
 GROWTH = (

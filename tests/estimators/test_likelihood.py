@@ -17,11 +17,12 @@ from tvsbayes.estimators import likelihood as density
 from tvsbayes.estimators.campaign_arrays import campaign_arrays, spot_constants
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.estimators.mode_search import Problem
+from tvsbayes.gears.priors import half_normal_coordinate
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import HOME_SD_NAMES, INDEX, LOOK_SCATTER_NAMES, NAMES
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.model.compiled import BATCH
-from tvsbayes.model.parameter_space import half_normal_coordinate, parameter_space
+from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, project, to_tvs
 
 pytestmark = pytest.mark.usefixtures("x64")

@@ -15,7 +15,7 @@ from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
-from tvsbayes.model.parameter_space import half_normal_coordinate
+from tvsbayes.gears.priors import half_normal_coordinate
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import (
     NOISE_COLUMNS,

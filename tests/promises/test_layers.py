@@ -41,7 +41,7 @@ MODEL = {"model", "estimators", "posterior", "assessment", "coordinates", "compa
 BESIDE_THE_TWIN = {"calibration", "metrology", "results", "inference", *MODEL}
 """What the digital twin shares no formula with, nor with the mirrors of the instrument."""
 JAX_FREE_PACKAGES = (
-    *("errors", "progress", "display", "files", "importing", "instrument", "head", "calibration", "metrology"),
+    *("errors", "progress", "display", "files", "gears", "importing", "instrument", "head", "calibration", "metrology"),
     *("results", "inference", "single_axis", "twin", "coordinates", "compensation", "positioner", "acquisition"),
     *("cameras", "report"),
 )
@@ -235,6 +235,7 @@ def test_twin_shares_no_formula_with_the_estimators(inner):
             reached = reachable(inner, name)
             assert not {room(other) for other in reached} & BESIDE_THE_TWIN, name
             borrowed = {"instrument.mirrors", "instrument.chains", "single_axis.axis_model", "single_axis.axis_rows"}
+            borrowed |= {"gears.play", "gears.kalman", "gears.places"}
             assert not reached & borrowed, name
 
 

@@ -11,8 +11,8 @@ from support.refusals import refusal
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign_header import mechanism_key
 from tvsbayes.single_axis.axis_campaign import (
+    AXIS_MOVES,
     axis_hashes,
-    axis_moves_bytes,
     read_axis,
     refuse_same_readings,
     write_axis,
@@ -50,7 +50,9 @@ def test_limits_and_assumed_moves_are_kept_and_no_estimate_depends_on_the_limits
     assert (copy.limits, copy.moves, copy.range_allowed) == ((-2500.0, 2400.5), marked.moves, (-2500.0, 2400.5))
     assert axis_hashes(replace(axis, limits=copy.limits)) == axis_hashes(axis)
     # Results of folders without the column stay valid.
-    assert axis_hashes(marked)["moves"] != axis_hashes(axis)["moves"] and b"assumed" not in axis_moves_bytes(axis.moves)
+    assert axis_hashes(marked)["moves"] != axis_hashes(axis)["moves"] and b"assumed" not in AXIS_MOVES.content(
+        axis.moves
+    )
     assert replace(copy, limits=None).range_allowed == (-2300.0, 2300.0), "the last move went there as well"
     write_axis(replace(axis, moves=tuple(replace(m, assumed=int(m.command == 2300)) for m in moves)), tmp_path / "b")
     assert read_axis(tmp_path / "b").range_allowed == (-2300.0, 2000.0)

@@ -9,9 +9,8 @@ import pytest
 from support.axes import campaign, drawn, random_moves
 
 from tvsbayes.single_axis.axis_campaign import AxisMove
-from tvsbayes.single_axis.axis_density import AxisDensity, headline_functionals
+from tvsbayes.single_axis.axis_density import AxisDensity, find_mode, headline_functionals
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
-from tvsbayes.single_axis.axis_mode import find_mode
 
 RATIO, WILD = 2.5, 400.0
 

@@ -13,9 +13,8 @@ from tvsbayes.inference.chain import run_of
 from tvsbayes.inference.importance import weighted_run
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE, RUNS
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
-from tvsbayes.single_axis.axis_density import AxisDensity
+from tvsbayes.single_axis.axis_density import AxisDensity, find_mode
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
-from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import summarise_axis
 

@@ -12,9 +12,8 @@ from support.axes import campaign, runs
 from support.published_iso230 import PUBLISHED, vector_runs
 
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
-from tvsbayes.single_axis.axis_iso230 import position_runs, target_runs
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
-from tvsbayes.single_axis.classic_line import classic_axis
+from tvsbayes.single_axis.classic_line import classic_axis, position_runs, target_runs
 
 type Table = dict[float, list[float]]
 ROUNDING = 1e-9

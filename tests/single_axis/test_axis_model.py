@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from support.axes import FIRST_EDITION, campaign, drawn, random_moves, runs
 
-from tvsbayes.single_axis import axis_model, process_places
+from tvsbayes.gears import places
+from tvsbayes.single_axis import axis_model
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_fit import model_of
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -137,7 +138,7 @@ def test_nodes_agree_with_all_positions(monkeypatch):
     axis = drawn(5).campaign
     exact = model_of(axis)
     w = np.zeros((1, len(exact.coordinates.names)))
-    monkeypatch.setattr(process_places, "PLACES_MAX", 3)
+    monkeypatch.setattr(places, "PLACES_MAX", 3)
     rough = model_of(axis)
     assert exact.places.exact and not rough.places.exact
     # 41 nodes over a travel of five lengths: 0.3 of 4296, where the scatter is held far too small.

@@ -13,7 +13,7 @@ from tvsbayes.report.axis_document import axis_fit_text
 from tvsbayes.results.estimates import Estimate, Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
-from tvsbayes.single_axis.axis_record import AxisSummary, PositionDeviation, facts_of, summarise_axis
+from tvsbayes.single_axis.axis_record import AxisSummary, PositionDeviation, summarise_axis
 from tvsbayes.single_axis.fit_doubts import RULES, WithoutProcesses, doubts_of
 from tvsbayes.single_axis.waves import WavePeriods
 from tvsbayes.statistics.intervals import WithSd
@@ -34,7 +34,7 @@ def clean() -> AxisSummary:
 
 
 def names(summary: AxisSummary, without: WithoutProcesses | None = None) -> list[str]:
-    return [doubt.name for doubt in doubts_of(facts_of(summary, without))]
+    return [doubt.name for doubt in doubts_of(summary, without)]
 
 
 def changed(summary: AxisSummary, **parameters: Estimate) -> AxisSummary:
@@ -48,7 +48,7 @@ def test_a_clean_axis_raises_no_doubt(clean):
 def test_the_scatter_of_readings_far_below_their_u_is_doubted(clean):
     """0.2 is the limit; a scale that the readings do not inform says nothing."""
     wide = changed(clean, reading_scale=estimate(0.08, 0.01))
-    [doubt] = doubts_of(facts_of(wide, None))
+    [doubt] = doubts_of(wide)
     assert doubt.name == "stated u" and not doubt.usable and "0.08 of their stated u" in doubt.text
     assert names(changed(clean, reading_scale=estimate(0.25, 0.01))) == []
     unknown = structs.replace(estimate(0.08, 0.01), contraction=0.0)
@@ -67,7 +67,7 @@ def test_a_play_that_varies_by_more_than_itself_is_doubted(clean):
 def test_an_error_larger_than_the_play_is_doubted_of_angles_alone(clean):
     """The lead of a screw may err by more than the play of its nut."""
     large = structs.replace(clean, deviations=(PositionDeviation(500.0, -0.6, 0.02, (-0.64, -0.56)),))
-    [doubt] = doubts_of(facts_of(large, None))
+    [doubt] = doubts_of(large)
     assert doubt.name == "error by position" and doubt.usable and "0.600(20) deg at command 500" in doubt.text
     assert names(structs.replace(large, unit="mm")) == []
     small = structs.replace(clean, deviations=(PositionDeviation(500.0, -0.45, 0.02, (-0.49, -0.41)),))
@@ -80,7 +80,7 @@ def test_a_wave_on_an_error_as_large_and_as_short_is_doubted(clean):
     error, short, long = estimate(0.15, 0.02), estimate(4.0, 1.0), estimate(6.0, 1.0)
     claimed = structs.replace(clean, periods=(wave,))
     on_error = changed(claimed, transmission_error=error, transmission_error_length=short)
-    assert names(on_error) == ["wave"] and "every 10 " in doubts_of(facts_of(on_error, None))[0].text
+    assert names(on_error) == ["wave"] and "every 10 " in doubts_of(on_error)[0].text
     assert names(changed(claimed, transmission_error=error, transmission_error_length=long)) == []
     smaller = changed(claimed, transmission_error=estimate(0.05, 0.01), transmission_error_length=short)
     assert names(smaller) == []
@@ -90,7 +90,7 @@ def test_a_wave_on_an_error_as_large_and_as_short_is_doubted(clean):
 
 def test_processes_that_explain_nothing_are_named_with_what_stating_them_0_gives(clean):
     now = changed(clean, per_command=estimate(0.6, 1e-4), backlash=estimate(0.2, 0.05))
-    [doubt] = doubts_of(facts_of(now, WithoutProcesses(20.0, WithSd(0.6001, 2e-5), WithSd(0.21, 0.01))))
+    [doubt] = doubts_of(now, WithoutProcesses(20.0, WithSd(0.6001, 2e-5), WithSd(0.21, 0.01)))
     assert doubt.name == "idle processes" and doubt.usable
     assert "odds 20 : 1" in doubt.text and "0.600100(20)" in doubt.text and "0.210(10) (now 0.200(50))" in doubt.text
     assert names(now, WithoutProcesses(2.0, WithSd(0.6001, 2e-5), WithSd(0.21, 0.01))) == []

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from support.axes import campaign, drawn, random_moves, runs
 
-from tvsbayes.single_axis import axis_mode
+from tvsbayes.single_axis import axis_density
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_density import find_mode
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
-from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_periods import WaveSample, separate_periods, strong_harmonics
 from tvsbayes.single_axis.axis_record import summarise_axis
@@ -243,13 +243,13 @@ def test_a_period_at_the_end_of_its_range_is_doubted():
 def test_a_search_that_diverges_restarts_within_bounds(monkeypatch):
     """A long record with narrow waves makes a search diverge, as forced here; the bounded one finds the mode."""
     model = model_of(drive(4, AMPLITUDE, WavePeriods((PERIOD,), (), True)))
-    there, search = find_mode(model), axis_mode._search
+    there, search = find_mode(model), axis_density._search
 
     def lost(*arguments, bounded=False):
         mode = search(*arguments, bounded=bounded)
         return mode if bounded else replace(mode, missing=("lost",), log_density=-1e9)
 
-    monkeypatch.setattr(axis_mode, "_search", lost)
+    monkeypatch.setattr(axis_density, "_search", lost)
     mode = find_mode(model)
     # Both end where the slope is small: within a tenth of a sd.
     assert not there.missing and not mode.missing and mode.log_density == pytest.approx(there.log_density, abs=0.01)

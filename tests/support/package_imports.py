@@ -10,8 +10,8 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tvsbayes"
 ORDER = (
-    *("errors", "progress", "display", "files", "statistics", "importing", "instrument", "head"),
-    *("calibration", "results", "inference", "metrology", "single_axis", "twin", "model"),
+    *("errors", "progress", "display", "files", "statistics", "gears", "importing", "instrument"),
+    *("head", "calibration", "results", "inference", "metrology", "single_axis", "twin", "model"),
     *("estimators", "posterior", "assessment", "coordinates", "compensation", "comparison", "planning", "studies"),
     *("positioner", "cameras", "acquisition"),
     *("pipeline", "report", "view", "cli"),

@@ -17,10 +17,11 @@ from tvsbayes.calibration.pointing import COMPLEX_STEP, INPUT_NAMES
 from tvsbayes.calibration.states import ZERO_NAMES, total_shift
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.gears.priors import HALF_NORMAL_MEAN, HALF_NORMAL_SD
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.parameters import HEADLINES, INDEX, KINDS, NAMES, QUANTITIES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
-from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD, physical_at
+from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
 from tvsbayes.statistics.predicted_readings import State
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from tvsbayes.assessment.weaknesses import headline_gradients, judged_headlines
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.gears.priors import half_normal
 from tvsbayes.instrument.parameters import HEADLINES, KINDS, NAMES
-from tvsbayes.model.parameter_space import half_normal
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.estimates import PriorSensitivity
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights, weighted_mean

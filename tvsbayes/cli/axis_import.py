@@ -30,11 +30,11 @@ from tvsbayes.importing.series import epics_table, is_archive, is_camonitor, is_
 from tvsbayes.importing.table import WORKBOOKS, ForeignTable
 from tvsbayes.importing.text import text_of
 from tvsbayes.single_axis.axis_campaign import (
+    AXIS_MOVES,
+    READINGS,
     AxisMove,
     Reading,
-    axis_moves_bytes,
     axis_templates,
-    readings_bytes,
     unit_of_folder,
 )
 
@@ -261,7 +261,7 @@ def _write(to: Path, rows: AxisRows) -> list[str]:
     _refuse_filled(to)
     moves = [AxisMove(**row) for row in rows.moves]
     readings = [Reading(**row) for row in rows.readings]
-    contents = {"moves.csv": axis_moves_bytes(moves), "readings.csv": readings_bytes(readings)}
+    contents = {"moves.csv": AXIS_MOVES.content(moves), "readings.csv": READINGS.content(readings)}
     if not (to / "campaign.toml").is_file():
         return write_folder(to, contents | {"campaign.toml": _header(rows)})
     return write_files(to, contents)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import SpotArrays
+from tvsbayes.gears.kalman import state_predicted, state_updated
 from tvsbayes.model.geometry import Scalar, materialise
 
 STATES = 6
@@ -66,11 +67,6 @@ def filter_rows(
     )
 
 
-def _along(states: Float[Array | np.ndarray, "6"], like: Array | np.ndarray) -> Float[Array, "6 ..."]:
-    """Reshape numbers of the six states to broadcast over the columns of `like`."""
-    return jnp.reshape(states, (STATES,) + (1,) * (like.ndim - 1))
-
-
 class Belief(eqx.Module):
     """Mean (for every column of residuals) and covariance of the filter's state."""
 
@@ -79,8 +75,7 @@ class Belief(eqx.Module):
 
     def renewed(self, row: FilterRows) -> Belief:
         """Predict the state at the spot, before the update with it."""
-        new = jnp.diag(row.variance)
-        return Belief(self.mean * _along(row.keep, self.mean), self.covariance * (row.keep[:, None] * row.keep) + new)
+        return Belief(*state_predicted(self.mean, self.covariance, row.keep, row.variance, jnp))
 
 
 class Gains(eqx.Module):
@@ -104,15 +99,11 @@ def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
     mean, covariance = belief.mean, belief.covariance
     errors, variances, gains = [], [], []
     for component in range(len(row.load)):
-        # Sums instead of matrix products: a library call costs more than six numbers.
-        gain = jnp.sum(covariance * row.load[component], axis=1)
-        variance_ahead = 1 + jnp.sum(row.load[component] * gain)
-        error = row.residual[component] - jnp.sum(_along(row.load[component], mean) * mean, axis=0)
-        mean = mean + _along(gain, mean) * (error / variance_ahead)
-        covariance = covariance - gain[:, None] * (gain / variance_ahead)
-        errors.append(error / jnp.sqrt(variance_ahead))
-        variances.append(variance_ahead)
-        gains.append(gain / jnp.sqrt(variance_ahead))
+        observed = row.residual[component], row.load[component]
+        mean, covariance, error, ahead, gain = state_updated(mean, covariance, *observed, 1.0, jnp)
+        errors.append(error / jnp.sqrt(ahead))
+        variances.append(ahead)
+        gains.append(gain / jnp.sqrt(ahead))
     variance = jnp.stack(variances)
     update = Gains(jnp.stack(gains), jnp.sqrt(variance))
     return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(variance)), update)

@@ -36,8 +36,8 @@ _HEADER_KEYS = (
 )
 
 
-def _header_value(keys: Keys, key: str) -> object:
-    """One checked value outside `[rig]`, by the type that its key requires."""
+def header_value(keys: Keys, key: str) -> object:
+    """One checked value of a header, by the type that its key requires."""
     if key in _TEXT_CHARS:
         return keys.text_value(key, _TEXT_CHARS[key])
     if key in _QUANTITIES:
@@ -59,7 +59,7 @@ def parse_header(keys: Keys) -> dict[str, object]:
     keys.word("format", ("tvsbayes-campaign/1",))
     keys.only(_HEADER_KEYS)
     plain_keys = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
-    header = {key: _header_value(keys, key) for key in plain_keys} | header_tables(keys, _HEADER_TABLES)
+    header = {key: header_value(keys, key) for key in plain_keys} | header_tables(keys, _HEADER_TABLES)
     check_power(keys, header)
     return header
 
@@ -71,7 +71,7 @@ def header_tables(keys: Keys, tables: Mapping[str, tuple[str, ...]]) -> dict[str
         table = keys.table(name)
         table.only(allowed)
         if table.values:
-            found[name] = {key: _header_value(table, key) for key in table.values}
+            found[name] = {key: header_value(table, key) for key in table.values}
     return found
 
 

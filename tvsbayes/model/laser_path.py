@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from tvsbayes.gears.play import band_begun, band_moved
 from tvsbayes.instrument.chains import Chain
 from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
@@ -172,11 +173,11 @@ def followed(
     driven = q + jnp.where(harmonics.on_wheel, 0.0, harmonics.error_rad(q))
 
     def take_up(band, move):
-        low, high = band
         q, first, approach = move
-        # Play is monotone in its state, so the two ends of the band bound all states between.
-        low = jnp.where(first, jnp.where(approach < 0, q + half, q - half), jnp.clip(low, q - half, q + half))
-        high = jnp.where(first, jnp.where(approach > 0, q - half, q + half), jnp.clip(high, q - half, q + half))
+        low, high = (
+            jnp.where(first, begun, moved)
+            for begun, moved in zip(band_begun(q, half, approach, jnp), band_moved(band, q, half, jnp), strict=True)
+        )
         return (low, high), (0.5 * (low + high), UNIFORM_SD * (high - low))
 
     rows = driven, moves.first, moves.approach

@@ -1,14 +1,12 @@
 """Coordinates with standard normal priors, and the model at a point of them.
 
-Every parameter has a coordinate z with prior N(0, 1): normal priors are value + u z, half-normals u Phi^-1((1 + Phi(z))
-/ 2) (formulation 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo parameters are mean +
-root z with root root^T their full covariance. u = 0 fixes a parameter whatever its z, so that one compiled function
-works for every choice of fixed parameters. Physical values have the units of their names.
+Every parameter has a coordinate z with prior N(0, 1) (`gears.priors`); the 24 stereo parameters are mean + root z with
+root root^T their full covariance. As u = 0 fixes a parameter whatever its z, one compiled function serves every choice
+of fixed parameters. Physical values have the units of their names.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from types import ModuleType
@@ -19,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy import special
 
+from tvsbayes.gears.priors import FARTHEST_SD, half_normal, half_normal_coordinate, half_normal_slope, values_at
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.chains import CHAINS, Chain
 from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, Mechanism
@@ -84,30 +82,6 @@ class Model(eqx.Module):
     gears: GearScales
 
 
-HALF_NORMAL_MEAN, HALF_NORMAL_SD = math.sqrt(2 / math.pi), math.sqrt(1 - 2 / math.pi)
-"""Mean and sd of |x|, x ~ N(0, 1)."""
-
-
-def half_normal[Number: (float, np.ndarray, jax.Array)](z: Number, functions: ModuleType = special) -> Number:
-    """Compute a half-normal quantity of scale 1 from its coordinate, Phi^-1((1 + Phi(z)) / 2).
-
-    1 - (1 + Phi(z)) / 2 = Phi(-z) / 2 is accurate where Phi(z) rounds to 1.
-
-    Args:
-        z: coordinates, any shape.
-        functions: module of `ndtr` and `ndtri`, SciPy's or JAX's.
-    """
-    return -functions.ndtri(0.5 * functions.ndtr(-z))
-
-
-def half_normal_slope[Number: (float, np.ndarray, jax.Array)](
-    z: Number, value: Number | None = None, functions: ModuleType = np
-) -> Number:
-    """Compute its derivative by the coordinate, phi(z) / (2 phi(value)), and the value where not given."""
-    value = half_normal(z) if value is None else value
-    return 0.5 * functions.exp(0.5 * (value**2 - z**2))
-
-
 @jax.custom_jvp
 def _half_normal(z: Float[Array, " n"]) -> Float[Array, " n"]:
     """Compute `half_normal` in JAX, with a derivative from its value, a tenth of the code of JAX's own."""
@@ -120,28 +94,6 @@ def _half_normal_along(
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     value = _half_normal(at[0])
     return value, half_normal_slope(at[0], value, jnp) * along[0]
-
-
-def half_normal_coordinate(value: np.ndarray) -> np.ndarray:
-    """Compute the coordinate of a half-normal quantity of scale 1, from the more accurate tail; values of any sign."""
-    near = special.ndtri(np.maximum(special.erf(np.maximum(value, 0.0) / np.sqrt(2)), 1e-16))
-    return np.where(np.less(value, 0.5), near, -special.ndtri(2 * special.ndtr(-np.maximum(value, 0.5))))
-
-
-def half_normal_sd(mean: float, sd: float) -> float:
-    """Compute the sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
-
-    Near zero the map from coordinate to quantity is flat on one side: its slope would give too small an sd.
-    """
-    nodes, weights = np.polynomial.hermite_e.hermegauss(48)
-    values = half_normal(mean + sd * nodes)
-    weights = weights / weights.sum()
-    centre = weights @ values
-    return float(np.sqrt(weights @ (values - centre) ** 2))
-
-
-FARTHEST_SD = 36.0
-"""Largest coordinate of a half-normal; larger ones are clipped."""
 
 
 class Point(eqx.Module):
@@ -205,12 +157,7 @@ def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: C
     """Convert coordinates to values in the units of `NAMES`, by functions of JAX or NumPy."""
     rig_z, stereo_z = z[..., : len(RIG_NAMES)], z[..., len(RIG_NAMES) :]
     half, log = (space.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
-    # Unused branches get harmless numbers, since `where` lets their infinities into the gradient. Beyond 37 sd Phi
-    # underflows and its inverse is infinite; a fit that goes there must be able to return.
-    w = functions.where(half, functions.minimum(rig_z, FARTHEST_SD), 0.0)
-    log_normal = space.value * functions.exp(functions.where(log, space.u, 0.0) * rig_z)
-    other = functions.where(log, log_normal, space.value + space.u * rig_z)
-    rig = functions.where(half, space.u * half_normal(w), other)
+    rig = values_at(rig_z, space.value, space.u, half, log, functions, half_normal)
     return functions.concatenate([rig, space.stereo_mean + stereo_z @ space.stereo_root.T], axis=-1)
 
 

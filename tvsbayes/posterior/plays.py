@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal, half_normal_coordinate, half_normal_slope
+from tvsbayes.gears.priors import FARTHEST_SD, half_normal, half_normal_coordinate, half_normal_slope
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,6 @@ from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_certificate import axis_traceability
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_iso230 import AXIS_SYMBOLS, target_runs
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
 from tvsbayes.single_axis.axis_record import (
@@ -58,7 +57,7 @@ from tvsbayes.single_axis.axis_record import (
     PositionDeviation,
     deviation_strata,
 )
-from tvsbayes.single_axis.classic_line import ClassicAxis
+from tvsbayes.single_axis.classic_line import AXIS_SYMBOLS, ClassicAxis, target_runs
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
 from tvsbayes.statistics.intervals import band95
 

@@ -10,8 +10,7 @@ from tvsbayes.errors import escaped
 from tvsbayes.report.document import FigureView
 from tvsbayes.report.drawing import BLACK, DIRECTION_STYLE, drawing, legend
 from tvsbayes.report.tables import TableView, three_digits_fixed
-from tvsbayes.single_axis.axis_iso230 import AXIS_TERMS, PositionRuns
-from tvsbayes.single_axis.classic_line import ClassicAxis
+from tvsbayes.single_axis.classic_line import AXIS_TERMS, ClassicAxis, PositionRuns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,13 +6,13 @@ found by name. No JAX.
 
 from __future__ import annotations
 
-import datetime
 import hashlib
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import escaped, refusal
@@ -30,7 +30,7 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import read_bytes, write_folder
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
-from tvsbayes.instrument.campaign_header import ENVIRONMENT, header_tables, header_values
+from tvsbayes.instrument.campaign_header import ENVIRONMENT, header_tables, header_value, header_values
 from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
@@ -216,7 +216,10 @@ class AxisCampaign(Shown):
         )
 
 
-_TEXTS = {**dict.fromkeys(("name", "operator", "instrument", "serial", "method"), 200), "notes": 4000}
+_HEADER = (
+    *("format", "unit", "name", "operator", "instrument", "serial", "method", "notes", "created", "powered_on"),
+    *("rate", "synthetic", "seed", "axis", REFERENCE, *HEADER_TABLES),
+)
 _FILES = {"moves.csv": CSV_BYTES_MAX, "readings.csv": CSV_BYTES_MAX, "campaign.toml": TOML_BYTES_MAX}
 """campaign.toml is written last: a folder without it is incomplete."""
 
@@ -264,38 +267,15 @@ def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[
 
 
 def _parse_header(keys: Keys) -> dict[str, object]:
-    keys.only(
-        (
-            "format",
-            "unit",
-            *_TEXTS,
-            "created",
-            "powered_on",
-            "rate",
-            "synthetic",
-            "seed",
-            "axis",
-            REFERENCE,
-            *HEADER_TABLES,
-        )
-    )
+    keys.only(_HEADER)
     header: dict[str, object] = {}
     for key in keys.values:
-        if key in _TEXTS:
-            header[key] = keys.text_value(key, _TEXTS[key])
-        elif key == "synthetic":
-            header[key] = keys.flag(key)
-        elif key == "seed":
-            header[key] = keys.integer(key, 0, 2**63 - 1)
-        elif key == "rate":
+        if key == "rate":
             header[key] = keys.number(key, -COMMAND_MAX, COMMAND_MAX)
             if not header[key]:
                 raise keys.refuse(key, "zero", "commands per second, not 0", "leave it out of an axis that stops")
-        elif key in ("created", "powered_on"):
-            if not isinstance(keys.values[key], datetime.date):
-                allowed = "a date or time such as 2026-01-15T10:00:00Z"
-                raise keys.refuse(key, "date", allowed, "write it without quotes")
-            header[key] = keys.values[key]
+        elif key not in ("format", "unit", "axis", REFERENCE, *HEADER_TABLES):
+            header[key] = header_value(keys, key)
     check_power(keys, header)
     return header | header_tables(keys, HEADER_TABLES)
 
@@ -346,24 +326,24 @@ def _parse_limits(keys: Keys) -> tuple[float, float] | None:
 def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
     """`period_between`: [low, high], or a list of such pairs, one for every unknown period."""
     allowed = f"[low, high] with 0 < low < high, or a list of up to {RANGES_MAX} such pairs"
+    refuse = partial(keys.refuse, "period_between", "range")
     value = keys.values["period_between"]
-    entries: list[object] = value if isinstance(value, list) else [value]
-    ranges = []
+    entries: list[Any] = value if isinstance(value, list) else [value]
+    ranges: list[tuple[float, float]] = []
     for pair in entries if entries and all(isinstance(entry, list) for entry in entries) else [entries]:
-        ends = pair if isinstance(pair, list) else []
-        numbers = [float(end) for end in ends if isinstance(end, int | float) and not isinstance(end, bool)]
-        if len(ends) != 2 or len(numbers) != 2:
-            raise keys.refuse("period_between", "range", allowed, "give both ends of every range, in their unit")
+        numbers = [float(end) for end in pair if isinstance(end, int | float) and not isinstance(end, bool)]
+        if not len(pair) == len(numbers) == 2:
+            raise refuse(allowed, "give both ends of every range, in their unit")
         low, high = numbers
         if not 0 < low < high <= COMMAND_MAX:
-            raise keys.refuse("period_between", "range", allowed, "order the ends; a known period goes into `periods`")
+            raise refuse(allowed, "order the ends; a known period goes into `periods`")
         ranges.append((low, high))
     for k, (low, high) in enumerate(ranges):
         if any((low, high) != other and low < other[1] and other[0] < high for other in ranges[:k]):
             rule = "ranges that are the same or do not overlap"
-            raise keys.refuse("period_between", "range", rule, "write one range twice where both periods may be there")
+            raise refuse(rule, "write one range twice where both periods may be there")
     if len(ranges) > RANGES_MAX:
-        raise keys.refuse("period_between", "range", allowed, "ask for fewer unknown periods at once")
+        raise refuse(allowed, "ask for fewer unknown periods at once")
     return tuple(ranges)
 
 
@@ -413,26 +393,9 @@ def axis_templates() -> dict[str, bytes]:
     return templates("axis_templates", AXIS_MOVES, READINGS)
 
 
-def axis_moves_bytes(moves: Iterable[AxisMove]) -> bytes:
-    """The content of `moves.csv`."""
-    return AXIS_MOVES.content(moves)
-
-
-def readings_bytes(readings: Iterable[Reading]) -> bytes:
-    """The content of `readings.csv`."""
-    return READINGS.content(readings)
-
-
 def _axis_table_lines(campaign: AxisCampaign) -> list[str]:
     priors = [toml_line(name, {"value": p.value, "u": p.u}) for name, p in sorted(campaign.stated.items())]
-    periods = campaign.periods
-    entries = {
-        "periods": list(periods.stated),
-        "periods_in": "seconds" if periods.in_seconds else None,
-        "period_between": [list(pair) for pair in periods.between],
-        "encoder_period": periods.encoder,
-        "absolute": campaign.absolute,
-    }
+    entries = {**campaign.periods.entries(), "absolute": campaign.absolute}
     return [*priors, *(toml_line(name, value) for name, value in entries.items() if value)]
 
 
@@ -441,10 +404,11 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
     lines = [toml_line("format", FORMAT), toml_line("unit", campaign.unit)]
     lines += [toml_line(key, value) for key, value in campaign.header.items()]
     # No estimate depends on them: they are no part of the hash of the inputs.
-    besides = [] if campaign.limits is None else [toml_line(LIMITS, list(campaign.limits))]
-    besides += [] if campaign.command_unit is None else [toml_line(COMMAND_UNIT, campaign.command_unit)]
+    limits = None if campaign.limits is None else list(campaign.limits)
+    besides = {LIMITS: limits, COMMAND_UNIT: campaign.command_unit}
+    lines += ["[axis]", *(toml_line(key, value) for key, value in besides.items() if value is not None)]
     reference = campaign.reference.lines()
-    lines += ["[axis]", *besides, *_axis_table_lines(campaign), *([f"[{REFERENCE}]"] if reference else []), *reference]
+    lines += [*_axis_table_lines(campaign), *([f"[{REFERENCE}]", *reference] if reference else [])]
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -454,7 +418,7 @@ def axis_bytes(campaign: AxisCampaign) -> dict[str, bytes]:
     Raises:
         InputError: `read_axis` would refuse them.
     """
-    contents = axis_moves_bytes(campaign.moves), readings_bytes(campaign.readings), axis_toml(campaign)
+    contents = AXIS_MOVES.content(campaign.moves), READINGS.content(campaign.readings), axis_toml(campaign)
     files = dict(zip(_FILES, contents, strict=True))
     _parse_files(files, None)
     return files
@@ -475,12 +439,9 @@ def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
     timing = [toml_line(key, campaign.header[key]) for key in ("rate", "powered_on") if key in campaign.header]
     reference = campaign.reference.lines(estimate=True)
     axis = "\n".join([campaign.unit, *timing, *_axis_table_lines(campaign), *reference])
-    contents = {
-        "moves": axis_moves_bytes(campaign.moves),
-        "readings": readings_bytes(readings),
-        "axis": axis.encode(),
-    }
-    return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+    contents = AXIS_MOVES.content(campaign.moves), READINGS.content(readings), axis.encode()
+    names = ("moves", "readings", "axis")
+    return {name: hashlib.sha256(data).hexdigest() for name, data in zip(names, contents, strict=True)}
 
 
 def refuse_same_readings(known: AxisCampaign, new: AxisCampaign) -> None:

@@ -39,8 +39,8 @@ from tvsbayes.metrology.traceability import (
 from tvsbayes.results.estimates import Estimate
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
-from tvsbayes.single_axis.axis_iso230 import AXIS_TERMS
 from tvsbayes.single_axis.axis_record import AxisResults, AxisSummary
+from tvsbayes.single_axis.classic_line import AXIS_TERMS
 
 SI = {
     "m": (1.0, r"\metre"),

@@ -7,7 +7,7 @@ so that the posterior shows no conflict with the prior. The check fits a model w
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,13 +22,13 @@ from tvsbayes.results.estimates import CONFLICT_LIMIT, conflict_sentence
 from tvsbayes.results.records import AnswerKind, EstimatorName, Tier
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
-from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, AxisDensity, headline_functionals
-from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
-from tvsbayes.single_axis.axis_model import AxisModel, LinearPosterior
+from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, AxisDensity, AxisMode, find_mode, headline_functionals
+from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.period_search import waves_of
+from tvsbayes.statistics.linear_posterior import LinearPosterior
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 ABSORBED = ("per_command", "backlash")
@@ -39,6 +39,14 @@ REMEDY = (
 )
 DRAWS = 200
 """Draws of the Laplace approximation for a value and its sd."""
+MODE, WEIGHING, WALKING, SUMMARISING = "mode", "weighted draws", "chain", "summarising"
+EQUAL_DRAWS = 2000
+"""Number of equally weighted draws kept of a sample."""
+ROUNDS_MAX = 32
+"""Largest number of rounds of weighted draws: beyond it a chain costs less than the further draws."""
+PILOTS_MAX = 16
+"""Largest number of rounds that adapt the proposal: waves, creep and drifts are nonlinear, the Laplace approximation is
+not."""
 
 
 @dataclass(frozen=True)
@@ -60,75 +68,51 @@ class PriorConflict:
     stated: bool
     distance: float
 
+    @property
+    def text(self) -> str:
+        """A sentence with the readings' value, the prior and the remedy."""
+        prior, origin = self.prior, "of [axis]" if self.stated else "by default"
+        entry = f"`{self.name.split('.')[0]} = {{ value = {prior.value:.10g}, u = {prior.u:.6g} }}` {origin}"
+        # Digits down to the second digit of its u.
+        digits = int(np.clip(2 + np.ceil(np.log10(max(abs(self.value), 1e-300) / self.sd)), 2, 12))
+        quantity = f"{self.name} = {self.value:.{digits}g} (u = {self.sd:.2g})"
+        return conflict_sentence(quantity, self.distance, entry, REMEDY)
 
-def prior_conflicts(
-    model: AxisModel, w: np.ndarray, stated: Mapping[str, AxisPrior], defaults: Mapping[str, AxisPrior], seed: int
-) -> tuple[PriorConflict, ...]:
-    """Priors that the readings contradict.
 
-    Args:
-        model: the fitted model.
-        w: coordinates of equal draws of its posterior, shape (n, d).
-        stated: entries of `[axis]`.
-        defaults: complete priors without the stated entries.
-        seed: seed of all random numbers.
-    """
-    rng = random_stream(seed, AxisStream.PRIOR_CONFLICTS)
-    conflicts = [_absorbed_conflict(model, name, defaults[name], rng) for name in ABSORBED if name in stated]
-    values = model.coordinates.values(w)
+def _conflicts(fit: AxisFit) -> Iterator[PriorConflict]:
+    """Priors that the readings contradict."""
+    model, stated = fit.model, fit.campaign.stated
+    rng, defaults = random_stream(fit.seed, AxisStream.PRIOR_CONFLICTS), default_priors(fit.rows)
+    for name in ABSORBED:
+        if name in stated:
+            yield from _absorbed_conflict(model, name, defaults[name], rng)
+    values = model.coordinates.values(fit.w)
     for k, name in enumerate(model.coordinates.names):
-        key = name.split(".")[0]
-        if key.startswith("wave_"):
-            continue
-        z = float(w[:, k].mean())
+        key, z = name.split(".")[0], float(fit.w[:, k].mean())
         # An axis much better than the default contradicts no statement of the user.
-        if key not in ABSORBED and (z if key not in stated else abs(z)) > CONFLICT_LIMIT:
-            draws = values[name]
-            conflicts.append(
-                PriorConflict(name, float(draws.mean()), float(draws.std()), model.priors[key], key in stated, abs(z))
-            )
-    return tuple(conflict for conflict in conflicts if conflict is not None)
-
-
-def conflict_text(conflict: PriorConflict) -> str:
-    """A sentence with the readings' value, the prior and the remedy."""
-    prior, key = conflict.prior, conflict.name.split(".")[0]
-    origin = "of [axis]" if conflict.stated else "by default"
-    entry = f"`{key} = {{ value = {prior.value:.10g}, u = {prior.u:.6g} }}` {origin}"
-    # Digits down to the second digit of its u.
-    digits = int(np.clip(2 + np.ceil(np.log10(max(abs(conflict.value), 1e-300) / conflict.sd)), 2, 12))
-    quantity = f"{conflict.name} = {conflict.value:.{digits}g} (u = {conflict.sd:.2g})"
-    return conflict_sentence(quantity, conflict.distance, entry, REMEDY)
+        far = (z if key not in stated else abs(z)) > CONFLICT_LIMIT
+        if far and key not in ABSORBED and not key.startswith("wave_"):
+            value, sd = float(values[name].mean()), float(values[name].std())
+            yield PriorConflict(name, value, sd, model.priors[key], key in stated, abs(z))
 
 
 def _absorbed_conflict(
     model: AxisModel, name: str, default: AxisPrior, rng: np.random.Generator
-) -> PriorConflict | None:
-    """The conflict of prior and readings beyond both u; None where there is none or the test is not possible."""
+) -> Iterator[PriorConflict]:
+    """The conflict of prior and readings beyond both u; none where the test is not possible."""
     prior = model.priors[name]
     if prior.u >= default.u or (name == "backlash" and not model.rows.both_sides):
-        return None
+        return
     without_prior = AxisModel.of(model.rows, {**model.priors, name: default}, None, model.coordinates.waves)
     mode = find_mode(without_prior)
     if mode.missing:
-        return None
-    w = rng.multivariate_normal(mode.w, mode.covariance, DRAWS) if len(mode.w) else np.zeros((DRAWS, 0))
-    draws = without_prior.linear(w).drawn(without_prior.line_terms(**{name: 1.0})[None], rng)[:, 0]
+        return
+    linear = without_prior.linear(mode.drawn(DRAWS, rng))
+    draws = linear.drawn(without_prior.line_terms(**{name: 1.0})[None], rng)[:, 0]
     value, sd = float(draws.mean()), float(draws.std())
     difference = abs(value - prior.value)
-    if difference <= CONFLICT_LIMIT * float(np.hypot(prior.u, sd)):
-        return None
-    return PriorConflict(name, value, sd, prior, True, difference / prior.u if prior.u else np.inf)
-
-
-MODE, WEIGHING, WALKING, SUMMARISING = "mode", "weighted draws", "chain", "summarising"
-EQUAL_DRAWS = 2000
-"""Number of equally weighted draws kept of a sample."""
-ROUNDS_MAX = 32
-"""Largest number of rounds of weighted draws: beyond it a chain costs less than the further draws."""
-PILOTS_MAX = 16
-"""Largest number of rounds that adapt the proposal: waves, creep and drifts are nonlinear, the Laplace approximation is
-not."""
+    if difference > CONFLICT_LIMIT * float(np.hypot(prior.u, sd)):
+        yield PriorConflict(name, value, sd, prior, True, difference / prior.u if prior.u else np.inf)
 
 
 @dataclass(frozen=True, repr=False)
@@ -198,7 +182,7 @@ class AxisFit(Shown):
         if not self.free:
             remedy = "state other values in [axis]: every scale is held where the readings cannot be"
         elif contradicted := [conflict for conflict in self.conflicts if conflict.stated]:
-            remedy = "; ".join(conflict_text(conflict) for conflict in contradicted)
+            remedy = "; ".join(conflict.text for conflict in contradicted)
         else:
             remedy = "look for wild readings, and at the values and u of [axis]"
         return NotConverged("unconverged", "UNCONVERGED: " + "; ".join(self.mode.missing), remedy=remedy)
@@ -206,7 +190,7 @@ class AxisFit(Shown):
     @cached_property
     def conflicts(self) -> tuple[PriorConflict, ...]:
         """Priors that the readings contradict."""
-        return prior_conflicts(self.model, self.w, self.campaign.stated, default_priors(self.rows), self.seed)
+        return tuple(_conflicts(self))
 
     @cached_property
     def linear(self) -> LinearPosterior:
@@ -220,7 +204,7 @@ class AxisFit(Shown):
         draws = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
         # All in one call: their posterior is joint, and a sum may be known far better than its terms.
         functionals, names = headline_functionals(self.model, self.w), self.model.shifts
-        shifts = np.array([self.model.shift(name) for name in names]).reshape(len(names), self.model.columns)
+        shifts = np.eye(self.model.columns)[list(self.model.shift_columns.values())]
         shifts = np.broadcast_to(shifts, (*functionals.shape[:-2], len(names), functionals.shape[-1]))
         functionals = np.concatenate([functionals, shifts], axis=-2)
         # In units of their sd: an offset is known to more digits than a contrast has; what is fixed stays exact.
@@ -302,10 +286,8 @@ def fit_axis(
         rng = random_stream(seed, AxisStream.RESAMPLING)
         if sample is not None and sample.convergence.converged:
             w = sample.equal(EQUAL_DRAWS, rng)
-        elif len(mode.w):
-            w = rng.multivariate_normal(mode.w, mode.covariance, EQUAL_DRAWS, method="cholesky")
         else:
-            w = np.zeros((EQUAL_DRAWS, 0))
+            w = mode.drawn(EQUAL_DRAWS, rng, "cholesky")
         fit = AxisFit(campaign, model, mode, sample, w, seed)
         assert fit.draws
     return fit

@@ -11,19 +11,19 @@ stop errors. NumPy.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from tvsbayes.gears.kalman import whitened
+from tvsbayes.gears.places import ProcessPlaces
 from tvsbayes.single_axis.axis_parameters import AxisCoordinates, AxisPrior
-from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_are_long, play_places, reversal_of
-from tvsbayes.single_axis.filter_of_rows import Whitened, averaged_variance, whitened
-from tvsbayes.single_axis.linear_posterior import LinearPosterior
-from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
+from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, PlayPlaces, legs_are_long, play_places, reversal_of
 from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
+from tvsbayes.statistics.linear_posterior import LinearPosterior
 from tvsbayes.statistics.predicted_readings import PredictedReadings
 
 OFFSET_TRAVELS = 1.0
@@ -36,41 +36,67 @@ BLOCK_NUMBERS_MAX = 8_000_000
 """Largest number of values in a block of draws."""
 OFFSET, SLOPE, CONTRAST, BACKLASH = 0, 1, 2, 3
 """Indices of the first columns, the terms of the line and the backlash."""
-LINE_TERMS = 4
-"""Their number."""
+LINE_COLUMNS = {"offset": OFFSET, "per_command": SLOPE, "ratio_contrast": CONTRAST, "backlash": BACKLASH}
 
 
-@dataclass(frozen=True)
-class Likelihood:
-    """Likelihood of the readings at many coordinates, linear quantities integrated out.
-
-    Attributes:
-        log_density: shape (n,).
-        linear: posterior of the requested functionals, in place of columns.
-    """
+class Likelihood(NamedTuple):
+    """Log density (n,) at many coordinates, and the posterior of the requested functionals, in place of columns."""
 
     log_density: np.ndarray
     linear: LinearPosterior
 
-    @classmethod
-    def undefined(cls, count: int, size: int) -> Likelihood:
-        """The likelihood at coordinates where the density is undefined."""
-        return cls(np.full(count, -np.inf), LinearPosterior(np.zeros((count, size)), np.zeros((count, size, size))))
 
-    @classmethod
-    def joined(cls, parts: Sequence[Likelihood]) -> Likelihood:
-        """Parts concatenated."""
-        mean, covariance = ([getattr(part.linear, name) for part in parts] for name in ("mean", "covariance"))
-        linear = LinearPosterior(np.concatenate(mean), np.concatenate(covariance))
-        return cls(np.concatenate([part.log_density for part in parts]), linear)
+def averaged_variance(duration: np.ndarray) -> np.ndarray:
+    """Variance of the mean of an exponentially correlated process over its own; `duration` is in correlation times."""
+    ratio = np.maximum(duration, 1e-3)
+    return np.where(duration > 1e-3, 2 / ratio * (1 + np.expm1(-ratio) / ratio), 1.0 - duration / 3)
 
 
-@dataclass(frozen=True)
-class _Block:
+def stop_variance(values: Mapping[str, np.ndarray], side: np.ndarray) -> np.ndarray:
+    """Variances (n, r) of errors of stops reached from sides (r,)."""
+    forward = 0.5 * (1.0 + side)
+    stop = np.outer(values["stop_sd.forward"] ** 2, forward)
+    return stop + np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
+
+
+class ScatteredReadings(NamedTuple):
+    """Readings as their noise depends on them; arrays (r,).
+
+    Attributes:
+        zero, stop: numbers of the homing and of the stop of each.
+        hours: time since the homing.
+        side: side from which the stop was reached.
+        variance: by the stated u.
+    """
+
+    zero: np.ndarray
+    stop: np.ndarray
+    hours: np.ndarray
+    side: np.ndarray
+    variance: np.ndarray
+
+
+def noise_covariances(
+    values: Mapping[str, np.ndarray], readings: ScatteredReadings, travel: float
+) -> dict[str, np.ndarray]:
+    """Covariances (n, r, r) by cause of what does not repeat, at the scales of n draws (formulation 8.2)."""
+    zero, stop, hours, side, variance = readings
+    one_zero, one_stop = np.equal.outer(zero, zero), np.equal.outer(stop, stop)
+    stops = stop_variance(values, side)
+    reading = np.outer(values["reading_scale"] ** 2, variance) + (FLOOR * travel) ** 2
+    return {
+        "homing": values["home_sd"][:, None, None] ** 2 * one_zero,
+        "drift": values["drift_per_root_hour"][:, None, None] ** 2 * np.minimum.outer(hours, hours) * one_zero,
+        "stops": np.sqrt(stops[:, :, None] * stops[:, None, :]) * one_stop,
+        "readings": reading[:, :, None] * np.eye(len(side)),
+    }
+
+
+class _Block(NamedTuple):
     """Products of a block of draws.
 
     Attributes:
-        products: products of whitened columns, shape (n, 1 + columns, 1 + columns).
+        products: products of whitened readings and columns, shape (n, 1 + columns, 1 + columns).
         log_scatter: log-determinant of the innovations, shape (n,).
         factor: factor of the prior covariance, shape (n, columns, columns).
     """
@@ -114,36 +140,33 @@ class AxisModel:
             more: further commands at which the processes will be evaluated.
             waves: waves of the model.
         """
-        unused = set()
-        if priors["creep"].u == 0 == priors["creep"].value or not _creeps(rows):
-            unused.add("creep_minutes")
-        unused |= {"stop_sd.forward", "stop_sd.backward"} if rows.in_motion else {"seeing_scale", "seeing_s"}
-        if rows.in_motion:
-            # Averaged readings hardly separate white noise from seeing: noise is as stated, excess counts as seeing.
-            unused |= {"transmission_error", "transmission_error_length", "play_variation", "reading_scale"}
-        if not np.any(rows.variance > 0):
-            unused.add("reading_scale")
-        if len(np.unique(rows.zero)) < 2:
-            unused.add("home_sd")
-        if not np.any(rows.hours > 0):
-            unused.add("drift_per_root_hour")
-        if not np.any(rows.side >= 0):
-            unused.add("stop_sd.forward")
-        if not np.any(rows.side <= 0):
-            unused.add("stop_sd.backward")
-        if priors["transmission_error"].u == 0 == priors["transmission_error"].value:
-            if priors["play_variation"].u == 0 == priors["play_variation"].value:
-                unused.add("transmission_error_length")
-        first_moves = np.flatnonzero(rows.legs.first)
-        unknown_segments = tuple(int(k) for k in rows.legs.segment[first_moves[rows.legs.side[first_moves] == 0]])
+        in_motion = rows.in_motion
+        unused = {
+            "creep_minutes": _is_zero(priors["creep"]) or not _creeps(rows),
+            "stop_sd.forward": in_motion or not np.any(rows.side >= 0),
+            "stop_sd.backward": in_motion or not np.any(rows.side <= 0),
+            "seeing_scale": not in_motion,
+            "seeing_s": not in_motion,
+            # At constant rate an error by position is a function of time and therefore part of the drift. Averaged
+            # readings hardly separate white noise from seeing: noise is as stated, excess counts as seeing.
+            "transmission_error": in_motion,
+            "play_variation": in_motion,
+            "transmission_error_length": in_motion
+            or (_is_zero(priors["transmission_error"]) and _is_zero(priors["play_variation"])),
+            "reading_scale": in_motion or not np.any(rows.variance > 0),
+            "home_sd": len(np.unique(rows.zero)) < 2,
+            "drift_per_root_hour": not np.any(rows.hours > 0),
+            "backlash": legs_are_long(rows),
+        }
+        coordinates = AxisCoordinates.of(
+            priors, frozenset(name for name, is_unused in unused.items() if is_unused), waves
+        )
         spread = play_places(rows, np.array([rows.travel])).spread[0]
-        unknown_segments = tuple(k for k in unknown_segments if np.any(spread[rows.segment == k] > 0))
-        if legs_are_long(rows):
-            unused.add("backlash")
-        # At constant rate an error by position is a function of time and therefore part of the drift.
-        command = rows.command[:0] if rows.in_motion else rows.command
-        places = process_places(command, np.zeros(0) if more is None else more)
-        return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused), waves), places, unknown_segments)
+        begun = rows.legs.first & (rows.legs.side == 0)
+        unknown = [int(k) for k in rows.legs.segment[begun] if np.any(spread[rows.segment == k] > 0)]
+        command = rows.command[:0] if in_motion else rows.command
+        places = ProcessPlaces.of(command, np.zeros(0) if more is None else more)
+        return cls(rows, dict(priors), coordinates, places, tuple(unknown))
 
     @cached_property
     def homed(self) -> np.ndarray:
@@ -164,14 +187,13 @@ class AxisModel:
     def shifts(self) -> tuple[str, ...]:
         """Shifts of the zero in time that have a column: `creep`, `thermal_per_K`."""
         there = {"creep": _creeps(self.rows), "thermal_per_K": self.rows.kelvin is not None}
-        names = [name for name, is_recorded in there.items() if is_recorded]
-        return tuple(name for name in names if not self.priors[name].u == 0 == self.priors[name].value)
+        return tuple(name for name, recorded in there.items() if recorded and not _is_zero(self.priors[name]))
 
     @cached_property
     def layout(self) -> dict[str, slice]:
         """Columns by what they are; those of the processes are in the order of the places."""
         places = len(self.places.command)
-        sizes = {"line": LINE_TERMS, "homed": len(self.homed), "unknown": len(self.unknown_segments)}
+        sizes = {"line": len(LINE_COLUMNS), "homed": len(self.homed), "unknown": len(self.unknown_segments)}
         sizes |= {"shifts": len(self.shifts), "waves": COLUMNS * len(self.coordinates.waves)}
         sizes |= {"reference": len(self.rows.reference_causes), "error": places, "play": places}
         ends = np.cumsum(list(sizes.values())).tolist()
@@ -226,88 +248,120 @@ class AxisModel:
         speed = 1.0 if wave.clock == "seconds" else abs(rows.line.slope * (rows.rate or 0.0))
         return wave_columns(self.clock_of_rows(wave), period, self.record(wave), rows.width_s * speed)
 
-    def _shifts_of_rows(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Columns (n or 1, rows) of the shifts of the zero in time."""
-        columns = {}
+    def in_time(
+        self, minutes: np.ndarray, warm_s: np.ndarray, kelvin: np.ndarray | float | None
+    ) -> dict[str, np.ndarray]:
+        """Factors (n or 1, r) of the shifts of the zero at times since the machine was switched on and temperatures.
+
+        `minutes` (n,) are the time constants of the creep.
+        """
+        factors = {}
         if "creep" in self.shifts:
-            minutes = values["creep_minutes"]
-            minutes = minutes if "creep_minutes" in self.coordinates.names else minutes[:1]
-            columns["creep"] = -np.expm1(-self.rows.warm_s[None] / (60.0 * minutes[:, None]))
-        if "thermal_per_K" in self.shifts and self.rows.kelvin is not None:
-            columns["thermal_per_K"] = self.rows.kelvin[None]
-        return columns
+            factors["creep"] = -np.expm1(-np.atleast_2d(warm_s) / (60.0 * minutes[:, None]))
+        if "thermal_per_K" in self.shifts:
+            factors["thermal_per_K"] = np.atleast_2d(np.asarray(kelvin, dtype=float))
+        return factors
+
+    def fill(
+        self,
+        columns: np.ndarray,
+        command: np.ndarray,
+        play: PlayPlaces,
+        in_time: Mapping[str, np.ndarray],
+        waves: Sequence[np.ndarray],
+    ) -> None:
+        """Fill the columns (n, r, columns) of readings at commands (r,); those of single homings stay.
+
+        Args:
+            columns: what is filled, zeros before.
+            command: where the processes act, (r,).
+            play: places in the play.
+            in_time: factors of the shifts of the zero.
+            waves: columns of every wave, (n or 1, r, `COLUMNS`).
+        """
+        weights = self.places.weights(command)
+        columns[..., OFFSET], columns[..., SLOPE] = 1.0, play.anchor - self.middle
+        columns[..., CONTRAST], columns[..., BACKLASH] = 0.5 * play.path, 0.5 * play.side
+        for name, factor in in_time.items():
+            columns[..., self.shift_columns[name]] = factor
+        for k, of_wave in enumerate(waves):
+            columns[..., self.of_wave(k)] = of_wave
+        columns[..., self.layout["error"]] = weights
+        columns[..., self.layout["play"]] = 0.5 * play.share[..., None] * weights
 
     def _columns(self, w: np.ndarray, values: Mapping[str, np.ndarray], extra: np.ndarray | None) -> np.ndarray:
         """Readings minus the prior means, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
         rows, backlash = self.rows, values["backlash"]
         drawn = zip(self.coordinates.waves, self.coordinates.wave_draws(w), strict=True)
-        waves, shifts = [self.wave_columns(wave, draws.period) for wave, draws in drawn], self._shifts_of_rows(values)
+        waves = [self.wave_columns(wave, draws.period) for wave, draws in drawn]
+        minutes = values["creep_minutes"]
+        in_time = self.in_time(
+            minutes if "creep_minutes" in self.coordinates.names else minutes[:1], rows.warm_s, rows.kelvin
+        )
         play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
         spread = play.spread if self.play_is_sampled else self._unknown_spread
         # Equal columns are computed once for all draws.
-        differ = self.play_is_sampled or any(len(each) > 1 for each in (*shifts.values(), *waves))
-        blocks = len(backlash) if differ else 1
-        width = 1 + self.columns + (0 if extra is None else extra.shape[1])
-        filled = np.zeros((blocks, len(rows.move), width))
-        level = rows.line.offset + rows.line.slope * self.middle
-        anchor = play.anchor - self.middle
-        filled[:, :, 0] = rows.value - level - self.priors["per_command"].value * anchor
-        filled[:, :, 0] -= 0.5 * self.priors["ratio_contrast"].value * play.path
-        filled[:, :, 0] -= 0.5 * play.side * backlash[:blocks, None]
-        columns = filled[:, :, 1:]
-        columns[..., OFFSET], columns[..., SLOPE], columns[..., CONTRAST] = 1.0, anchor, 0.5 * play.path
-        columns[..., BACKLASH] = 0.5 * play.side
+        differ = self.play_is_sampled or any(len(each) > 1 for each in (*in_time.values(), *waves))
+        size = len(w) if differ else 1
+        filled = np.zeros((size, len(rows.move), 1 + self.columns + (0 if extra is None else extra.shape[1])))
+        columns = filled[:, :, 1 : 1 + self.columns]
+        self.fill(columns, rows.command, play, in_time, waves)
         columns[..., self.layout["homed"]] = rows.zero[:, None] == self.homed
         columns[..., self.layout["unknown"]] = spread[..., None] * np.equal.outer(rows.segment, self.unknown_segments)
-        for name, column in shifts.items():
-            filled[:, :, 0] -= self.priors[name].value * column
-            columns[..., self.shift_columns[name]] = column
-        for k, wave in enumerate(waves):
-            columns[..., self.of_wave(k)] = wave
         columns[..., self.layout["reference"]] = rows.reference
-        columns[..., self.layout["error"]] = self._weights
-        columns[..., self.layout["play"]] = 0.5 * play.share[:, :, None] * self._weights
+        means = self._prior_means(values)[:size]
+        filled[:, :, 0] = rows.value
+        for column in np.flatnonzero(means.any(axis=0)):
+            filled[:, :, 0] -= means[:, column, None] * columns[..., column]
         if extra is not None:
-            columns[..., self.columns :] = extra
+            filled[:, :, 1 + self.columns :] = extra
         return filled
 
-    def _stop_variance(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Variances of stop errors (in motion: of seeing), shape (n, rows)."""
-        rows = self.rows
+    def _prior_means(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Prior means of the columns, (n, columns)."""
+        means = np.zeros((len(values["backlash"]), self.columns))
+        means[:, OFFSET] = self.rows.line.offset + self.rows.line.slope * self.middle
+        means[:, SLOPE] = self.priors["per_command"].value
+        means[:, CONTRAST] = self.priors["ratio_contrast"].value
+        means[:, BACKLASH] = values["backlash"]
+        for name, column in self.shift_columns.items():
+            means[:, column] = self.priors[name].value
+        return means
+
+    def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (n or 1, rows, c) in units of the scatter, decorrelated, and its log-determinant (n,).
+
+        The states of the filter are the drift of the zero and the error of the stop; in motion, the seeing.
+        """
+        rows, n = self.rows, len(values["backlash"])
         if rows.in_motion:
-            seeing = (values["seeing_scale"] * rows.reading_u) ** 2
-            return seeing[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None])
-        forward = 0.5 * (1.0 + rows.side)
-        stop = np.outer(values["stop_sd.forward"] ** 2, forward)
-        return stop + np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
-
-    def _reading_variance(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Variances of readings, shape (n, rows)."""
-        rows = self.rows
+            stop = np.outer((values["seeing_scale"] * rows.reading_u) ** 2, np.ones(len(rows.move)))
+            ratio = rows.width_s / values["seeing_s"][:, None]
+            stop = stop * averaged_variance(ratio)
+            gap = np.maximum(HOUR_S * rows.hours - rows.width_s, 0.0) / values["seeing_s"][:, None]
+            mean_factor = np.where(ratio > 1e-3, -np.expm1(-ratio) / np.maximum(ratio, 1e-3), 1.0 - 0.5 * ratio)
+            carry = np.minimum(np.exp(-gap) * mean_factor**2 / averaged_variance(ratio), 1.0)
+        else:
+            stop = stop_variance(values, rows.side)
+            carry = np.ones((1, len(rows.move)))
+        carry = np.where(rows.redrawn, 0.0, carry)
         reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
-        exact = rows.in_motion or self.places.exact
-        return reading if exact else reading + self.between_nodes(values)[:, None]
-
-    def _carry(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Share of the previous row's stop error (in motion: seeing) in each row: shape (n or 1, rows)."""
-        rows = self.rows
-        if not rows.in_motion:
-            return np.where(rows.redrawn, 0.0, 1.0)[None]
-        duration_s = values["seeing_s"][:, None]
-        gap = np.maximum(HOUR_S * rows.hours - rows.width_s, 0.0)[None] / duration_s
-        ratio = rows.width_s[None] / duration_s
-        mean_factor = np.where(ratio > 1e-3, -np.expm1(-ratio) / np.maximum(ratio, 1e-3), 1.0 - 0.5 * ratio)
-        carry = np.exp(-gap) * mean_factor**2 / averaged_variance(ratio)
-        return np.where(rows.redrawn, 0.0, np.minimum(carry, 1.0))
+        if not (rows.in_motion or self.places.exact):
+            reading = reading + self.between_nodes(values)[:, None]
+        keep, variance = np.empty((2, len(rows.move), 2, n))
+        keep[:, 0] = np.r_[0, rows.zero[1:] == rows.zero[:-1]][:, None]
+        variance[:, 0] = np.outer(rows.hours, values["drift_per_root_hour"] ** 2)
+        keep[:, 1], variance[:, 1] = carry.T, ((1 - carry**2) * stop).T
+        white, log_scatter = whitened(np.swapaxes(columns, 0, 1), keep, variance, np.ascontiguousarray(reading.T))
+        return np.swapaxes(white, 0, 1), log_scatter
 
     def between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Variance (n,) of both processes midway between nodes, as lost by cubic interpolation."""
         spacing = abs(self.rows.line.slope) * (self.places.command[1] - self.places.command[0])
-        length = values["transmission_error_length"]
-        weight = np.array([1.0, -0.0625, 0.5625, 0.5625, -0.0625])
+        weight = np.array([1.0, 0.0625, -0.5625, -0.5625, 0.0625])
         positions = np.array([1.5, 0.0, 1.0, 2.0, 3.0]) * spacing
-        weight[1:] *= -1
-        correlation = matern52((positions[:, None] - positions)[None], length[:, None, None])
+        length = values["transmission_error_length"][:, None, None]
+        correlation = matern52((positions[:, None] - positions)[None], length)
         residual = np.maximum(np.einsum("i,nij,j->n", weight, correlation, weight), 0.0)
         return residual * (values["transmission_error"] ** 2 + 0.25 * values["play_variation"] ** 2)
 
@@ -317,13 +371,13 @@ class AxisModel:
         weighted = np.any(self._weights != 0, axis=0)
         return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), weighted, weighted)))
 
-    def _factor(self, values: Mapping[str, np.ndarray], scales: Sequence[np.ndarray], reorder: bool) -> np.ndarray:
-        """Factor of the prior covariance of the columns, shape (n, columns, columns); `scales` (n,) are the waves'.
+    def _factor(self, w: np.ndarray, values: Mapping[str, np.ndarray], reorder: bool = False) -> np.ndarray:
+        """Factor of the prior covariance of the columns, shape (n, columns, columns).
 
         It is a Cholesky factor with places in order. With `reorder`, places with influence on rows precede the others
         and do not depend on the coordinates of these.
         """
-        sd = np.zeros((len(values["backlash"]), self.columns))
+        sd = np.zeros((len(w), self.columns))
         sd[:, OFFSET] = OFFSET_TRAVELS * self.rows.travel
         sd[:, SLOPE], sd[:, CONTRAST] = self.priors["per_command"].u, self.priors["ratio_contrast"].u
         sd[:, BACKLASH] = 0.0 if self.play_is_sampled else self.priors["backlash"].u
@@ -332,27 +386,26 @@ class AxisModel:
         sd[:, self.layout["unknown"]] = np.sqrt(1 / 3)
         for name, column in self.shift_columns.items():
             sd[:, column] = self.priors[name].u
-        for k, scale in enumerate(scales):
-            sd[:, self.of_wave(k)] = np.outer(scale, SHARES)
+        for k, draws in enumerate(self.coordinates.wave_draws(w)):
+            sd[:, self.of_wave(k)] = np.outer(draws.scale, SHARES)
         # Never rescaled: the readings share the error, so that their scatter says nothing about it.
         sd[:, self.layout["reference"]] = 1.0
         factor = sd[:, None] * np.eye(self.columns)
         distance = abs(self.rows.line.slope) * (self.places.command[:, None] - self.places.command)
-        length = values["transmission_error_length"][:, None, None]
-        covariance = matern52(distance[None], length) + JITTER * np.eye(len(distance))
+        covariance = matern52(distance[None], values["transmission_error_length"][:, None, None])
+        covariance = covariance + JITTER * np.eye(len(distance))
         if reorder:
             first = np.argsort(~np.any(self._weights != 0, axis=0), kind="stable")
             root = np.empty_like(covariance)
             root[:, first[:, None], first] = np.linalg.cholesky(covariance[:, first[:, None], first])
         else:
             root = np.linalg.cholesky(covariance)
-        error, play = self.layout["error"], self.layout["play"]
-        factor[:, error, error] = values["transmission_error"][:, None, None] * root
-        factor[:, play, play] = values["play_variation"][:, None, None] * root
+        for block, scale in (("error", "transmission_error"), ("play", "play_variation")):
+            factor[:, self.layout[block], self.layout[block]] = values[scale][:, None, None] * root
         return factor
 
     def _blocks(
-        self, w: np.ndarray, extra: np.ndarray | None = None, *, informed: bool = False
+        self, w: np.ndarray, extra: np.ndarray | None = None, informed: bool = False
     ) -> Iterator[tuple[slice, _Block]]:
         """The draws w (n, d) in blocks that fit into memory; `informed`: products only of the columns in `informed`."""
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
@@ -363,96 +416,72 @@ class AxisModel:
             columns = self._columns(w[part], values, extra)
             if informed:
                 columns = columns[:, :, np.concatenate(([0], 1 + self.informed))]
-            white = self._whitened(values, columns)
-            scales = [draws.scale for draws in self.coordinates.wave_draws(w[part])]
-            products = np.swapaxes(white.columns, 1, 2) @ white.columns
-            spread = self.rows.log_density_within(values["reading_scale"])
-            yield part, _Block(products, white.log_scatter - 2 * spread, self._factor(values, scales, informed))
+            white, log_scatter = self._whitened(values, columns)
+            log_scatter = log_scatter - 2 * self.rows.log_density_within(values["reading_scale"])
+            yield part, _Block(np.swapaxes(white, 1, 2) @ white, log_scatter, self._factor(w[part], values, informed))
 
     def white(self, w: np.ndarray) -> np.ndarray:
         """Whitened readings and columns (rows, 1 + columns) at one draw w (1, d)."""
         values = self.coordinates.values(w)
-        return self._whitened(values, self._columns(w, values, None)).columns[0]
+        return self._whitened(values, self._columns(w, values, None))[0][0]
 
     def prior_factor(self, w: np.ndarray) -> np.ndarray:
         """Factor of the prior covariance of the columns (columns, columns) at one draw w (1, d)."""
-        scales = [draws.scale for draws in self.coordinates.wave_draws(w)]
-        return self._factor(self.coordinates.values(w), scales, False)[0]
+        return self._factor(w, self.coordinates.values(w))[0]
 
     def whitened_extra(self, w: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Further columns (rows, c), whitened as the model's columns at one draw w (1, d)."""
-        return self._whitened(self.coordinates.values(w), columns[None]).columns[0]
-
-    def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> Whitened:
-        drift, stop = values["drift_per_root_hour"] ** 2, self._stop_variance(values)
-        return whitened(columns, self.rows, drift, stop, self._reading_variance(values), self._carry(values))
+        return self._whitened(self.coordinates.values(w), columns[None])[0][0]
 
     def log_likelihood(self, w: np.ndarray) -> np.ndarray:
         """Log density of the readings at coordinates (n, d), shape (n,)."""
-        return self.likelihood(w, np.zeros((0, self.columns))).log_density
-
-    def likelihood(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """Likelihood at coordinates (n, d), with the posterior of functionals (t, columns) of the linear quantities."""
-        rows, count = len(self.rows.move), len(functionals)
-        log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), count)), np.empty((len(w), count, count))
-        for part, block in self._blocks(w):
-            normal = _normal_equations(block, 0)
-            scale = np.sqrt(np.diagonal(normal.information, axis1=1, axis2=2))
-            scaled = normal.information / (scale[:, :, None] * scale[:, None, :])
-            root = np.linalg.cholesky(scaled)
-            sides = np.concatenate([normal.right_side[:, None], functionals @ block.factor], axis=1) / scale[:, None]
-            solved = np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
-            products = sides @ solved
-            log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
-            residual = block.products[:, 0, 0] - products[:, 0, 0]
-            log_density[part] = -0.5 * (block.log_scatter + log_det + residual + rows * np.log(2 * np.pi))
-            mean[part], covariance[part] = products[:, 0, 1:], products[:, 1:, 1:]
-        if count:
-            mean += self._prior_means(w) @ functionals.T
-        return Likelihood(log_density, LinearPosterior(mean, covariance))
-
-    def _prior_means(self, w: np.ndarray) -> np.ndarray:
-        """Prior means of the columns, (n, columns)."""
-        means = np.zeros((len(w), self.columns))
-        means[:, OFFSET] = self.rows.line.offset + self.rows.line.slope * self.middle
-        means[:, SLOPE] = self.priors["per_command"].value
-        means[:, CONTRAST] = self.priors["ratio_contrast"].value
-        means[:, BACKLASH] = self.coordinates.values(w)["backlash"]
-        for name, column in self.shift_columns.items():
-            means[:, column] = self.priors[name].value
-        return means
+        return self._likelihood(w, np.zeros((0, self.columns))).log_density
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it is undefined."""
         return self.posterior(w, np.zeros((0, self.columns))).log_density
 
     def posterior(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """`likelihood` with the prior of the coordinates; -inf where the density is undefined."""
+        """`log_density` at coordinates (n, d), with the posterior of functionals (t, columns)."""
         count = len(functionals)
-        likelihood = Likelihood.undefined(len(w), count)
-        usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
-        if len(usable):
-            prior = self.coordinates.log_prior(w[usable])
-            usable, prior = usable[np.isfinite(prior)], prior[np.isfinite(prior)]
-        if len(usable):
-            likelihood_there = self._possible(w[usable], functionals)
-            value = likelihood_there.log_density + prior
-            likelihood.log_density[usable] = np.where(np.isfinite(value), value, -np.inf)
-            likelihood.linear.mean[usable], likelihood.linear.covariance[usable] = (
-                likelihood_there.linear.mean,
-                likelihood_there.linear.covariance,
-            )
-        return likelihood
+        log_density, mean = np.full(len(w), -np.inf), np.zeros((len(w), count))
+        covariance, prior = np.zeros((len(w), count, count)), np.full(len(w), -np.inf)
+        near = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
+        if len(near):
+            prior[near] = self.coordinates.log_prior(w[near])
+        parts = [np.flatnonzero(np.isfinite(prior))]
+        while parts:
+            if not len(part := parts.pop()):
+                continue
+            try:
+                found = self._likelihood(w[part], functionals)
+            except np.linalg.LinAlgError:
+                # Rounding made a factorisation fail at one of them.
+                parts += np.array_split(part, 2) if len(part) > 1 else []
+                continue
+            value = found.log_density + prior[part]
+            log_density[part] = np.where(np.isfinite(value), value, -np.inf)
+            mean[part], covariance[part] = found.linear.mean, found.linear.covariance
+        return Likelihood(log_density, LinearPosterior(mean, covariance))
 
-    def _possible(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """`likelihood`, -inf where rounding makes a factorisation fail."""
-        try:
-            return self.likelihood(w, functionals)
-        except np.linalg.LinAlgError:
-            if len(w) == 1:
-                return Likelihood.undefined(1, len(functionals))
-            middle = len(w) // 2
-            return Likelihood.joined([self._possible(half, functionals) for half in (w[:middle], w[middle:])])
+    def _likelihood(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
+        """Likelihood at coordinates (n, d), linear quantities integrated out."""
+        rows, count = len(self.rows.move), len(functionals)
+        log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), count)), np.empty((len(w), count, count))
+        for part, block in self._blocks(w):
+            information, right_side = _normal_equations(block.products, block.factor)
+            scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+            scaled = information / (scale[:, :, None] * scale[:, None, :])
+            root = np.linalg.cholesky(scaled)
+            sides = np.concatenate([right_side[:, None], functionals @ block.factor], axis=1) / scale[:, None]
+            products = sides @ np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
+            log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
+            residual = block.products[:, 0, 0] - products[:, 0, 0]
+            log_density[part] = -0.5 * (block.log_scatter + log_det + residual + rows * np.log(2 * np.pi))
+            mean[part], covariance[part] = products[:, 0, 1:], products[:, 1:, 1:]
+        if count:
+            mean += self._prior_means(self.coordinates.values(w)) @ functionals.T
+        return Likelihood(log_density, LinearPosterior(mean, covariance))
 
     def linear(self, w: np.ndarray) -> LinearPosterior:
         """Posterior of the linear quantities given coordinates (n, d); means include the prior means."""
@@ -460,17 +489,17 @@ class AxisModel:
         informed, others = self.informed, np.setdiff1d(np.arange(self.columns), self.informed)
         # Places without influence on rows have no information: only the matrix of the others is inverted.
         for part, block in self._blocks(w, informed=len(others) > 0):
-            reduced = replace(block, factor=block.factor[:, informed[:, None], informed]) if len(others) else block
-            normal = _normal_equations(reduced, 0)
-            inverse = _inverse(normal.information)
+            factor = block.factor[:, informed[:, None], informed] if len(others) else block.factor
+            information, right_side = _normal_equations(block.products, factor)
+            inverse = _inverse(information)
             loading = block.factor[:, :, informed] if len(others) else block.factor
-            means[part] = np.einsum("nij,njk,nk->ni", loading, inverse, normal.right_side, optimize=True)
+            means[part] = np.einsum("nij,njk,nk->ni", loading, inverse, right_side, optimize=True)
             covariances[part] = loading @ inverse @ np.swapaxes(loading, 1, 2)
             for group in (others[: len(others) // 2], others[len(others) // 2 :]):
                 # Columns of the error by position, then of the play, which are independent in the prior.
-                factor = block.factor[:, group[:, None], group]
-                covariances[part, group[:, None], group] += factor @ np.swapaxes(factor, 1, 2)
-        return LinearPosterior(means + self._prior_means(w), covariances)
+                own = block.factor[:, group[:, None], group]
+                covariances[part, group[:, None], group] += own @ np.swapaxes(own, 1, 2)
+        return LinearPosterior(means + self._prior_means(self.coordinates.values(w)), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> PredictedReadings:
         """Predict readings of some rows by all others, given the scales, with noise and stop errors.
@@ -486,9 +515,9 @@ class AxisModel:
         extra[rows, np.arange(len(rows))] = 1.0
         means, covariances = np.empty((len(w), len(rows))), np.empty((len(w), len(rows), len(rows)))
         for part, block in self._blocks(w, extra):
-            normal = _normal_equations(block, len(rows))
-            inverse = _inverse(normal.information)
-            expected = np.einsum("nij,nj->ni", inverse, normal.right_side)
+            information, right_side = _normal_equations(block.products, block.factor)
+            inverse = _inverse(information)
+            expected = np.einsum("nij,nj->ni", inverse, right_side)
             means[part] = self.rows.value[rows] - expected[:, self.columns :]
             covariances[part] = inverse[:, self.columns :, self.columns :]
         return PredictedReadings(means, covariances)
@@ -497,13 +526,7 @@ class AxisModel:
         """A functional (columns,) of `offset`, `per_command`, `ratio_contrast`, `backlash` by their factors."""
         functional = np.zeros(self.columns)
         for name, factor in factors.items():
-            functional[_LINE_COLUMNS[name]] = factor
-        return functional
-
-    def shift(self, name: str) -> np.ndarray:
-        """A functional (columns,) of one of `shifts`."""
-        functional = np.zeros(self.columns)
-        functional[self.shift_columns[name]] = 1.0
+            functional[LINE_COLUMNS[name]] = factor
         return functional
 
     @property
@@ -519,13 +542,13 @@ class AxisModel:
         Raises:
             ValueError: a period is unknown, and no draws are given.
         """
-        functionals = np.zeros((len(command), self.columns))
-        functionals[:, self.layout["error"]] = self.places.weights(command)
         by_draw = self.repeats_by_draw
         if by_draw and w is None:
             raise ValueError("draws are needed where a period is not known")
         draws = self.coordinates.wave_draws(np.zeros((1, len(self.coordinates.names))) if w is None else w)
-        functionals = np.repeat(functionals[None], 1 if w is None or not by_draw else len(w), axis=0)
+        size = len(w) if by_draw and w is not None else 1
+        functionals = np.zeros((size, len(command), self.columns))
+        functionals[..., self.layout["error"]] = self.places.weights(command)
         for k, (wave, draw) in enumerate(zip(self.coordinates.waves, draws, strict=True)):
             if wave.clock == "position":
                 x = self.clock(wave, command, command, command)
@@ -533,34 +556,27 @@ class AxisModel:
         return functionals if by_draw else functionals[0]
 
 
+def _is_zero(prior: AxisPrior) -> bool:
+    """Whether a prior states that there is no such thing."""
+    return prior.u == 0 == prior.value
+
+
 def _creeps(rows: AxisRows) -> bool:
     """Whether times are known, so that a creep can be estimated."""
     return bool(np.ptp(rows.warm_s) > 0)
 
 
-_LINE_COLUMNS = {"offset": OFFSET, "per_command": SLOPE, "ratio_contrast": CONTRAST, "backlash": BACKLASH}
-
-
-class _NormalEquations(NamedTuple):
-    """Information (n, c, c) and right-hand side (n, c)."""
-
-    information: np.ndarray
-    right_side: np.ndarray
-
-
-def _normal_equations(block: _Block, flat: int) -> _NormalEquations:
-    """Normal equations of the columns in units of their prior, then of `flat` ones."""
-    products, columns = block.products, block.factor.shape[1]
-    factor = block.factor
-    if flat:
-        size = columns + flat
-        factor = np.zeros((len(block.factor), size, size))
-        factor[:, :columns, :columns] = block.factor
-        factor[:, range(columns, size), range(columns, size)] = 1.0
+def _normal_equations(products: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Information (n, c, c) and right-hand side (n, c) of the columns in units of their prior, then of flat ones."""
+    columns, size = factor.shape[1], products.shape[1] - 1
+    if size > columns:
+        whole = np.repeat(np.eye(size)[None], len(factor), axis=0)
+        whole[:, :columns, :columns] = factor
+        factor = whole
     transposed = np.swapaxes(factor, 1, 2)
     information = transposed @ products[:, 1:, 1:] @ factor
     information[:, range(columns), range(columns)] += 1.0
-    return _NormalEquations(information, np.einsum("nij,nj->ni", transposed, products[:, 1:, 0]))
+    return information, np.einsum("nij,nj->ni", transposed, products[:, 1:, 0])
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:

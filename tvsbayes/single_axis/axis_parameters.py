@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
@@ -33,11 +32,11 @@ class AxisQuantity(Quantity):
     """A quantity of an axis; in its unit, {unit} stands for that of the folder.
 
     Attributes:
-        line: function of the middle command and the travel; it returns the factors of `per_command`, `ratio_contrast`,
-            `backlash` and the offset at the middle command whose sum the quantity is. None for all other quantities.
+        line: function of the middle command; it returns the factors of `per_command`, `ratio_contrast`, `backlash` and
+            the offset at the middle command whose sum the quantity is. None for all other quantities.
     """
 
-    line: Callable[[float, float], Mapping[str, float]] | None = None
+    line: Callable[[float], Mapping[str, float]] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,52 +56,60 @@ class AxisKey(AxisQuantity):
     median: float = 1.0
 
 
-def _key(
-    name: str, kind: Kind, share: float | None, u: float, label: str, unit: str = "{unit}", **fields: Any
-) -> AxisKey:
-    return AxisKey(name=name, block=name, kind=kind, share=share, u=u, label=label, unit=unit, **fields)
-
-
-def _linear_key(name: str, *texts: Any, **fields: Any) -> AxisKey:
-    return _key(name, *texts, line=lambda middle, travel: {name: 1.0}, **fields)
-
-
-def _side(side: str, part: float) -> list[AxisQuantity]:
-    """The ratio in one direction, given its part of the contrast."""
-    factors = {"per_command": 1.0, "ratio_contrast": part}
-    line = lambda middle, travel: factors  # noqa: E731
-    return AxisQuantity.many("per_command", (side,), unit=_PER_COMMAND, headline=True, line=line)
+def _key(name: str, kind: Kind, share: float | None, label: str, unit: str = "{unit}", **fields: Any) -> AxisKey:
+    return AxisKey(name=name, block=name, kind=kind, share=share, label=label, unit=unit, **fields)
 
 
 _PER_COMMAND = "{unit} per command"
 CONTRAST_PARTS = {"forward": 0.5, "backward": -0.5}
 """Parts of the contrast that the ratios of both directions have."""
 AXIS_QUANTITIES: Quantities[AxisQuantity] = Quantities(
-    _linear_key("per_command", "normal", None, 1.0, "unit per command", _PER_COMMAND, target="per_command"),
-    _linear_key("ratio_contrast", "normal", None, 0.0, "forward less backward", _PER_COMMAND),
-    *chain.from_iterable(_side(*each) for each in CONTRAST_PARTS.items()),
+    _key(
+        *("per_command", "normal", None, "unit per command", _PER_COMMAND),
+        target="per_command",
+        line=lambda middle: {"per_command": 1.0},
+    ),
+    _key(
+        *("ratio_contrast", "normal", None, "forward less backward", _PER_COMMAND),
+        line=lambda middle: {"ratio_contrast": 1.0},
+    ),
+    *(
+        AxisQuantity(
+            name=f"per_command.{side}",
+            block="per_command",
+            unit=_PER_COMMAND,
+            headline=True,
+            line=lambda middle, part=part: {"per_command": 1.0, "ratio_contrast": part},
+        )
+        for side, part in CONTRAST_PARTS.items()
+    ),
     *AxisQuantity.many("effective_per_command", (), unit=_PER_COMMAND, target="effective_per_command"),
-    _linear_key("backlash", "normal", 0.05, 0.0, "play lost in a reversal", headline=True, target="backlash"),
-    _key("transmission_error", "half-normal", 0.002, 0.0, "error by position, sd"),
-    _key("transmission_error_length", "log-normal", 0.2, 0.7, "correlation length"),
-    _key("play_variation", "half-normal", 0.001, 0.0, "play by position, sd"),
-    _key("drift_per_root_hour", "half-normal", 0.0005, 0.0, "drift of the zero per root hour"),
-    _key("stop_sd", "log-normal", 0.0005, 1.5, "scatter of stops"),
+    _key(
+        *("backlash", "normal", 0.05, "play lost in a reversal"),
+        headline=True,
+        target="backlash",
+        line=lambda middle: {"backlash": 1.0},
+    ),
+    _key("transmission_error", "half-normal", 0.002, "error by position, sd"),
+    _key("transmission_error_length", "log-normal", 0.2, "correlation length", u=0.7),
+    _key("play_variation", "half-normal", 0.001, "play by position, sd"),
+    _key("drift_per_root_hour", "half-normal", 0.0005, "drift of the zero per root hour"),
+    _key("stop_sd", "log-normal", 0.0005, "scatter of stops", u=1.5),
     *AxisQuantity.many("stop_sd", CONTRAST_PARTS, unit="{unit}", label="scatter of stops, {0}"),
     # 95 % from 1.5e-7 T, an index pulse, to 3e-3 T, a motor that stalls at its stop. A narrower prior far from the data
     # makes the promise after two or three homings too wide.
-    _key("home_sd", "log-normal", 0.00002, 2.5, "scatter of homings"),
-    _key("reading_scale", "log-normal", None, 0.5, "scatter of readings / u", "1"),
-    _key("creep", "normal", 0.0005, 0.0, "zero creeps while warming up"),
-    _key("creep_minutes", "log-normal", None, 0.8, "time constant of creep, minutes", "min", median=20.0),
-    _key("thermal_per_K", "normal", 0.0001, 0.0, "zero shifts per kelvin", "{unit}/K"),
-    _key("seeing_scale", "log-normal", None, 1.0, "seeing / u of a reading", "1"),
-    _key("seeing_s", "log-normal", None, 1.2, "seeing lasts, s", "s", median=10.0),
+    _key("home_sd", "log-normal", 0.00002, "scatter of homings", u=2.5),
+    _key("reading_scale", "log-normal", None, "scatter of readings / u", "1", u=0.5),
+    _key("creep", "normal", 0.0005, "zero creeps while warming up"),
+    _key("creep_minutes", "log-normal", None, "time constant of creep, minutes", "min", u=0.8, median=20.0),
+    _key("thermal_per_K", "normal", 0.0001, "zero shifts per kelvin", "{unit}/K"),
+    _key("seeing_scale", "log-normal", None, "seeing / u of a reading", "1", u=1.0),
+    _key("seeing_s", "log-normal", None, "seeing lasts, s", "s", u=1.2, median=10.0),
     *AxisQuantity.many(
         *("offset", ()),
         unit="{unit}",
         label="reading at command 0",
-        line=lambda middle, travel: {"offset": 1.0, "per_command": -middle},
+        line=lambda middle: {"offset": 1.0, "per_command": -middle},
     ),
 )
 """Reported quantities of an axis."""
@@ -208,22 +215,16 @@ class AxisCoordinates:
 
     def values(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Every name of `SAMPLED` at coordinates (n, d): arrays (n,)."""
-        from scipy.special import log_ndtr, ndtri_exp
+        from tvsbayes.gears.priors import values_at
 
-        values = {}
-        for name, prior in self.priors.items():
-            if name not in self.names:
-                values[name] = np.full(len(w), prior.value)
-                continue
-            z, kind = w[:, self.names.index(name)], kind_of(name)
-            if kind == "half-normal":
-                # u Phi^-1((1 + Phi(z)) / 2) = -u Phi^-1(Phi(-z) / 2), exact in the far tail too.
-                values[name] = -prior.u * ndtri_exp(log_ndtr(-z) - np.log(2.0))
-            elif kind == "log-normal":
-                values[name] = prior.value * np.exp(prior.u * z)
-            else:
-                values[name] = prior.value + prior.u * z
-        return values
+        names, priors = list(self.priors), self.priors.values()
+        free = {name: w[:, k] for k, name in enumerate(self.names)}
+        z = np.column_stack([free.get(name, np.zeros(len(w))) for name in names])
+        value, u = (np.array(column) for column in zip(*((prior.value, prior.u) for prior in priors), strict=True))
+        half, log = (np.array([kind_of(name) == kind for name in names]) for kind in ("half-normal", "log-normal"))
+        fixed = np.array([name not in free for name in names])
+        values = np.where(fixed, value, values_at(z, value, u, half, log))
+        return dict(zip(names, np.ascontiguousarray(values.T), strict=True))
 
     def coordinate(self, name: str, value: float) -> float:
         """Coordinate of a free parameter with a normal or log-normal prior."""

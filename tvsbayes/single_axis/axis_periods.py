@@ -7,14 +7,16 @@ those of the first harmonic.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.results.estimates import Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_model import LinearPosterior
 from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, absent_coord, wave_columns
 from tvsbayes.statistics.intervals import interval95, phases_deg
+from tvsbayes.statistics.linear_posterior import LinearPosterior
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
@@ -144,8 +146,7 @@ def period_estimate(sample: WaveSample) -> PeriodEstimate:
     )
 
 
-@dataclass(frozen=True)
-class PeriodGroup:
+class PeriodGroup(NamedTuple):
     """Neighbouring draws of a period: their mean, minimum and maximum, and their share of all."""
 
     mean: float
@@ -166,9 +167,9 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
     """Weaknesses of the readings about waves, in words, with remedies."""
     sentences = []
     for sample in samples:
-        unit = sample.period_unit(fit.campaign.unit)
         groups = separate_periods(sample.period)
         if sample.probability > 0.5 and len(groups) > 1 and sample.wave.known is None:
+            unit = sample.period_unit(fit.campaign.unit)
             shares = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
             sentences.append(
                 f"the readings do not determine the period of the wave: {shares}; read a longer run, at places that "
@@ -196,11 +197,9 @@ def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
     """Warnings of periods at the end of the stated range: the true one may lie beyond it."""
     sentences = []
     for sample in samples:
-        wave = sample.wave
-        if wave.known is not None or not sample.probability > 0.5:
-            continue
-        low, high = interval95(sample.period)
-        if low < wave.low * (1 + SAME_SHARE) or high > wave.high * (1 - SAME_SHARE):
+        wave, (low, high) = sample.wave, interval95(sample.period)
+        at_an_end = low < wave.low * (1 + SAME_SHARE) or high > wave.high * (1 - SAME_SHARE)
+        if wave.known is None and sample.probability > 0.5 and at_an_end:
             of = sample.period_unit(unit)
             sentences.append(
                 f"the period {np.mean(sample.period):.4g} {of} lies at the end of the range that was asked for "
@@ -211,18 +210,10 @@ def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
 
 def _one_wave_twice(fit: AxisFit) -> list[str]:
     """Gear and encoder with one period, which their readings hardly separate."""
-    sentences = []
-    model, rows = fit.model, fit.rows
-    gears = [wave for wave in model.coordinates.waves if wave.clock == "position"]
-    for wave in gears:
-        for other in model.coordinates.waves:
-            if other.clock != "encoder":
-                continue
-            span = float(np.ptp(rows.value))
-            if abs(1 / wave.peak - 1 / other.peak) * span < 1.0:
-                sentences.append(
-                    f"gear and encoder both have a wave of about {other.peak:.4g} {fit.campaign.unit}: their "
-                    "sum is determined, its division is not; turn the encoder's shaft against the gear, or read with a "
-                    "second instrument"
-                )
-    return sentences
+    waves, span = fit.model.coordinates.waves, float(np.ptp(fit.rows.value))
+    return [
+        f"gear and encoder both have a wave of about {other.peak:.4g} {fit.campaign.unit}: their sum is determined, "
+        "its division is not; turn the encoder's shaft against the gear, or read with a second instrument"
+        for wave, other in product(waves, waves)
+        if (wave.clock, other.clock) == ("position", "encoder") and abs(1 / wave.peak - 1 / other.peak) * span < 1.0
+    ]

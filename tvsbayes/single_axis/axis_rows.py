@@ -1,20 +1,19 @@
 """An axis campaign as arrays: stops with readings, sides of approach, state of the play.
 
 A row is a move with its readings averaged; for a drive at constant rate, it is the mean over a short time
-(`rows_in_motion`). Positions are commands; `unit` is that of the readings. Formulation 8.1.
+(`_rows_in_motion`). Positions are commands; `unit` is that of the readings. Formulation 8.1.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, listed
+from tvsbayes.gears.play import rests
 from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.reference import corrected, loadings
@@ -136,22 +135,24 @@ class AxisRows:
         freedom = float(np.sum(self.count[known] - 1))
         return -freedom * np.log(reading_scale) - 0.5 * float(self.within[known].sum()) / reading_scale**2
 
+    @property
+    def since_homing(self) -> np.ndarray:
+        """Hours since the homing of each row's zero."""
+        hours, first = np.cumsum(self.hours), np.searchsorted(self.zero, self.zero)
+        return hours - hours[first] + self.hours[first]
+
     def without(self, left_out: np.ndarray) -> AxisRows:
         """The rows where `left_out` is false; `hours` and `redrawn` are adapted, the line stays."""
-        rows_kept = np.flatnonzero(~left_out)
-        hours, redrawn = np.zeros(len(rows_kept)), np.ones(len(rows_kept), dtype=bool)
+        kept = np.flatnonzero(~left_out)
         time_h = np.cumsum(self.hours)
-        for k, row in enumerate(rows_kept):
-            previous = rows_kept[k - 1] if k else -1
-            first = np.flatnonzero(self.zero == self.zero[row])[0]
-            same = previous >= first
-            hours[k] = time_h[row] - time_h[previous] if same else time_h[row] - time_h[first] + self.hours[first]
-            redrawn[k] = not same or bool(self.redrawn[previous + 1 : row + 1].any())
+        zero, (_, first) = self.zero[kept], np.unique(self.zero, return_index=True)
+        homed_h = (time_h - self.hours)[first[np.searchsorted(self.zero[first], zero)]]
+        changes = np.cumsum(self.redrawn)[kept]
+        redrawn = np.r_[True, (np.diff(changes) > 0) | (np.diff(zero) > 0)]
         arrays = ("move", "command", "side", "segment", "zero", "path", "value", "variance", "within", "count")
-        columns = {
-            name: getattr(self, name)[rows_kept] for name in (*arrays, "time_s", "warm_s", "width_s", "reference")
-        }
-        columns["kelvin"] = None if self.kelvin is None else self.kelvin[rows_kept]
+        columns = {name: getattr(self, name)[kept] for name in (*arrays, "time_s", "warm_s", "width_s", "reference")}
+        columns["kelvin"] = None if self.kelvin is None else self.kelvin[kept]
+        hours = _since_row_before(time_h[kept], zero, homed_h)
         return replace(self, hours=hours, redrawn=redrawn, **columns)
 
 
@@ -170,76 +171,6 @@ def legs_of(moves: Sequence[AxisMove]) -> Legs:
     return Legs(command, step, first, side, segment)
 
 
-def _means(used: Sequence[Reading]) -> dict[int, dict[str, float]]:
-    """Means of the readings of every move, by the fields of `AxisRows`.
-
-    Without a stated u, it comes from repeated readings of one move; without these it is unknown, 0.
-    """
-    by_move: dict[int, list[Reading]] = defaultdict(list)
-    for reading in used:
-        by_move[reading.move].append(reading)
-    unknown = [[float(r.value or 0.0) for r in of_move if r.u == 0] for of_move in by_move.values()]
-    repeated = [values for values in unknown if len(values) > 1]
-    squares = sum(len(values) * float(np.var(values)) for values in repeated)
-    freedom = sum(len(values) - 1 for values in repeated)
-    pooled = float(np.sqrt(squares / freedom)) if freedom else 0.0
-    means = {}
-    for move, of_move in by_move.items():
-        values = np.array([r.value for r in of_move], dtype=float)
-        u = np.array([r.u or pooled for r in of_move])
-        if np.all(u > 0):
-            weight = 1 / u**2
-            mean = float(weight @ values / weight.sum())
-            means[move] = {"value": mean, "variance": float(1 / weight.sum())}
-            means[move] |= {"within": float(weight @ (values - mean) ** 2), "count": len(of_move)}
-        else:
-            means[move] = {"value": float(values.mean()), "variance": 0.0, "within": 0.0, "count": len(of_move)}
-    return means
-
-
-def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray, moves: np.ndarray) -> None:
-    """Refuse angles that jump by whole turns.
-
-    Raises:
-        InputError: readings of an angle wrap.
-    """
-    turn = TURNS.get(campaign.unit)
-    jumps = turn_jumps(command, value, turn) if turn is not None else {}
-    if jumps:
-        moves_text = listed([int(moves[row]) for row in jumps], 5)
-        raise InputError(
-            "wrapped",
-            f"readings.csv: the angle jumps by whole turns at move {moves_text}; allowed: a continuous angle",
-            file="readings.csv",
-            column="value",
-            remedy=f"unwrap them: add or subtract {turn:g} {campaign.unit}; or are command and value exchanged?",
-        )
-
-
-def _check_motion(slope: float, command: np.ndarray, value: np.ndarray, remedy: str) -> None:
-    """Refuse readings that do not follow the command.
-
-    Raises:
-        NothingToEstimate: the readings do not change with the command.
-    """
-    if not abs(slope) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
-        found = "the readings do not move with the command: nothing to estimate"
-        raise NothingToEstimate("no-motion", found, file="readings.csv", remedy=remedy)
-
-
-def _used(campaign: AxisCampaign) -> list[Reading]:
-    """Readings that count, less the stated expansion of the reference, with the u of their own noise."""
-    used = [r for r in campaign.noisy if r.status == "ok" and r.value is not None]
-    return corrected(campaign.reference, campaign.moves, used)
-
-
-def _with_reference(rows: AxisRows, campaign: AxisCampaign) -> AxisRows:
-    """The rows with the errors that their readings share."""
-    used = [r for r in campaign.readings if r.status == "ok" and r.value is not None]
-    known = loadings(campaign.reference, campaign.moves, used, rows.move, rows.time_s, rows.value)
-    return replace(rows, reference=known.columns, reference_causes=known.names)
-
-
 def rows_of(campaign: AxisCampaign) -> AxisRows:
     """The rows of a campaign.
 
@@ -247,90 +178,133 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         NothingToEstimate: fewer than two positions were read, fewer than three moves, or the readings do not change.
         InputError: too many moves, or angles that wrap.
     """
-    if campaign.rate is not None:
-        return _with_reference(rows_in_motion(campaign, campaign.rate), campaign)
-    used = _used(campaign)
-    means = _means(used)
-    moves = np.array(sorted(means), dtype=int)
+    used = [r for r in campaign.noisy if r.status == "ok" and r.value is not None]
+    used = corrected(campaign.reference, campaign.moves, used)
+    rows = _rows_at_stops(campaign, used) if campaign.rate is None else _rows_in_motion(campaign, used, campaign.rate)
+    stated = [r for r in campaign.readings if r.status == "ok" and r.value is not None]
+    known = loadings(campaign.reference, campaign.moves, stated, rows.move, rows.time_s, rows.value)
+    rows = replace(rows, reference=known.columns, reference_causes=known.names)
+    return rows if rows.in_motion or legs_are_long(rows) else _line_with_play(rows)
+
+
+def _rows(campaign: AxisCampaign, legs: Legs, move: np.ndarray, time_s: np.ndarray, **columns: Any) -> AxisRows:
+    """The rows with what follows from their moves and times."""
+    clock, segment = np.array([m.time_s for m in campaign.moves], dtype=float), legs.segment[move]
+    zero = 0 * segment if campaign.absolute else segment
+    of_zero = segment if campaign.rate is not None else zero
+    homed_s = clock[np.searchsorted(legs.segment, of_zero)]
+    return AxisRows(
+        unit=campaign.unit,
+        legs=legs,
+        move=move,
+        segment=segment,
+        zero=zero,
+        hours=_hours(time_s, zero, homed_s),
+        time_s=time_s,
+        warm_s=time_s - warm_from(campaign),
+        kelvin=kelvin_at(campaign.moves, time_s, clock),
+        rate=campaign.rate,
+        command_unit=campaign.command_unit,
+        **columns,
+    )
+
+
+def _refused(code: str, found: str, allowed: str, remedy: str, column: str | None = None) -> InputError:
+    message = f"readings.csv: {found}; allowed: {allowed}"
+    return InputError(code, message, file="readings.csv", column=column, remedy=remedy)
+
+
+def _rows_at_stops(campaign: AxisCampaign, used: Sequence[Reading]) -> AxisRows:
+    """A row for every move with readings, their mean.
+
+    Without a stated u, it comes from repeated readings of one move; without these it is unknown, 0.
+    """
+    used = sorted(used, key=lambda r: r.move)
+    value, u = np.array([r.value for r in used], dtype=float), np.array([r.u for r in used])
+    at_move = np.array([r.move for r in used], dtype=int)
+    moves, first, count = np.unique(at_move, return_index=True, return_counts=True)
     legs = legs_of(campaign.moves)
-    if len(moves) < 3 or len(np.unique(legs.command[moves])) < 2:
+    command, side = legs.command[moves], legs.side[moves]
+    if len(moves) < 3 or len(np.unique(command)) < 2:
         raise NothingToEstimate(
             "too-few-positions",
-            f"readings of {len(moves)} moves at {len(np.unique(legs.command[moves]))} positions: nothing to estimate",
+            f"readings of {len(moves)} moves at {len(np.unique(command))} positions: nothing to estimate",
             file="readings.csv",
             remedy="read at least three moves at two positions, better at five or more, from both directions",
         )
     if len(moves) > ROWS_MAX:
-        raise InputError(
-            "too-many",
-            f"readings.csv: readings of {len(moves)} moves; allowed: at most {ROWS_MAX}",
-            file="readings.csv",
-            remedy="thin them out, or give readings at one standstill one move: they are averaged exactly",
-        )
-    read = {name: np.array([means[m][name] for m in moves]) for name in ("value", "variance", "within", "count")}
-    value = read["value"]
-    command = legs.command[moves]
-    _check_turns(campaign, command, value, moves)
-    design = np.column_stack([np.ones(len(command)), command - command.mean(), legs.side[moves]])
-    level, slope, _ = np.linalg.lstsq(design, value, rcond=None)[0]
-    remedy = "check the columns move and value, and that the reading follows this axis"
-    _check_motion(slope, command, value, remedy)
-    times_s = np.array([m.time_s for m in campaign.moves])
-    zero = 0 * legs.segment if campaign.absolute else legs.segment
-    stated_u = [r.u for r in used if r.u > 0]
-    rows = AxisRows(
-        unit=campaign.unit,
-        legs=legs,
-        move=moves,
+        remedy = "thin them out, or give readings at one standstill one move: they are averaged exactly"
+        raise _refused("too-many", f"readings of {len(moves)} moves", f"at most {ROWS_MAX}", remedy)
+    stated = u[u > 0]
+    u = np.where(u > 0, u, scatter_within(value[u == 0], at_move[u == 0]))
+    known = np.minimum.reduceat(u, first) > 0
+    weight = np.where(np.repeat(known, count), 1.0 / np.where(u > 0, u, 1.0) ** 2, 1.0)
+    total = np.add.reduceat(weight, first)
+    mean = np.add.reduceat(weight * value, first) / total
+    within = np.add.reduceat(weight * (value - np.repeat(mean, count)) ** 2, first)
+    _check_turns(campaign, command, mean, moves)
+    design = np.column_stack([np.ones(len(command)), command - command.mean(), side])
+    level, slope, _ = np.linalg.lstsq(design, mean, rcond=None)[0]
+    _check_motion(slope, command, mean, "check the columns move and value, and that the reading follows this axis")
+    return _rows(
+        *(campaign, legs, moves, np.array([m.time_s for m in campaign.moves], dtype=float)[moves]),
         command=command,
-        side=legs.side[moves],
-        segment=legs.segment[moves],
-        zero=zero[moves],
-        hours=_hours(times_s / HOUR_S, zero, moves),
+        side=side,
         path=_path(legs)[moves],
-        redrawn=_redrawn(legs, moves) | (read["variance"] == 0),
-        value=value,
-        variance=read["variance"],
-        within=read["within"],
-        count=read["count"],
+        redrawn=_redrawn(legs, moves) | ~known,
+        value=mean,
+        variance=np.where(known, 1.0 / total, 0.0),
+        within=np.where(known, within, 0.0),
+        count=count,
         line=Line(float(level - slope * command.mean()), float(slope)),
-        time_s=times_s[moves],
-        warm_s=times_s[moves] - warm_from(campaign),
-        kelvin=_kelvin(campaign, times_s[moves]),
         width_s=np.zeros(len(moves)),
-        rate=None,
-        reading_u=float(np.median(stated_u)) if stated_u else 0.0,
-        command_unit=campaign.command_unit,
+        reading_u=float(np.median(stated)) if len(stated) else 0.0,
     )
-    return _with_reference(rows if legs_are_long(rows) else _line_with_play(rows), campaign)
+
+
+def scatter_within(value: np.ndarray, group: np.ndarray) -> float:
+    """Pooled sd of values (n,) about the means of their groups, numbers (n,); 0 where none has two."""
+    count = np.bincount(group)
+    mean = np.bincount(group, value) / np.maximum(count, 1)
+    freedom = int(np.maximum(count - 1, 0).sum())
+    return float(np.sqrt(np.sum((value - mean[group]) ** 2) / freedom)) if freedom else 0.0
+
+
+def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray, moves: np.ndarray) -> None:
+    """Refuse angles that jump by whole turns."""
+    turn = TURNS.get(campaign.unit)
+    jumps = turn_jumps(command, value, turn) if turn is not None else {}
+    if jumps:
+        found = f"the angle jumps by whole turns at move {listed([int(moves[row]) for row in jumps], 5)}"
+        remedy = f"unwrap them: add or subtract {turn:g} {campaign.unit}; or are command and value exchanged?"
+        raise _refused("wrapped", found, "a continuous angle", remedy, "value")
+
+
+def _check_motion(slope: float, command: np.ndarray, value: np.ndarray, remedy: str) -> None:
+    """Refuse readings that do not follow the command."""
+    if not abs(slope) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
+        found = "the readings do not move with the command: nothing to estimate"
+        raise NothingToEstimate("no-motion", found, file="readings.csv", remedy=remedy)
 
 
 ROWS_IN_MOTION, PER_PERIOD, READINGS_IN_MOTION = 2000, 5.0, 100_000
 """Largest number of rows of a drive, rows in the shortest stated period, largest number of readings."""
 WIDE_ROWS = 400
 """Number of rows of a drive without stated periods; fewer readings are not averaged."""
+FLOOR_SHARE = 1e-9
+"""Least u of a reading in motion, as a share of the travel."""
 
 
-def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
+def _rows_in_motion(campaign: AxisCampaign, used: Sequence[Reading], rate: float) -> AxisRows:
     """The rows of a drive at constant rate: means of the readings of equal short times.
 
     The model averages a wave over the same times, so that only detail shorter than a fifth of the shortest period is
     lost. Without a stated u, it comes from second differences of neighbouring readings.
-
-    Raises:
-        NothingToEstimate, InputError: as `rows_of`.
     """
-    used = sorted(
-        (r for r in _used(campaign) if r.time_s is not None),
-        key=lambda r: (r.move, r.time_s or 0.0),
-    )
+    used = sorted((r for r in used if r.time_s is not None), key=lambda r: (r.move, r.time_s or 0.0))
     if len(used) > READINGS_IN_MOTION:
-        raise InputError(
-            "too-many",
-            f"readings.csv: {len(used)} readings in motion; allowed: at most {READINGS_IN_MOTION}",
-            file="readings.csv",
-            remedy="thin them out, or fit one part of the record",
-        )
+        remedy = "thin them out, or fit one part of the record"
+        raise _refused("too-many", f"{len(used)} readings in motion", f"at most {READINGS_IN_MOTION}", remedy)
     if len(used) < 5:
         raise NothingToEstimate(
             "too-few-positions",
@@ -338,66 +312,43 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
             file="readings.csv",
             remedy="read at least five, better several periods long",
         )
-    move = np.array([r.move for r in used])
-    time_s, value = np.array([r.time_s for r in used], dtype=float), np.array([r.value for r in used], dtype=float)
-    by_move = {name: np.array([getattr(m, name) for m in campaign.moves]) for name in ("segment", "time_s", "command")}
-    command = by_move["command"][move] + rate * (time_s - by_move["time_s"][move])
+    move, legs = np.array([r.move for r in used]), legs_of(campaign.moves)
+    time_s, value, u = (np.array([getattr(r, name) for r in used], dtype=float) for name in ("time_s", "value", "u"))
+    command = legs.command[move] + rate * (time_s - np.array([m.time_s for m in campaign.moves])[move])
     _check_turns(campaign, command, value, move)
     slope = float(np.polyfit(command - command.mean(), value, 1)[0])
     remedy = "give total positions, not what they are off the drive; check the sign of `rate`"
     _check_motion(slope, command, value, remedy)
-    u = np.array([r.u for r in used])
     u = np.where(u > 0, u, _neighbours_sd(value - slope * command, move))
     weight = 1.0 / np.maximum(u, FLOOR_SHARE * abs(slope) * np.ptp(command)) ** 2
     width = _width_s(campaign, abs(slope * rate), time_s, move)
     is_first = np.r_[True, np.diff(move) > 0]
     since_move_s = time_s - time_s[is_first][np.cumsum(is_first) - 1]
     bin_of = np.floor(since_move_s / width).astype(int) if width else np.arange(len(used))
-    first_readings = np.flatnonzero(np.r_[True, (np.diff(move) > 0) | (np.diff(bin_of) != 0)])
-    weight_sum = np.add.reduceat(weight, first_readings)
+    first = np.flatnonzero(np.r_[True, (np.diff(move) > 0) | (np.diff(bin_of) != 0)])
+    total, count = np.add.reduceat(weight, first), np.diff(np.r_[first, len(used)])
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(weight * values, first_readings) / weight_sum
+        return np.add.reduceat(weight * values, first) / total
 
-    count = np.diff(np.r_[first_readings, len(used)])
-    rows_move, rows_time, rows_command, rows_value = move[first_readings], mean(time_s), mean(command), mean(value)
-    spread = np.sqrt(mean((time_s - np.repeat(rows_time, count)) ** 2))
-    segment = by_move["segment"][rows_move]
-    first = np.r_[True, np.diff(segment) > 0]
-    zero = 0 * segment if campaign.absolute else segment
-    starts_s = np.array([by_move["time_s"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
-    gaps = np.where(np.r_[True, np.diff(zero) > 0], rows_time - starts_s, np.r_[0.0, np.diff(rows_time)])
-    design = np.column_stack([np.ones(len(rows_command)), rows_command - rows_command.mean()])
-    level, per_command = np.linalg.lstsq(design, rows_value, rcond=None)[0]
-    starts_command = np.array([by_move["command"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
-    return AxisRows(
-        unit=campaign.unit,
-        legs=legs_of(campaign.moves),
-        move=rows_move,
-        command=rows_command,
-        side=np.full(len(rows_move), int(np.sign(rate))),
-        segment=segment,
-        zero=zero,
-        hours=np.maximum(gaps, 0.0) / HOUR_S,
-        path=np.abs(rows_command - starts_command),
-        redrawn=first,
-        value=rows_value,
-        variance=1.0 / weight_sum,
-        within=np.zeros(len(count)),
+    at, at_s, position = mean(command), mean(time_s), mean(value)
+    design = np.column_stack([np.ones(len(at)), at - at.mean()])
+    level, per_command = np.linalg.lstsq(design, position, rcond=None)[0]
+    segment = legs.segment[move[first]]
+    return _rows(
+        *(campaign, legs, move[first], at_s),
+        command=at,
+        side=np.full(len(at), int(np.sign(rate))),
+        path=np.abs(at - legs.command[np.searchsorted(legs.segment, segment)]),
+        redrawn=np.r_[True, np.diff(segment) > 0],
+        value=position,
+        variance=1.0 / total,
+        within=np.zeros(len(at)),
         count=count,
-        line=Line(float(level - per_command * rows_command.mean()), float(per_command)),
-        time_s=rows_time,
-        warm_s=rows_time - warm_from(campaign),
-        kelvin=_kelvin(campaign, rows_time),
-        width_s=np.sqrt(12.0) * spread,
-        rate=rate,
+        line=Line(float(level - per_command * at.mean()), float(per_command)),
+        width_s=np.sqrt(12.0) * np.sqrt(mean((time_s - np.repeat(at_s, count)) ** 2)),
         reading_u=float(np.median(u)),
-        command_unit=campaign.command_unit,
     )
-
-
-FLOOR_SHARE = 1e-9
-"""Least u of a reading in motion, as a share of the travel."""
 
 
 def _neighbours_sd(deviations: np.ndarray, move: np.ndarray) -> float:
@@ -408,14 +359,7 @@ def _neighbours_sd(deviations: np.ndarray, move: np.ndarray) -> float:
 
 
 def _width_s(campaign: AxisCampaign, speed: float, time_s: np.ndarray, move: np.ndarray) -> float:
-    """Time over which readings are averaged, s; 0 where they are not averaged.
-
-    Args:
-        campaign: campaign with the stated periods.
-        speed: unit per second.
-        time_s: times of the readings, s.
-        move: moves of the readings.
-    """
+    """Time over which readings (n,) at a speed in units per second are averaged, s; 0 where they are not."""
     if len(time_s) <= WIDE_ROWS:
         return 0.0
     span = sum(float(np.ptp(time_s[move == number])) for number in np.unique(move))
@@ -431,17 +375,13 @@ def warm_from(campaign: AxisCampaign) -> float:
     return campaign.moves[0].time_s if campaign.powered_on_s is None else campaign.powered_on_s
 
 
-def _kelvin(campaign: AxisCampaign, times_s: np.ndarray) -> np.ndarray | None:
-    return kelvin_at(campaign.moves, times_s, np.array([move.time_s for move in campaign.moves], dtype=float))
+def _hours(time_s: np.ndarray, zero: np.ndarray, homed_s: np.ndarray) -> np.ndarray:
+    """Hours since the previous row of the same zero, in its first row since `homed_s`, (rows,)."""
+    return np.maximum(_since_row_before(time_s, zero, homed_s), 0.0) / HOUR_S
 
 
-def _hours(times_h: np.ndarray, zero: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    hours = np.zeros(len(moves))
-    for row, move in enumerate(moves):
-        first = int(np.flatnonzero(zero == zero[move])[0])
-        previous = int(moves[row - 1]) if row and zero[moves[row - 1]] == zero[move] else first
-        hours[row] = times_h[move] - times_h[previous]
-    return hours
+def _since_row_before(time: np.ndarray, zero: np.ndarray, homed: np.ndarray) -> np.ndarray:
+    return np.where(np.r_[True, np.diff(zero) > 0], time - homed, np.r_[0.0, np.diff(time)])
 
 
 def _path(legs: Legs) -> np.ndarray:
@@ -453,19 +393,18 @@ def _path(legs: Legs) -> np.ndarray:
 def _redrawn(legs: Legs, moves: np.ndarray) -> np.ndarray:
     """Whether the axis moved, or homed, since the previous row."""
     changes = np.cumsum(legs.first | (legs.step != 0))
-    return np.array([True, *(changes[after] > changes[before] for before, after in pairwise(moves))])
+    return np.r_[True, np.diff(changes[moves]) > 0]
 
 
-@dataclass(frozen=True)
-class PlayPlaces:
+class PlayPlaces(NamedTuple):
     """Positions of the output in the play; shapes (n or 1, rows).
 
-    While a leg is lost in the play, the output stays where an earlier move left it. `anchor` is the command of that
-    move, `path` the commands travelled up to it, `side` its position in the play then, in halves of the play. Where
-    the side at the start of a segment is unknown, all are means of the two possible ends.
+    While a leg is lost in the play, the output stays where an earlier move left it. Where the side at the start of a
+    segment is unknown, all are means of the two possible ends.
 
     Attributes:
-        anchor, path, side: values of the last move that moved the output.
+        anchor, path, side: command of that earlier move, commands travelled up to it, and its position in the play
+            then, in halves of the play.
         share: present position of the output in the play, in halves of it, -1 to 1.
         spread: half of the distance between the possible ends, unit.
     """
@@ -477,70 +416,31 @@ class PlayPlaces:
     spread: np.ndarray
 
 
-class _PlayEnd:
-    """One possible position of the output, for every draw of the backlash; arrays (n,)."""
-
-    def __init__(self, command: float, path: float, side: float, n: int):
-        self.anchor, self.path, self.side = np.full(n, command), np.full(n, path), np.full(n, side)
-
-    def place(self, slope: float, half: np.ndarray) -> np.ndarray:
-        return slope * self.anchor + self.side * half
-
-    def follow(self, command: float, path: float, slope: float, half: np.ndarray) -> None:
-        """Apply a move: the wheel moves the output once the play is taken up."""
-        output, wheel = self.place(slope, half), slope * command
-        # Without play the side is that of the leg, and both sides coincide.
-        for side, is_moved in ((-1.0, output < wheel - half), (1.0, output > wheel + half)):
-            self.anchor = np.where(is_moved, command, self.anchor)
-            self.path = np.where(is_moved, path, self.path)
-            self.side = np.where(is_moved, side, self.side)
-
-
-def _places_in_motion(rows: AxisRows) -> PlayPlaces:
-    """Positions of a drive that never reverses: the play is taken up on one side."""
-    side = (-float(np.sign(rows.line.slope)) * rows.side)[None].astype(float)
-    return PlayPlaces(rows.command[None], rows.path[None], side, side, np.zeros_like(side))
-
-
 def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
     """The play operator for backlash (n,), unit; the least-squares line's slope decides which legs are lost in it.
 
     A negative backlash is not play but an overshooting reversal: every stop is on its own side immediately.
     """
-    if rows.in_motion:
-        return _places_in_motion(rows)
     legs, slope = rows.legs, rows.line.slope
+    if rows.in_motion:
+        # A drive that never reverses: the play is taken up on one side.
+        taken_up = (-np.sign(slope) * rows.side)[None].astype(float)
+        return PlayPlaces(rows.command[None], rows.path[None], taken_up, taken_up, np.zeros_like(taken_up))
     motion = legs.step * slope
     shortest = np.min(np.abs(motion[motion != 0]), initial=np.inf)
     if np.all(backlash < shortest) and not np.any(legs.first & (legs.side == 0)):
         # Every leg moves the output, for all values of the play.
         backlash = backlash[:1]
-    half = 0.5 * np.maximum(backlash, 0.0)
-    n, count, slope_sign = len(half), len(rows.move), float(np.sign(slope))
-    places = PlayPlaces(*(np.empty((n, count)) for _ in range(5)))
-    path = _path(legs)
-    ends: list[_PlayEnd] = []
-    row = 0
-    for move in range(len(legs.command)):
-        command, travelled = float(legs.command[move]), float(path[move])
-        if legs.first[move]:
-            side = -float(legs.side[move]) * slope_sign
-            ends = [_PlayEnd(command, travelled, s, n) for s in ((side,) if side else (-1.0, 1.0))]
-        elif motion[move]:
-            for end in ends:
-                end.follow(command, travelled, slope, half)
-        if row < count and rows.move[row] == move:
-            low, high = ends[0], ends[-1]
-            lowest, highest = low.place(slope, half), high.place(slope, half)
-            offset = 0.5 * (lowest + highest) - slope * command
-            middle_side = 0.5 * (low.side + high.side)
-            places.anchor[:, row] = 0.5 * (low.anchor + high.anchor)
-            places.path[:, row] = 0.5 * (low.path + high.path)
-            places.side[:, row] = middle_side
-            places.share[:, row] = np.where(half > 0, offset / np.where(half > 0, half, 1.0), middle_side)
-            places.spread[:, row] = 0.5 * (highest - lowest)
-            row += 1
-    return places
+    half, wheel = 0.5 * np.maximum(backlash, 0.0), slope * legs.command
+    approach = legs.side * np.sign(slope)
+    ends = rests(wheel, legs.first, approach, half, set(rows.move.tolist()))
+    anchor, path, side, output = (
+        each.mean(axis=1).T for each in (legs.command[ends.anchor], _path(legs)[ends.anchor], ends.side, ends.output)
+    )
+    spread = 0.5 * (ends.output[:, 1] - ends.output[:, 0]).T
+    halves = half[:, None]
+    share = np.where(halves > 0, (output - wheel[rows.move]) / np.where(halves > 0, halves, 1.0), side)
+    return PlayPlaces(anchor, path, side, share, spread)
 
 
 def line_design(rows: AxisRows) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -12,14 +11,14 @@ from tvsbayes.inference.importance import K_MAX, PILOT_ROUNDS, weighted_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.comparison_record import AxisHoldOut, HeldOutReadings
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
-from tvsbayes.single_axis.axis_density import AxisDensity
+from tvsbayes.single_axis.axis_density import AxisDensity, find_mode
 from tvsbayes.single_axis.axis_fit import model_of
-from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.predicted_stops import transferred_scales
 from tvsbayes.statistics.intervals import NORMAL_95, WithSd, rms
+from tvsbayes.statistics.predicted_readings import Pooled
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
@@ -36,7 +35,7 @@ def _mean_weights(rows: AxisRows, members: np.ndarray) -> np.ndarray:
     return rows.count[members] / rows.count[members].sum()
 
 
-def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> WithSd[float]:
+def _classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> WithSd[float]:
     """Mean of rows `members` from offset, scale and play fitted to the other rows."""
     line = fit_line(rows, ~left_out)
     weights = _mean_weights(rows, members)
@@ -45,16 +44,7 @@ def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray
     return WithSd(float(design_row @ line.solution), float(np.sqrt(variance)))
 
 
-@dataclass(frozen=True)
-class _Prediction:
-    """Prediction of the rows left out: mean (rows,), covariance (rows, rows), and its fault in words, "" for none."""
-
-    mean: np.ndarray
-    covariance: np.ndarray
-    fault: str = ""
-
-
-def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Prediction | None:
+def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> Pooled | None:
     """Prediction by draws (n, d) of the posterior of all rows, reweighted to omit the rows left out.
 
     None where the weights are unreliable. Leave-one-out by importance sampling (Vehtari, Gelman and Gabry, Stat.
@@ -64,16 +54,25 @@ def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Predictio
     smoothed = smoothed_weights(-stops.log_densities(model.rows.value[rows]))
     if not smoothed.pareto_k < K_MAX or effective_draws(smoothed.weights) < EFFECTIVE_MIN:
         return None
-    return _Prediction(*stops.pooled(smoothed.weights))
+    return stops.pooled(smoothed.weights)
 
 
-def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> _Prediction:
-    """Prediction from a fit of the other rows."""
+def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> tuple[Pooled, str]:
+    """Prediction from a fit of the other rows, and the fault of its sample in words, "" for none."""
     reduced = AxisModel.of(model.rows.without(left_out), model.priors, None, model.coordinates.waves)
     rng = random_stream(seed, AxisStream.HELD_OUT)
-    sample = _equal_draws(reduced, DRAWS, seed, rng)
-    w = transferred_scales(reduced, sample.w, model, rng)
-    return _Prediction(*model.left_out(w, np.flatnonzero(left_out)).pooled(), sample.fault)
+    draws, fault = _equal_draws(reduced, DRAWS, seed, rng)
+    w = transferred_scales(reduced, draws, model, rng)
+    return model.left_out(w, np.flatnonzero(left_out)).pooled(), fault
+
+
+def _equal_draws(model: AxisModel, count: int, seed: int, rng: np.random.Generator) -> tuple[np.ndarray, str]:
+    """Equal draws (n, d) by importance sampling, and the fault of their sample in words, "" for none."""
+    mode = find_mode(model)
+    if not len(mode.w):
+        return np.zeros((count, 0)), "; ".join(mode.missing)
+    sample = weighted_run(AxisDensity(model, mode), seed, rounds_least=ROUNDS_MIN, pilots_max=PILOT_ROUNDS).sample
+    return sample.equal(count, rng), "; ".join(sample.convergence.missing)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
@@ -108,7 +107,7 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     def draws() -> np.ndarray:
         """Coordinates of the scales, from all rows."""
         rng = random_stream(seed, AxisStream.HELD_OUT_BY_WEIGHTS)
-        return _equal_draws(model, DRAWS_WEIGHTED, seed, rng).w
+        return _equal_draws(model, DRAWS_WEIGHTED, seed, rng)[0]
 
     with Job({"hold-out": 1.0}, progress) as job:
         for number, position in enumerate(positions):
@@ -119,9 +118,9 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
                 continue
             rows_left_out = np.flatnonzero(left_out)
             prediction = _reweighted(model, draws(), rows_left_out) if len(positions) > REFITTED_MAX else None
-            prediction = prediction or _refitted(model, left_out, seed + number)
-            if prediction.fault:
-                warnings.append(f"position {position:.10g}: {prediction.fault}")
+            if prediction is None:
+                prediction, fault = _refitted(model, left_out, seed + number)
+                warnings += [f"position {position:.10g}: {fault}"] if fault else []
             predictions += _scores(rows, position, prediction)
     return AxisHoldOut(
         positions=tuple(predictions),
@@ -132,26 +131,9 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     )
 
 
-@dataclass(frozen=True)
-class _EqualDraws:
-    """Coordinates (n, d) of equal draws, and the fault of their sample in words, "" for none."""
-
-    w: np.ndarray
-    fault: str
-
-
-def _equal_draws(model: AxisModel, count: int, seed: int, rng: np.random.Generator) -> _EqualDraws:
-    """Equal draws by importance sampling."""
-    mode = find_mode(model)
-    if not len(mode.w):
-        return _EqualDraws(np.zeros((count, 0)), "; ".join(mode.missing))
-    sample = weighted_run(AxisDensity(model, mode), seed, rounds_least=ROUNDS_MIN, pilots_max=PILOT_ROUNDS).sample
-    return _EqualDraws(sample.equal(count, rng), "; ".join(sample.convergence.missing))
-
-
-def _scores(rows: AxisRows, position: float, prediction: _Prediction) -> list[HeldOutReadings]:
+def _scores(rows: AxisRows, position: float, prediction: Pooled) -> list[HeldOutReadings]:
     """Scores of the position by side of approach."""
-    predictions, mean, covariance = [], prediction.mean, prediction.covariance
+    predictions, (mean, covariance) = [], prediction
     left_out = rows.command == position
     rows_left_out = np.flatnonzero(left_out)
     for side in (1, -1, 0):
@@ -163,7 +145,7 @@ def _scores(rows: AxisRows, position: float, prediction: _Prediction) -> list[He
         predicted = float(weights @ mean[of_side])
         u = float(np.sqrt(weights @ covariance[np.ix_(of_side, of_side)] @ weights))
         z = (rows.value[members] - mean[of_side]) / np.sqrt(np.diag(covariance)[of_side])
-        classic = classic_prediction(rows, left_out, members)
+        classic = _classic_prediction(rows, left_out, members)
         predictions.append(
             HeldOutReadings(
                 position=float(position),

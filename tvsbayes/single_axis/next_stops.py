@@ -7,22 +7,20 @@ covariances. The variance due to unknown scales stays constant: the plan begins 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.progress import Advance, Job, Show
+from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, AxisStop, Reading, stops_csv
-from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
+from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, deviation_functionals, headline_functionals
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
-from tvsbayes.single_axis.axis_record import deviation_functionals
 from tvsbayes.single_axis.axis_rows import SIDES, AxisRows, reversal_of, rows_of
 
 TARGETS = (*(name for name, quantity in AXIS_QUANTITIES.items() if quantity.target), "position")
@@ -133,116 +131,56 @@ def _with_stop(campaign: AxisCampaign, rows: AxisRows, stop: AxisStop, seconds: 
     return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading))
 
 
-def _functionals(fit: AxisFit, target: str, places: np.ndarray) -> np.ndarray:
-    """Functionals (t, columns) of the target in the fit's model."""
+def _variance(model: AxisModel, w: np.ndarray, target: str, places: np.ndarray) -> tuple[float, float]:
+    """Variance of a target, unit^2: mean of its variances given the scales, draws (n, d), and that of their means."""
     if target == "position":
-        return deviation_functionals(fit, places)
-    return headline_functionals(fit.model, fit.w)[..., [HEADLINE_DRAWS.index(target)], :]
-
-
-@dataclass(frozen=True)
-class _Variance:
-    """Variance of a target, unit^2: mean of its variances given the scales, and variance between their means."""
-
-    given: float
-    between: float
-
-
-def _variance(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray) -> _Variance:
-    """The variance with the rows of a campaign, at the draws of the fit."""
-    rows = replace(rows_of(campaign), line=fit.rows.line)
-    model = AxisModel.of(rows, fit.model.priors, places, fit.model.coordinates.waves)
-    model = replace(model, coordinates=fit.model.coordinates)
-    linear, functionals = model.linear(fit.w), _functionals(replace(fit, model=model), target, places)
+        functionals = deviation_functionals(model, w, places)
+    else:
+        functionals = headline_functionals(model, w)[..., [HEADLINE_DRAWS.index(target)], :]
+    linear = model.linear(w)
     between = np.var(linear.mean_of(functionals), axis=0)
-    return _Variance(float(np.mean(linear.sd_of(functionals) ** 2)), float(np.mean(between)))
+    return float(np.mean(linear.sd_of(functionals) ** 2)), float(np.mean(between))
 
 
-def _with_linear_play(fit: AxisFit) -> AxisFit:
-    """The fit with every reversal assumed longer than the play, in which the readings are then linear."""
-    names = fit.model.coordinates.names
-    remaining = tuple(name for name in names if name != "backlash")
-    model = replace(fit.model, coordinates=replace(fit.model.coordinates, names=remaining))
-    return replace(fit, model=model, w=np.delete(fit.w, names.index("backlash"), axis=1))
-
-
-@dataclass(frozen=True)
 class _Aim:
     """A target, and its u after more stops.
 
     Attributes:
-        fit: fit of the present readings with few draws of the scales.
-        target: name in `TARGETS`.
         places: commands of the candidates, shape (n,).
-        now: present variance at all draws.
-        given: mean of the present variances given the scales, at the few draws.
+        u_now: present u.
+
+    Raises:
+        NothingToEstimate: the target is fixed.
     """
 
-    fit: AxisFit
-    target: str
-    places: np.ndarray
-    now: _Variance
-    given: float
-
-    @classmethod
-    def of(cls, fit: AxisFit, target: str, places: np.ndarray) -> _Aim:
-        """The target with the readings of a fit.
-
-        Raises:
-            NothingToEstimate: the target is fixed.
-        """
-        now = _variance(fit, fit.campaign, target, places)
+    def __init__(self, fit: AxisFit, target: str, places: np.ndarray):
+        self.target, self.places, self._model, w = target, places, fit.model, fit.w
+        self._given, self._between = _variance(self._with(fit.campaign), w, target, places)
         if target == "backlash" and fit.model.play_is_sampled:
-            # A sampled play has no variance given the scales: that of a linear play replaces it.
-            now, fit = _Variance(now.given + now.between, 0.0), _with_linear_play(fit)
-        few = replace(fit, w=fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)])
-        given = _variance(few, fit.campaign, target, places).given
-        if not given:
+            # A sampled play has no variance given the scales: that of a linear play replaces it, for which every
+            # reversal is longer than the play.
+            self._given, self._between = self._given + self._between, 0.0
+            names = fit.model.coordinates.names
+            linear = replace(fit.model.coordinates, names=tuple(name for name in names if name != "backlash"))
+            self._model, w = replace(fit.model, coordinates=linear), np.delete(w, names.index("backlash"), axis=1)
+        self._few = w[np.linspace(0, len(w) - 1, DRAWS).astype(int)]
+        self._given_few, _ = _variance(self._with(fit.campaign), self._few, target, places)
+        if not self._given_few:
             remedy = f"state {target} in [axis] with u above 0, or name another target"
             raise NothingToEstimate("held", f"{target} is held at its value: no reading changes it", remedy=remedy)
-        return cls(few, target, places, now, given)
+        self.u_now = math.sqrt(self._between + self._given)
 
-    @property
-    def u_now(self) -> float:
-        """Present u."""
-        return float(np.sqrt(self.now.between + self.now.given))
+    def _with(self, campaign: AxisCampaign) -> AxisModel:
+        """The model of the readings of a campaign, with the coordinates of the fit."""
+        rows = replace(rows_of(campaign), line=self._model.rows.line)
+        model = AxisModel.of(rows, self._model.priors, self.places, self._model.coordinates.waves)
+        return replace(model, coordinates=self._model.coordinates)
 
     def u(self, campaign: AxisCampaign) -> float:
         """The u with the readings of a campaign."""
         # With few draws the ratio of variances is more accurate than the variance.
-        given = _variance(self.fit, campaign, self.target, self.places).given
-        return float(np.sqrt(self.now.between + self.now.given * given / self.given))
-
-
-@dataclass(frozen=True)
-class _Session:
-    """Readings with planned ones.
-
-    Attributes:
-        campaign: all readings.
-        u: u of the target by them, unit.
-        minutes: time of the planned stops.
-        stops: these, in order.
-    """
-
-    campaign: AxisCampaign
-    u: float
-    minutes: float = 0.0
-    stops: tuple[NextStop, ...] = ()
-
-    def choices(self, aim: _Aim, move_s: float, minutes: float, advance: Advance) -> Iterator[_Session]:
-        """The session with one more stop: at every place from both sides, within the limits and the time."""
-        low, high = aim.fit.campaign.range_allowed
-        for k, command in enumerate(aim.places.tolist()):
-            advance(k / len(aim.places))
-            for direction in ("forward", "backward"):
-                via = _run_up_start(self.campaign, command, SIDES[direction])
-                stop_minutes = (1 + (via is not None)) * move_s / 60.0
-                if (via is None or low <= via <= high) and self.minutes + stop_minutes <= minutes:
-                    after = _with_stop(self.campaign, aim.fit.rows, AxisStop(via, command, direction), move_s)
-                    u = aim.u(after)
-                    stop = NextStop(command, direction, via, u, self.u - u, (self.u - u) / stop_minutes)
-                    yield _Session(after, u, self.minutes + stop_minutes, (*self.stops, stop))
+        given, _ = _variance(self._with(campaign), self._few, self.target, self.places)
+        return math.sqrt(self._between + self._given * given / self._given_few)
 
 
 def plan_next(
@@ -280,17 +218,23 @@ def plan_next(
     grid = np.unique(np.r_[np.linspace(low, high, CANDIDATES), np.clip(fit.rows.command.min(), low, high)])
     if _whole(fit.campaign):
         grid = np.unique(np.clip(np.round(grid), math.ceil(low), math.floor(high)))
-    aim, move_s = _Aim.of(fit, target, grid), _move_seconds(fit.campaign)
-    session, longest = _Session(fit.campaign, aim.u_now), math.inf if minutes is None else minutes
-
-    def advance(share: float) -> None:
-        job.at((len(session.stops) + share) / count)
-
+    aim, move_s = _Aim(fit, target, grid), _move_seconds(fit.campaign)
+    campaign, u_now, spent, stops = fit.campaign, aim.u_now, 0.0, []
     with Job({"choosing stops": 1.0}, progress) as job:
-        for _ in range(count):
-            choices = session.choices(aim, move_s, longest, advance)
-            best = max(choices, key=lambda choice: choice.stops[-1].gain_per_minute, default=None)
+        while len(stops) < count:
+            best: tuple[NextStop, AxisCampaign] | None = None
+            for k, (command, direction) in enumerate(product(grid.tolist(), ("forward", "backward"))):
+                job.at((len(stops) + k / (2 * len(grid))) / count)
+                via = _run_up_start(campaign, command, SIDES[direction])
+                needed = (1 + (via is not None)) * move_s / 60.0
+                if (via is None or low <= via <= high) and (minutes is None or spent + needed <= minutes):
+                    after = _with_stop(campaign, fit.rows, AxisStop(via, command, direction), move_s)
+                    u = aim.u(after)
+                    stop = NextStop(command, direction, via, u, u_now - u, (u_now - u) / needed)
+                    if best is None or stop.gain_per_minute > best[0].gain_per_minute:
+                        best = stop, after
             if best is None:
                 break
-            session = best
-    return AxisPlan(target, aim.u_now, session.stops, session.minutes)
+            stops.append(best[0])
+            campaign, u_now, spent = best[1], best[0].u, spent + (1 + (best[0].via is not None)) * move_s / 60.0
+    return AxisPlan(target, aim.u_now, tuple(stops), spent)

@@ -8,12 +8,13 @@ columns are whitened once, and every period costs products with its own few colu
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.errors import refusal
-from tvsbayes.single_axis.axis_mode import find_mode
+from tvsbayes.single_axis.axis_density import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
 from tvsbayes.single_axis.axis_rows import AxisRows
@@ -53,8 +54,7 @@ RESOLVED, UNRESOLVED = 0.5, 1e3
 evidence of an unresolved wave, which would represent changes of the other."""
 
 
-@dataclass(frozen=True)
-class _WhitenedModel:
+class _WhitenedModel(NamedTuple):
     """Whitened readings and columns at the mode.
 
     Attributes:
@@ -62,27 +62,26 @@ class _WhitenedModel:
         w: coordinates, shape (1, d).
         base: whitened readings and columns in units of their priors, shape (rows, 1 + columns).
         inverse: inverse of the columns' information, shape (columns, columns).
-        towards: right-hand side, shape (columns,).
     """
 
     model: AxisModel
     w: np.ndarray
     base: np.ndarray
     inverse: np.ndarray
-    towards: np.ndarray
 
 
 def _whitened_model(model: AxisModel, w: np.ndarray) -> _WhitenedModel:
     white, factor = model.white(w), model.prior_factor(w)
-    base = np.column_stack([white[:, :1], white[:, 1:] @ factor])
-    information = base[:, 1:].T @ base[:, 1:] + np.eye(factor.shape[1])
-    return _WhitenedModel(model, w, base, np.linalg.inv(information), base[:, 1:].T @ base[:, 0])
+    columns = white[:, 1:] @ factor
+    inverse = np.linalg.inv(columns.T @ columns + np.eye(factor.shape[1]))
+    return _WhitenedModel(model, w, np.column_stack([white[:, :1], columns]), inverse)
 
 
 def _log_evidence(state: _WhitenedModel, wave: Wave, log_period: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Log Bayes factors (p, scales) of a wave against none, at logs of periods (p,) and scales (scales,)."""
     model, rows = state.model, len(state.base)
     evidence = np.empty((len(log_period), len(scales)))
+    towards = state.inverse @ (state.base[:, 1:].T @ state.base[:, 0])
     for start in range(0, len(log_period), AT_ONCE):
         block = slice(start, start + AT_ONCE)
         columns = model.wave_columns(wave, np.exp(log_period[block])) * np.array(SHARES)
@@ -90,7 +89,7 @@ def _log_evidence(state: _WhitenedModel, wave: Wave, log_period: np.ndarray, sca
         flat = np.moveaxis(columns, 0, 1).reshape(rows, -1)
         white = model.whitened_extra(state.w, flat)
         cross = white.T @ state.base[:, 1:]
-        right_side = (white.T @ state.base[:, 0] - cross @ state.inverse @ state.towards).reshape(count, COLUMNS)
+        right_side = (white.T @ state.base[:, 0] - cross @ towards).reshape(count, COLUMNS)
         wave_block = white.reshape(rows, count, COLUMNS)
         cross = cross.reshape(count, COLUMNS, -1)
         information = np.einsum("rpi,rpj->pij", wave_block, wave_block, optimize=True)
@@ -103,16 +102,12 @@ def _log_evidence(state: _WhitenedModel, wave: Wave, log_period: np.ndarray, sca
     return evidence
 
 
-@dataclass(frozen=True)
-class _SearchResult:
-    """A wave with tables from its evidence, and its log Bayes factor against none."""
+def _search(state: _WhitenedModel, wave: Wave, others: Sequence[Wave] = ()) -> tuple[Wave, float]:
+    """Search one wave with all others as in `state`; its period must be resolved from those of `others`.
 
-    wave: Wave
-    log_evidence: float
-
-
-def _search(state: _WhitenedModel, wave: Wave, others: Sequence[Wave] = ()) -> _SearchResult:
-    """Search one wave with all others as in `state`; its period must be resolved from those of `others`."""
+    Returns:
+        The wave with tables from its evidence, and its log Bayes factor against none.
+    """
     span = float(np.ptp(state.model.clock_of_rows(wave)))
     low, high = (np.log(end * wave.unit) for end in SCALE_RANGE)
     log_scale = np.linspace(low, high, SCALES)
@@ -152,7 +147,7 @@ def _search(state: _WhitenedModel, wave: Wave, others: Sequence[Wave] = ()) -> _
     absent = float(np.clip(1 / (1 + np.exp(np.clip(total, -50, 50))), ABSENT_MIN, ABSENT_MAX))
     scale_table = TabulatedDensity.of(log_scale, TEMPER * by_scale, FLOOR)
     peak_period = float(np.exp(grid[int(np.argmax(by_period))]))
-    return _SearchResult(replace(wave, log_scale=scale_table, log_period=table, absent=absent, peak=peak_period), total)
+    return replace(wave, log_scale=scale_table, log_period=table, absent=absent, peak=peak_period), total
 
 
 def _sharp(evidence: np.ndarray, grid: np.ndarray) -> float:
@@ -218,7 +213,7 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: WavePerio
     for k, wave in enumerate([*stated, *unknown, *encoder]):
         without = mode[None].copy()
         without[0, names.index(f"wave_scale.{k + 1}")] = absent_coord(all_waves[k])
-        results.append(_search(_whitened_model(model, without), wave).wave)
+        results.append(_search(_whitened_model(model, without), wave)[0])
     return tuple(results)
 
 
@@ -241,20 +236,20 @@ def _inferred(
     """
     found: list[Wave] = []
 
-    def strongest(ranges: Sequence[Wave]) -> _SearchResult:
+    def strongest(ranges: Sequence[Wave]) -> tuple[Wave, float]:
         peaks = [_at_peak(wave) for wave in found]
         model = AxisModel.of(rows, priors, None, [*known, *peaks])
         mode = find_mode(model, start).w
         start.update(zip(model.coordinates.names, mode.tolist(), strict=True))
         state = _whitened_model(model, mode[None])
-        return max((_search(state, wave, peaks) for wave in ranges), key=lambda result: result.log_evidence)
+        return max((_search(state, wave, peaks) for wave in ranges), key=lambda result: result[1])
 
     different = list({(wave.low, wave.high): wave for wave in waves}.values())
-    while different and len(found) < WAVES_MAX and (best := strongest(different)).log_evidence > FURTHER:
-        found.append(best.wave)
+    while different and len(found) < WAVES_MAX and (best := strongest(different))[1] > FURTHER:
+        found.append(best[0])
     for wave in different:
         while sum((one.low, one.high) == (wave.low, wave.high) for one in found) < waves.count(wave):
-            found.append(strongest([wave]).wave)
+            found.append(strongest([wave])[0])
     return found
 
 

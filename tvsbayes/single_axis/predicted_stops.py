@@ -17,10 +17,11 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.conditions import kelvin_at, pause_s
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_model import BACKLASH, CONTRAST, FLOOR, OFFSET, SLOPE, AxisModel, LinearPosterior
+from tvsbayes.single_axis.axis_model import CONTRAST, AxisModel, ScatteredReadings, noise_covariances
 from tvsbayes.single_axis.axis_parameters import SAMPLED, AxisCoordinates
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, PlayPlaces, legs_of, play_places, rows_of, warm_from
 from tvsbayes.single_axis.waves import wave_columns
+from tvsbayes.statistics.linear_posterior import LinearPosterior
 from tvsbayes.statistics.predicted_readings import PredictedReadings, State, Use
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
@@ -113,7 +114,7 @@ class PredictedAxis:
         rows = self.fit.rows
         kelvin = 0.0 if rows.kelvin is None else float(rows.kelvin.mean())
         return State(
-            float(_since_homing(rows).mean()), float(rows.path.mean()), float(rows.warm_s.mean()) / HOUR_S, kelvin
+            float(rows.since_homing.mean()), float(rows.path.mean()), float(rows.warm_s.mean()) / HOUR_S, kelvin
         )
 
     @cached_property
@@ -150,7 +151,11 @@ class PredictedAxis:
     def scatter(self, side: np.ndarray, use: State, u: np.ndarray | float) -> dict[str, np.ndarray]:
         """Compute what does not repeat, by cause, of readings after one homing, each at a stop of its own."""
         hours = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side)) + self._walked_hours
-        return self._scattered(np.zeros(len(side)), hours, np.arange(len(side)), side, np.asarray(u) ** 2)
+        variance = np.broadcast_to(np.asarray(u, dtype=float) ** 2, np.shape(side))
+        return self._noise(ScatteredReadings(np.zeros(len(side)), np.arange(len(side)), hours, side, variance))
+
+    def _noise(self, readings: ScatteredReadings) -> dict[str, np.ndarray]:
+        return noise_covariances(self.scales, readings, self.fit.rows.travel)
 
     def read(self, campaign: AxisCampaign) -> PredictedReadings:
         """Predict the readings of another campaign of this axis, after homings of its own, at its own states.
@@ -167,14 +172,15 @@ class PredictedAxis:
         elif self.fit.rows.kelvin is not None:
             # Somewhere in the range that was read.
             unknown = float(np.ptp(self.fit.rows.kelvin)) ** 2 / 12
-        hours = _since_homing(rows)
+        hours = rows.since_homing
         if self.fit.campaign.absolute:
             pause = pause_s(self.fit.campaign.header, campaign.header, self.fit.campaign.moves[-1].time_s)
             hours = hours + self._walked_hours + pause / HOUR_S
         shared, own = self._shared_errors(campaign, rows)
         state = State(hours, rows.path, rows.warm_s / HOUR_S, kelvin)
         repeated = self._readings(rows.command, play, state, shared)
-        scatter = self._scattered(rows.zero, hours, np.cumsum(rows.redrawn), rows.side, rows.variance)
+        readings = ScatteredReadings(rows.zero, np.cumsum(rows.redrawn), hours, rows.side, rows.variance)
+        scatter = self._noise(readings)
         covariance = repeated.covariance + sum(scatter.values()) + own @ own.T
         if "thermal_per_K" in self.fit.model.shifts:
             column = self.fit.model.shift_columns["thermal_per_K"]
@@ -188,7 +194,7 @@ class PredictedAxis:
     def noise(self, side: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Mean variance (r,) drawn anew at every visit: of stops, and of readings with stated variances (r,)."""
         count = np.arange(len(side))
-        scatter = self._scattered(count, np.zeros(len(side)), count, side, variance)
+        scatter = self._noise(ScatteredReadings(count, count, np.zeros(len(side)), side, variance))
         return np.diagonal(scatter["stops"] + scatter["readings"], axis1=1, axis2=2).mean(axis=0)
 
     @cached_property
@@ -197,13 +203,7 @@ class PredictedAxis:
 
     def _in_time(self, state: State) -> dict[str, np.ndarray]:
         """Factors of the shifts of the zero at a state: (1 or n, 1 or r)."""
-        factors = {}
-        if "creep" in self.fit.model.shifts:
-            minutes = self.scales["creep_minutes"][:, None]
-            factors["creep"] = -np.expm1(-60.0 * np.atleast_2d(state.warm_hours) / minutes)
-        if "thermal_per_K" in self.fit.model.shifts:
-            factors["thermal_per_K"] = np.atleast_2d(np.asarray(state.kelvin, dtype=float))
-        return factors
+        return self.fit.model.in_time(self.scales["creep_minutes"], HOUR_S * np.asarray(state.warm_hours), state.kelvin)
 
     def _shared_errors(self, campaign: AxisCampaign, rows: AxisRows) -> tuple[np.ndarray, np.ndarray]:
         """Errors of rows of another campaign that its readings share, by cause.
@@ -230,55 +230,23 @@ class PredictedAxis:
         """
         known = self.fit.model
         model = AxisModel.of(known.rows, known.priors, command, known.coordinates.waves)
-        in_time = self._in_time(state)
-        drawn = model.coordinates.wave_draws(self.w)
-        waves, line = [], model.rows.line
-        for wave, draws in zip(model.coordinates.waves, drawn, strict=True):
-            x = model.clock(wave, command, np.zeros(len(command)), line.offset + line.slope * command)
+        in_time, waves = self._in_time(state), []
+        for wave, draws in zip(model.coordinates.waves, model.coordinates.wave_draws(self.w), strict=True):
+            x = model.clock(
+                wave, command, np.zeros(len(command)), model.rows.line.offset + model.rows.line.slope * command
+            )
             waves.append(wave_columns(x, draws.period, model.record(wave)))
         size = max(len(each) for each in (play.anchor, *in_time.values(), *waves))
         functionals = np.zeros((size, len(command), model.columns))
-        functionals[..., OFFSET], functionals[..., SLOPE] = 1.0, play.anchor - model.middle
-        functionals[..., CONTRAST], functionals[..., BACKLASH] = 0.5 * play.path, 0.5 * play.side
+        model.fill(functionals, command, play, in_time, waves)
         functionals[..., model.layout["homed"]] = 1.0 / (len(model.homed) + 1)
-        for name, factor in in_time.items():
-            functionals[..., model.shift_columns[name]] = factor
-        for k, wave_factors in enumerate(waves):
-            functionals[..., model.of_wave(k)] = wave_factors
         functionals[..., model.layout["reference"]] = reference
-        weights = model.places.weights(command)
-        functionals[..., model.layout["error"]] = weights
-        functionals[..., model.layout["play"]] = 0.5 * play.share[..., None] * weights
         linear = model.linear(self.w)
         functionals = functionals[0] if size == 1 else functionals
         covariance = functionals @ linear.covariance @ np.swapaxes(functionals, -1, -2)
         if not model.places.exact:
             covariance = covariance + model.between_nodes(self.scales)[:, None, None] * np.eye(len(command))
         return PredictedReadings(linear.mean_of(functionals), covariance)
-
-    def _scattered(
-        self, zero: np.ndarray, hours: np.ndarray, stop: np.ndarray, side: np.ndarray, variance: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """Covariances by cause of readings with numbers of their homing and their stop."""
-        scales, one_zero, one_stop = self.scales, np.equal.outer(zero, zero), np.equal.outer(stop, stop)
-        forward = 0.5 * (1.0 + side)
-        stops = scales["stop_sd.forward"][:, None] ** 2 * forward + scales["stop_sd.backward"][:, None] ** 2 * (
-            1 - forward
-        )
-        reading = scales["reading_scale"][:, None] ** 2 * variance + (FLOOR * self.fit.rows.travel) ** 2
-        return {
-            "homing": scales["home_sd"][:, None, None] ** 2 * one_zero,
-            "drift": scales["drift_per_root_hour"][:, None, None] ** 2 * np.minimum.outer(hours, hours) * one_zero,
-            "stops": np.sqrt(stops[:, :, None] * stops[:, None, :]) * one_stop,
-            "readings": (reading * np.ones(len(side)))[:, :, None] * np.eye(len(side)),
-        }
-
-
-def _since_homing(rows: AxisRows) -> np.ndarray:
-    """Hours since the homing of each row's zero."""
-    hours = np.cumsum(rows.hours)
-    first = np.searchsorted(rows.zero, rows.zero)
-    return hours - hours[first] + rows.hours[first]
 
 
 def longest_use(moves: Sequence[AxisMove]) -> tuple[float, float]:

@@ -56,6 +56,15 @@ class WavePeriods:
     def __bool__(self) -> bool:
         return bool(self.stated or self.between or self.encoder is not None)
 
+    def entries(self) -> dict[str, object]:
+        """The entries of `[axis]`."""
+        return {
+            "periods": list(self.stated),
+            "periods_in": "seconds" if self.in_seconds else None,
+            "period_between": [list(pair) for pair in self.between],
+            "encoder_period": self.encoder,
+        }
+
     @property
     def shortest(self) -> float | None:
         """Shortest of the gear's periods; None without any."""

@@ -92,7 +92,7 @@ FAULTS = (
           "test_every_name_drives_its_field_and_nothing_else"),
     Fault("prior sds count twice", "parameter_space._values", Reads("space.u", "2 * value"),
           "test_physical_values_are_scipys_quantiles"),
-    Fault("the half-normal prior has the wrong tail", "parameter_space.half_normal", Argument("z", "-value"),
+    Fault("the half-normal prior has the wrong tail", "priors.half_normal", Argument("z", "-value"),
           "test_physical_values_are_scipys_quantiles"),
     # Pictures: which camera, which look.
     Fault("directions beside up and down are taken for cameras", "named_cameras", Local("directions", "False"),
@@ -285,7 +285,7 @@ FAULTS = (
     Fault("a row of a study counts whatever its numbers are", "StudyRows._take", Call("_digest", "stated"),
           "test_a_row_that_does_not_say_what_was_written_is_made_again"),
     # One axis.
-    Fault("an axis is homed from the wrong side", "play_places", Local("side", "-value"),
+    Fault("an axis is homed from the wrong side", "play_places", Local("approach", "-value"),
           "test_play_is_the_clip_of_the_definition"),
     Fault("an axis' stop error is drawn anew while it stands", "axis_rows._redrawn", Returns("value | True"),
           "test_repeats_at_one_stop_share_its_error"),

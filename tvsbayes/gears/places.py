@@ -1,4 +1,4 @@
-"""Places of the processes of position: every position with readings, or even nodes where there are many."""
+"""Places at which errors by position have their values: every position read, or even nodes. NumPy."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-PLACES_MAX = 60
-"""Largest number of positions that are places themselves; more are replaced by `NODES` interpolated nodes."""
-NODES = 41
+PLACES_MAX, NODES = 60, 41
+"""Largest number of positions at which the processes have a value each; more are interpolated from so many nodes."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +22,13 @@ class ProcessPlaces:
     command: np.ndarray
     exact: bool
 
+    @classmethod
+    def of(cls, commands: np.ndarray, more: np.ndarray) -> ProcessPlaces:
+        """Places for rows at `commands` and further evaluations at `more`; none for no rows."""
+        places = np.unique(np.concatenate([commands, more])) if len(commands) else commands
+        exact = len(np.unique(commands)) <= PLACES_MAX
+        return cls(places if exact else np.linspace(places[0], places[-1], NODES), exact)
+
     def weights(self, command: np.ndarray) -> np.ndarray:
         """Weight of each place at commands (n,): shape (n, places).
 
@@ -32,27 +38,17 @@ class ProcessPlaces:
         weights = np.zeros((len(command), len(self.command)))
         if not len(self.command):
             return weights
+        rows = np.arange(len(command))
         if self.exact:
             nearest = np.searchsorted(self.command, command)
             if not np.array_equal(self.command[np.minimum(nearest, len(self.command) - 1)], command):
                 raise ValueError("a command at which no process stands")
-            weights[np.arange(len(command)), nearest] = 1.0
+            weights[rows, nearest] = 1.0
             return weights
         spacing = self.command[1] - self.command[0]
         first = np.clip(((command - self.command[0]) // spacing).astype(int) - 1, 0, len(self.command) - 4)
         t = (command - self.command[first]) / spacing
         # Lagrange's polynomial of third order through four nodes.
         for k in range(4):
-            others = [j for j in range(4) if j != k]
-            weights[np.arange(len(command)), first + k] = np.prod([(t - j) / (k - j) for j in others], axis=0)
+            weights[rows, first + k] = np.prod([(t - j) / (k - j) for j in range(4) if j != k], axis=0)
         return weights
-
-
-def process_places(commands: np.ndarray, more: np.ndarray) -> ProcessPlaces:
-    """Places for rows at `commands` and further evaluations at `more`; none for no rows."""
-    if not len(commands):
-        return ProcessPlaces(commands, True)
-    all_commands = np.unique(np.concatenate([commands, more]))
-    if len(np.unique(commands)) <= PLACES_MAX:
-        return ProcessPlaces(all_commands, True)
-    return ProcessPlaces(np.linspace(all_commands[0], all_commands[-1], NODES), False)

@@ -1,4 +1,4 @@
-"""The posterior of the linear quantities of an axis: normal at every draw of the scales. NumPy."""
+"""The posterior of quantities in which the observations are linear: normal, at every draw of the scales. NumPy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class LinearPosterior:
-    """Posterior of the linear quantities given the scales: normal, by column of the model.
+    """Posterior of linear quantities (columns) given n draws of the scales.
 
     Attributes:
         mean: shape (n, columns).
