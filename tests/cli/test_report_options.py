@@ -12,8 +12,7 @@ from support.signers import signer
 
 from tvsbayes.cli.report_options import tolerance_of
 from tvsbayes.report.axis_document import figures_by_name
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading, write_axis
-from tvsbayes.single_axis.reference import Reference
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading, Reference, write_axis
 
 
 @pytest.fixture(scope="module")

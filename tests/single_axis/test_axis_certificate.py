@@ -17,11 +17,10 @@ from tvsbayes.metrology.dcc import Embedded, Parties
 from tvsbayes.report.axis_document import axis_document, criteria_of, curve_commands
 from tvsbayes.report.document import Issue
 from tvsbayes.report.page import page_html
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading, axis_bytes, read_axis, write_axis
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading, Reference, axis_bytes, read_axis, write_axis
 from tvsbayes.single_axis.axis_certificate import axis_certificate
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_record import AxisResults, summarise_axis
-from tvsbayes.single_axis.reference import Reference
 
 PATH = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
 DAY = datetime.date(2026, 11, 28)

@@ -10,11 +10,13 @@ import pytest
 from support.axes import OFF, drawn, random_moves, runs
 from support.refusals import refusal
 
+from tvsbayes.files.documents import StatedValue
 from tvsbayes.single_axis.axis_budget import _variances, axis_budgets
 from tvsbayes.single_axis.axis_campaign import (
     AxisCampaign,
     AxisMove,
     Reading,
+    Reference,
     axis_bytes,
     axis_hashes,
     read_axis,
@@ -26,7 +28,6 @@ from tvsbayes.single_axis.axis_record import AxisSummary, summarise_axis
 from tvsbayes.single_axis.axis_rows import rows_of
 from tvsbayes.single_axis.classic_line import classic_axis
 from tvsbayes.single_axis.predicted_stops import PredictedAxis
-from tvsbayes.single_axis.reference import Reference, StatedValue
 
 PLACES = np.linspace(0.0, 400.0, 6)
 

@@ -25,7 +25,7 @@ def band_begun(wheel: Any, half: Any, approach: Any, xp: ModuleType = np) -> tup
     return xp.where(approach < 0, above, below), xp.where(approach > 0, below, above)
 
 
-def band_moved(band: tuple[Any, Any], wheel: Any, half: Any, xp: ModuleType = np) -> tuple[Any, Any]:
+def band_moved(band: Any, wheel: Any, half: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Compute the lowest and highest output after a move.
 
     Play is monotone in its state, so that the two ends bound all states between.

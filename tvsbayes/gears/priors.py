@@ -1,7 +1,7 @@
 """Priors of a joint's parameters and the coordinates in which each is standard normal. NumPy or JAX.
 
 Normal priors are value + u z, half-normals u Phi^-1((1 + Phi(z)) / 2), which has no boundary and no mirrored mode,
-log-normals value exp(u z) (formulation 4.1, 8.3). u = 0 fixes a parameter whatever its z.
+log-normals value exp(u z) (formulation 4.1). u = 0 fixes a parameter whatever its z.
 """
 
 from __future__ import annotations

@@ -6,9 +6,10 @@ found by name. No JAX.
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -28,14 +29,12 @@ from tvsbayes.files.csv_kind import (
 )
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import read_bytes, write_folder
-from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, StatedValue, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
 from tvsbayes.instrument.campaign_header import ENVIRONMENT, header_tables, header_value, header_values
 from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
-from tvsbayes.single_axis.reference import TABLE as REFERENCE
-from tvsbayes.single_axis.reference import Reference, parse_reference
 from tvsbayes.single_axis.waves import WavePeriods
 
 FORMAT = "tvsbayes-axis/1"
@@ -51,6 +50,11 @@ DEGREES = {
 """Units of angle of readings, in deg."""
 TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
 """One turn in each unit of angle."""
+REFERENCE, COMMON = "reference", "common"
+"""Table of what reads the axis; its word for a u of readings.csv that is one error of all readings."""
+NO_EXPANSION, EXPANSION_MAX = StatedValue(0.0, 0.0), 1e-2
+"""Largest relative expansion, 1/K."""
+CERTIFICATE_CHARS_MAX = 200
 _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
 """Log-normal parameters by which the model divides: the density is undefined where they are fixed at 0."""
 HEADER_TABLES = {
@@ -146,6 +150,45 @@ AXIS_MOVES = CsvKind(
     [AxisMove(0, 0, 0.0, 0, "unknown")],
 )
 READINGS = CsvKind(Reading, "readings.csv", "a row for every reading")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What `[reference]` states of what reads the axis: uncertainties common to all its readings.
+
+    A reading errs by u, by u_per_unit times the reading, by an error of the expansion times reading and temperature
+    less 20 degC, and with `u_is = "common"` by its stated u, each times one normal number for the folder (formulation
+    8.6). The unit is that of the readings; degC.
+
+    Attributes:
+        u: standard uncertainty of an offset of all readings, unit.
+        u_per_unit: standard uncertainty of the scale, relative.
+        expansion_per_K: relative expansion of the reference: a reading r at T means r (1 + expansion (T - 20 degC)).
+        common: whether the u of readings.csv is one error of all readings, not noise of each.
+        certificate: name of its certificate, "" where not stated.
+        valid_until: last day of its validity.
+    """
+
+    u: float = 0.0
+    u_per_unit: float = 0.0
+    expansion_per_K: StatedValue = NO_EXPANSION
+    common: bool = False
+    certificate: str = ""
+    valid_until: datetime.date | None = None
+
+    @property
+    def expands(self) -> bool:
+        """Whether its readings depend on the temperature."""
+        return self.expansion_per_K != NO_EXPANSION
+
+    def lines(self, *, estimate: bool = False) -> list[str]:
+        """The entries of `[reference]`; with `estimate` those on which an estimate depends."""
+        entries: dict[str, object] = {"u": self.u or None, "u_per_unit": self.u_per_unit or None}
+        entries["expansion_per_K"] = self.expansion_per_K._asdict() if self.expands else None
+        entries["u_is"] = COMMON if self.common else None
+        if not estimate:
+            entries |= {"certificate": self.certificate or None, "valid_until": self.valid_until}
+        return [toml_line(name, value) for name, value in entries.items() if value is not None]
 
 
 @dataclass(frozen=True, repr=False)
@@ -347,6 +390,28 @@ def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
     return tuple(ranges)
 
 
+def _parse_reference(keys: Keys, moves: Sequence[AxisMove]) -> Reference:
+    """Check `[reference]` of a folder with these moves."""
+    keys.only(("u", "u_per_unit", "expansion_per_K", "u_is", "certificate", "valid_until"))
+    numbers = {name: keys.number(name, 0.0, COMMAND_MAX) for name in ("u", "u_per_unit") if name in keys}
+    expansion = NO_EXPANSION
+    if "expansion_per_K" in keys:
+        ends = -EXPANSION_MAX, EXPANSION_MAX
+        if isinstance(keys.values["expansion_per_K"], int | float):
+            expansion = StatedValue(keys.number("expansion_per_K", *ends), 0.0)
+        else:
+            expansion = keys.quantity("expansion_per_K", *ends, EXPANSION_MAX)
+        if not any(move.temperature_degC is not None for move in moves):
+            remedy = "add the column temperature_degC to moves.csv, or leave the expansion out"
+            raise keys.refuse("expansion_per_K", "temperature", "an expansion where temperatures are recorded", remedy)
+    certificate = keys.text_value("certificate", CERTIFICATE_CHARS_MAX) if "certificate" in keys else ""
+    common = "u_is" in keys and keys.word("u_is", (COMMON, "independent")) == COMMON
+    until = keys.values.get("valid_until")
+    if until is not None and (not isinstance(until, datetime.date) or isinstance(until, datetime.datetime)):
+        raise keys.refuse("valid_until", "date", "a date such as 2027-01-15", "write it without quotes")
+    return Reference(**numbers, expansion_per_K=expansion, common=common, certificate=certificate, valid_until=until)
+
+
 def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     keys = parse_toml(files["campaign.toml"], "campaign.toml")
     keys.word("format", (FORMAT,))
@@ -362,7 +427,7 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     moves = parse_axis_moves(files["moves.csv"])
     readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
     command_unit = axis.text_value(COMMAND_UNIT, UNIT_CHARS_MAX) if COMMAND_UNIT in axis else None
-    limits, reference = _parse_limits(axis), parse_reference(keys.table(REFERENCE), moves)
+    limits, reference = _parse_limits(axis), _parse_reference(keys.table(REFERENCE), moves)
     return AxisCampaign(
         *(unit, moves, readings, stated, header, periods, path, absolute, limits, command_unit, reference)
     )

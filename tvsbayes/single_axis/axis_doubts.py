@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from tvsbayes.results.estimates import CONFLICT_LIMIT
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading
 from tvsbayes.single_axis.axis_parameters import axis_priors
 from tvsbayes.single_axis.axis_rows import AxisRows
-from tvsbayes.single_axis.classic_line import LineFit, fit_line
+from tvsbayes.single_axis.classic_line import fit_line
 
 SLOPE_SHARE, SLOPE_ERRORS = 0.2, 6.0
 """Least difference of a doubtful segment's slope from the others, as a share and in standard errors: errors by position
@@ -36,13 +35,22 @@ LINE_SLOPE = float(np.sqrt(12.0))
 
 def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """Doubts about the data, in sentences."""
-    sentences = _beyond_limits(campaign) + temperature_doubts(campaign.moves)
+    sentences = temperature_doubts(campaign.moves)
+    if campaign.limits is not None:
+        low, high = campaign.limits
+        beyond = [m.move for m in campaign.moves if not m.assumed and not low <= m.command <= high]
+        words = f"commands beyond `limits = [{low:.10g}, {high:.10g}]` of [axis]: moves {listed(beyond, 5)}"
+        sentences[:0] = [f"{words}; correct one of both"] if beyond else []
+    unread, readings = len(campaign.readings) - int(rows.count.sum()), len(campaign.readings)
     if rows.in_motion:
-        return sentences + _warnings_in_motion(campaign, rows)
+        if not any(r.u > 0 for r in campaign.readings):
+            found = f"{rows.reading_u:.2g} {rows.unit} by differences of neighbours"
+            sentences.append(f"no reading has a stated u: {found}")
+        if unread:
+            sentences.append(f"{unread} of {readings} readings are not used: their status is not ok")
+        return sentences
     sentences += lone_doubts(campaign.moves, [move.command for move in campaign.moves], "command")
-    legs = rows.legs
-    zero_steps = (legs.step == 0) & ~legs.first
-    unmoved = [int(m) for m in rows.move if zero_steps[m]]
+    unmoved = [int(m) for m in rows.move if rows.legs.step[m] == 0 and not rows.legs.first[m]]
     if unmoved:
         sentences.append(
             f"same command as the move before: moves {listed(unmoved, 5)}; nothing moved, so they are of one stop and "
@@ -52,31 +60,9 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
         sentences.append("all moves have the same time: drift is not determined")
     if not np.any(rows.variance > 0):
         sentences.append("no reading has a stated u: the scatter of stops includes that of the readings")
-    unread = len(campaign.readings) - int(rows.count.sum())
     if unread:
         sentences.append(f"{unread} readings are not used: their status is not ok")
     return sentences + data_doubts(campaign, rows)
-
-
-def _beyond_limits(campaign: AxisCampaign) -> list[str]:
-    """Moves made beyond the stated limits."""
-    if campaign.limits is None:
-        return []
-    low, high = campaign.limits
-    beyond = [m.move for m in campaign.moves if not m.assumed and not low <= m.command <= high]
-    words = f"commands beyond `limits = [{low:.10g}, {high:.10g}]` of [axis]: moves {listed(beyond, 5)}"
-    return [f"{words}; correct one of both"] if beyond else []
-
-
-def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """Doubts about a record of a drive in continuous motion."""
-    sentences = []
-    if not any(r.u > 0 for r in campaign.readings):
-        sentences.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
-    unread = len(campaign.readings) - int(rows.count.sum())
-    if unread:
-        sentences.append(f"{unread} of {len(campaign.readings)} readings are not used: their status is not ok")
-    return sentences
 
 
 def data_doubts(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
@@ -87,13 +73,10 @@ def data_doubts(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
 
 def _odd_segments(rows: AxisRows) -> list[str]:
     """Segments whose slope differs from that of the others."""
-    lines: dict[int, LineFit] = {}
-    for segment in np.unique(rows.segment):
-        of_segment = rows.segment == segment
-        # Three rows determine offset, slope and play; a fourth their scatter.
-        if of_segment.sum() > 3 and np.ptp(rows.command[of_segment]) > 0:
-            lines[int(segment)] = fit_line(rows, of_segment)
-    sentences = []
+    members = {int(segment): rows.segment == segment for segment in np.unique(rows.segment)}
+    # Three rows determine offset, slope and play; a fourth their scatter.
+    judged = {k: of for k, of in members.items() if of.sum() > 3 and np.ptp(rows.command[of]) > 0}
+    lines, sentences = {k: fit_line(rows, of) for k, of in judged.items()}, []
     for segment, line in lines.items():
         # If two segments differ, the data do not show which one is wrong: both are named.
         others = [other for number, other in lines.items() if number != segment or len(lines) > 2]
@@ -102,7 +85,7 @@ def _odd_segments(rows: AxisRows) -> list[str]:
         typical = sorted(others, key=lambda other: float(other.solution[1]))[(len(others) - 1) // 2]
         slope, reference = float(line.solution[1]), float(typical.solution[1])
         u = float(np.sqrt(line.covariance[1, 1] + typical.covariance[1, 1]))
-        gap, span = abs(slope - reference), float(np.ptp(rows.command[rows.segment == segment]))
+        gap, span = abs(slope - reference), float(np.ptp(rows.command[judged[segment]]))
         bound = max(abs(float(fit.solution[2])) + fit.scatter for fit in (line, typical))
         if gap > max(SLOPE_SHARE * min(abs(slope), abs(reference)), SLOPE_ERRORS * u) and gap * span > PLAYS * bound:
             sentences.append(
@@ -132,6 +115,13 @@ def _odd_ratio(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     ]
 
 
+def _wild(reading: int, move: int, rows: AxisRows, distance: str) -> str:
+    return (
+        f"reading {reading} (move {move}, command {rows.legs.command[move]:.10g}) lies {distance}: look at it in "
+        "readings.csv, and if it is wrong give it another status than ok, such as wild"
+    )
+
+
 def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """Readings far from the others at their stop; if two differ, the reading farther from the line."""
     stops: dict[int, list[Reading]] = defaultdict(list)
@@ -140,11 +130,12 @@ def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
             stops[reading.move].append(reading)
     line = fit_line(rows)
     side = {int(move): int(s) for move, s in zip(rows.move, rows.side, strict=True)}
-    candidates: list[tuple[Reading, float, float]] = []
+    farthest: list[Reading] = []
+    apart, sds = [], []
     for move, readings in stops.items():
         if len(readings) < 2:
             continue
-        values = np.array([float(r.value or 0.0) for r in readings])
+        values, u = (np.array([float(getattr(r, name) or 0.0) for r in readings]) for name in ("value", "u"))
         centre = float(np.median(values))
         if len(readings) == 2:
             # Both are at the same distance from their median.
@@ -152,42 +143,31 @@ def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
             centre = float(np.dot(design, line.solution))
         k = int(np.argmax(np.abs(values - centre)))
         others = np.delete(values, k)
-        u = [r.u for r in readings]
-        sd = float(np.hypot(u[k], np.linalg.norm(np.delete(u, k)) / len(others))) if all(u) else 0.0
-        candidates.append((readings[k], float(values[k] - np.median(others)), sd))
-    # Without a stated u, the scale is their typical difference; a stated u may be too small.
-    known = bool(candidates) and all(sd > 0 for _, _, sd in candidates)
-    if len(candidates) < STOPS_MIN:
+        farthest.append(readings[k])
+        apart.append(float(values[k] - np.median(others)))
+        sds.append(float(np.hypot(u[k], np.linalg.norm(np.delete(u, k)) / len(others))) if all(u) else 0.0)
+    if len(farthest) < STOPS_MIN:
         return []
-    sizes = np.array([abs(deviations) / (sd if known else 1.0) for _, deviations, sd in candidates])
+    # Without a stated u, the scale is their typical difference; a stated u may be too small.
+    known = all(sd > 0 for sd in sds)
+    sizes = np.abs(apart) / (np.array(sds) if known else 1.0)
     typical = float(np.median(sizes)) / 0.6745
     scale = max(typical, 1.0) if known else typical
     return [
-        f"reading {reading.reading} (move {reading.move}, command {rows.legs.command[reading.move]:.10g}) lies "
-        f"{deviations:+.3g} {rows.unit}, {size / scale:.0f} sds, off what else was read at its stop: look at it in "
-        "readings.csv, and if it is wrong give it another status than ok, such as wild"
-        for (reading, deviations, _), size in zip(candidates, sizes, strict=True)
+        _wild(
+            *(reading.reading, reading.move, rows),
+            f"{distance:+.3g} {rows.unit}, {size / scale:.0f} sds, off what else was read at its stop",
+        )
+        for reading, distance, size in zip(farthest, apart, sizes, strict=True)
         if size > WILD * scale > 0
     ]
 
 
-@dataclass(frozen=True)
-class _RobustLine:
-    """A robust line with a reversal and an offset of each segment.
+def _off_robust_line(rows: AxisRows) -> tuple[np.ndarray, float]:
+    """Deviations (rows,) from a robust line with a reversal and an offset of each segment, and the reversal, unit.
 
-    Attributes:
-        deviations: deviation of every row from the line, unit, shape (rows,).
-        reversal: the reversal, unit.
-    """
-
-    deviations: np.ndarray
-    reversal: float
-
-
-def _robust_line(rows: AxisRows) -> _RobustLine:
-    """Medians: the slope of pairs half the rows apart on one side, then each side of each segment.
-
-    All pairs (Theil, Sen) would determine the slope somewhat better, in a time quadratic in the rows.
+    Medians: the slope of pairs half the rows apart on one side, then each side of each segment. All pairs (Theil, Sen)
+    would determine the slope somewhat better, in a time quadratic in the rows.
     """
     slopes = []
     for side in np.unique(rows.side):
@@ -200,13 +180,15 @@ def _robust_line(rows: AxisRows) -> _RobustLine:
     deviations = rows.value - float(np.median(slopes or [rows.line.slope])) * rows.command
     reversals = []
     for segment in np.unique(rows.segment):
-        sides = [(rows.segment == segment) & (rows.side == side) for side in (-1, 0, 1)]
-        centres = [float(np.median(deviations[of_rows])) if of_rows.any() else None for of_rows in sides]
-        if centres[0] is not None and centres[2] is not None:
-            reversals.append(abs(centres[2] - centres[0]))
-        for of_rows, centre in zip(sides, centres, strict=True):
-            deviations[of_rows] -= centre or 0.0
-    return _RobustLine(deviations, float(np.median(reversals or [0.0])))
+        centres = {}
+        for side in (-1, 0, 1):
+            members = (rows.segment == segment) & (rows.side == side)
+            if members.any():
+                centres[side] = float(np.median(deviations[members]))
+                deviations[members] -= centres[side]
+        if {-1, 1} <= set(centres):
+            reversals.append(abs(centres[1] - centres[-1]))
+    return deviations, float(np.median(reversals or [0.0]))
 
 
 def _wild_stops(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
@@ -216,14 +198,13 @@ def _wild_stops(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """
     if len(rows.value) < STOPS_JUDGED_MIN:
         return []
-    line = _robust_line(rows)
-    typical = float(np.median(np.abs(line.deviations))) / 0.6745
-    wild = np.abs(line.deviations) > max(WILD_STOP * typical, WILD_SHARE * rows.travel)
+    deviations, reversal = _off_robust_line(rows)
+    typical = float(np.median(np.abs(deviations))) / 0.6745
+    wild = np.abs(deviations) > max(WILD_STOP * typical, WILD_SHARE * rows.travel)
     leg = np.abs(rows.legs.step[rows.move] * rows.line.slope)
     reading = {r.move: r.reading for r in campaign.readings if r.status == "ok"}
+    off = f"{rows.unit} off the line through the others, typical is {typical:.2g}"
     return [
-        f"reading {reading[int(rows.move[k])]} (move {rows.move[k]}, command {rows.command[k]:.10g}) lies "
-        f"{line.deviations[k]:+.3g} {rows.unit} off the line through the others, typical is {typical:.2g}: look at it "
-        "in readings.csv, and if it is wrong give it another status than ok, such as wild"
-        for k in np.flatnonzero(wild & (leg > PLAYS * line.reversal))
+        _wild(reading[int(rows.move[k])], int(rows.move[k]), rows, f"{deviations[k]:+.3g} {off}")
+        for k in np.flatnonzero(wild & (leg > PLAYS * reversal))
     ]

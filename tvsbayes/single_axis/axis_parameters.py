@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -60,6 +61,11 @@ def _key(name: str, kind: Kind, share: float | None, label: str, unit: str = "{u
     return AxisKey(name=name, block=name, kind=kind, share=share, label=label, unit=unit, **fields)
 
 
+def _side(part: float, middle: float) -> dict[str, float]:
+    """Factors of the ratio in one direction, given its part of the contrast."""
+    return {"per_command": 1.0, "ratio_contrast": part}
+
+
 _PER_COMMAND = "{unit} per command"
 CONTRAST_PARTS = {"forward": 0.5, "backward": -0.5}
 """Parts of the contrast that the ratios of both directions have."""
@@ -79,7 +85,7 @@ AXIS_QUANTITIES: Quantities[AxisQuantity] = Quantities(
             block="per_command",
             unit=_PER_COMMAND,
             headline=True,
-            line=lambda middle, part=part: {"per_command": 1.0, "ratio_contrast": part},
+            line=partial(_side, part),
         )
         for side, part in CONTRAST_PARTS.items()
     ),

@@ -6,6 +6,7 @@ A row is a move with its readings averaged; for a drive at constant rate, it is 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -14,9 +15,8 @@ import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, listed
 from tvsbayes.gears.play import rests
-from tvsbayes.instrument.conditions import kelvin_at
+from tvsbayes.instrument.conditions import degC_at, kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
-from tvsbayes.single_axis.reference import corrected, loadings
 from tvsbayes.statistics.intervals import WithSd
 from tvsbayes.statistics.wrapped import turn_jumps
 
@@ -178,12 +178,11 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         NothingToEstimate: fewer than two positions were read, fewer than three moves, or the readings do not change.
         InputError: too many moves, or angles that wrap.
     """
-    used = [r for r in campaign.noisy if r.status == "ok" and r.value is not None]
-    used = corrected(campaign.reference, campaign.moves, used)
+    used = _expanded(campaign, [r for r in campaign.noisy if r.status == "ok" and r.value is not None])
     rows = _rows_at_stops(campaign, used) if campaign.rate is None else _rows_in_motion(campaign, used, campaign.rate)
-    stated = [r for r in campaign.readings if r.status == "ok" and r.value is not None]
-    known = loadings(campaign.reference, campaign.moves, stated, rows.move, rows.time_s, rows.value)
-    rows = replace(rows, reference=known.columns, reference_causes=known.names)
+    errors = _reference_errors(campaign, rows)
+    reference = np.column_stack(list(errors.values())) if errors else np.zeros((len(rows.value), 0))
+    rows = replace(rows, reference=reference, reference_causes=tuple(errors))
     return rows if rows.in_motion or legs_are_long(rows) else _line_with_play(rows)
 
 
@@ -207,6 +206,43 @@ def _rows(campaign: AxisCampaign, legs: Legs, move: np.ndarray, time_s: np.ndarr
         command_unit=campaign.command_unit,
         **columns,
     )
+
+
+STANDARD_DEGC = 20.0
+"""Temperature at which lengths are stated (ISO 1)."""
+
+
+def _above_standard(campaign: AxisCampaign, time_s: np.ndarray) -> np.ndarray:
+    """Temperatures less 20 degC, (r,); 0 of a reference that does not expand."""
+    clock = np.array([move.time_s for move in campaign.moves], dtype=float)
+    degC = degC_at(campaign.moves, time_s, clock) if campaign.reference.expands else None
+    return np.zeros(len(time_s)) if degC is None else degC - STANDARD_DEGC
+
+
+def _expanded(campaign: AxisCampaign, readings: list[Reading]) -> list[Reading]:
+    """Readings less the stated expansion of the reference: r at T means r (1 + expansion (T - 20 degC))."""
+    if not campaign.reference.expands:
+        return readings
+    times = [campaign.moves[r.move].time_s if r.time_s is None else r.time_s for r in readings]
+    value = np.array([r.value for r in readings], dtype=float)
+    above = _above_standard(campaign, np.array(times, dtype=float))
+    true = value * (1.0 + campaign.reference.expansion_per_K.value * above)
+    return [replace(reading, value=v) for reading, v in zip(readings, true.tolist(), strict=True)]
+
+
+def _reference_errors(campaign: AxisCampaign, rows: AxisRows) -> dict[str, np.ndarray]:
+    """Errors of rows (r,) per standard normal number of each cause; a common u is the mean of a row's readings."""
+    reference, value, stated = campaign.reference, rows.value, defaultdict[int, list[float]](list)
+    for reading in campaign.readings if reference.common else ():
+        if reading.status == "ok" and reading.value is not None:
+            stated[reading.move].append(reading.u)
+    errors = {
+        "u": np.full(len(value), reference.u),
+        "u_per_unit": reference.u_per_unit * value,
+        "expansion_per_K": reference.expansion_per_K.u * value * _above_standard(campaign, rows.time_s),
+        "u of readings": np.array([np.mean(stated.get(int(move), [0.0])) for move in rows.move]),
+    }
+    return {name: column for name, column in errors.items() if np.any(column != 0)}
 
 
 def _refused(code: str, found: str, allowed: str, remedy: str, column: str | None = None) -> InputError:

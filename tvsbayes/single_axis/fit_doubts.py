@@ -121,10 +121,14 @@ class Facts:
         error, length = map(self.summary.parameters.get, ("transmission_error", "transmission_error_length"))
         if error is None or length is None or not error.informed:
             return None
-        waves = self.summary.periods if self.summary.periods_in == "unit" else ()
-        waves = [wave for wave in waves if wave.probability > LIKELY]
         # A process that is smooth over half a period makes no such wave.
-        waves = [w for w in waves if error.value > w.amplitude.value and length.value < 0.5 * w.period.value]
+        waves = [
+            wave
+            for wave in (self.summary.periods if self.summary.periods_in == "unit" else ())
+            if wave.probability > LIKELY
+            and error.value > wave.amplitude.value
+            and length.value < 0.5 * wave.period.value
+        ]
         return max(waves, key=lambda wave: wave.amplitude.value, default=None)
 
     @property

@@ -219,7 +219,8 @@ def plan_next(
     if _whole(fit.campaign):
         grid = np.unique(np.clip(np.round(grid), math.ceil(low), math.floor(high)))
     aim, move_s = _Aim(fit, target, grid), _move_seconds(fit.campaign)
-    campaign, u_now, spent, stops = fit.campaign, aim.u_now, 0.0, []
+    stops: list[NextStop] = []
+    campaign, u_now, spent = fit.campaign, aim.u_now, 0.0
     with Job({"choosing stops": 1.0}, progress) as job:
         while len(stops) < count:
             best: tuple[NextStop, AxisCampaign] | None = None
