@@ -235,7 +235,7 @@ def test_twin_shares_no_formula_with_the_estimators(inner):
             reached = reachable(inner, name)
             assert not {room(other) for other in reached} & BESIDE_THE_TWIN, name
             borrowed = {"instrument.mirrors", "instrument.chains", "single_axis.axis_model", "single_axis.axis_rows"}
-            borrowed |= {"gears.play", "gears.kalman", "gears.places"}
+            borrowed |= {"gears.play", "gears.kalman", "gears.places", "gears.states"}
             assert not reached & borrowed, name
 
 

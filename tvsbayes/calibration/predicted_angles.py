@@ -16,8 +16,9 @@ import numpy as np
 from tvsbayes.calibration.frames import P_INPUTS
 from tvsbayes.calibration.optics import Values, beam_components, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.calibration.states import HOUR_S, ZERO_NAMES, homings_of, uses_of, zero_shifts
+from tvsbayes.calibration.states import ZERO_NAMES, homings_of, uses_of, zero_shifts
 from tvsbayes.errors import NothingToEstimate
+from tvsbayes.gears.states import HOUR_S, scatter_covariances
 from tvsbayes.instrument.axes import AXES, SIDES, Axis
 from tvsbayes.instrument.campaign import Campaign, ordered_spots, pixels_of
 from tvsbayes.instrument.stereo_pair import triangulate
@@ -107,16 +108,11 @@ class PredictedAngles:
     def scatter(self, side: np.ndarray, use: State, u: np.ndarray | float) -> dict[str, np.ndarray]:
         """Compute what does not repeat, by cause, of angles after one homing, each at a stop of its own."""
         hours = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side)) + self._walked_hours
-        once = np.eye(len(side))
         low, high = (self._noise[f"stop_sd_deg.{name}"][:, None] ** 2 for name in SIDES[self.axis])
         stops = np.where(np.asarray(side) > 0, high, low)
-        walk = self._zeros[f"drift_deg_per_root_hour.{self.axis}"][:, None, None] ** 2
-        return {
-            "homing": self._home_sd_deg[:, None, None] ** 2 * np.ones_like(once),
-            "drift": walk * np.minimum.outer(hours, hours),
-            "stops": stops[:, :, None] * once,
-            "readings": np.broadcast_to(np.square(u) * once, (DRAWS, *once.shape)),
-        }
+        scales = self._home_sd_deg, self._zeros[f"drift_deg_per_root_hour.{self.axis}"]
+        readings = np.broadcast_to(np.square(u), stops.shape)
+        return scatter_covariances(scales, stops, readings, hours, np.zeros(len(side)), np.arange(len(side)))
 
 
 def _known(angles: np.ndarray) -> PredictedReadings:

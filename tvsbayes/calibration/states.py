@@ -9,6 +9,7 @@ from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
+from tvsbayes.gears.states import HOUR_MINUTES, HOUR_S, crept, travelled
 from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.campaign import Campaign, Look, ordered_spots
 from tvsbayes.instrument.conditions import kelvin, powered_on_s, warm_minutes
@@ -21,7 +22,6 @@ ZERO_NAMES = names_of(
     "home_sd_deg",
 )
 """What a zero depends on in use, of both axes."""
-HOUR_S, HOUR_MINUTES = 3600.0, 60.0
 
 
 def zero_shifts(zeros: Mapping[str, np.ndarray], axis: str, state: State) -> dict[str, np.ndarray]:
@@ -35,7 +35,7 @@ def zero_shifts(zeros: Mapping[str, np.ndarray], axis: str, state: State) -> dic
     hours, steps, degrees = (np.atleast_2d(each) for each in (state.warm_hours, state.travel, state.kelvin))
     minutes = zeros["creep_minutes"][:, None]
     return {
-        "creep": zeros[f"creep_deg.{axis}"][:, None] * -np.expm1(-HOUR_MINUTES * hours / minutes),
+        "creep": zeros[f"creep_deg.{axis}"][:, None] * crept(HOUR_MINUTES * hours, minutes),
         "temperature": zeros[f"thermal_deg_per_K.{axis}"][:, None] * degrees,
         "travel": 0.5 * zeros[f"ratio_contrast_deg_per_step.{axis}"][:, None] * steps,
     }
@@ -83,8 +83,7 @@ def _timeline(campaign: Campaign) -> tuple[np.ndarray, dict[Axis, State]]:
     states: dict[Axis, State] = {}
     for axis in AXES:
         steps = np.array([getattr(move, f"{axis}_steps") for move in moves], dtype=float)
-        way = np.cumsum(np.abs(np.diff(steps, prepend=steps[:1])))
-        states[axis] = State((time_s - time_s[first]) / HOUR_S, way - way[first], warm_hours, kelvin(moves))
+        states[axis] = State((time_s - time_s[first]) / HOUR_S, travelled(steps, segment), warm_hours, kelvin(moves))
     return first, states
 
 

@@ -33,11 +33,12 @@ from tvsbayes.compensation.verification import (
     use_over,
 )
 from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.gears.states import HOUR_S
 from tvsbayes.results.comparison_record import Comparison
 from tvsbayes.results.watch_record import PlannedChange, Watch, WatchPlan
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_readings
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, rows_of
+from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedAxis
 from tvsbayes.statistics.predicted_readings import frees_shift
 from tvsbayes.statistics.streams import AxisStream, random_stream

@@ -15,10 +15,11 @@ import numpy as np
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import FORMATS, Wish
 from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.gears.states import HOUR_S, crept
 from tvsbayes.results.compensation_record import CAUSES, Compensation, SidePromise, TableRow
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
-from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows
+from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.waves import wave_columns
 from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
 
@@ -81,7 +82,7 @@ def _creep(fit: AxisFit, values: dict[str, np.ndarray], drawn: np.ndarray, comma
     rows = fit.rows
     order = np.argsort(rows.command)
     minutes = np.interp(command, rows.command[order], rows.warm_s[order]) / 60.0
-    return fit.draws["creep"][drawn, None] * -np.expm1(-minutes / values["creep_minutes"][:, None])
+    return fit.draws["creep"][drawn, None] * crept(minutes, values["creep_minutes"][:, None])
 
 
 def _off_their_mean(errors: np.ndarray, spans: int) -> np.ndarray:

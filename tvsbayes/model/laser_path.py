@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.gears.play import band_begun, band_moved
+from tvsbayes.gears.states import crept
 from tvsbayes.instrument.chains import Chain
 from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
@@ -70,8 +71,8 @@ class ZeroShift(eqx.Module):
         self, warm_minutes: Float[Array, " moves"], kelvin: Float[Array, " moves"]
     ) -> Float[Array, "moves 2"]:
         """Compute shifts at times t since the machine was switched on and temperatures T - T_0."""
-        crept = -jnp.expm1(-warm_minutes / self.creep_minutes)
-        return crept[:, None] * self.creep_rad + kelvin[:, None] * self.thermal_rad_per_K
+        share = crept(warm_minutes, self.creep_minutes, jnp)
+        return share[:, None] * self.creep_rad + kelvin[:, None] * self.thermal_rad_per_K
 
 
 class Transmission(eqx.Module):

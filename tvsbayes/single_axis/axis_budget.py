@@ -17,7 +17,7 @@ from tvsbayes.results.estimates import Estimate
 from tvsbayes.results.metrology_tables import BudgetTable
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals, mean_play
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_model import ScatteredReadings, noise_covariances
+from tvsbayes.single_axis.axis_model import noise_covariances
 from tvsbayes.single_axis.classic_line import AXIS_SYMBOLS, ClassicAxis, figure_parts, target_runs
 
 STRATA = 24
@@ -72,8 +72,8 @@ def _variances(fit: AxisFit, functional: np.ndarray, w: np.ndarray) -> dict[str,
     by_prior = np.linalg.solve(loaded.T @ loaded + np.eye(loaded.shape[1]), factor.T @ functional)
     gain = inverse_root.T @ (loaded @ by_prior)
     variances = {name: float(by_prior[columns] @ by_prior[columns]) for name, (columns, _) in _columns(fit).items()}
-    readings = ScatteredReadings(rows.zero, np.cumsum(rows.redrawn), rows.since_homing, rows.side, rows.variance)
-    noise = noise_covariances(model.coordinates.values(w), readings, rows.travel)
+    readings = rows.zero, np.cumsum(rows.redrawn), rows.since_homing, rows.side, rows.variance
+    noise = noise_covariances(model.coordinates.values(w), rows, *readings)
     return variances | {name: float(gain @ noise[cause][0] @ gain) for cause, name in NOISE.items()}
 
 

@@ -19,8 +19,9 @@ import numpy as np
 
 from tvsbayes.gears.kalman import whitened
 from tvsbayes.gears.places import ProcessPlaces
+from tvsbayes.gears.states import HOUR_S, crept, scatter_covariances
 from tvsbayes.single_axis.axis_parameters import AxisCoordinates, AxisPrior
-from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, PlayPlaces, legs_are_long, play_places, reversal_of
+from tvsbayes.single_axis.axis_rows import AxisRows, PlayPlaces, legs_are_long, play_places, reversal_of
 from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
 from tvsbayes.statistics.linear_posterior import LinearPosterior
@@ -52,6 +53,11 @@ def averaged_variance(duration: np.ndarray) -> np.ndarray:
     return np.where(duration > 1e-3, 2 / ratio * (1 + np.expm1(-ratio) / ratio), 1.0 - duration / 3)
 
 
+def reading_variance(values: Mapping[str, np.ndarray], variance: np.ndarray, rows: AxisRows) -> np.ndarray:
+    """Variances (n, r) of readings with stated ones (r,)."""
+    return np.outer(values["reading_scale"] ** 2, variance) + (FLOOR * rows.travel) ** 2
+
+
 def stop_variance(values: Mapping[str, np.ndarray], side: np.ndarray) -> np.ndarray:
     """Variances (n, r) of errors of stops reached from sides (r,)."""
     forward = 0.5 * (1.0 + side)
@@ -59,37 +65,28 @@ def stop_variance(values: Mapping[str, np.ndarray], side: np.ndarray) -> np.ndar
     return stop + np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
 
 
-class ScatteredReadings(NamedTuple):
-    """Readings as their noise depends on them; arrays (r,).
-
-    Attributes:
-        zero, stop: numbers of the homing and of the stop of each.
-        hours: time since the homing.
-        side: side from which the stop was reached.
-        variance: by the stated u.
-    """
-
-    zero: np.ndarray
-    stop: np.ndarray
-    hours: np.ndarray
-    side: np.ndarray
-    variance: np.ndarray
-
-
 def noise_covariances(
-    values: Mapping[str, np.ndarray], readings: ScatteredReadings, travel: float
+    values: Mapping[str, np.ndarray],
+    rows: AxisRows,
+    zero: np.ndarray,
+    stop: np.ndarray,
+    hours: np.ndarray,
+    side: np.ndarray,
+    variance: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Covariances (n, r, r) by cause of what does not repeat, at the scales of n draws (formulation 8.2)."""
-    zero, stop, hours, side, variance = readings
-    one_zero, one_stop = np.equal.outer(zero, zero), np.equal.outer(stop, stop)
-    stops = stop_variance(values, side)
-    reading = np.outer(values["reading_scale"] ** 2, variance) + (FLOOR * travel) ** 2
-    return {
-        "homing": values["home_sd"][:, None, None] ** 2 * one_zero,
-        "drift": values["drift_per_root_hour"][:, None, None] ** 2 * np.minimum.outer(hours, hours) * one_zero,
-        "stops": np.sqrt(stops[:, :, None] * stops[:, None, :]) * one_stop,
-        "readings": reading[:, :, None] * np.eye(len(side)),
-    }
+    """Covariances (n, r, r) by cause of what does not repeat, at the scales of n draws; further arguments are (r,).
+
+    Args:
+        values: values of all scales, each (n,).
+        rows: the axis.
+        zero: numbers of the homings.
+        stop: numbers of the stops.
+        hours: times since the homings.
+        side: sides from which the stops were reached.
+        variance: variances of the readings by their stated u.
+    """
+    scales, stops = (values["home_sd"], values["drift_per_root_hour"]), stop_variance(values, side)
+    return scatter_covariances(scales, stops, reading_variance(values, variance, rows), hours, zero, stop)
 
 
 class _Block(NamedTuple):
@@ -257,7 +254,7 @@ class AxisModel:
         """
         factors = {}
         if "creep" in self.shifts:
-            factors["creep"] = -np.expm1(-np.atleast_2d(warm_s) / (60.0 * minutes[:, None]))
+            factors["creep"] = crept(np.atleast_2d(warm_s), 60.0 * minutes[:, None])
         if "thermal_per_K" in self.shifts:
             factors["thermal_per_K"] = np.atleast_2d(np.asarray(kelvin, dtype=float))
         return factors
@@ -345,7 +342,7 @@ class AxisModel:
             stop = stop_variance(values, rows.side)
             carry = np.ones((1, len(rows.move)))
         carry = np.where(rows.redrawn, 0.0, carry)
-        reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
+        reading = reading_variance(values, rows.variance, rows)
         if not (rows.in_motion or self.places.exact):
             reading = reading + self.between_nodes(values)[:, None]
         keep, variance = np.empty((2, len(rows.move), 2, n))

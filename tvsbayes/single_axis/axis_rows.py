@@ -15,6 +15,7 @@ import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, listed
 from tvsbayes.gears.play import rests
+from tvsbayes.gears.states import HOUR_S, travelled
 from tvsbayes.instrument.conditions import degC_at, kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
 from tvsbayes.statistics.intervals import WithSd
@@ -22,7 +23,6 @@ from tvsbayes.statistics.wrapped import turn_jumps
 
 SIDES = {"forward": 1, "backward": -1, "unknown": 0}
 DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}
-HOUR_S = 3600.0
 ROWS_MAX = 2000
 """Largest number of moves with readings: a fit with this number takes minutes."""
 LONG_LEGS, LONG_ERRORS = 2.0, 10.0
@@ -286,7 +286,7 @@ def _rows_at_stops(campaign: AxisCampaign, used: Sequence[Reading]) -> AxisRows:
         *(campaign, legs, moves, np.array([m.time_s for m in campaign.moves], dtype=float)[moves]),
         command=command,
         side=side,
-        path=_path(legs)[moves],
+        path=travelled(legs.command, legs.segment)[moves],
         redrawn=_redrawn(legs, moves) | ~known,
         value=mean,
         variance=np.where(known, 1.0 / total, 0.0),
@@ -420,12 +420,6 @@ def _since_row_before(time: np.ndarray, zero: np.ndarray, homed: np.ndarray) -> 
     return np.where(np.r_[True, np.diff(zero) > 0], time - homed, np.r_[0.0, np.diff(time)])
 
 
-def _path(legs: Legs) -> np.ndarray:
-    """Commands travelled since the segment began."""
-    total = np.cumsum(np.abs(legs.step))
-    return total - total[legs.first][np.cumsum(legs.first) - 1]
-
-
 def _redrawn(legs: Legs, moves: np.ndarray) -> np.ndarray:
     """Whether the axis moved, or homed, since the previous row."""
     changes = np.cumsum(legs.first | (legs.step != 0))
@@ -470,8 +464,9 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
     half, wheel = 0.5 * np.maximum(backlash, 0.0), slope * legs.command
     approach = legs.side * np.sign(slope)
     ends = rests(wheel, legs.first, approach, half, set(rows.move.tolist()))
+    path = travelled(legs.command, legs.segment)[ends.anchor]
     anchor, path, side, output = (
-        each.mean(axis=1).T for each in (legs.command[ends.anchor], _path(legs)[ends.anchor], ends.side, ends.output)
+        each.mean(axis=1).T for each in (legs.command[ends.anchor], path, ends.side, ends.output)
     )
     spread = 0.5 * (ends.output[:, 1] - ends.output[:, 0]).T
     halves = half[:, None]

@@ -14,6 +14,7 @@ import numpy as np
 
 from tvsbayes.display import concise
 from tvsbayes.errors import escaped
+from tvsbayes.gears.states import crept
 from tvsbayes.results.estimates import Measured, PeriodEstimate, varies_beyond
 from tvsbayes.single_axis.axis_campaign import TURNS
 from tvsbayes.single_axis.axis_density import AxisMode, find_mode
@@ -310,7 +311,7 @@ def _sum_in_time(fit: AxisFit) -> str:
     rows, draws, moved = fit.rows, fit.draws, np.zeros(len(fit.w))
     if "creep" in fit.model.shifts:
         minutes = fit.model.coordinates.values(fit.w)["creep_minutes"]
-        first, last = (-np.expm1(-rows.warm_s[k] / (60.0 * minutes)) for k in (0, -1))
+        first, last = (crept(rows.warm_s[k], 60.0 * minutes) for k in (0, -1))
         moved = moved + draws["creep"] * (last - first)
     if "thermal_per_K" in fit.model.shifts and rows.kelvin is not None:
         moved = moved + draws["thermal_per_K"] * (rows.kelvin[-1] - rows.kelvin[0])

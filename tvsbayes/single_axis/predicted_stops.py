@@ -14,12 +14,13 @@ from functools import cached_property
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
+from tvsbayes.gears.states import HOUR_S, travelled
 from tvsbayes.instrument.conditions import kelvin_at, pause_s
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_model import CONTRAST, AxisModel, ScatteredReadings, noise_covariances
+from tvsbayes.single_axis.axis_model import CONTRAST, AxisModel, noise_covariances
 from tvsbayes.single_axis.axis_parameters import SAMPLED, AxisCoordinates
-from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, PlayPlaces, legs_of, play_places, rows_of, warm_from
+from tvsbayes.single_axis.axis_rows import AxisRows, PlayPlaces, legs_of, play_places, rows_of, warm_from
 from tvsbayes.single_axis.waves import wave_columns
 from tvsbayes.statistics.linear_posterior import LinearPosterior
 from tvsbayes.statistics.predicted_readings import PredictedReadings, State, Use
@@ -152,10 +153,10 @@ class PredictedAxis:
         """Compute what does not repeat, by cause, of readings after one homing, each at a stop of its own."""
         hours = np.broadcast_to(np.asarray(use.hours, dtype=float), np.shape(side)) + self._walked_hours
         variance = np.broadcast_to(np.asarray(u, dtype=float) ** 2, np.shape(side))
-        return self._noise(ScatteredReadings(np.zeros(len(side)), np.arange(len(side)), hours, side, variance))
+        return self._noise(np.zeros(len(side)), np.arange(len(side)), hours, side, variance)
 
-    def _noise(self, readings: ScatteredReadings) -> dict[str, np.ndarray]:
-        return noise_covariances(self.scales, readings, self.fit.rows.travel)
+    def _noise(self, *readings: np.ndarray) -> dict[str, np.ndarray]:
+        return noise_covariances(self.scales, self.fit.rows, *readings)
 
     def read(self, campaign: AxisCampaign) -> PredictedReadings:
         """Predict the readings of another campaign of this axis, after homings of its own, at its own states.
@@ -179,8 +180,7 @@ class PredictedAxis:
         shared, own = self._shared_errors(campaign, rows)
         state = State(hours, rows.path, rows.warm_s / HOUR_S, kelvin)
         repeated = self._readings(rows.command, play, state, shared)
-        readings = ScatteredReadings(rows.zero, np.cumsum(rows.redrawn), hours, rows.side, rows.variance)
-        scatter = self._noise(readings)
+        scatter = self._noise(rows.zero, np.cumsum(rows.redrawn), hours, rows.side, rows.variance)
         covariance = repeated.covariance + sum(scatter.values()) + own @ own.T
         if "thermal_per_K" in self.fit.model.shifts:
             column = self.fit.model.shift_columns["thermal_per_K"]
@@ -194,7 +194,7 @@ class PredictedAxis:
     def noise(self, side: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Mean variance (r,) drawn anew at every visit: of stops, and of readings with stated variances (r,)."""
         count = np.arange(len(side))
-        scatter = self._noise(ScatteredReadings(count, count, np.zeros(len(side)), side, variance))
+        scatter = self._noise(count, count, np.zeros(len(side)), side, variance)
         return np.diagonal(scatter["stops"] + scatter["readings"], axis1=1, axis2=2).mean(axis=0)
 
     @cached_property
@@ -252,6 +252,5 @@ class PredictedAxis:
 def longest_use(moves: Sequence[AxisMove]) -> tuple[float, float]:
     """Longest time, hours, and travel, commands, of the segments of moves."""
     legs, time_s = legs_of(moves), np.array([move.time_s for move in moves])
-    each = [np.flatnonzero(legs.segment == segment) for segment in np.unique(legs.segment)]
-    hours = max(float(np.ptp(time_s[members])) for members in each) / HOUR_S
-    return hours, max(float(np.abs(legs.step[members]).sum()) for members in each)
+    since_s = time_s - time_s[np.searchsorted(legs.segment, legs.segment)]
+    return float(since_s.max()) / HOUR_S, float(travelled(legs.command, legs.segment).max())
