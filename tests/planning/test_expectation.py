@@ -12,10 +12,10 @@ from support.commands import steps
 from support.dozen_spots import dozen_plan
 
 from tvsbayes.estimators.mode_search import Problem
+from tvsbayes.gears.priors import half_normal_coordinate
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
-from tvsbayes.gears.priors import half_normal_coordinate
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import (
     NOISE_COLUMNS,
