@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import SpotArrays
 from tvsbayes.gears.kalman import state_predicted, state_updated
-from tvsbayes.model.geometry import Scalar, materialise
+from tvsbayes.model.geometry import materialise
 
 STATES = 6
 
@@ -85,16 +85,19 @@ class Gains(eqx.Module):
     sd: Float[Array, "*spots components"]
 
 
-class KalmanUpdate(eqx.Module):
-    """Result of an update with one spot: the state, standardised errors and the log of their variances' product."""
+class Seen(eqx.Module):
+    """Filtered spots, or one: standardised errors (spots, components, ...), logs of their variances' products.
 
+    `belief` is the state after the last of them; `gains` are those of all.
+    """
+
+    standardised: Float[Array, "..."]
+    log_variance: Float[Array, "*spots"]
     belief: Belief
-    standardised: Float[Array, "components *columns"]
-    log_variance: Scalar
     gains: Gains
 
 
-def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
+def kalman_update(belief: Belief, row: FilterRows) -> Seen:
     """Update with one spot, by a scalar update for each component, as their noise is independent, of unit variance."""
     mean, covariance = belief.mean, belief.covariance
     errors, variances, gains = [], [], []
@@ -106,24 +109,12 @@ def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
         gains.append(gain / jnp.sqrt(ahead))
     variance = jnp.stack(variances)
     update = Gains(jnp.stack(gains), jnp.sqrt(variance))
-    return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(variance)), update)
+    return Seen(jnp.stack(errors), jnp.sum(jnp.log(variance)), Belief(mean, covariance), update)
 
 
 def no_belief(*columns: int) -> Belief:
     """Return the state before the first spot, at which all states are new."""
     return Belief(jnp.zeros((STATES, *columns)), jnp.zeros((STATES, STATES)))
-
-
-class Seen(eqx.Module):
-    """Filtered spots: standardised errors (spots, components, ...), and logs of their variances' products.
-
-    `belief` is the state after the last of them; `gains` are those of all.
-    """
-
-    standardised: Float[Array, "..."]
-    log_variance: Float[Array, "*spots"]
-    belief: Belief
-    gains: Gains
 
 
 def filtered(rows: FilterRows, before: Belief) -> Seen:
@@ -137,20 +128,17 @@ def filtered(rows: FilterRows, before: Belief) -> Seen:
     return Seen(standardised, log_variance, after, gains)
 
 
-class ColumnsSeen(eqx.Module):
-    """Columns standardised by the filter, and the means of its state for them after the last spot."""
-
-    standardised: Float[Array, "spots components columns"]
-    mean: Float[Array, "6 columns"]
-
-
 def columns_filtered(
     columns: Float[Array, "spots components columns"],
     rows: FilterRows,
     gains: Gains,
     before: Float[Array, "6 columns"],
-) -> ColumnsSeen:
-    """Filter further columns with known gains: products of few numbers before and after the scan."""
+) -> tuple[Float[Array, "spots components columns"], Float[Array, "6 columns"]]:
+    """Filter further columns with known gains: products of few numbers before and after the scan.
+
+    Returns:
+        The columns standardised, and the means of the state for them after the last spot.
+    """
     load, whitened = rows.load / gains.sd[..., None], columns / gains.sd[..., None]
     loads: list[Any] = []
     residuals: list[Any] = []
@@ -173,4 +161,4 @@ def columns_filtered(
         return keep[:, None] * mean + followed, standardised
 
     mean, standardised = jax.lax.scan(step, before, materialise((*whole, rows.keep, gains.gain)))
-    return ColumnsSeen(standardised, mean)
+    return standardised, mean

@@ -201,9 +201,9 @@ def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
         def of_group(group, of_places):
             means, block, along = of_places
             own = jax.lax.dynamic_slice_in_dim(by_error, group * columns, columns, axis=2)
-            passed_on = columns_filtered(own, given.rows, after.gains, means[group])
-            flat = passed_on.standardised.reshape(-1, columns)
-            return means.at[group].set(passed_on.mean), block.at[group].set(flat), along.at[group].add(along_with(flat))
+            passed_on, mean = columns_filtered(own, given.rows, after.gains, means[group])
+            flat = passed_on.reshape(-1, columns)
+            return means.at[group].set(mean), block.at[group].set(flat), along.at[group].add(along_with(flat))
 
         def of_pair(pair, gram):
             return gram.at[pair].add(block[one[pair]].T @ block[two[pair]])

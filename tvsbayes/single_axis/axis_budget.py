@@ -95,10 +95,11 @@ def _sources(fit: AxisFit, functionals: np.ndarray, unit: str) -> list[Source]:
         mean, spread = float(each.mean()), float(each.var(ddof=1)) if len(each) > 1 else 0.0
         # GUM G.3: the relative sd of a variance of nu degrees of freedom is the root of 2 / nu.
         dof = max(2 * mean**2 / spread, 1.0) if spread > 1e-12 * mean**2 and kind == "A" else math.inf
-        u, own_unit = _input(fit, part)
-        contribution = math.sqrt(mean)
-        input_u = (own_unit, None, u, kind, "normal", dof, contribution / u) if u else None
-        sources.append(Source(part, *(input_u or (unit, None, contribution, kind, "normal", dof, 1.0))))
+        contribution, (u, own_unit) = math.sqrt(mean), _input(fit, part)
+        if not u:
+            # Its input is no single number.
+            u, own_unit = contribution, unit
+        sources.append(Source(part, own_unit, None, u, kind, "normal", dof, contribution / u if u else 1.0))
     return [*sources, Source(SCALES, unit, None, float(means.std()), "A", "sampled posterior", math.inf, 1.0)]
 
 

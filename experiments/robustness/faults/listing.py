@@ -57,7 +57,7 @@ FAULTS = (
           "test_contrast_is_positive_minus_negative_ratio"),
     Fault("the backlash has the wrong sign", "laser_path.followed", Local("half", "-value"),
           "test_first_row_of_a_segment_rehomes_with_the_mean_ratio"),
-    Fault("the creep of the zeros has the wrong sign", "shift_rad", Local("crept", "-value"), "test_zeros_in_time"),
+    Fault("the creep of the zeros has the wrong sign", "shift_rad", Local("share", "-value"), "test_zeros_in_time"),
     Fault("the mirror offset has the wrong sign", "beam_angles", Local("offset", "-value"),
           "test_beam_angles_of_the_nominal_chain"),
     Fault("the right camera stands on the left", "geometry.image", Reads("cameras.translation_mm", "-value"),
