@@ -31,7 +31,7 @@ from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.stereo_pair import Stereo, read_stereo, rotation_matrix, rotation_vector, stereo_bytes
-from tvsbayes.report.advice import assumed_stereo
+from tvsbayes.report.fit_text import assumed_stereo
 from tvsbayes.results.metrology_tables import BudgetRow, BudgetTable
 
 pytestmark = pytest.mark.thorough

@@ -17,8 +17,8 @@ from tvsbayes.comparison.axis_sessions import (
 )
 from tvsbayes.comparison.departures import FALSE_ALARM_RATE, LOOKS_MIN
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.report.command_text import changes_text
-from tvsbayes.report.watch_text import HELPS, REMEDIES, watch_plan_text, watch_text
+from tvsbayes.report.command_text import changes_text, watch_plan_text, watch_text
+from tvsbayes.report.tables import sentences
 from tvsbayes.results.watch_record import MOVED, OK
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis
@@ -80,7 +80,7 @@ def test_what_moved_is_named_with_its_size(known, what, size, change):
 
 def test_every_change_has_its_help_and_remedy(known):
     for change in watch_axis(known, session(1, 52)).changes:
-        assert change.what in HELPS and change.what in REMEDIES
+        assert change.what in sentences("watch_better") and change.what in sentences("moved")
 
 
 def test_a_plan_watches_with_the_power_that_it_states(known):

@@ -25,7 +25,7 @@ from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.instrument.campaign import Campaign, write_campaign
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.report.watch_text import HELPS, REMEDIES
+from tvsbayes.report.tables import sentences
 from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
@@ -170,5 +170,6 @@ def test_the_command_keeps_a_table(ask, say, mounted_rig, mixed_fit, truth, tmp_
     assert (code, document["verdict"], document["error"]["code"]) == (2, "CANNOT TELL", "header")
     assert other.read_text() == "night,what\n"
     of_axis = {"ratio", "play", "zero"}
-    assert set(HELPS) == {change.what for change in (*CHANGES, *SIGHTED_CHANGES)} | of_axis
-    assert set(REMEDIES) == {what.split(":")[0] for what in HELPS}
+    helps, remedies = sentences("watch_better"), sentences("moved")
+    assert set(helps) == {change.what for change in (*CHANGES, *SIGHTED_CHANGES)} | of_axis
+    assert set(remedies) == {what.split(":")[0] for what in helps}

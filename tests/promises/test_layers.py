@@ -65,7 +65,6 @@ OF_ONE_INSTRUMENT = {
     "twin.physics": "the twin's own such column",
     "twin.simulated_axis": "the twin of an axis",
     "report.axis_document": "the report of an axis",
-    "report.iso230_views": "its test by ISO 230-2",
     "report.head_document": "the report of a head",
     "view.laser_ways": "draws the mirrors of a scanner",
 }

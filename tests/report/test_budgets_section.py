@@ -11,7 +11,7 @@ from msgspec import structs
 
 from tvsbayes.metrology.budget_tables import Source, budget_table
 from tvsbayes.metrology.look_budget import Budget
-from tvsbayes.report.uncertainty_sections import budgets_section
+from tvsbayes.report.scanner_sections import budgets_section
 from tvsbayes.results.estimates import Estimate
 from tvsbayes.results.metrology_tables import BudgetTable
 

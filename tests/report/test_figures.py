@@ -21,7 +21,7 @@ from tvsbayes.report.figures import (
     ratio_curves,
     trajectories,
 )
-from tvsbayes.report.fit_sections import residuals_section
+from tvsbayes.report.scanner_sections import residuals_section
 from tvsbayes.results.estimates import Cause, CauseGroup, CurvePoint, Curves, Measured
 
 

@@ -11,9 +11,8 @@ from support.small_results import small_summary
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.importing.sightings import STEP_DEG
-from tvsbayes.report.advice import next_steps
 from tvsbayes.report.evidence import Criterion
-from tvsbayes.report.fit_text import FINE_DEG, classic_text, demo_text, fit_text
+from tvsbayes.report.fit_text import FINE_DEG, classic_text, demo_text, fit_text, next_steps
 from tvsbayes.report.result_tables import KEY_PARAMETERS
 from tvsbayes.report.scanner_document import verdict_of
 from tvsbayes.results.convergence import Agreement, Importance, MonteCarloError, NamedValue, Sampling

@@ -11,10 +11,9 @@ from support.bent_rig import calibration
 from support.geared_rig import SD_DEG, geared
 from support.small_results import estimate
 
-from tvsbayes.report.evidence import gear_bands
-from tvsbayes.report.fit_sections import fit_sections, gear_section
+from tvsbayes.report.evidence import gear_bands, gear_errors
 from tvsbayes.report.fit_text import fit_text
-from tvsbayes.report.position_figures import gear_errors
+from tvsbayes.report.scanner_sections import fit_sections, gear_section
 from tvsbayes.results.estimates import StopResidual
 
 

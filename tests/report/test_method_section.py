@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 from support.small_results import small_record
 
-from tvsbayes.report.uncertainty_sections import limits_section, method_section
+from tvsbayes.report.scanner_sections import method_section
+from tvsbayes.report.tables import sentences
 
 
 def test_a_stated_length_is_printed_with_its_unit_and_u():
@@ -18,5 +19,5 @@ def test_a_stated_length_is_printed_with_its_unit_and_u():
 
 
 def test_limits_use_only_symbols_that_the_page_explains():
-    items = limits_section(SimpleNamespace()).items
+    items = sentences("sections")["limits"]
     assert any("emission angle at pan 0 (C0)" in item for item in items)

@@ -30,17 +30,19 @@ from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.pipeline import load_calibration
 from tvsbayes.report.document import Document, Issue, Section, Verdict
-from tvsbayes.report.fit_sections import _parameters
 from tvsbayes.report.page import BROWSERS, page_html, print_to_pdf, prose, replace_page, typeset
-from tvsbayes.report.parameter_words import (
+from tvsbayes.report.scanner_document import _cells, answer_table, report_document, step_sizes
+from tvsbayes.report.scanner_sections import _parameters
+from tvsbayes.report.tables import (
+    TableView,
     cause_in_words,
+    chance_text,
     name_in_words,
     sentence_in_words,
+    sentences,
     share_in_words,
     source_in_words,
 )
-from tvsbayes.report.scanner_document import NO_APERTURE, _cells, answer_table, report_document, step_sizes
-from tvsbayes.report.tables import TableView, chance_text
 
 BYTES_MAX = 3_000_000
 
@@ -158,10 +160,10 @@ def test_the_first_page_has_results_and_customer(page, evidence, no_pictures):
 
 def test_millimetres_without_aperture_readings_state_their_source(evidence, no_pictures):
     """All calibrations share what is stated of the aperture: they are compared by their beams alone."""
-    assert words(report_html(evidence)).count(NO_APERTURE) == 1
+    assert words(report_html(evidence)).count(sentences("sections")["no_aperture"]) == 1
     first, *others = evidence.campaign.spots
     read = replace(evidence.campaign, spots=(replace(first, aperture_deg=70.0), *others))
-    assert NO_APERTURE not in words(report_html(replace(evidence, campaign=read)))
+    assert sentences("sections")["no_aperture"] not in words(report_html(replace(evidence, campaign=read)))
 
 
 def test_a_step_is_given_in_millimetres(evidence, no_pictures):

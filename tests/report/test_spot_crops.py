@@ -10,7 +10,7 @@ from support.small_campaign import small_campaign
 
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, frame_name, read_campaign, write_campaign
-from tvsbayes.report.spot_pictures import HALF_PX, LOOKS_SHOWN, spot_crops, spot_gallery
+from tvsbayes.report.evidence import HALF_PX, LOOKS_SHOWN, spot_crops, spot_gallery
 
 
 def usable_spots(campaign):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tvsbayes.report.watch_text import watch_text
+from tvsbayes.report.command_text import watch_text
 from tvsbayes.results.watch_record import MOVED, MovedPart, Watch
 
 

@@ -233,7 +233,7 @@ def report(
 ) -> None:
     """Write the page of an axis, and its certificate."""
     from tvsbayes.report.axis_document import figures_by_name
-    from tvsbayes.report.criteria import criterion_text
+    from tvsbayes.report.evidence import criterion_text
 
     data = read_axis(folder)
     wish = tolerance_of(tolerance, of, rule, guard, figures_by_name(data.unit))

@@ -128,8 +128,7 @@ def fit(
 
     data = read_campaign(campaign)
     _warn_implausible(data, stops=not anyway)
-    from tvsbayes.report.advice import assumed_stereo
-    from tvsbayes.report.fit_text import fit_text
+    from tvsbayes.report.fit_text import assumed_stereo, fit_text
 
     compile_for(report_line)
     with chain_progress("go on with --resume") as progress:

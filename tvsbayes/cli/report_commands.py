@@ -227,7 +227,7 @@ class PageContent:
 
     def lines(self, page: WrittenPage) -> list[str]:
         """Verdicts on the limits and the page's number, for a terminal."""
-        from tvsbayes.report.criteria import criterion_text
+        from tvsbayes.report.evidence import criterion_text
         from tvsbayes.report.fit_text import validation_lines
 
         lines = [criterion_text(c) for c in self.evidence.criteria]

@@ -88,7 +88,7 @@ def plan_watch(
         from tvsbayes.planning.watch_plan import MINUTES, watch_plan
 
         looks = watch_plan(fitted, rig, minutes=MINUTES if minutes is None else minutes, seed=seed)
-    from tvsbayes.report.watch_text import watch_plan_text
+    from tvsbayes.report.command_text import watch_plan_text
 
     text = watch_plan_text(looks)
     if out is not None:
@@ -104,7 +104,7 @@ def _plan_axis_watch(folder: Path, minutes: float | None, out: Path | None, seed
 
     from tvsbayes.comparison.axis_sessions import plan_watch_axis
     from tvsbayes.compensation.promise import SURER, refuse_answer
-    from tvsbayes.report.watch_text import watch_plan_text
+    from tvsbayes.report.command_text import watch_plan_text
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import results_for
 

@@ -20,7 +20,7 @@ TABLE_COLUMNS = ("time", "verdict", "p", "looks", "moved")
 def finish_watch(result: Watch, append: Path | None, as_json: bool, looks: str = "looks") -> None:
     """Print the result, add it to a table, and end with its exit code; `looks` is what the new data are."""
     from tvsbayes.comparison.departures import POWER_MIN
-    from tvsbayes.report.watch_text import watch_text
+    from tvsbayes.report.command_text import watch_text
     from tvsbayes.results.watch_record import CANNOT_TELL, OK
 
     error = None if append is None else _append(append, result)
@@ -31,7 +31,7 @@ def finish_watch(result: Watch, append: Path | None, as_json: bool, looks: str =
 
 def _append(table: Path, result: Watch) -> InputError | None:
     """Append the current line (time in UTC); returns the error of a failure, so that the result is still printed."""
-    from tvsbayes.report.watch_text import moved_text
+    from tvsbayes.report.command_text import moved_text
 
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     moved = "; ".join(map(moved_text, result.moved))

@@ -1,4 +1,4 @@
-"""Results of an axis: tables, texts of commands, the document of its page.
+"""Results of an axis: tables, texts of commands, figures, the document of its page.
 
 Commands and values in the axis' own units; texts of a campaign are `escaped`.
 """
@@ -19,10 +19,7 @@ from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.metrology.conformity import Criterion, Tolerance
 from tvsbayes.metrology.traceability import performed
-from tvsbayes.report.advice import ROUGH, UNSAMPLED
-from tvsbayes.report.budget_views import budget_view
 from tvsbayes.report.compensation_text import compensation_section
-from tvsbayes.report.criteria import COLOUR, criteria_table, criterion_text
 from tvsbayes.report.document import (
     Document,
     FigureView,
@@ -32,32 +29,42 @@ from tvsbayes.report.document import (
     Section,
     Verdict,
     about_table,
+    labelled,
     sentence,
     terminal,
 )
-from tvsbayes.report.drawing import DIRECTION_STYLE, drawing, legend
-from tvsbayes.report.iso230_views import iso230_figure, iso230_table, targets_table
+from tvsbayes.report.drawing import BLACK, DIRECTION_STYLE, banded, drawing, legend
+from tvsbayes.report.evidence import COLOUR, criteria_table, criterion_text
+from tvsbayes.report.fit_text import ROUGH, UNSAMPLED
 from tvsbayes.report.page import digest_number, numbered
-from tvsbayes.report.position_figures import banded
-from tvsbayes.report.result_tables import WAVE_COLUMNS, WAVES, percent, wave_row
-from tvsbayes.report.tables import TableView, interval_text, two_digits
+from tvsbayes.report.result_tables import waves_table
+from tvsbayes.report.tables import (
+    TableView,
+    degrees_of_freedom,
+    interval_text,
+    optional,
+    percent,
+    plural,
+    sentences,
+    table,
+    three_digits,
+    three_digits_fixed,
+    to_digits,
+    two_digits,
+)
 from tvsbayes.results.comparison_record import AxisHoldOut
 from tvsbayes.results.compensation_record import stored_verification
 from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
+from tvsbayes.results.metrology_tables import BudgetTable
 from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_certificate import axis_traceability
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
-from tvsbayes.single_axis.axis_record import (
-    AxisResults,
-    AxisSummary,
-    PositionDeviation,
-    deviation_strata,
-)
-from tvsbayes.single_axis.classic_line import AXIS_SYMBOLS, ClassicAxis, target_runs
+from tvsbayes.single_axis.axis_record import AxisResults, AxisSummary, PositionDeviation, deviation_strata
+from tvsbayes.single_axis.classic_line import AXIS_SYMBOLS, AXIS_TERMS, ClassicAxis, PositionRuns, target_runs
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
 from tvsbayes.statistics.intervals import band95
 
@@ -79,23 +86,14 @@ HELPS = {
     "read is known better: --target effective_per_command"
 }
 """Alternatives by target where further stops hardly help."""
-CONFLICT_TEXT = "the numbers hold only if the readings, not the priors, are wrong"
-"""Part of the verdict where the readings contradict priors."""
-BUDGETS = (
-    "Shares are of the variance. An error that all readings of the reference share is never rescaled by their scatter. "
-    "The u of a figure of ISO 230-2 is that of its measurement; what the axis does not repeat is in the figure.",
-)
-METHOD = (
-    "Readings = offset + unit per command x command, play taken up on the side of arrival, an error and a play "
-    "that repeat by position (Matern processes), waves where periods are asked for, a zero that creeps and drifts, "
-    "an error of every stop, noise. What is linear is integrated out exactly; scales are sampled, never maximised.",
-    "The ratio of the gears holds beyond the range read; the line through the stops belongs to that range.",
-)
-
-
-MEAN_PLAY = "its mean over the positions read"
 STOPS_ALONE = ("backlash", "ratio_contrast", "offset")
 """Parameters that a drive at constant rate does not show: it has one direction and no zero of its own."""
+BUDGET_WORDS = {
+    "effective_per_command": "line through the positions read, mean of both directions",
+    "effective_backlash": "mean play over the positions read",
+}
+"""Results of an axis, by the name of their budget."""
+NO_FIGURE = "\u2013"
 
 
 def is_drive(summary: AxisSummary) -> bool:
@@ -103,35 +101,38 @@ def is_drive(summary: AxisSummary) -> bool:
     return "seeing_s" in summary.parameters
 
 
-def _row(name: str, estimate: Estimate) -> list[str]:
-    return [name, concise(estimate.value, estimate.sd), interval_text(*estimate.interval95, estimate.sd)]
+def _contains_zero(interval95: tuple[float, float]) -> bool:
+    return interval95[0] <= 0 <= interval95[1]
 
 
 def period_table(summary: AxisSummary) -> TableView | None:
     """Every wave with amplitude and period, given that it exists; None where the model has none."""
-    unit, rows = escaped(summary.unit), []
-    for source, periods in (("gear", summary.periods), ("encoder", summary.encoder_periods)):
-        period_unit = "s" if source == "gear" and summary.periods_in == "seconds" else unit
-        rows += [wave_row(source, wave, unit, period_unit) for wave in periods]
-    return TableView(f"{WAVES}; phase at position or time 0", WAVE_COLUMNS, rows) if rows else None
+    unit = escaped(summary.unit)
+    gear_unit = "s" if summary.periods_in == "seconds" else unit
+    waves = [("gear", wave, gear_unit) for wave in summary.periods]
+    return waves_table(
+        [*waves, *(("encoder", wave, unit) for wave in summary.encoder_periods)], unit, "position or time"
+    )
+
+
+def _cells(estimate: Estimate) -> list[str]:
+    low, high = estimate.interval95
+    return [concise(estimate.value, estimate.sd), interval_text(low, high, estimate.sd)]
 
 
 def ratio_table(summary: AxisSummary) -> TableView:
     """Unit per command by direction: of the gears, of the line through the readings, and from the classic estimate."""
-    unit = escaped(summary.unit)
     low, high = summary.range_command
     sides = ("forward",) if is_drive(summary) else tuple(summary.per_command)
-    rows = [_row(_of_side("gears", side, sides), summary.per_command[side]) for side in sides]
-    line = f"line from {low:.10g} to {high:.10g}"
-    rows += [_row(_of_side(line, side, sides), summary.effective_per_command[side]) for side in sides]
+    kinds = {"gears": summary.per_command, f"line from {low:.10g} to {high:.10g}": summary.effective_per_command}
+    rows = [
+        [f"{label}, {side}" if len(sides) > 1 else label, *_cells(estimates[side])]
+        for label, estimates in kinds.items()
+        for side in sides
+    ]
     classic = summary.classic
     rows.append(["classic: least-squares line", concise(classic.per_command, classic.u_per_command or 0.0), ""])
-    return TableView(f"{unit} per command, value(u)", ["", "value(u)", "95 % interval"], rows)
-
-
-def _of_side(label: str, side: str, sides: Sequence[str]) -> str:
-    """A label with its direction, where there are two."""
-    return f"{label}, {side}" if len(sides) > 1 else label
+    return TableView(f"{escaped(summary.unit)} per command, value(u)", ["", "value(u)", "95 % interval"], rows)
 
 
 def parameter_table(summary: AxisSummary) -> TableView:
@@ -140,31 +141,105 @@ def parameter_table(summary: AxisSummary) -> TableView:
     left_out = {"per_command", *(STOPS_ALONE if is_drive(summary) else ())}
     for name, estimate in summary.parameters.items():
         if name not in left_out:
-            share = "" if estimate.contraction is None else f"{100 * max(estimate.contraction, 0.0):.0f} %"
-            rows.append([labels.get(name, name), *_row(name, estimate)[1:], share])
+            share = optional(lambda x: f"{100 * max(x, 0.0):.0f} %", estimate.contraction)
+            rows.append([labels.get(name, name), *_cells(estimate), share])
         if name == "backlash" and summary.effective_backlash is not None:
-            rows.append([MEAN_PLAY, *_row(name, summary.effective_backlash)[1:], ""])
+            rows.append(["its mean over the positions read", *_cells(summary.effective_backlash), ""])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: set by the readings, 0 %: set by the prior"
     return TableView(caption, ["", "value(u)", "95 % interval", "data"], rows)
+
+
+def deviation_table(deviations: Sequence[PositionDeviation], unit: str, limit: int) -> TableView:
+    """Errors that repeat by position, minus the line; at most `limit` positions, evenly spread."""
+    caption, count = f"error that repeats by position, off the line through the stops, {escaped(unit)}", len(deviations)
+    if count > limit:
+        caption += f"; {limit} of {count} positions, fit.json has all"
+        deviations = [deviations[round(k * (count - 1) / (limit - 1))] for k in range(limit)]
+    columns = {
+        "command": lambda d: f"{d.position:.10g}",
+        "value(u)": lambda d: concise(d.value, d.sd),
+        "95 % interval": lambda d: interval_text(d.interval95[0], d.interval95[1], d.sd),
+    }
+    return table(caption, deviations, columns)
+
+
+def iso230_table(classic: ClassicAxis, unit: str) -> TableView | None:
+    """The figures by letter, against the targets and about the line; None where the readings give none."""
+    columns = {"actual less target": classic.iso230, "about the line": classic.iso230_about_line}
+    shown = {title: f for title, f in columns.items() if f is not None and any(v is not None for v in f.values())}
+    rows = [
+        [f"{symbol}, {AXIS_TERMS[name]}"]
+        + [optional(three_digits_fixed, figures[name], NO_FIGURE) for figures in shown.values()]
+        for name, symbol in classic.symbols.items()
+    ]
+    return TableView(f"ISO 230-2, {escaped(unit)}", ["", *shown], rows) if shown else None
+
+
+def targets_table(classic: ClassicAxis, unit: str) -> TableView | None:
+    """Mean and s by position and side; None without targets."""
+    rows = classic.iso230_targets
+    if not rows:
+        return None
+    names = ("mean_forward", "s_forward", "mean_backward", "s_backward", "reversal")
+    sizes = {name: [abs(v) for row in rows if (v := getattr(row, name)) is not None] for name in names}
+    spread = max((size for of_name in sizes.values() for size in of_name), default=0.0)
+    # One number of decimals: three digits of the largest number, at least two of the smallest s.
+    smallest = min((s for name in names[1:4:2] for s in sizes[name] if s), default=spread)
+    decimals = max(0, 2 - int(f"{min(spread, 30 * smallest) or 1.0:.0e}".split("e")[1]))
+    cells = [
+        [f"{row.position:.10g}"]
+        + [optional(lambda v: f"{v:.{decimals}f}", getattr(row, name), NO_FIGURE) for name in names]
+        + [f"{row.runs_forward}, {row.runs_backward}"]
+        for row in rows
+    ]
+    caption = f"actual less target, {escaped(unit)}"
+    if len(cells) > TABLE_ROWS:
+        caption += f"; {TABLE_ROWS} of {len(cells)} positions, fit.json has all"
+        cells = [cells[k] for k in np.linspace(0, len(cells) - 1, TABLE_ROWS).astype(int)]
+    columns = ["target", "mean, forward", "s, forward", "mean, backward", "s, backward", "B", "runs"]
+    return TableView(caption, columns, cells)
+
+
+def budget_view(budget: BudgetTable) -> TableView:
+    """A budget with its columns by GUM 7.2.7; its caption has the result."""
+    caption = (
+        f"{BUDGET_WORDS.get(budget.quantity, budget.quantity)}: {budget.estimate:.10g} {escaped(budget.unit)}, "
+        f"u = {two_digits(budget.u)}, effective degrees of freedom {degrees_of_freedom(budget.dof)}, "
+        f"k = {budget.coverage_factor:.2f}, U = {two_digits(budget.expanded)}"
+    )
+    columns = {
+        "source": lambda row: row.quantity,
+        "type": lambda row: row.kind,
+        "u": lambda row: optional(lambda u: f"{two_digits(u)} {row.unit}".removesuffix(" 1"), row.u),
+        "dof": lambda row: "" if row.u is None else degrees_of_freedom(row.dof),
+        "sensitivity": lambda row: optional(three_digits, row.sensitivity),
+        "contribution": lambda row: optional(two_digits, None if row.contribution is None else abs(row.contribution)),
+        "share %": lambda row: f"{100 * row.share:.1f}",
+    }
+    return table(caption, budget.rows, columns)
 
 
 def for_firmware(summary: AxisSummary) -> str:
     """Values for a motion controller: commands per unit on the line read, play in commands."""
     sides = tuple(summary.effective_per_command.values())
     ratio, u_ratio = sum(estimate.value for estimate in sides) / len(sides), max(estimate.sd for estimate in sides)
-    low, high = summary.range_command
-    text = f"for your firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
-    text += f"{escaped(summary.unit)}, "
     play, where = summary.effective_backlash, " on average"
     if play is None:
         play, where = summary.parameters["backlash"], ""
-    in_commands = concise(play.value / abs(ratio), play.sd / abs(ratio))
-    if play.interval95[0] <= 0 <= play.interval95[1]:
-        return f"{text}play of {in_commands} commands{where} is not significant: its 95 % interval contains 0"
-    if play.value < 0:
-        overshoot = concise(-play.value / abs(ratio), play.sd / abs(ratio))
-        return f"{text}no play: a reversal overshoots by {overshoot} commands{where}"
-    return f"{text}play of {in_commands} commands{where}"
+
+    def in_commands(value: float) -> str:
+        return f"{concise(value / abs(ratio), play.sd / abs(ratio))} commands{where}"
+
+    words = f"play of {in_commands(play.value)}"
+    if _contains_zero(play.interval95):
+        words += " is not significant: its 95 % interval contains 0"
+    elif play.value < 0:
+        words = f"no play: a reversal overshoots by {in_commands(-play.value)}"
+    low, high = summary.range_command
+    return (
+        f"for your firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
+        f"{escaped(summary.unit)}, {words}"
+    )
 
 
 def result_lines(summary: AxisSummary) -> list[str]:
@@ -177,13 +252,11 @@ def result_lines(summary: AxisSummary) -> list[str]:
 
 def _waves(estimates: Sequence[PeriodEstimate], summary: AxisSummary, periods_in: str) -> list[str]:
     """Probable waves, in words."""
-    unit = escaped(summary.unit)
-    texts = []
+    unit, texts = escaped(summary.unit), []
     for e in estimates:
         if e.probability >= LIKELY:
             period = f"{e.period.value:.10g}" if e.source == "stated" else concise(e.period.value, e.period.sd)
-            amplitude = concise(e.amplitude.value, e.amplitude.sd)
-            x_unit = "s" if periods_in == "seconds" else unit
+            amplitude, x_unit = concise(e.amplitude.value, e.amplitude.sd), "s" if periods_in == "seconds" else unit
             texts.append(f"a wave of {amplitude} {unit} every {period} {x_unit}, probability {percent(e.probability)}")
     return texts
 
@@ -191,21 +264,12 @@ def _waves(estimates: Sequence[PeriodEstimate], summary: AxisSummary, periods_in
 def worst_place(summary: AxisSummary) -> str:
     """The largest error by position and its possible source."""
     worst = max(summary.deviations, key=lambda d: abs(d.value))
-    text = f"the error by position is largest at command {worst.position:.10g}: {concise(worst.value, worst.sd)} "
-    text += f"{escaped(summary.unit)} off the line"
-    if worst.interval95[0] <= 0 <= worst.interval95[1]:
-        text += ", whose 95 % interval contains 0"
-    return f"{text}; it is the sum of the errors of gears and encoder, which one encoder cannot separate"
-
-
-def deviation_table(deviations: Sequence[PositionDeviation], unit: str, limit: int) -> TableView:
-    """Errors that repeat by position, minus the line; at most `limit` positions, evenly spread."""
-    rows = [[f"{d.position:.10g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
-    caption = f"error that repeats by position, off the line through the stops, {escaped(unit)}"
-    if len(rows) > limit:
-        caption += f"; {limit} of {len(rows)} positions, fit.json has all"
-        rows = [rows[round(k * (len(rows) - 1) / (limit - 1))] for k in range(limit)]
-    return TableView(caption, ["command", "value(u)", "95 % interval"], rows)
+    doubt = ", whose 95 % interval contains 0" * _contains_zero(worst.interval95)
+    return (
+        f"the error by position is largest at command {worst.position:.10g}: {concise(worst.value, worst.sd)} "
+        f"{escaped(summary.unit)} off the line{doubt}; it is the sum of the errors of gears and encoder, which one "
+        "encoder cannot separate"
+    )
 
 
 def _scatter(classic: ClassicAxis, unit: str) -> str:
@@ -218,29 +282,20 @@ def _scatter(classic: ClassicAxis, unit: str) -> str:
 
 def classic_text(classic: ClassicAxis, unit: str) -> str:
     """The classic estimate of an axis as text."""
-    unit_text = escaped(unit)
-    play = None
-    if classic.backlash is not None:
-        play = f"backlash {concise(classic.backlash, classic.u_backlash or 0.0)} {unit_text}"
-    table = iso230_table(classic, unit)
+    unit_text, figures = escaped(unit), iso230_table(classic, unit)
+    play = optional(lambda value: f"backlash {concise(value, classic.u_backlash or 0.0)} {unit_text}", classic.backlash)
     return terminal(
         f"{concise(classic.per_command, classic.u_per_command or 0.0)} {unit_text} per command",
-        play,
+        play or None,
         f"{_scatter(classic, unit_text)}; stops taken as independent",
-        None if table is None else "",
-        None if table is None else classic.iso230_basis,
-        table,
+        *(() if figures is None else ("", classic.iso230_basis, figures)),
     )
-
-
-def _lines(title: str, texts: Sequence[str]) -> list[str]:
-    return [f"{title}: {text}" for text in texts]
 
 
 def warnings_note(summary: AxisSummary) -> str:
     """A reference to doubts and warnings, at the end of a verdict."""
     counts = {"doubt": len(summary.doubts), "warning": len(summary.warnings)}
-    named = [f"the {count} {word}s" if count > 1 else f"the {word}" for word, count in counts.items() if count]
+    named = [f"the {plural(count, word)}" if count > 1 else f"the {word}" for word, count in counts.items() if count]
     return f"; see {' and '.join(named)}" if named else ""
 
 
@@ -254,25 +309,23 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     """
     words = {None: "Laplace approximation", IMPORTANCE: "weighted draws"}
     method = words.get(summary.tier, f"chain of {summary.tier}")
-    parts: list[Part] = []
-    if details:
-        deviations = deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN)
-        parts = [deviations if summary.deviations else None, iso230_table(summary.classic, summary.unit)]
-        parts += _lines("weak (set by the priors, not by the readings)", summary.weak_directions)
-    elif count := len(summary.weak_directions):
-        parts = [f"--details and the report say more: {count} weak direction{'s' * (count > 1)}"]
-    title = "not accepted" if summary.explained else "NOT CONVERGED"
-    parts += [*_lines(title, summary.problems), *_lines("warning", summary.warnings)]
-    parts += _lines("doubt", [doubt.text for doubt in summary.doubts])
-    parts += _lines("prior conflict", summary.prior_conflicts)
-    parts += [f"written: {', '.join(written)}"] if written else []
-    data = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {method}"
-    answer = result_lines(summary) if summary.explained else []
+    weak, deviations = summary.weak_directions, summary.deviations
+    parts: list[Part] = [
+        *(result_lines(summary) if summary.explained else []),
+        deviation_table(deviations, summary.unit, DEVIATIONS_SHOWN) if details and deviations else None,
+        iso230_table(summary.classic, summary.unit) if details else None,
+        *labelled("weak (set by the priors, not by the readings)", weak if details else ()),
+        f"--details and the report say more: {plural(len(weak), 'weak direction')}" if weak and not details else None,
+        *labelled("not accepted" if summary.explained else "NOT CONVERGED", summary.problems),
+        *labelled("warning", summary.warnings),
+        *labelled("doubt", [doubt.text for doubt in summary.doubts]),
+        *labelled("prior conflict", summary.prior_conflicts),
+        f"written: {', '.join(written)}" if written else None,
+    ]
     return terminal(
-        *answer,
         *parts,
-        "" if answer or any(part is not None for part in parts) else None,
-        data,
+        "" if any(part is not None for part in parts) else None,
+        f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {method}",
         _agreement(summary),
         *(period_table(summary), parameter_table(summary), ratio_table(summary)),
         f"verdict: {axis_verdict(summary)}",
@@ -295,54 +348,55 @@ def axis_verdict(summary: AxisSummary) -> str:
     if not summary.explained:
         return "NOT CONVERGED, use none of these numbers"
     if summary.prior_conflicts:
-        return f"PRIOR CONFLICT, {CONFLICT_TEXT}"
+        return "PRIOR CONFLICT, the numbers hold only if the readings, not the priors, are wrong"
+    verdict = ROUGH if summary.answer == "rough" else "usable"
     if any(not doubt.usable for doubt in summary.doubts):
-        return f"DOUBTFUL, not usable as it is{warnings_note(summary)}"
-    if not summary.converged:
-        return f"{UNSAMPLED}{warnings_note(summary)}"
-    return f"{ROUGH if summary.answer == 'rough' else 'usable'}{warnings_note(summary)}"
-
-
-def hold_out_table(hold_out: AxisHoldOut, unit: str) -> TableView:
-    """Positions left out, with their predictions."""
-    rows = []
-    for p in hold_out.positions:
-        # To the digits of u.
-        mean = concise(p.mean, p.u).partition("(")[0]
-        row = [f"{p.position:.10g}", p.direction, str(p.n), mean, concise(p.predicted, p.u), f"{p.z:+.1f}"]
-        rows.append([*row, f"{p.classic_z:+.1f}"])
-    caption = f"positions left out and predicted, {escaped(unit)}; z in stated uncertainties"
-    return TableView(caption, ["position", "direction", "n", "mean", "predicted(u)", "z", "z classic"], rows)
+        verdict = "DOUBTFUL, not usable as it is"
+    elif not summary.converged:
+        verdict = UNSAMPLED
+    return f"{verdict}{warnings_note(summary)}"
 
 
 def axis_hold_out_text(hold_out: AxisHoldOut, unit: str) -> str:
-    """A hold-out as text."""
-    errors = f"RMS z {hold_out.rms_z:.2f}, classic {hold_out.classic_rms_z:.2f}; "
-    errors += f"{100 * hold_out.inside_share:.0f} % of the left-out readings in their 95 % intervals"
-    return terminal(hold_out_table(hold_out, unit), errors, *_lines("warning", hold_out.warnings))
-
-
-def next_table(plan: AxisPlan, unit: str) -> TableView:
-    """Stops to be read next."""
-    rows = []
-    for stop in plan.next:
-        over = "" if stop.via is None else f"{stop.via:.10g}"
-        rows.append([f"{stop.command:.10g}", stop.direction, over, two_digits(stop.u)])
-    u = f"u of {plan.target} afterwards"
-    caption = f"stops to read next, in this order; now u = {two_digits(plan.u_now)} "
-    caption += unit_of(plan.target, escaped(unit))
-    return TableView(caption, ["command", "direction", "go first to", u], rows)
+    """Positions left out, with their predictions."""
+    positions = table(
+        f"positions left out and predicted, {escaped(unit)}; z in stated uncertainties",
+        hold_out.positions,
+        {
+            "position": lambda p: f"{p.position:.10g}",
+            "direction": lambda p: p.direction,
+            "n": lambda p: str(p.n),
+            "mean": lambda p: to_digits(p.mean, p.u),
+            "predicted(u)": lambda p: concise(p.predicted, p.u),
+            "z": lambda p: f"{p.z:+.1f}",
+            "z classic": lambda p: f"{p.classic_z:+.1f}",
+        },
+    )
+    errors = (
+        f"RMS z {hold_out.rms_z:.2f}, classic {hold_out.classic_rms_z:.2f}; {100 * hold_out.inside_share:.0f} % of the "
+        "left-out readings in their 95 % intervals"
+    )
+    return terminal(positions, errors, *labelled("warning", hold_out.warnings))
 
 
 def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     """A plan as text."""
     if not plan.next:
         return "the time is too short for a single stop"
+    stops = table(
+        f"stops to read next, in this order; now u = {two_digits(plan.u_now)} {unit_of(plan.target, escaped(unit))}",
+        plan.next,
+        {
+            "command": lambda stop: f"{stop.command:.10g}",
+            "direction": lambda stop: stop.direction,
+            "go first to": lambda stop: optional(lambda via: f"{via:.10g}", stop.via),
+            f"u of {plan.target} afterwards": lambda stop: two_digits(stop.u),
+        },
+    )
     share = plan.next[-1].u / plan.u_now
     helps = HELPS.get(plan.target, MORE_HELPS)
     warning = f"these stops have little effect: u falls by {100 * (1 - share):.1f} %; {helps}"
-    minutes = f"{plan.minutes:.1f} minutes in all"
-    return terminal(next_table(plan, unit), minutes, warning if share > HELPLESS_SHARE else None)
+    return terminal(stops, f"{plan.minutes:.1f} minutes in all", warning if share > HELPLESS_SHARE else None)
 
 
 def axis_errors(fit: AxisFit, commands: np.ndarray, values: np.ndarray) -> Figure:
@@ -375,18 +429,26 @@ def wave(sample: WaveSample, unit: str) -> Figure:
     return figure
 
 
-def _wave_figures(fit: AxisFit) -> list[FigureView]:
-    """Figures of probable waves."""
-    alt, unit = "A wave over one period as a curve with a band.", escaped(fit.campaign.unit)
-    figures = []
-    for sample in wave_samples(fit):
-        if sample.probability > LIKELY:
-            period_unit = "s" if sample.wave.clock == "seconds" else unit
-            period = f"{float(np.mean(sample.period[sample.likeliest])):.4g} {period_unit}"
-            name = "encoder" if sample.wave.clock == "encoder" else "gear"
-            caption = f"Wave of the {name} every {period}: one period, both harmonics, with its 95 % band."
-            figures.append(FigureView(wave(sample, fit.campaign.unit), alt, caption))
-    return figures
+def iso230_plot(runs: PositionRuns, unit: str) -> Figure:
+    """Every run, means by side, and means plus and less 2 s."""
+    with drawing(3.4) as figure:
+        axes = figure.add_subplot()
+        axes.axhline(0.0, color=BLACK, linewidth=0.6)
+        for name, sides in (("forward", runs.forward), ("backward", runs.backward)):
+            read = np.isfinite(sides).sum(axis=1) > 0
+            if not read.any():
+                continue
+            (marker, colour), at, deviations = DIRECTION_STYLE[name], runs.position[read], sides[read]
+            mean = np.nanmean(deviations, axis=1)
+            axes.plot(at, deviations, color=colour, linewidth=0.5, alpha=0.5, rasterized=True)
+            axes.plot(at, mean, marker, linestyle="-", color=colour, markersize=4, linewidth=1.4, label=f"mean, {name}")
+            if np.all(np.isfinite(deviations).sum(axis=1) > 1):
+                s = np.nanstd(deviations, axis=1, ddof=1)
+                for sign, label in ((2, f"mean \u00b1 2 s, {name}"), (-2, None)):
+                    axes.plot(at, mean + sign * s, "--", color=colour, linewidth=0.9, label=label)
+        axes.set(xlabel="target", ylabel=f"actual less target, {unit}")
+        legend(figure, 2)
+    return figure
 
 
 def curve_commands(low: float, high: float) -> np.ndarray:
@@ -394,51 +456,61 @@ def curve_commands(low: float, high: float) -> np.ndarray:
     return np.linspace(low, high, CURVE_POINTS)
 
 
-def _error_figures(fit: AxisFit) -> list[FigureView]:
-    """The error by position; a drive read in motion has none."""
-    if fit.rows.in_motion:
-        return []
-    commands = curve_commands(float(fit.rows.command.min()), float(fit.rows.command.max()))
-    alt = "The error that repeats by position over the command as a curve with a band, and every stop as a marker."
-    caption = "Deviation from the line through the stops: what repeats by position with its 95 % band, and the stops."
-    return [FigureView(axis_errors(fit, commands, deviation_strata(fit, commands)), alt, caption)]
+def _figures(fit: AxisFit) -> list[FigureView]:
+    """The error by position, which a drive read in motion has none of, and probable waves."""
+    views, unit = [], fit.campaign.unit
+    if not fit.rows.in_motion:
+        commands = curve_commands(float(fit.rows.command.min()), float(fit.rows.command.max()))
+        alt = "The error that repeats by position over the command as a curve with a band, and every stop as a marker."
+        caption = "Deviation from the line through the stops: what repeats by position with its 95 % band, and the "
+        figure = axis_errors(fit, commands, deviation_strata(fit, commands))
+        views.append(FigureView(figure, alt, f"{caption}stops."))
+    for sample in wave_samples(fit):
+        if sample.probability > LIKELY:
+            period_unit = "s" if sample.wave.clock == "seconds" else escaped(unit)
+            period = f"{float(np.mean(sample.period[sample.likeliest])):.4g} {period_unit}"
+            name = "encoder" if sample.wave.clock == "encoder" else "gear"
+            caption = f"Wave of the {name} every {period}: one period, both harmonics, with its 95 % band."
+            views.append(FigureView(wave(sample, unit), "A wave over one period as a curve with a band.", caption))
+    return views
 
 
 def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[Section]:
     """Sections in the order of the page; `figures` are those after the first page."""
-    summary, campaign = results.summary, results.fit.campaign
-    unit, classic, waves = summary.unit, summary.classic, period_table(summary)
-    line = f"Least-squares line: {concise(classic.per_command, classic.u_per_command or 0.0)} {unit} per command, "
-    line += f"stops independent; {_scatter(classic, unit)}."
-    parameters = [ratio_table(summary) if waves else None, parameter_table(summary)]
+    summary, campaign, of_drive = results.summary, results.fit.campaign, is_drive(results.summary)
+    unit, classic, fixed = summary.unit, summary.classic, sentences("axis_sections")
+    line = (
+        f"Least-squares line: {concise(classic.per_command, classic.u_per_command or 0.0)} {unit} per command, stops "
+        f"independent; {_scatter(classic, unit)}."
+    )
+    parameters = [ratio_table(summary) if period_table(summary) else None, parameter_table(summary)]
     result_texts = [sentence(text) for text in (result_lines(summary) if summary.explained else ())]
     deviations = [deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None]
-    compensation = compensation_in(campaign)
-    compensation_sections = []
-    if compensation is not None:
+    compensations = []
+    if (compensation := compensation_in(campaign)) is not None:
         verification = stored_verification(campaign, axis_hashes(campaign), compensation.digest, compensation.unit)
-        compensation_sections = [compensation_section(compensation, verification)]
+        compensations = [compensation_section(compensation, verification)]
+    budgets = Section("Uncertainty budgets", [fixed["budgets"]], tables=[*map(budget_view, summary.budgets)])
     return [
         Section("Result", result_texts, tables=parameters, figures=figures, opened=True),
-        *([] if is_drive(summary) else [Section("What repeats by position", tables=deviations)]),
-        *compensation_sections,
+        *([] if of_drive else [Section("What repeats by position", tables=deviations)]),
+        *compensations,
         Section("What the readings do not determine", items=summary.weak_directions or ["No remarks."]),
         Section("Classic", [line]),
-        *([] if is_drive(summary) else [iso230_section(results)]),
-        *(
-            [Section("Uncertainty budgets", BUDGETS, tables=[*map(budget_view, summary.budgets)])]
-            if summary.budgets
-            else []
-        ),
-        Section("Method", METHOD),
+        *([] if of_drive else [_iso230_section(results)]),
+        *([budgets] if summary.budgets else []),
+        Section("Method", fixed["method"]),
     ]
 
 
-def iso230_section(results: AxisResults) -> Section:
-    """The test by ISO 230-2."""
-    classic, unit = results.summary.classic, results.summary.unit
-    runs = target_runs(results.fit.rows).runs
-    figures = [] if runs is None else [iso230_figure(runs, unit)]
+def _iso230_section(results: AxisResults) -> Section:
+    """The test by ISO 230-2: figures by letter, by position, and the standard's plot."""
+    classic, unit, runs = results.summary.classic, results.summary.unit, target_runs(results.fit.rows).runs
+    figures = []
+    if runs is not None:
+        alt = "Deviations of every run over the target, with the mean of either side and lines at two s from it."
+        caption = "ISO 230-2: deviations of every run, their means by side, and the means plus and less 2 s."
+        figures = [FigureView(iso230_plot(runs, unit), alt, caption)]
     tables = [iso230_table(classic, unit), targets_table(classic, unit)]
     return Section("ISO 230-2", [sentence(classic.iso230_basis)], tables=tables, figures=figures)
 
@@ -451,13 +523,13 @@ def _play_number(summary: AxisSummary) -> Number:
     return Number("play", concise(play.value, play.sd), note)
 
 
-def _steps(summary: AxisSummary, folder: str) -> list[str]:
-    """What to do next, in sentences."""
+def _step(summary: AxisSummary, folder: str) -> str:
+    """What to do next, in a sentence."""
     if not is_drive(summary):
-        return [f"`tvsbayes plan --given {folder}` says which stops to read next."]
+        return f"`tvsbayes plan --given {folder}` says which stops to read next."
     if any(wave.probability >= TABLE_LIKELY for wave in summary.periods):
-        return [f"`tvsbayes compensate {folder} --to pec -o worm.csv` writes the table of the strongest wave's period."]
-    return ["Log a longer run: of N periods, noise leaves about period / (2 N) times noise over amplitude."]
+        return f"`tvsbayes compensate {folder} --to pec -o worm.csv` writes the table of the strongest wave's period."
+    return "Log a longer run: of N periods, noise leaves about period / (2 N) times noise over amplitude."
 
 
 def figures_by_name(unit: str) -> dict[str, tuple[str, str]]:
@@ -488,34 +560,33 @@ def criteria_of(summary: AxisSummary, tolerance: Tolerance | None) -> tuple[Crit
 def axis_document(results: AxisResults, issue: Issue, criteria: Sequence[Criterion] = ()) -> Document:
     """The report of an axis with its number; `results.fit` must include `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
-    origin = provenance(axis_hashes(fit.campaign), fit.seed)
-    content = json.dumps([summary.as_json(), origin.inputs], sort_keys=True)
-    header = fit.campaign.header
+    campaign, header = fit.campaign, fit.campaign.header
+    origin = provenance(axis_hashes(campaign), fit.seed)
     verdict = sentence(axis_verdict(summary))
     if criteria:
         verdict = f"{'. '.join(map(criterion_text, criteria))}. {verdict}"
     elif summary.explained:
         verdict += " No limit was stated."
     colour = "cannot-tell" if summary.explained else "not-met"
-    figures = [*_error_figures(fit), *_wave_figures(fit)]
-    folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
+    figures = _figures(fit)
+    folder = "AXIS" if campaign.path is None else typed(campaign.path.resolve().name)
     return numbered(
         Document(
-            results=digest_number(content.encode()),
-            name=title_of(header, fit.campaign.path),
+            results=digest_number(json.dumps([summary.as_json(), origin.inputs], sort_keys=True).encode()),
+            name=title_of(header, campaign.path),
             about=about_table(header, str(header.get("created") or ""), issue),
             verdict=Verdict(verdict, COLOUR[criteria[0].verdict] if criteria else colour),
             numbers=[] if is_drive(summary) else [_play_number(summary)],
             answer=period_table(summary) or ratio_table(summary),
             picture=figures[0] if figures else None,
-            steps=_steps(summary, folder),
+            steps=[_step(summary, folder)],
             criteria=criteria_table(criteria),
-            traceable=axis_traceability(fit.campaign, performed(fit.campaign, issue.day)).statement,
+            traceable=axis_traceability(campaign, performed(campaign, issue.day)).statement,
             warnings=[
                 *summary.problems,
-                *_lines("Doubt", [doubt.text for doubt in summary.doubts]),
+                *labelled("Doubt", [doubt.text for doubt in summary.doubts]),
                 *summary.warnings,
-                *_lines("Prior conflict", summary.prior_conflicts),
+                *labelled("Prior conflict", summary.prior_conflicts),
             ],
             versions=origin.shown_versions,
             sections=axis_sections(results, figures[1:]),

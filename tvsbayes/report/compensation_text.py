@@ -8,17 +8,12 @@ from typing import TYPE_CHECKING
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.axes import SIDES
-from tvsbayes.report.document import Part, Section, sentence, terminal
-from tvsbayes.report.tables import TableView, three_digits, two_digits
+from tvsbayes.report.document import Section, labelled, sentence, terminal
+from tvsbayes.report.tables import TableView, sentences, table, three_digits, two_digits
 from tvsbayes.results.compensation_record import (
-    APPLIED,
     BROKEN,
     CANNOT_TELL,
     CAUSES,
-    NOT_APPLIED,
-    OTHER_MACHINE,
-    TWICE,
-    WRONG_SIGN,
     AimedPromise,
     Compensation,
     Verification,
@@ -27,55 +22,7 @@ from tvsbayes.results.compensation_record import (
 if TYPE_CHECKING:
     from tvsbayes.comparison.verified_looks import AimPlan
 
-REMEDIES = {
-    NOT_APPLIED: "the controller does not use the table, or not its play: is the file loaded, were the settings saved, "
-    "does compensation start only after homing?",
-    TWICE: "the table, or its play, acts in two places: remove one of them (a backlash setting beside the table?)",
-    WRONG_SIGN: "the controller adds the correction instead of subtracting it, or forward and backward are exchanged",
-    OTHER_MACHINE: "the table is of another machine, or this one changed: measure it again and compensate again",
-    APPLIED: "readings lie farther off than the table allows: measure again, and compensate again if that persists",
-}
-"""Remedies by the most probable hypothesis, where the promise is broken."""
-SCANNER_REMEDIES = {
-    NOT_APPLIED: "counters follow the nominal degrees per step, or come without the run-up that takes up the play: use "
-    "those of `tvsbayes steps-for` with `via_pan_steps` and `via_tilt_steps`, or the header's",
-    TWICE: "the calibration acts in the host and in the controller: remove one of them",
-    WRONG_SIGN: "the correction is subtracted instead of added, or left and right, up and down are exchanged",
-    OTHER_MACHINE: "something moved, a counter has the other sign, or the calibration is of another machine: "
-    "see `tvsbayes check FRESH` and `tvsbayes watch CAMPAIGN FRESH`",
-    APPLIED: "looks lie farther off than the calibration allows: `tvsbayes watch CAMPAIGN FRESH` says what moved",
-}
-"""Remedies for a scanner."""
-HELPS = {
-    "homing": "the scatter of homings; read after several homings, or verify without homing in between",
-    "stops": "the scatter of single stops; no table corrects that",
-    "table": "the table itself; read more, at more positions",
-    "format": "what the format cannot hold; csv, linuxcnc and header hold both sides by position",
-    "drift": "the walk of the zero; home more often, or guide",
-    "creep": "the creep of a zero that warms up; use it warm, or home it again",
-    "temperature": "the shift with the temperature; read cold and warm, or keep the room steady",
-    "travel": "a contrast of the directions; of gears whose teeth keep step state `ratio_contrast` 0, u 0 in [axis]",
-    "readings": "the readings themselves; a better reference",
-}
-"""Remedies by the largest cause of the remaining error."""
-AIMED_HELPS = {
-    "homing": "the scatter of homings; look after several homings, or aim without homing in between",
-    "table": "the calibration itself; look more, at more counters",
-    "format": "what the format cannot hold, and whole steps; the header and `steps-for` hold both sides by counter",
-    "travel": "a contrast of the directions; of gears whose teeth keep step state `ratio_contrast_deg_per_step` 0, u 0 "
-    "in [rig.prior], else home after less travel",
-}
-"""The same for a scanner or head, where they differ."""
-DRIVE_HELPS = {
-    "format": "waves of other periods, which a table of one period does not hold",
-    "drift": "the walk of the zero; guide",
-}
-"""The same for a drive at constant rate, where they differ."""
-ABSOLUTE_HELPS = {
-    "drift": "the walk of the zero, which no homing sets and a short campaign hardly shows, so that it is the prior's: "
-    "read again on another day into the same folder, or state the drift",
-}
-"""The same for absolute encoders, where they differ."""
+APPLIED_TITLE = "Applied correction and remaining error"
 
 
 def promise_table(result: Compensation | AimedPromise) -> TableView:
@@ -93,23 +40,22 @@ def promise_table(result: Compensation | AimedPromise) -> TableView:
 
 def sizes_table(verification: Verification) -> TableView:
     """Errors without the table and with it."""
-    rows = [
-        [
-            "before (expected without the table)",
-            two_digits(verification.before.rms),
-            two_digits(verification.before.worst),
-        ],
-        ["after (read)", two_digits(verification.after.rms), two_digits(verification.after.worst)],
+    points, homed = verification.millimetres, verification.after_with_homing
+    sizes = [
+        ("before (expected without the table)", verification.before, points and points.before),
+        ("after (read)", verification.after, points and points.after),
+        *([] if homed is None else [("after, with the shift common to all", homed, None)]),
     ]
-    if (homed := verification.after_with_homing) is not None:
-        rows.append(["after, with the shift common to all", two_digits(homed.rms), two_digits(homed.worst)])
-    columns = ["", "RMS", "worst"]
-    if (points := verification.millimetres) is not None:
-        columns += [f"RMS at {points.distance_mm:.10g} mm, mm", "worst, mm"]
-        for row, size in zip(rows, (points.before, points.after, None), strict=False):
-            row += ["", ""] if size is None else [two_digits(size.rms), two_digits(size.worst)]
+    columns = {
+        "": lambda row: row[0],
+        "RMS": lambda row: two_digits(row[1].rms),
+        "worst": lambda row: two_digits(row[1].worst),
+    }
+    if points is not None:
+        columns[f"RMS at {points.distance_mm:.10g} mm, mm"] = lambda row: two_digits(row[2].rms) if row[2] else ""
+        columns["worst, mm"] = lambda row: two_digits(row[2].worst) if row[2] else ""
     scope = " of both axes" * verification.looks + ", and of points" * (points is not None)
-    return TableView(f"errors, {escaped(verification.unit)}{scope}", columns, rows)
+    return table(f"errors, {escaped(verification.unit)}{scope}", sizes, columns)
 
 
 def _promise_text(verification: Verification) -> str:
@@ -125,19 +71,19 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
     """A compensation as text."""
     unit, (low, high) = escaped(result.unit), result.range_command
     shift = ", but for one shift common to all" if result.zero_free else ""
-    lines: list[Part] = [
+    return terminal(
         f"compensation for {result.target}: {len(result.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
         f"aim: reading = {result.offset:.6g} + {result.per_command:.9g} x command{shift}",
         "",
         promise_table(result),
         "",
         *_validity(result),
-        f"largest remaining error: {_help(result)}",
-        *(f"the format: {text}" for text in result.unsaid),
-    ]
-    lines += _homing_remarks(result)
-    lines.append(f"nothing is applied yet; apply it once, in one place, then {result.shown_by}")
-    return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
+        f"largest remaining error: {_largest(result)}",
+        *labelled("the format", result.unsaid),
+        *_homing_remarks(result),
+        f"nothing is applied yet; apply it once, in one place, then {result.shown_by}",
+        *labelled("written", [escaped(path, 200) for path in written]),
+    )
 
 
 def aimed_text(result: AimedPromise) -> str:
@@ -152,9 +98,9 @@ def aimed_text(result: AimedPromise) -> str:
         promise_table(result),
         "",
         f"the promise holds between these counters, within {two_digits(result.hours)} h and {travel} of travel "
-        f"{_since(any(result.homings.values()))}{_kelvin(result)}",
+        f"{_conditions(result)}",
         f"arrive with at least {run_up} of travel on a side",
-        f"largest remaining error: {_help(result)}",
+        f"largest remaining error: {_largest(result)}",
         *_homing_remarks(result),
     )
 
@@ -172,27 +118,31 @@ def _shift_free(result: Compensation | AimedPromise) -> bool:
     return bool(result.free_axes) if isinstance(result, AimedPromise) else result.shift_free
 
 
+def _homed(result: Compensation | AimedPromise) -> bool:
+    return any(result.homings.values()) if isinstance(result, AimedPromise) else bool(result.homings)
+
+
 def _of_axes(result: Compensation | AimedPromise) -> str:
     """The axes whose errors are less a shift, where there are two."""
     return f" of {' and of '.join(result.free_axes)}" if isinstance(result, AimedPromise) else ""
 
 
-def _help(result: Compensation | AimedPromise) -> str:
+def _largest(result: Compensation | AimedPromise) -> str:
     """The largest cause of the remaining error, with its remedy."""
     counted = [cause for cause in CAUSES if cause != "homing" or not _shift_free(result)]
     largest = max(counted, key=lambda cause: max(left.causes.get(cause, 0.0) for left in result.sides.values()))
-    own = AIMED_HELPS if isinstance(result, AimedPromise) else DRIVE_HELPS if result.in_motion else {}
-    homed = any(result.homings.values()) if isinstance(result, AimedPromise) else result.homings
-    return (HELPS | own | ({} if homed else ABSOLUTE_HELPS))[largest]
+    kind = "remaining_aim" if isinstance(result, AimedPromise) else "remaining_drive"
+    own = sentences(kind) if isinstance(result, AimedPromise) or result.in_motion else {}
+    absolute = {} if _homed(result) else sentences("remaining_absolute")
+    return str((sentences("remaining") | own | absolute)[largest])
 
 
-def _since(homed: bool) -> str:
-    return "since homing" if homed else "after the campaign, from whose first move on the absolute zero walks"
-
-
-def _kelvin(result: Compensation | AimedPromise) -> str:
+def _conditions(result: Compensation | AimedPromise) -> str:
+    """Since when, and at which temperatures, a promise holds."""
+    absolute = "after the campaign, from whose first move on the absolute zero walks"
     low, high = result.kelvin or (0.0, 0.0)
-    return f", at temperatures as read, over {two_digits(high - low)} K" if result.kelvin else ""
+    kelvin = f", at temperatures as read, over {two_digits(high - low)} K" if result.kelvin else ""
+    return ("since homing" if _homed(result) else absolute) + kelvin
 
 
 def _homing_remarks(result: Compensation | AimedPromise) -> list[str]:
@@ -204,38 +154,50 @@ def _homing_remarks(result: Compensation | AimedPromise) -> list[str]:
         for side, promise in result.sides.items()
         if promise.error95_with_homing is not None
     ]
-    remark = "one homing was read: the promise is of errors but for one shift common to all, as within one homing"
     where = "home_sd_deg in [rig.prior]" if isinstance(result, AimedPromise) else "home_sd in [axis]"
-    prior = f"with the next homing's error, which its prior alone determines, {where}, 95 % are at most: "
-    return [f"{remark}; {prior}{', '.join(homed)} {escaped(result.unit)}"]
+    return [
+        "one homing was read: the promise is of errors but for one shift common to all, as within one homing; with the "
+        f"next homing's error, which its prior alone determines, {where}, 95 % are at most: {', '.join(homed)} "
+        f"{escaped(result.unit)}"
+    ]
 
 
 def _validity(result: Compensation) -> list[str]:
     """Validity of the promise, in words."""
     if result.in_motion:
-        travel, added = f"{result.travel_command:.6g}", [row.add_forward for row in result.table]
+        added = [row.add_forward for row in result.table]
         size = three_digits(abs(result.per_command) * (max(added) - min(added)))
         seconds = f", {result.settings['period_s']:.5g} s" if "period_s" in result.settings else ""
         return [
-            f"the promise holds within {travel} commands, off the drive's own line, but for one shift",
+            f"the promise holds within {result.travel_command:.6g} commands, off the drive's own line, but for one "
+            "shift",
             f"the error that repeats every {result.settings['period_command']:.6g} commands{seconds}: {size} "
             f"{escaped(result.unit)} peak to peak",
         ]
     return [
         f"the promise holds between these commands, within {two_digits(result.hours)} h and "
-        f"{result.travel_command:.4g} commands of travel {_since(bool(result.homings))}{_kelvin(result)}",
+        f"{result.travel_command:.4g} commands of travel {_conditions(result)}",
         f"arrive with at least {result.reversal_command:.4g} commands of travel on a side",
     ]
 
 
 def verification_text(verification: Verification) -> str:
     """A verification as text."""
+    what, kind, under = "table", "readings", "under the table"
+    if verification.looks:
+        what, kind, under = "calibration", "looks", "that the calibration aimed"
+    helps = None
+    if verification.verdict == BROKEN:
+        remedies = sentences("broken") | (sentences("broken_aim") if verification.looks else {})
+        helps = f"what to do: {remedies[verification.world]}"
+    elif verification.verdict == CANNOT_TELL and verification.needed is None:
+        helps = "no number of such readings decides: the correction is smaller than the uncertainty of homing and fit"
+    elif verification.verdict == CANNOT_TELL:
+        more = f"about {verification.needed} {kind} of this kind" if verification.needed else f"some more {kind}"
+        helps = f"what to do: take {more}; `tvsbayes plan --verify FOLDER` lists the most informative"
     p = "< 0.0003" if verification.p < 3e-4 else f"= {verification.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in verification.worlds.items()]
-    what, kind, under, remedies = "table", "readings", "under the table", REMEDIES
-    if verification.looks:
-        what, kind, under, remedies = "calibration", "looks", "that the calibration aimed", REMEDIES | SCANNER_REMEDIES
-    lines: list[Part] = [
+    return terminal(
         f"{verification.verdict}: {verification.world} (p {p})",
         "",
         TableView(f"{verification.readings} {kind} {under}", [f"the {what} was", "probability"], rows),
@@ -243,20 +205,8 @@ def verification_text(verification: Verification) -> str:
         sizes_table(verification),
         _promise_text(verification),
         *verification.remarks,
-    ]
-    if verification.verdict == BROKEN:
-        lines.append(f"what to do: {remedies[verification.world]}")
-    elif verification.verdict == CANNOT_TELL and verification.needed is None:
-        lines.append(
-            "no number of such readings decides: the correction is smaller than the uncertainty of homing and fit"
-        )
-    elif verification.verdict == CANNOT_TELL:
-        more = f"about {verification.needed} {kind} of this kind" if verification.needed else f"some more {kind}"
-        lines.append(f"what to do: take {more}; `tvsbayes plan --verify FOLDER` lists the most informative")
-    return terminal(*lines)
-
-
-APPLIED_TITLE = "Applied correction and remaining error"
+        helps,
+    )
 
 
 def compensation_section(result: Compensation, verification: Verification | None) -> Section:
@@ -273,34 +223,32 @@ def compensation_section(result: Compensation, verification: Verification | None
 
 def verified_section(verification: Verification) -> Section:
     """Section of a scanner's report: verification by fresh looks aimed with its calibration, points in mm."""
-    text = "Counters by `tvsbayes steps-for` or the header, held against fresh looks. " + _verdict(verification)
+    text = f"Counters by `tvsbayes steps-for` or the header, held against fresh looks. {_verdict(verification)}"
     return Section(APPLIED_TITLE, [text], tables=[sizes_table(verification)])
 
 
 def _verdict(verification: Verification) -> str:
     kind = "readings" if verification.millimetres is None else "looks"
-    text = f"{verification.verdict}: {verification.readings} fresh {kind}, "
-    text += f"most probable: {verification.world}, p = {verification.p:.2g}."
-    return f"{text} {sentence(_promise_text(verification))}"
+    return (
+        f"{verification.verdict}: {verification.readings} fresh {kind}, most probable: {verification.world}, "
+        f"p = {verification.p:.2g}. {sentence(_promise_text(verification))}"
+    )
 
 
 def verify_plan_text(plan: VerifyPlan) -> str:
     """A plan of readings that verify a table, as text."""
     rows = [[f"{command:.10g}", "forward" if side > 0 else "backward"] for command, side in plan.stops]
-    table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    return terminal(table, f"to arrive on a side, come from at least {plan.run_up:.4g} commands away", _power(plan))
+    stops = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
+    return terminal(stops, f"to arrive on a side, come from at least {plan.run_up:.4g} commands away", _power(plan))
 
 
 def aim_plan_text(plan: AimPlan) -> str:
     """A plan of looks that verify a calibration, as text."""
     rows = [[str(p), str(t), SIDES["pan"][ps > 0], SIDES["tilt"][ts > 0]] for p, t, ps, ts in plan.stops]
-    columns = ["pan", "tilt", "arriving", ""]
-    table = TableView(
-        f"{len(rows)} looks with the calibration in force, in this order, from a homing on", columns, rows
-    )
+    title = f"{len(rows)} looks with the calibration in force, in this order, from a homing on"
     pan, tilt = plan.run_up
     run_up = f"to arrive on a side, come from at least {pan} steps of pan and {tilt} of tilt away"
-    return terminal(table, run_up, _power(plan))
+    return terminal(TableView(title, ["pan", "tilt", "arriving", ""], rows), run_up, _power(plan))
 
 
 def _power(plan: VerifyPlan | AimPlan) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -127,16 +127,20 @@ class Document:
 
 def about_table(header: Mapping[str, object], measured: str, issue: Issue) -> TableView:
     """Object, dates, operator and customer of a measurement; `measured` is a date or "" where not recorded."""
-    recorded = [("measured", measured)]
-    recorded += [(label, str(header.get(key) or "")) for key, label in RECORDED]
-    stated = [("laboratory", issue.laboratory), ("customer", issue.customer)]
-    rows = [[label, text or NOT_RECORDED] for label, text in recorded]
-    return TableView("What was measured", [], rows + [[label, text or NOT_STATED] for label, text in stated])
+    recorded = [(label, str(header.get(key) or "")) for key, label in RECORDED]
+    rows = [[label, text or NOT_RECORDED] for label, text in (("measured", measured), *recorded)]
+    rows += [["laboratory", issue.laboratory or NOT_STATED], ["customer", issue.customer or NOT_STATED]]
+    return TableView("What was measured", [], rows)
 
 
 def sentence(text: str) -> str:
     """A remark as a sentence: capital first, full stop last."""
     return f"{text[0].upper()}{text[1:]}."
+
+
+def labelled(label: str, texts: Iterable[str]) -> list[str]:
+    """Remarks of one kind, each after the name of the kind."""
+    return [f"{label}: {text}" for text in texts]
 
 
 type Part = str | TableView | None

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
@@ -69,6 +70,12 @@ def legend(figure: Figure, columns: int, panel: Axes | None = None) -> None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     figure.legend(list(handles.values()), list(map(str, handles)), loc="outside lower center", ncols=columns)
+
+
+def banded(axes: Axes, x: np.ndarray, band: np.ndarray, name: str, light: str = SKY, dark: str = BLUE) -> None:
+    """A curve with its 95 % band; `band` has low, mean, high, shape (3, n)."""
+    axes.fill_between(x, band[0], band[2], color=light, alpha=0.4, linewidth=0, label=f"{name}, 95 %")
+    axes.plot(x, band[1], color=dark, linewidth=1.2, label="its mean")
 
 
 def colour_map(stops: Sequence[str]) -> Colormap:

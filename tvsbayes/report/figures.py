@@ -34,8 +34,7 @@ from tvsbayes.report.drawing import (
     drawing,
     legend,
 )
-from tvsbayes.report.parameter_words import share_in_words
-from tvsbayes.report.tables import three_digits
+from tvsbayes.report.tables import share_in_words, three_digits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,32 +14,15 @@ from tvsbayes.head.pointing_model import PointingModel, pointing_model
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.traceability import traceability
-from tvsbayes.report.advice import LAPLACE_SHORT
-from tvsbayes.report.document import Document, FigureView, Issue, Section, about_table
+from tvsbayes.report.document import Document, FigureView, Issue, Section, about_table, labelled
 from tvsbayes.report.figures import intervals
-from tvsbayes.report.fit_sections import stop_views
-from tvsbayes.report.fit_text import validation_lines
+from tvsbayes.report.fit_text import LAPLACE_SHORT, validation_lines
 from tvsbayes.report.page import numbered
-from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
 from tvsbayes.report.result_tables import headline_table
 from tvsbayes.report.scanner_document import answer_table, measured_days, verdict_of
-from tvsbayes.report.tables import TableView, two_digits
+from tvsbayes.report.scanner_sections import stop_views
+from tvsbayes.report.tables import TableView, name_in_words, sentence_in_words, sentences, two_digits
 from tvsbayes.results.fit_record import FitRecord
-
-OPTICS = (
-    "The line of sight is that of two geared axes by exact rotations: the azimuth axis leans, the elevation axis is "
-    "not square to it, nor the line of sight to the elevation axis, and it sags. To first order these are TPOINT's "
-    "terms."
-)
-GEARS = (
-    "Counters drive gears with a ratio, a difference of both directions, play, errors that repeat by position, a zero "
-    "that drifts; every stop has an error of its own."
-)
-LOOKS = {
-    "sighting": "Each sighting gives two residuals on the sphere. Refraction is as the table of sightings has it.",
-    "spot": "Each spot gives three residuals: the four pixels of the stereo pair less the range.",
-}
-"""What a look gives, by its kind."""
 
 
 def pointing_table(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> TableView:
@@ -68,32 +51,21 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
         doubts: warnings of `check`.
     """
     summary, look = record.summary, campaign.looks_table.required[0]
-    weaknesses = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
-    warnings = [*summary.problems, *(f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts)]
-    warnings += [f"`check` warns: {sentence_in_words(text)}" for text in doubts]
-    if summary.estimator == "laplace":
-        warnings.append(LAPLACE_SHORT)
-    validation = [] if summary.validation is None else validation_lines(summary.validation)
-    stops = () if record.evidence is None else record.evidence.residuals
     tables, classic, source = [headline_table(summary)], None, f"The {look}s are taken as stated."
     if campaign.has_images:
         classic, source = classic_of(campaign), traceability(campaign).statement
     else:
         joint = {name: (estimate.value, estimate.sd) for name, estimate in summary.parameters.items()}
         tables.append(pointing_table(pointing_model(campaign), joint))
-    noise, scale = summary.noise, summary.parameters["pixel_scale"].value
-    scatter = f"chi-square {noise.chi2:.1f} for {noise.dof:.1f} degrees of freedom; "
-    scatter += f"{look}s scatter by {scale:.2f} times their stated u."
-    sections = [
-        Section("Result", tables=tables, opened=True),
-        Section("Stops", text=[scatter], figures=[view for axis in AXES for view in stop_views(stops, axis)]),
-        Section(
-            f"What the {look}s do not determine",
-            items=[sentence_in_words(text) for text in weaknesses] or ["No remarks."],
-        ),
-        Section("Signs of model errors", items=validation or ["Not asked."]),
-        Section("Method", text=[OPTICS, GEARS, LOOKS[look]]),
-    ]
+    weak = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
+    tests = [] if summary.validation is None else validation_lines(summary.validation)
+    stops = () if record.evidence is None else record.evidence.residuals
+    noise, scale, method = summary.noise, summary.parameters["pixel_scale"].value, sentences("head_method")
+    scatter = (
+        f"chi-square {noise.chi2:.1f} for {noise.dof:.1f} degrees of freedom; {look}s scatter by {scale:.2f} times "
+        "their stated u."
+    )
+    ratios = FigureView(intervals(summary), "Ratios with 95 % intervals; values in the table", "Effective ratios.")
     return numbered(
         Document(
             results=record.results_id,
@@ -101,14 +73,23 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
             about=about_table(campaign.header, measured_days(campaign, issue), issue),
             verdict=verdict_of(summary, (), doubts),
             answer=answer_table(summary, classic, "the line of sight"),
-            picture=FigureView(
-                intervals(summary), "Ratios with 95 % intervals; values in the table", "Effective ratios."
-            ),
+            picture=ratios,
             steps=[f"`tvsbayes compare CAMPAIGN --by positions` says how well the fit predicts {look}s left out."],
             traceable=source,
-            warnings=warnings,
+            warnings=[
+                *summary.problems,
+                *labelled("Prior conflict", map(sentence_in_words, summary.prior_conflicts)),
+                *labelled("`check` warns", map(sentence_in_words, doubts)),
+                *([LAPLACE_SHORT] if summary.estimator == "laplace" else []),
+            ],
             versions=record.provenance.shown_versions,
-            sections=sections,
+            sections=[
+                Section("Result", tables=tables, opened=True),
+                Section("Stops", text=[scatter], figures=[view for axis in AXES for view in stop_views(stops, axis)]),
+                Section(f"What the {look}s do not determine", items=[*map(sentence_in_words, weak)] or ["No remarks."]),
+                Section("Signs of model errors", items=tests or ["Not asked."]),
+                Section("Method", text=[method["axes"], method["gears"], method[look]]),
+            ],
             title="Calibration of a pan-tilt head",
             issue=issue,
         )

@@ -1,4 +1,4 @@
-"""Tables shared by texts and the page: both estimators, their gap, predictions, budgets of a point.
+"""Tables shared by texts and the page: both estimators, their gap, predictions, budgets, limits.
 
 Units are in captions and heads; numbers have two digits of their uncertainty (GUM 7.2.6).
 """
@@ -6,6 +6,7 @@ Units are in captions and heads; numbers have two digits of their uncertainty (G
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,9 +16,18 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.experiments import name_of
 from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
 from tvsbayes.metrology.look_budget import Budget
-from tvsbayes.report.parameter_words import share_in_words
-from tvsbayes.report.tables import TableView, interval_text, signed, three_digits
-from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
+from tvsbayes.report.tables import (
+    TableView,
+    interval_text,
+    percent,
+    present,
+    sentences,
+    share_in_words,
+    signed,
+    table,
+    three_digits,
+)
+from tvsbayes.results.comparison_record import Gap, HoldOut
 from tvsbayes.results.estimates import Estimate, FitSummary, PeriodEstimate
 
 KEY_PARAMETERS = (
@@ -29,8 +39,16 @@ HEAD_PARAMETERS = tuple(term.name for term in HEAD_TERMS.values())
 """The terms of a head, which follow them."""
 MORE_PARAMETERS = names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm", "home_sd_deg")
 """Parameters of the table of details."""
+GEAR_SCALES = names_of(
+    *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
+    *("creep_deg", "thermal_deg_per_K", "harmonic_amplitude_deg"),
+)
+"""Scales of repeated errors of the gears and of drifts of the zeros."""
 SHARE_SHOWN = 5e-4
 """Least share of a variance in a table: smaller shares are printed as 0.0 %."""
+ESTIMATE_COLUMNS = ("quantity", "value(u)", "95 % interval", "set by")
+"""Columns of `estimate_row`."""
+WAVES = "waves, given that they are there"
 
 
 def classic_table(result: ClassicResult) -> TableView:
@@ -41,8 +59,7 @@ def classic_table(result: ClassicResult) -> TableView:
         if r is None:
             rows.append([direction, "0", "no experiment", "", "", ""])
             continue
-        optional = (r.sd_deg_per_step, r.u_type_a_deg_per_step)
-        sd, u = ("-" if x is None else f"{x:.6f}" for x in optional)
+        sd, u = ("-" if x is None else f"{x:.6f}" for x in (r.sd_deg_per_step, r.u_type_a_deg_per_step))
         # The digits of the interval follow its own u.
         gum = "-" if r.interval95_gum is None else interval_text(*r.interval95_gum, r.u_gum_deg_per_step or 0.0)
         rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
@@ -50,30 +67,18 @@ def classic_table(result: ClassicResult) -> TableView:
     return TableView("classic four-point estimator", columns, rows)
 
 
-PLAY_ALONE = {
-    "cleared": "Its first beam alone was approached in the direction of its steps: they lost no play.",
-    "reversed": "Its first beam alone was approached against the direction of its steps: they lost the play.",
-    "unknown": "How its first beam alone was approached is not known: its steps may have lost no play.",
-}
-
-
 def outlier_lines(result: ClassicResult) -> list[str]:
     """Every experiment that makes the sd of its direction, and what the sd is without it."""
     lines = []
     for direction, r in result.directions.items():
-        if r is None or r.sd_deg_per_step is None or (one := r.outlier) is None:
-            continue
-        lines.append(
-            f"Experiment {name_of(direction, one.experiment)} with {one.deg_per_step:.6f} deg/step makes the sd: "
-            f"{r.sd_deg_per_step:.6f}, without it {one.sd_without_deg_per_step:.6f} and mean "
-            f"{one.mean_without_deg_per_step:.6f} (Grubbs' test, p {one.p:.1g})."
-        )
-        lines += [PLAY_ALONE[one.play_alone]] if one.play_alone else []
+        if r is not None and r.sd_deg_per_step is not None and (one := r.outlier) is not None:
+            lines.append(
+                f"Experiment {name_of(direction, one.experiment)} with {one.deg_per_step:.6f} deg/step makes the sd: "
+                f"{r.sd_deg_per_step:.6f}, without it {one.sd_without_deg_per_step:.6f} and mean "
+                f"{one.mean_without_deg_per_step:.6f} (Grubbs' test, p {one.p:.1g})."
+            )
+            lines += [sentences("first_beam_alone")[one.play_alone]] if one.play_alone else []
     return lines
-
-
-ESTIMATE_COLUMNS = ("quantity", "value(u)", "95 % interval", "set by")
-"""Columns of `estimate_row`."""
 
 
 def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
@@ -81,49 +86,38 @@ def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
     label = f"{label}, {unit}" if unit else label
     if estimate is None:
         return [label, "never moved", "", ""]
-    origin = "fixed" if estimate.contraction is None else ("data" if estimate.informed else "prior")
+    origin = "fixed" if estimate.contraction is None else "data" if estimate.informed else "prior"
     interval = interval_text(*estimate.interval95, estimate.sd)
     return [label, concise(estimate.value, estimate.sd), interval, origin]
 
 
-def _estimate_rows(estimates: Mapping[str, Estimate | None], names: Iterable[str]) -> list[list[str]]:
-    """Rows of those of the named quantities that there are."""
-    quantities = (QUANTITIES[name] for name in names if name in estimates)
-    return [estimate_row(quantity.label, estimates[quantity.name], quantity.unit_text) for quantity in quantities]
+def _estimates(caption: str, estimates: Mapping[str, Estimate | None], names: Iterable[str]) -> TableView:
+    """Those of the named quantities that there are."""
+    quantities = [QUANTITIES[name] for name in names if name in estimates]
+    rows = [estimate_row(quantity.label, estimates[quantity.name], quantity.unit_text) for quantity in quantities]
+    return TableView(caption, ESTIMATE_COLUMNS, rows)
 
 
 def headline_table(summary: FitSummary) -> TableView:
     """Ratios, contrasts and key parameters of the joint estimator: the last table of a fit."""
     pose = summary.reference_pose_deg
+    kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
+    title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     estimates = {f"effective_deg_per_step.{part}": e for part, e in summary.effective.items()}
     estimates |= {
         f"effective_contrast_deg_per_step.{part}": e for part, e in summary.contrasts.items() if e is not None
     }
     estimates |= {n: summary.parameters[n] for n in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if n in summary.parameters}
-    kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
-    title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     in_sums = {name for weak in summary.weak_directions if weak.of_sums for name in weak.loadings}
-    rows = _estimate_rows(estimates, estimates)
-    rows = [[*row[:-1], "sum"] if name in in_sums else row for name, row in zip(estimates, rows, strict=True)]
-    return TableView(title, ESTIMATE_COLUMNS, rows)
+    view = _estimates(title, estimates, estimates)
+    rows = [[*row[:-1], "sum"] if name in in_sums else row for name, row in zip(estimates, view.rows, strict=True)]
+    return replace(view, rows=rows)
 
 
-def details_table(summary: FitSummary) -> TableView:
-    """Pose of the positioner, and L."""
-    rows = _estimate_rows(summary.parameters, MORE_PARAMETERS)
-    return TableView("the positioner in frame S (the left camera's)", ESTIMATE_COLUMNS, rows)
-
-
-def range_text(summary: FitSummary) -> str:
-    """Range of counters of the effective ratios."""
-    return ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in summary.range_steps.items()) + " steps"
-
-
-GEAR_SCALES = names_of(
-    *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
-    *("creep_deg", "thermal_deg_per_K", "harmonic_amplitude_deg"),
-)
-"""Scales of repeated errors of the gears and of drifts of the zeros."""
+def details_table(summary: FitSummary) -> TableView | None:
+    """Pose of the positioner, and L; None for a head with sightings, which has no camera frame."""
+    caption = "the positioner in frame S (the left camera's)"
+    return present(_estimates(caption, summary.parameters, MORE_PARAMETERS))
 
 
 def gears_table(summary: FitSummary) -> TableView | None:
@@ -131,52 +125,57 @@ def gears_table(summary: FitSummary) -> TableView | None:
     names = [name for name in GEAR_SCALES if name in summary.parameters]
     if not any(name.startswith(("transmission", "play", "harmonic")) for name in names):
         return None
-    return TableView("gears: what repeats by position", ESTIMATE_COLUMNS, _estimate_rows(summary.parameters, names))
+    return _estimates("gears: what repeats by position", summary.parameters, names)
 
 
-WAVES = "waves, given that they are there"
-WAVE_COLUMNS = [
-    *("", "amplitude(u) every period(u)", "amplitude, 95 %", "period, 95 %"),
-    *("phase(u), deg", "there is a wave"),
-]
+def range_text(summary: FitSummary) -> str:
+    """Range of counters of the effective ratios."""
+    return ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in summary.range_steps.items()) + " steps"
 
 
-def wave_row(name: str, wave: PeriodEstimate, unit: str, period_unit: str) -> list[str]:
-    """A row of `WAVE_COLUMNS`; `unit` is that of the amplitude."""
-    stated = wave.source == "stated"
-    period = f"{wave.period.value:.10g}" if stated else concise(wave.period.value, wave.period.sd)
-    amplitude = f"{concise(wave.amplitude.value, wave.amplitude.sd)} {unit}"
-    amplitude95 = interval_text(*wave.amplitude.interval95, wave.amplitude.sd)
-    period95 = "stated" if stated else interval_text(*wave.period.interval95, wave.period.sd)
-    phase = concise(wave.phase_deg.value, wave.phase_deg.sd)
-    return [name, f"{amplitude} every {period} {period_unit}", amplitude95, period95, phase, percent(wave.probability)]
+def waves_table(waves: Iterable[tuple[str, PeriodEstimate, str]], unit: str, zero: str) -> TableView | None:
+    """Waves with name and unit of the period; None where there are none.
+
+    `unit` is that of the amplitude, `zero` where the phase is counted from.
+    """
+
+    def period(wave: PeriodEstimate) -> str:
+        return f"{wave.period.value:.10g}" if wave.source == "stated" else concise(wave.period.value, wave.period.sd)
+
+    def ends(of: Estimate) -> str:
+        return interval_text(*of.interval95, of.sd)
+
+    columns = {
+        "": lambda row: row[0],
+        "amplitude(u) every period(u)": lambda row: (
+            f"{concise(row[1].amplitude.value, row[1].amplitude.sd)} {unit} every {period(row[1])} {row[2]}"
+        ),
+        "amplitude, 95 %": lambda row: ends(row[1].amplitude),
+        "period, 95 %": lambda row: "stated" if row[1].source == "stated" else ends(row[1].period),
+        "phase(u), deg": lambda row: concise(row[1].phase_deg.value, row[1].phase_deg.sd),
+        "there is a wave": lambda row: percent(row[1].probability),
+    }
+    return present(table(f"{WAVES}; phase at {zero} 0", waves, columns))
 
 
-def percent(probability: float) -> str:
-    """A probability from draws, never printed as 0 or 100 %."""
-    return "> 99.9 %" if probability > 0.999 else "< 0.1 %" if probability < 0.001 else f"{100 * probability:.1f} %"
-
-
-def waves_table(summary: FitSummary) -> TableView | None:
+def rig_waves_table(summary: FitSummary) -> TableView | None:
     """Waves of the periods that the rig states; None where there are none."""
-    rows = [wave_row(wave.axis, wave, "deg", "deg") for wave in summary.periods]
-    return TableView(f"{WAVES}; phase at counter 0", WAVE_COLUMNS, rows) if rows else None
+    return waves_table([(wave.axis, wave, "deg") for wave in summary.periods], "deg", "counter")
 
 
 def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
     """The gap between both estimators by its terms, for the directions that have one."""
     stated = {direction: gap for direction, gap in gaps.items() if gap is not None}
-
-    def cell(term: GapTerm) -> str:
-        return signed(term.value, term.sd)
-
+    first = next(iter(stated.values()))
     rows = [
         ["classic mean", *(f"{gap.classic:.6f}" for gap in stated.values())],
         ["effective ratio (joint)", *(concise(gap.joint.value, gap.joint.sd) for gap in stated.values())],
-        ["classic - joint", *(cell(gap.total) for gap in stated.values())],
+        ["classic - joint", *(signed(gap.total.value, gap.total.sd) for gap in stated.values())],
+        *(
+            [f"  {term.name}", *(signed(gap.terms[k].value, gap.terms[k].sd) for gap in stated.values())]
+            for k, term in enumerate(first.terms)
+        ),
     ]
-    for number, term in enumerate(next(iter(stated.values())).terms):
-        rows.append([f"  {term.name}", *(cell(gap.terms[number]) for gap in stated.values())])
     return TableView("why the classic differs from the joint, deg/step, value(u)", ["", *stated], rows)
 
 
@@ -184,18 +183,15 @@ def hold_out_table(hold_out: HoldOut) -> TableView | None:
     """Predictions of left-out angles by both estimators; None where there are none."""
     if hold_out.classic is None or hold_out.joint is None:
         return None
-    rows = [
-        [
-            name,
-            f"{score.rms_deg:.3f}",
-            f"{score.rms_block_deg:.3f}",
-            f"{100 * score.coverage:.0f} %",
-            f"{score.log_density:+.2f}",
-        ]
-        for name, score in (("classic", hold_out.classic), ("joint", hold_out.joint))
-    ]
-    columns = ["", "rms error", "rms of block means", "inside 95 %", "log density"]
-    return TableView(f"angles of {len(hold_out.predictions)} experiments left out by {hold_out.by}, deg", columns, rows)
+    columns = {
+        "": lambda row: row[0],
+        "rms error": lambda row: f"{row[1].rms_deg:.3f}",
+        "rms of block means": lambda row: f"{row[1].rms_block_deg:.3f}",
+        "inside 95 %": lambda row: f"{100 * row[1].coverage:.0f} %",
+        "log density": lambda row: f"{row[1].log_density:+.2f}",
+    }
+    caption = f"angles of {len(hold_out.predictions)} experiments left out by {hold_out.by}, deg"
+    return table(caption, (("classic", hold_out.classic), ("joint", hold_out.joint)), columns)
 
 
 def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") -> TableView:

@@ -1,4 +1,4 @@
-"""The document of a scanner: verdict, results of both estimators, errors in mm, warnings, next steps; its sections.
+"""The document of a scanner: verdict, results of both estimators, errors in mm, warnings, next steps.
 
 Ratios in deg/step, lost motion in deg, distances in mm.
 """
@@ -15,23 +15,34 @@ from tvsbayes.display import concise
 from tvsbayes.errors import typed
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.estimators.plausibility import misfit_causes
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.conformity import Criterion
 from tvsbayes.metrology.traceability import performed, traceability
 from tvsbayes.report import figures
-from tvsbayes.report.advice import LAPLACE_SHORT, assumed_stereo, next_steps, verdict_line
 from tvsbayes.report.compensation_text import verified_section
-from tvsbayes.report.criteria import COLOUR, WORST_FIRST, criteria_table
-from tvsbayes.report.document import Document, FigureView, Issue, Number, Verdict, about_table, sentence
+from tvsbayes.report.document import Document, FigureView, Issue, Number, Verdict, about_table, labelled, sentence
 from tvsbayes.report.drawing import ESTIMATOR_STYLE
-from tvsbayes.report.evidence import SATISFIED, Evidence
-from tvsbayes.report.fit_sections import fit_sections
-from tvsbayes.report.fit_text import validation_lines
+from tvsbayes.report.evidence import COLOUR, SATISFIED, WORST_FIRST, Evidence, criteria_table
+from tvsbayes.report.fit_text import (
+    LAPLACE_SHORT,
+    assumed_stereo,
+    failed,
+    next_steps,
+    validation_lines,
+    verdict_line,
+)
 from tvsbayes.report.page import numbered
-from tvsbayes.report.parameter_words import cause_in_words, sentence_in_words
-from tvsbayes.report.tables import TableView, chance_text, interval_text, two_digits
-from tvsbayes.report.uncertainty_sections import uncertainty_sections
+from tvsbayes.report.scanner_sections import fit_sections, uncertainty_sections
+from tvsbayes.report.tables import (
+    TableView,
+    cause_in_words,
+    chance_text,
+    interval_text,
+    sentence_in_words,
+    sentences,
+    two_digits,
+)
 from tvsbayes.results.estimates import Estimate, FitSummary
 
 NO_CLASSIC = "not estimated"
@@ -39,10 +50,6 @@ ASYMMETRY_MAX = 1.5
 """Largest ratio of the distances of an interval's ends from the value for which half the interval is stated as U."""
 CAUSES_LISTED = 3
 """Number of listed causes of a point's uncertainty; the section on budgets has all."""
-NO_APERTURE = (
-    "The campaign has no aperture readings: baseline, emission angle at pan 0 and the aperture's zero are as stated "
-    "for every calibration. The errors in mm hold if the statement does, and calibrations differ by the beam alone."
-)
 
 
 def report_document(e: Evidence, issue: Issue | None = None) -> Document:
@@ -82,30 +89,26 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
     """
     if not summary.explained:
         return Verdict("NOT CONVERGED: the numbers below must not be used", "not-met")
-    validation = summary.validation
-    failed = "" if validation is None or validation.passed else validation_lines(validation)[0] + ". "
-    if failed and not criteria:
-        return Verdict(f"{failed}No limit was stated", "cannot-tell")
+    validation = failed(summary)
+    failure = "" if validation is None else f"{validation_lines(validation)[0]}. "
     if not criteria:
         usable = verdict_line(summary).removeprefix("verdict: ") + "; see the warnings of check" * bool(doubts)
-        return Verdict(f"{sentence(usable)} No limit was stated", "cannot-tell")
+        return Verdict(f"{failure or f'{sentence(usable)} '}No limit was stated", "cannot-tell")
     judgements = []
     for verdict in WORST_FIRST:
-        criteria_of_verdict = [c for c in criteria if c.verdict == verdict]
-        limits = dict.fromkeys((c.limit, c.unit) for c in criteria_of_verdict)
-        for limit, unit in limits:
-            same_limit = [c for c in criteria_of_verdict if (c.limit, c.unit) == (limit, unit)]
+        of_verdict = [c for c in criteria if c.verdict == verdict]
+        for limit, unit in dict.fromkeys((c.limit, c.unit) for c in of_verdict):
+            same_limit = [c for c in of_verdict if (c.limit, c.unit) == (limit, unit)]
             chances = [c.probability or 0.0 for c in same_limit]
             misses = COLOUR[verdict] == "not-met"
             bound = "" if len(same_limit) == 1 else "at most " if misses else "at least "
             worst = chance_text(max(chances) if misses else min(chances), bound)
             names = ", ".join(c.quantity for c in same_limit)
             judgements.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
-    text, (worst, _) = "; ".join(sentence for _, sentence in judgements), judgements[0]
-    prefix = ""
-    if failed and validation is not None:
-        prefix = "With that factor: " if validation.widens else "As fitted: "
-    return Verdict(failed + prefix + text[0].upper() + text[1:], COLOUR[worst])
+    text, worst_verdict = "; ".join(judgement for _, judgement in judgements), judgements[0][0]
+    if validation is not None:
+        failure += "With that factor: " if validation.widens else "As fitted: "
+    return Verdict(failure + text[0].upper() + text[1:], COLOUR[worst_verdict])
 
 
 def measured_days(campaign: Campaign, issue: Issue) -> str:
@@ -120,30 +123,28 @@ def answer_table(summary: FitSummary, classic: ClassicResult | None, object_name
 
     Ratios of both directions that are equal as printed share a row.
     """
-    rows, applicable = [], classic is not None
-    for direction in DIRECTIONS:
-        pair = next(pair for pair in SENSES.values() if direction in pair)
-        cells = _cells(summary.effective[direction])
-        if not applicable and all(_cells(summary.effective[d]) == cells for d in pair):
-            if direction == pair[0]:
-                rows.append([f"{' and '.join(pair)}, deg/step", *cells])
+    rows, extra = [], [NO_CLASSIC] if classic is not None else []
+    for pair in SENSES.values():
+        cells = [_cells(summary.effective[direction]) for direction in pair]
+        if classic is None and cells[0] == cells[1]:
+            rows.append([f"{' and '.join(pair)}, deg/step", *cells[0]])
             continue
-        four_point = None if classic is None else classic.directions[direction]
-        classic_cell = "no experiment"
-        if four_point is not None:
-            mean = concise(four_point.mean_deg_per_step, four_point.u_gum_deg_per_step or 0.0)
-            classic_cell = f"{mean}, n = {four_point.n}"
-        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[classic_cell] * applicable])
+        for direction, of_direction in zip(pair, cells, strict=True):
+            four_point = None if classic is None else classic.directions[direction]
+            classic_cell = "no experiment"
+            if four_point is not None:
+                mean = concise(four_point.mean_deg_per_step, four_point.u_gum_deg_per_step or 0.0)
+                classic_cell = f"{mean}, n = {four_point.n}"
+            rows.append([f"{direction}, deg/step", *of_direction, *[classic_cell] * len(extra)])
     for axis, pair in SENSES.items():
         if (contrast := summary.contrasts[axis]) is not None:
-            rows.append([f"{' - '.join(pair)}, \u00b5deg/step", *_cells(scaled(contrast, 1e6)), *[""] * applicable])
+            rows.append([f"{' - '.join(pair)}, \u00b5deg/step", *_cells(scaled(contrast, 1e6)), *[""] * len(extra)])
     for axis in AXES:
-        play = _cells(summary.parameters[f"backlash_deg.{axis}"])
-        rows.append([f"backlash {axis}, deg", *play, *[NO_CLASSIC] * applicable])
+        rows.append([f"backlash {axis}, deg", *_cells(summary.parameters[f"backlash_deg.{axis}"]), *extra])
     pose = summary.reference_pose_deg
     pose_text = f"pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     caption = f"Degrees of {object_name} per motor step at {pose_text}, and play; U: half the 95 % interval"
-    columns = ["", "joint value(u)", "95 % interval", "U, 95 %", *["classic value(u)"] * applicable]
+    columns = ["", "joint value(u)", "95 % interval", "U, 95 %", *["classic value(u)"] * len(extra)]
     return TableView(caption, columns, rows)
 
 
@@ -160,23 +161,19 @@ def _cells(estimate: Estimate | None) -> list[str]:
     if estimate is None:
         return ["never moved", "", ""]
     low, high = estimate.interval95
-    interval = interval_text(low, high, estimate.sd)
     near, far = sorted((estimate.value - low, high - estimate.value))
     half = two_digits(0.5 * (high - low)) if far <= ASYMMETRY_MAX * near or far == near else ""
-    return [concise(estimate.value, estimate.sd), interval, half]
+    return [concise(estimate.value, estimate.sd), interval_text(low, high, estimate.sd), half]
 
 
 def both_estimators(e: Evidence) -> FigureView:
     """Ratios of both estimators with their intervals; without experiments only the joint ones."""
-    picture = figures.intervals(e.fit.summary, e.classic)
+    whose, caption = "both estimators", "Effective ratios, joint (circles) and classic (triangles)."
     if e.classic is None:
+        whose = ""
         caption = "Effective ratios. The classic method needs four-point experiments: the campaign has none."
-        return FigureView(picture, "Ratios with 95 % intervals; values in the table beside it", caption)
-    return FigureView(
-        picture,
-        "Ratios of both estimators with 95 % intervals; values in the table beside it",
-        "Effective ratios, joint (circles) and classic (triangles).",
-    )
+    alt = f"Ratios {f'of {whose} ' * bool(whose)}with 95 % intervals; values in the table beside it"
+    return FigureView(figures.intervals(e.fit.summary, e.classic), alt, caption)
 
 
 def point_errors(e: Evidence) -> list[Number]:
@@ -195,25 +192,25 @@ def step_sizes(e: Evidence) -> list[str]:
             mm = e.range_mm * math.radians(sum(abs(ratio.value) for ratio in ratios) / len(ratios))
             u_mm = e.range_mm * math.radians(max(ratio.sd for ratio in ratios))
             sizes.append(f"{concise(mm, u_mm)} mm in {axis}")
-    if not sizes:
-        return []
-    return [f"At {e.range_mm:g} mm one step moves the spot by about {' and '.join(sizes)}, across the beam."]
+    about = f"At {e.range_mm:g} mm one step moves the spot by about {' and '.join(sizes)}, across the beam."
+    return [about] if sizes else []
 
 
 def error_sources(e: Evidence) -> list[str]:
     """What errors in mm rest on; causes of the joint calibration's error, and of the last simple calibration's."""
     order = np.argsort(-e.budget.share)[:CAUSES_LISTED]
     causes = ", ".join(f"{cause_in_words(e.budget.causes[k])} {100 * e.budget.share[k]:.0f} %" for k in order)
-    sentences = [] if e.campaign.aperture_read else [NO_APERTURE]
-    sentences += [f"Causes of the remaining error of the joint one, as shares of the variance: {causes}."]
-    for name, error in list(e.simple_errors.items())[-1:]:
-        sentences.append(
+    return [
+        *([] if e.campaign.aperture_read else [sentences("sections")["no_aperture"]]),
+        f"Causes of the remaining error of the joint one, as shares of the variance: {causes}.",
+        *(
             f"Error of {name} there: its beam points {error.azimuth_deg:+.2f} deg in azimuth and "
             f"{error.elevation_deg:+.2f} deg in elevation from the joint one (ratios, lost motion, mirrors), which "
             f"alone makes {_mm(error.by_direction_mm)}; where it takes beam and aperture to stand, and the aperture's "
             f"zero, alone make {_mm(error.by_place_mm)}."
-        )
-    return sentences
+            for name, error in list(e.simple_errors.items())[-1:]
+        ),
+    ]
 
 
 def _mm(value: float) -> str:
@@ -224,25 +221,23 @@ def _mm(value: float) -> str:
 
 def warnings_of(e: Evidence) -> list[str]:
     """Warnings for the user of the numbers, besides the verdict and the next steps."""
-    summary = e.fit.summary
-    warnings = list(summary.problems)
-    if summary.estimator == "laplace":
-        warnings.append(LAPLACE_SHORT)
-    if e.campaign.header.get("synthetic"):
-        warnings.append("The campaign is synthetic: made by the digital twin, not measured.")
-    if (note := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
-        warnings.append(sentence(note))
-    warnings += [f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts]
-    warnings += [f"`check` warns: {sentence_in_words(text)}" for text in e.doubts]
-    return warnings
+    summary, assumed = e.fit.summary, assumed_stereo(e.campaign.stereo, e.shown.budgets)
+    synthetic = "The campaign is synthetic: made by the digital twin, not measured."
+    return [
+        *summary.problems,
+        *([LAPLACE_SHORT] if summary.estimator == "laplace" else []),
+        *([synthetic] if e.campaign.header.get("synthetic") else []),
+        *([] if assumed is None else [sentence(assumed)]),
+        *labelled("Prior conflict", map(sentence_in_words, summary.prior_conflicts)),
+        *labelled("`check` warns", map(sentence_in_words, e.doubts)),
+    ]
 
 
 def _steps(e: Evidence) -> list[str]:
     """Next steps: those of the fit, then the best of a plan; the plan's own section has all."""
     folder = "CAMPAIGN" if e.campaign.path is None else typed(e.campaign.path.resolve().name)
     summary = e.fit.summary
-    failed = not summary.explained
-    causes = misfit_causes(e.campaign, summary.parameters["pixel_scale"].value) if failed else ()
+    causes = () if summary.explained else misfit_causes(e.campaign, summary.parameters["pixel_scale"].value)
     steps = next_steps(summary, folder, causes)
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
@@ -256,7 +251,7 @@ def _steps(e: Evidence) -> list[str]:
         steps.append(f"Add looks until the limit is met; the fewest: {command}.")
     if not steps:
         steps.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
-    if not e.criteria and e.fit.summary.converged:
+    if not e.criteria and summary.converged:
         limit = f"`tvsbayes report {folder} --limit-mm 5`, or `--limit-deg-per-step 0.0005`"
         steps.append(f"State the largest permissible error; the page then says whether it is met: {limit}.")
     return steps

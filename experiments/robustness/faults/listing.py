@@ -152,7 +152,7 @@ FAULTS = (
     # Judging a fit, comparing, watching.
     Fault("a fit's degrees of freedom are n instead of n - p", "summarise", Local("determined", "0.0"),
           "test_dof_counts_spots_less_what_they_determine"),
-    Fault("a failed validation is no verdict", "advice.failed", Returns("None"),
+    Fault("a failed validation is no verdict", "fit_text.failed", Returns("None"),
           "test_no_reader_of_the_text_can_miss_a_failure"),
     Fault("cameras that two campaigns share count twice", "changes.compare", Local("shared", "False"),
           "test_a_calibration_has_not_changed_from_itself"),
