@@ -41,7 +41,7 @@ FREE = (
     (r"\b[\d.]+ (s|min|seconds)\b", "SECONDS"),
     (r'"(seconds|cpu_s|wall_s|elapsed_s)": [\d.e-]+', r'"\1": SECONDS'),
     (r'"command": "tvsbayes [^"]*"|Command: tvsbayes write \S+', "COMMAND"),
-    (r"\b[0-9A-F]{12}\b|sha256-[\w+/=]+", "HASH"),
+    (r"\b(?=\d*[A-F])[0-9A-F]{12}\b|sha256-[\w+/=]+", "HASH"),
 )
 """What two runs of one tree have otherwise."""
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")

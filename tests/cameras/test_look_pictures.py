@@ -72,6 +72,39 @@ def test_numbers_of_experiments_are_no_moves(tmp_path, form):
     assert {spot.move for spot in pair_looks(views, None, matching="number").spots} == {1, 2, 3}
 
 
+@pytest.mark.parametrize(
+    ("names", "counted"),
+    [
+        (("pan+000_tilt+000", "pan+000_tilt+040", "pan+060_tilt+000"), "counters"),
+        (("az5.0_el0.0", "az5.0_el5.0", "az10.0_el0.0"), "counters"),
+        (("pan0", "pan100", "pan200"), "counters"),
+        (("exp01_P1", "exp01_P2", "exp01_P3"), "points of experiments"),
+    ],
+)
+def test_numbers_of_something_else_are_no_moves(tmp_path, names, counted):
+    """Counters stand in names as often as numbers of moves do."""
+    drawn(tmp_path, *pairs(*(f"_{name}" for name in names)))
+    views = views_of(tmp_path).views
+    for moves in (None, range(201)):
+        with pytest.raises(Question, match=f"numbers of {counted} in the names"):
+            pair_looks(views, moves)
+    assert [spot.move for spot in pair_looks(views, None, matching="order").spots] == [0, 1, 2]
+
+
+def test_pictures_of_no_look_are_left_out_and_named(tmp_path):
+    """Dark frames, backgrounds and the board, by words in their names or folders."""
+    drawn(tmp_path, *pairs("_00_on", "_00_off", "_01_on", "_01_off", "_background"))
+    found = views_of(tmp_path)
+    assert [view.numbers for view in found.views] == [[0], [1]]
+    assert [name for name in found.without_spot if "left" in name] == [
+        *("left_00_off.png", "left_01_off.png", "left_background.png"),
+    ]
+    boards = tmp_path / "boards"
+    boards.mkdir()
+    drawn(boards, *pairs("_calib_1", "_calib_2"))
+    assert len(views_of(boards).views) == 2 and not views_of(boards).without_spot
+
+
 def test_rows_without_pictures_take_their_own(tmp_path):
     drawn(tmp_path, *pairs("3", "5"))
     numbers = (0.1,) * 4

@@ -23,11 +23,13 @@ from tvsbayes.cameras.picture_pairs import (
     directions_in,
     is_experiment,
     natural_order,
+    picture_words,
     read_folder,
 )
 from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, IMAGE_PIXELS_MAX, PNG_SIGNATURE, decode_image, png_bytes
+from tvsbayes.importing.words import vocabulary
 from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Spot, frame_name
 from tvsbayes.progress import Advance, unshown
 
@@ -57,11 +59,16 @@ class View:
         """Numbers in the name, in order."""
         return [int(number) for number in _NUMBER.findall(self.name)]
 
-    def is_of_experiment(self, position: int) -> bool:
-        """Whether one of its numbers counts experiments, not moves: exp01_P1."""
+    def word_before(self, position: int) -> str:
+        """The word before one of its numbers; "" for none."""
         number = list(_NUMBER.finditer(self.name))[position]
-        word = re.search(r"([a-z]+)[ _.#-]*$", self.name[: number.start()].lower())
-        return word is not None and is_experiment(word[1])
+        word = re.search(r"([a-z]+)[ _.#=+-]*$", self.name[: number.start()].lower())
+        return "" if word is None else word[1]
+
+    @property
+    def without_spot(self) -> bool:
+        """Whether a word of its name says that no spot is looked for: dark, background, calib."""
+        return bool({*re.findall(r"[^\W\d_]+", self.name.lower())} & picture_words()["no_look"])
 
     def without_number(self, position: int) -> str:
         """The name without one of its numbers: the rest may name the sheet."""
@@ -81,6 +88,7 @@ class ViewedFolder:
         unnamed: files without a camera in their names, or in folders below the pairs.
         other_size: files of another size than most.
         unread: files in formats that are not read.
+        without_spot: files of pairs that show no spot, by a word in their name.
     """
 
     views: tuple[View, ...]
@@ -89,6 +97,7 @@ class ViewedFolder:
     unnamed: tuple[str, ...]
     other_size: tuple[str, ...]
     unread: tuple[str, ...]
+    without_spot: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -136,13 +145,17 @@ def views_of(folder: Path, *, swap: bool = False, globs: tuple[str, str] | None 
         allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
         place = escaped(str(folder), 200)
         raise refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
+    views = tuple(View(n, (complete[n]["left"], complete[n]["right"])) for n in sorted(complete, key=natural_order))
+    # Where all are called so, the word is none of these.
+    looks = tuple(view for view in views if not view.without_spot) or views
     return ViewedFolder(
-        views=tuple(View(n, (complete[n]["left"], complete[n]["right"])) for n in sorted(complete, key=natural_order)),
+        views=looks,
         image_sizes=dict(pictures.usual),
         unpaired=tuple(p.name for pair in by_view.values() if len(pair) == 1 for p in pair.values()),
         unnamed=pictures.left_out(),
         other_size=pictures.other_size,
         unread=pictures.left_out(OTHER_SUFFIXES),
+        without_spot=tuple(p.name for view in views if view not in looks for p in dict.fromkeys(view.pictures)),
     )
 
 
@@ -172,7 +185,7 @@ def pair_looks(
 
     Raises:
         InputError: neither numbers nor counts match.
-        Question: the numbers are those of experiments, and nothing says at which moves they were seen.
+        Question: the numbers are those of experiments or counters, and nothing says at which moves they were seen.
     """
     waiting = [spot.spot for spot in rows if spot.status == UNDETECTED and spot.u_left_px is None]
     if rows and not waiting:
@@ -183,8 +196,8 @@ def pair_looks(
     names, renumbered = [""] * len(views), None
     if slot is not None:
         stated, names = [view.numbers[slot] for view in views], [view.without_number(slot) for view in views]
-        if matching is None and _are_experiments(views, slot, names):
-            raise _question(views[0], stated[0])
+        if matching is None and (counted := _counted(views, slot, names)):
+            raise _question(views[0], stated[0], counted)
         # A day before a time of day counts too.
         times = [tuple(view.numbers[: slot + 1]) for view in views]
         numbers = stated
@@ -206,18 +219,26 @@ def pair_looks(
     return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, method, (), without, renumbered)
 
 
-def _are_experiments(views: Sequence[View], slot: int, names: Sequence[str]) -> bool:
-    """Whether numbers that repeat are those of experiments, by the word before them or a direction beside them."""
-    if len({view.numbers[slot] for view in views}) == len(views):
-        return False
-    return any(map(directions_in, names)) or any(view.is_of_experiment(slot) for view in views)
+def _counted(views: Sequence[View], slot: int, names: Sequence[str]) -> str:
+    """What the numbers at a place count where they are none of moves, by the words beside them; else ""."""
+    words = {view.word_before(slot) for view in views}
+    if words & picture_words()["counter"]:
+        return "counters"
+    numbered = [any(is_experiment(view.word_before(k)) for k in range(len(view.numbers))) for view in views]
+    points = {"p", *(word for (word,) in vocabulary("point", "looks.toml"))}
+    if any(numbered) and words <= points:
+        return "points of experiments"
+    repeated = len({view.numbers[slot] for view in views}) < len(views)
+    if repeated and (any(map(directions_in, names)) or any(map(is_experiment, words))):
+        return "experiments"
+    return ""
 
 
-def _question(view: View, number: int) -> InputError:
-    """The question at which moves pictures were seen whose numbers are those of experiments."""
+def _question(view: View, number: int, counted: str) -> InputError:
+    """The question at which moves pictures were seen whose names have numbers of something else."""
     return question(
         file=escaped(str(view.pictures[0].path), 200),
-        found=f"numbers of experiments in the names ({number} in {escaped(view.name, 80)}), which repeat",
+        found=f"numbers of {counted} in the names ({number} in {escaped(view.name, 80)})",
         allowed="the number of the move, or a lab book that says at which move each picture was taken: `tvsbayes "
         "import BOOK.csv --to CAMPAIGN --relative --pictures FOLDER`",
         candidates=(

@@ -274,7 +274,8 @@ _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\dA-Za-z_]+")
 
 
 @cache
-def _words() -> dict[str, frozenset[str]]:
+def picture_words() -> dict[str, frozenset[str]]:
+    """Words in names of pictures by what they say, in all languages."""
     content = tomllib.loads((shipped_data() / "words" / "pictures.toml").read_text("utf-8"))
     return {name: frozenset(" ".join(languages.values()).split()) for name, languages in content.items()}
 
@@ -285,7 +286,7 @@ def _stem(name: str) -> str:
 
 def _side_of(word: str) -> str:
     """The side that a word names, alone or joined to another word: leftcam, camL; "" for none."""
-    words = _words()
+    words = picture_words()
     for side in CAMERAS:
         for own in words[side]:
             rest = word.removeprefix(own) if word.startswith(own) else word.removesuffix(own)
@@ -304,7 +305,7 @@ def direction_of(word: str) -> str:
     """The direction of motion that a word names: left, right, up, down; "" for none."""
     if len(word) == 1:
         return ""
-    return next((name for name in (*CAMERAS, "up", "down") if word in _words()[name]), "")
+    return next((name for name in (*CAMERAS, "up", "down") if word in picture_words()[name]), "")
 
 
 def directions_in(text: str) -> list[str]:
@@ -314,7 +315,7 @@ def directions_in(text: str) -> list[str]:
 
 def _marks(path: str, numbered: frozenset[str]) -> Iterator[_Mark]:
     """The words of cameras in a path without suffix; `numbered` words make a camera of the number behind them."""
-    words, start = _words(), 0
+    words, start = picture_words(), 0
     parts = path.split("/")
     for depth, part in zip(range(len(parts), 0, -1), parts, strict=True):
         tokens = list(_TOKENS.finditer(part))
@@ -361,7 +362,7 @@ def named_cameras(
         sides: cameras of the smaller and the larger number.
         numbered: words that make a camera of the number behind them; None: camera and its translations.
     """
-    numbered = _words()["camera"] if numbered is None else numbered
+    numbered = picture_words()["camera"] if numbered is None else numbered
     # Without accents.
     letters = {name: unicodedata.normalize("NFKD", _stem(name)) for name in names}
     paths = {name: "".join(c for c in path if not unicodedata.combining(c)) for name, path in letters.items()}
@@ -436,7 +437,7 @@ def _guessed(images: Sequence[str], named: Named, pairing: Pairing) -> dict[str,
     last = {name: match for name, stem in stems.items() if (match := re.search(r"[_-]0*([0-9]{1,9})$", stem))}
     numbers = sorted({int(match[1]) for match in last.values()})
     of_folder = _of_two_folders(images, pairing.sides)
-    guesses = [named_cameras(images, pairing.sides, _words()["perhaps"] | _words()["camera"])]
+    guesses = [named_cameras(images, pairing.sides, picture_words()["perhaps"] | picture_words()["camera"])]
     if len(numbers) == 2:
         guesses.append(
             {n: Key(stems[n][: m.start()], pairing.sides[numbers.index(int(m[1]))]) for n, m in last.items()}

@@ -236,6 +236,7 @@ def _unpaired_lines(views: ViewedFolder, pairs: PairedLooks, rows: str) -> list[
         f"not of {_sizes_px(views.image_sizes)} as most": views.other_size,
         "of a kind that is not read; save them as PNG of 8 bits": views.unread,
         "a second pair for its row": pairs.left_over,
+        "of no look, by its name": views.without_spot,
     }
     lines = [
         f"{len(names)} files: " * (len(names) > 1) + f"{named(names, NAMES_LISTED)}: {reason}"
