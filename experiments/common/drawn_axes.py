@@ -1,4 +1,4 @@
-"""Drawn axes: driven anywhere, also by what a table adds, or at constant rate; read; scored against their truth."""
+"""Drawn axes: driven anywhere, also by what a table adds, or at constant rate; read."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from experiments.common.page import line
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.waves import WavePeriods
-from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
 from tvsbayes.twin.simulated_axis import AxisTruth, stops_of
 
 RATE = 15.0
@@ -26,27 +24,6 @@ def drive(seed: int) -> AxisCampaign:
     stated["reading_scale"] = AxisPrior(1.0, 0.0)
     periods = WavePeriods((), ((60.0, 600.0),), True)
     return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, periods)
-
-
-def scored(draws: np.ndarray, true: float) -> dict[str, float]:
-    """How far the mean is off in sds, and the share of the draws below the truth."""
-    return {"z": float((draws.mean() - true) / draws.std()), "below": float(np.mean(draws < true))}
-
-
-def rms(z: Sequence[float]) -> str:
-    """Of z, for a table."""
-    return f"{np.sqrt(np.mean(np.square(z))):.2f}" if len(z) else ""
-
-
-def scores_line(protocol: str, name: str, scores: Sequence[dict], *more: str) -> str:
-    """A row: shares of truths in central 50 and 95 % intervals and RMS z, each with its bounds."""
-    below = np.array([score["below"] for score in scores])
-    cells = [protocol, f"`{name}`", str(len(scores))]
-    for level in (0.5, 0.95):
-        low, high = binomial_bounds(len(scores), level)
-        cells += [f"{100 * np.mean(np.abs(below - 0.5) <= level / 2):.0f} %", f"{low:.2f} to {high:.2f}"]
-    low, high = rms_bounds(len(scores))
-    return line(*cells, rms([score["z"] for score in scores]), f"{low:.2f} to {high:.2f}", *more)
 
 
 def up_and_down(travel: float, positions: int, homings: int) -> tuple[tuple[AxisMove, ...], list[int]]:

@@ -1,4 +1,4 @@
-"""Samplers that share no code with the one they judge: NUTS by NumPyro or BlackJAX, emcee's stretch move.
+"""A sampler that shares no code with the one it judges: NUTS by NumPyro.
 
 A triangular quadratic shear w -> y of volume 1 takes the curvature out of the stiff directions, and z = mode + C y with
 C the Cholesky factor of the Laplace covariance. Coordinates change the cost of a draw, not the posterior.
@@ -8,34 +8,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import emcee
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arviz_stats.base import array_stats
 
-from experiments.common.clock import timed
 from experiments.common.jax_density import innovations, log_density, without_padding
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
-from tvsbayes.posterior import transport
-from tvsbayes.posterior.target import Target
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 """Of draws (chain, draw)."""
-STRETCH_STEPS = 400
 STEP = 0.5
 """Posterior sds (of what the coordinates before leave open) over which second differences are taken."""
 STIFF_SD = 0.05
 """Prior sds: a coordinate that the data determine better than this, given those before it, is sheared."""
 BATCH = 64
-
-
-def worst_ess(draws: np.ndarray) -> float:
-    """Least bulk effective draws of (chain, draw, quantity)."""
-    return float(np.min(array_stats.ess(draws, method="bulk", **AXES)))
 
 
 @dataclass(frozen=True)
@@ -189,60 +178,3 @@ def nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Settin
     _, (z, diverging, leapfrogs, acceptance), sampling_s = several(state, setting.draws, setting.limit_s, "draws")
     figures = int(diverging.sum()), float(leapfrogs.mean()), float(acceptance.mean())
     return Run(np.swapaxes(z, 0, 1), *figures, compile_s, warmup_s, sampling_s)
-
-
-def blackjax_nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Setting) -> Run:
-    """Sample exp(-potential) by BlackJAX (the extra `bench`): windows of warm-up for every chain, diagonal mass.
-
-    Chains go in step, as in `nuts`; `limit_s` does not count.
-    """
-    import blackjax
-
-    def of_one_chain(key, start):
-        keys = jax.random.split(key, 2)
-        adapted = blackjax.window_adaptation(blackjax.nuts, lambda w: -potential(w), target_acceptance_rate=0.8)
-        (state, tuned), _ = adapted.run(keys[0], start, setting.warmup)
-        return state, tuned, keys[1]
-
-    def draws(state, tuned, key):
-        kernel = blackjax.nuts(lambda w: -potential(w), **tuned)
-
-        def step(state, key):
-            state, info = kernel.step(key, state)
-            return state, (state.position, info.is_divergent, info.num_integration_steps, info.acceptance_rate)
-
-        return jax.lax.scan(step, state, jax.random.split(key, setting.draws))[1]
-
-    key, first = jax.random.split(jax.random.PRNGKey(setting.seed))
-    keys = jax.random.split(key, setting.chains)
-    starts = 0.1**0.5 * jax.random.normal(first, (setting.chains, size))
-    cpu = time.process_time()
-    warm = jax.jit(jax.vmap(of_one_chain)).lower(keys, starts).compile()
-    walk = jax.jit(jax.vmap(draws)).lower(*jax.eval_shape(jax.vmap(of_one_chain), keys, starts)).compile()
-    compile_s, cpu = time.process_time() - cpu, time.process_time()
-    standing = jax.block_until_ready(warm(keys, starts))
-    warmup_s, cpu = time.process_time() - cpu, time.process_time()
-    z, diverging, leapfrogs, acceptance = (np.asarray(x) for x in walk(*standing))
-    figures = int(diverging.sum()), float(leapfrogs.mean()), float(acceptance.mean())
-    return Run(z, *figures, compile_s, warmup_s, time.process_time() - cpu)
-
-
-def straight(path: transport.Transport) -> transport.Transport:
-    """The map without what noise scales and wide coordinates do to the others: by the covariance at the mode alone."""
-    still = {"slope": np.zeros_like(path.slope), "half": np.zeros_like(path.half)}
-    return replace(path, narrow=0, bend=path.bend[:, :0, :0], **still)
-
-
-def stretch(joint: JointFit, start: np.ndarray, path: transport.Transport) -> dict[str, float]:
-    """Emcee's default move in Laplace-whitened coordinates from draws that a map has made: worst bulk ESS, seconds."""
-    plain = straight(path)
-    began = plain.to_w(path.mapped(start).z)
-    walkers = 2 * len(began)
-    generator = np.random.default_rng(3)
-    began = np.concatenate([began, began + 0.1 * generator.standard_normal(began.shape)])
-    sampler = emcee.EnsembleSampler(walkers, began.shape[1], Target(joint, plain), vectorize=True)
-    state = emcee.State(began, random_state=np.random.RandomState(1).get_state())
-    _, cost = timed(lambda: sampler.run_mcmc(state, STRETCH_STEPS, skip_initial_state_check=True))
-    kept = plain.mapped(sampler.get_chain()[STRETCH_STEPS // 4 :].reshape(-1, began.shape[1])).z
-    kept = kept.reshape(-1, walkers, kept.shape[1])[..., np.flatnonzero(joint.free)].transpose(1, 0, 2)
-    return {"ess": worst_ess(kept), **cost}

@@ -90,6 +90,17 @@ def commit(revision: str = "HEAD") -> str:
     return git("rev-parse", "--short", revision) or "?"
 
 
+def state() -> str:
+    """Short commit of the working tree, with + where tracked files of the package differ from it; ? outside git."""
+    return commit() + "+" * bool(git("diff", "--name-only", "HEAD", "--", "tvsbayes"))
+
+
+def cpu_model() -> str:
+    """The processor's own name (Linux)."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    return next((row.split(":", 1)[1].strip() for row in lines if row.startswith("model name")), "unknown processor")
+
+
 def commits_of(rows: Iterable[Mapping[str, object]]) -> str:
     """The commits at which rows were made, in their order; ? for a row that names none."""
     return ", ".join(dict.fromkeys(str(row.get("commit", "?")) for row in rows))

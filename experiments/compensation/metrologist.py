@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import parser
-from experiments.common.console import console, quietly
+from experiments.common.commands import console, quietly
 from experiments.common.drawn_axes import read, stands
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import stored_compensation

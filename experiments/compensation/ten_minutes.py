@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import print_only
-from experiments.common.console import console, quietly
+from experiments.common.commands import console, quietly
 from experiments.common.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import stored_compensation

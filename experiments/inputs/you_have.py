@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.common.command_line import print_only
-from experiments.common.console import console, quietly
+from experiments.common.commands import console, quietly
 from experiments.common.paper_lab import LABS, write_lab
 from experiments.common.rigs import mounted_rig
 from experiments.common.rows import ROOT

@@ -13,8 +13,9 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.common.command_line import study
-from experiments.common.drawn_axes import drive, scored, scores_line
-from experiments.common.page import line
+from experiments.common.coverage import NOTE, against, table
+from experiments.common.drawn_axes import drive
+from experiments.common.page import heading, line
 from experiments.common.rows import commit, commits_of
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
@@ -34,100 +35,74 @@ PROTOCOLS = {
 PARAMETERS = ("per_command", "ratio_contrast", "backlash", "creep", "thermal_per_K")
 
 
-def _stops(places: np.ndarray, seed: int) -> tuple[AxisMove, ...]:
-    """Beyond the low end, up, beyond the high end, down; the room cools and warms by some kelvin."""
-    commands = [places[0] - 300.0, *places, places[-1] + 300.0, *places[::-1]]
-    kelvin = 20.0 + 3.0 * np.sin(np.arange(len(commands)) / 9.0 + seed)
-    return tuple(
-        AxisMove(k, 0, 60.0 * k, float(c), "" if k else "backward", float(t))
-        for k, (c, t) in enumerate(zip(commands, kelvin, strict=True))
-    )
-
-
 def template(protocol: str, seed: int) -> AxisCampaign:
-    """Moves, statements and requested periods."""
+    """Moves beyond the low end, up, beyond the high end, down; statements and requested periods."""
     if protocol == "drive":
         return drive(seed)
-    stated = {"per_command": AxisPrior(0.01, 0.002)}
+    stated, places, periods = {"per_command": AxisPrior(0.01, 0.002)}, np.linspace(-2000, 2000, 10), WavePeriods()
     if protocol == "stops":
         places = np.sort(np.random.default_rng([seed, 99]).choice(np.arange(-2000.0, 2001.0, 10.0), 24, replace=False))
         periods = WavePeriods((8.0,), ((2.5, 7.0),))
-        return AxisCampaign("deg", _stops(places, seed), (), stated, periods=periods)
+    else:
+        stated["creep"] = AxisPrior(0.0, 0.1)
+    commands = [places[0] - 300.0, *places, places[-1] + 300.0, *places[::-1]]
+    # The room cools and warms by some kelvin.
+    degC = 20.0 + 3.0 * np.sin(np.arange(len(commands)) / 9.0 + seed)
     moves = tuple(
-        AxisMove(m.move, m.segment, m.time_s, m.command, m.approach) for m in _stops(np.linspace(-2000, 2000, 10), seed)
+        AxisMove(k, 0, 60.0 * k, float(c), "" if k else "backward", float(t) if protocol == "stops" else None)
+        for k, (c, t) in enumerate(zip(commands, degC, strict=True))
     )
-    return AxisCampaign("deg", moves, (), stated | {"creep": AxisPrior(0.0, 0.1)})
+    return AxisCampaign("deg", moves, (), stated, periods=periods)
+
+
+def scored(draws: np.ndarray, true: float) -> dict[str, float]:
+    return against(draws, np.full(draws.shape, 1 / draws.size), true, np.inf)
 
 
 def one_axis(task: tuple[str, int]) -> dict[str, object]:
-    """Draw, read and fit one axis."""
     protocol, seed = task
     axis = simulate_axis(template(protocol, seed), seed=seed)
     fit = fit_axis(axis.campaign, tier="importance", seed=seed)
-    true, draws = axis.truth.parameters, fit.draws
-    row: dict[str, object] = {"protocol": protocol, "seed": seed, "commit": commit(), "waves": []}
-    row["problems"] = list(fit.missing)
-    for name in PARAMETERS:
-        if name in draws and draws[name].std() > 0 and not (protocol == "drive" and name == "backlash"):
-            row[name] = scored(draws[name], true[name])
-    samples, truths = wave_samples(fit), axis.truth.waves
+    true, draws, truths, samples = axis.truth.parameters, fit.draws, axis.truth.waves, wave_samples(fit)
+    told = [name for name in PARAMETERS if name in draws and draws[name].std() > 0]
+    quantities = {name: scored(draws[name], true[name]) for name in told if (protocol, name) != ("drive", "backlash")}
     # Of a range that holds one wave, what was added to it is a false one.
-    waves: list[dict[str, object]] = [
-        {"there": False, "probability": sample.probability} for sample in samples[len(truths) :]
-    ]
+    waves: list[dict] = [{"there": False, "probability": sample.probability} for sample in samples[len(truths) :]]
     for wave, sample in zip(truths, samples, strict=False):
-        one: dict[str, object] = {"there": bool(wave.amplitude > 0), "probability": sample.probability}
+        one: dict = {"there": bool(wave.amplitude > 0), "probability": sample.probability, "quantities": {}}
         if wave.amplitude > 0:
-            one["amplitude"] = scored(sample.amplitude, wave.amplitude)
             phase = sample.phase_deg()
-            one["phase"] = scored(phase, phase.mean() + (wave.phase_deg - phase.mean() + 180.0) % 360.0 - 180.0)
+            near = phase.mean() + (wave.phase_deg - phase.mean() + 180.0) % 360.0 - 180.0
+            one["quantities"] = {"amplitude": scored(sample.amplitude, wave.amplitude), "phase": scored(phase, near)}
             if sample.wave.known is None:
-                one["period"] = scored(np.log(sample.true_period), float(np.log(wave.period)))
+                one["quantities"]["period"] = scored(np.log(sample.true_period), float(np.log(wave.period)))
         waves.append(one)
-    return {**row, "waves": waves}
+    row = {"protocol": protocol, "seed": seed, "commit": commit(), "problems": list(fit.missing)}
+    return {**row, "quantities": quantities, "waves": waves}
 
 
 TEXT = """# Axes that creep, follow the temperature and make waves
 
-Made by `python -m experiments.intervals.axis_in_time`: axes drawn from the priors and fitted by `fit --quick`. Shares
-of truths in central intervals, RMS of z = (mean - truth) / sd; bounds are two-sided at 1e-4 for so many axes.
+Made by `python -m experiments.intervals.axis_in_time`: axes drawn from the priors and fitted by `fit --quick`; {note}.
 Amplitude, period and phase: of the waves that are there, given that there is one; of those too weak to be seen the
 interval is wide. {axes} axes, commit {commit}.
-
-| protocol | quantity | axes | in 50 % | bounds | in 95 % | bounds | RMS z | bounds |
-|---|---|---|---|---|---|---|---|---|"""
-WAVES_TEXT = """
-## Is there a wave?
-
-| protocol | waves that are not there | claimed above 0.95 | waves that are there | claimed above 0.95 | not accepted |
-|---|---|---|---|---|---|"""
+"""
 
 
-def table(every: list[dict]) -> None:
-    """Both tables."""
-    rows = [row for row in every if not row["problems"]]
-    print(TEXT.format(axes=len(every), commit=commits_of(every)))
-    for protocol, what in PROTOCOLS.items():
-        mine = [row for row in rows if row["protocol"] == protocol]
-        for name in PARAMETERS:
-            if scores := [row[name] for row in mine if name in row]:
-                print(scores_line(f"{protocol}: {what}", name, scores))
-        waves = [wave for row in mine for wave in row["waves"] if wave["there"]]
-        for name in ("amplitude", "period", "phase"):
-            if scores := [wave[name] for wave in waves if name in wave]:
-                print(scores_line(protocol, name, scores))
-    print(WAVES_TEXT)
-    for protocol in PROTOCOLS:
-        mine = [row for row in rows if row["protocol"] == protocol]
-        refused = sum(row["protocol"] == protocol for row in every) - len(mine)
-        waves = [wave for row in mine for wave in row["waves"]]
-        cells = [protocol]
-        for there in (False, True):
-            chances = [wave["probability"] for wave in waves if wave["there"] is there]
-            cells += [str(len(chances)), str(sum(chance > SURE for chance in chances))]
-        if waves:
-            print(line(*cells, refused))
+def page(every: list[dict]) -> None:
+    print(TEXT.format(axes=len(every), commit=commits_of(every), note=NOTE))
+    of = {p: [row for row in every if row["protocol"] == p and not row["problems"]] for p in PROTOCOLS}
+    waves = {p: [wave for row in rows for wave in row["waves"]] for p, rows in of.items()}
+    print(*(f"- {protocol}: {what}" for protocol, what in PROTOCOLS.items()), "", sep="\n")
+    table({p: [row["quantities"] for row in rows] for p, rows in of.items()})
+    table({p: [wave["quantities"] for wave in some if wave["there"]] for p, some in waves.items()})
+    print("## Is there a wave?\n")
+    print(heading(f"protocol | not there | claimed above {SURE:g} | there | claimed above {SURE:g} | not accepted"))
+    for protocol, some in waves.items():
+        chances = [[wave["probability"] for wave in some if wave["there"] is there] for there in (False, True)]
+        cells = (cell for of in chances for cell in (len(of), sum(chance > SURE for chance in of)))
+        print(line(protocol, *cells, sum(row["protocol"] == protocol for row in every) - len(of[protocol])))
 
 
 if __name__ == "__main__":
-    study(__file__, __doc__, one_axis, ("protocol", "seed"), PROTOCOLS, table, 200)
+    study(__file__, __doc__, one_axis, ("protocol", "seed"), PROTOCOLS, page, 200)

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
-from experiments.common.page import line
+from experiments.common.page import heading, line
 from experiments.common.rows import commit, commits_of
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
@@ -32,21 +32,16 @@ KINDS = (CLEAN, WAVE, WIDE_U, POSE)
 PLACES = np.linspace(-180.0, 180.0, 9)
 
 
-def _moves() -> tuple[AxisMove, ...]:
-    """Two cycles beyond both ends, a move a minute."""
-    cycle = [*PLACES, 200.0, *PLACES[::-1], -200.0]
-    commands = [-200.0, *cycle, *cycle]
-    return tuple(AxisMove(k, 0, 60.0 * k, float(c), "" if k else "backward") for k, c in enumerate(commands))
-
-
 def drawn_axis(kind: str, seed: int) -> AxisCampaign:
-    """An axis with its readings; the play is stated to the simulation alone."""
-    rng = np.random.default_rng([seed, 7])
+    """An axis read in two cycles beyond both ends, a move a minute; the play is stated to the simulation alone."""
+    rng, ratio = np.random.default_rng([seed, 7]), AxisPrior(1.0, 0.01)
+    commands = [-200.0, *[*PLACES, 200.0, *PLACES[::-1], -200.0] * 2]
+    moves = tuple(AxisMove(k, 0, 60.0 * k, float(c), "" if k else "backward") for k, c in enumerate(commands))
     periods = WavePeriods((60.0,)) if kind == WAVE else WavePeriods()
     while True:
         play = abs(rng.normal(0.0, 0.01 * 360.0))
-        stated = {"per_command": AxisPrior(1.0, 0.01), "backlash": AxisPrior(play, 0.0)}
-        axis = simulate_axis(AxisCampaign("deg", _moves(), (), stated, periods=periods), seed=int(rng.integers(2**31)))
+        stated = {"per_command": ratio, "backlash": AxisPrior(play, 0.0)}
+        axis = simulate_axis(AxisCampaign("deg", moves, (), stated, periods=periods), seed=int(rng.integers(2**31)))
         if play + axis.truth.play_variation.min() > 0:
             break
     readings = axis.campaign.readings
@@ -58,16 +53,14 @@ def drawn_axis(kind: str, seed: int) -> AxisCampaign:
         values = np.array([float(each.value or 0.0) for each in readings])
         values += 5.0 * play * np.sin(np.radians(np.outer(values, turn)) + phases).sum(axis=1)
         readings = tuple(replace(each, value=float(value)) for each, value in zip(readings, values, strict=True))
-    return replace(axis.campaign, readings=readings, stated={"per_command": stated["per_command"]})
+    return replace(axis.campaign, readings=readings, stated={"per_command": ratio})
 
 
 def one_axis(task: tuple[str, int]) -> dict[str, object]:
-    """Draw and fit one axis."""
     kind, seed = task
-    summary = summarise_axis(fit_axis(drawn_axis(kind, seed), sampled=False, seed=seed))
-    names = [doubt.name for doubt in summary.doubts]
-    usable = all(doubt.usable for doubt in summary.doubts)
-    return {"kind": kind, "seed": seed, "commit": commit(), "doubts": names, "usable": usable}
+    doubts = summarise_axis(fit_axis(drawn_axis(kind, seed), sampled=False, seed=seed)).doubts
+    row = {"kind": kind, "seed": seed, "commit": commit(), "doubts": [doubt.name for doubt in doubts]}
+    return {**row, "usable": all(doubt.usable for doubt in doubts)}
 
 
 TEXT = """# Doubts about fits of axes
@@ -75,25 +68,18 @@ TEXT = """# Doubts about fits of axes
 Made by `python -m experiments.intervals.fit_doubts`: drawn axes, read at nine places to and fro twice, fitted by
 Laplace. How many fits raise each doubt, and how many are called DOUBTFUL; other doubts leave them usable. Right are
 idle processes where they are drawn so small, the stated u, and the error by position of a reader.
-
-{axes} axes, commit {commit}.
 """
 
 
 def table(rows: list[dict]) -> None:
-    """Shares by kind and doubt, with their 99.9 % bounds."""
-    print(TEXT.format(axes=len(rows), commit=commits_of(rows)))
-    print(line("axes", "n", *(rule.name for rule in RULES), "DOUBTFUL", "bounds of 1 %"))
-    print(line(*["---"] * (len(RULES) + 4)))
+    print(f"{TEXT}\n{len(rows)} axes, commit {commits_of(rows)}.\n")
+    print(heading("axes", "n", *(rule.name for rule in RULES), "DOUBTFUL", "bounds of 1 %"))
     for kind in KINDS:
-        mine = [row for row in rows if row["kind"] == kind]
-        if not mine:
-            continue
-        counts = Counter(name for row in mine for name in row["doubts"])
-        doubtful = sum(not row["usable"] for row in mine)
-        low, high = binomial_bounds(len(mine), 0.01)
-        bounds = f"{low * len(mine):.0f} to {high * len(mine):.0f}"
-        print(line(kind, len(mine), *(counts[rule.name] for rule in RULES), doubtful, bounds))
+        if mine := [row for row in rows if row["kind"] == kind]:
+            counts = Counter(name for row in mine for name in row["doubts"])
+            doubtful, (low, high) = sum(not row["usable"] for row in mine), binomial_bounds(len(mine), 0.01)
+            bounds = f"{low * len(mine):.0f} to {high * len(mine):.0f}"
+            print(line(kind, len(mine), *(counts[rule.name] for rule in RULES), doubtful, bounds))
 
 
 if __name__ == "__main__":

@@ -16,15 +16,16 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import study
-from experiments.common.drawn_instruments import scored, tables
+from experiments.common.coverage import NOTE, USABLE, answers, failures, table, tried
 from experiments.common.rigs import mounted_rig, shipped_plan
+from experiments.common.rows import commit
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
 from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.twin.simulated_campaign import simulate
 
-KINDS = ("sightings", "spots")
+KEYS, KINDS = ("kind", "seed"), ("sightings", "spots")
 PAN_STEPS, TILT_STEPS = (-1500, -800, -200, 400, 900, 1500), (100, 400, 800, 1200)
 
 
@@ -37,8 +38,7 @@ def head_of(kind: str) -> Rig:
     mounted = mounted_rig()
     stated = {n: p for n, p in mounted.table.priors.items() if n in HEAD.documented}
     table = RigTable(stated, mechanism=HEAD)
-    small = {"elevation_zero_deg": Prior(0.0, 2.0)}
-    table = replace(table, priors={**table.priors, **small})
+    table = replace(table, priors={**table.priors, "elevation_zero_deg": Prior(0.0, 2.0)})
     return replace(mounted, table=table, truth=dict(table.priors))
 
 
@@ -57,24 +57,24 @@ def plan_of(kind: str, seed: int) -> tuple[PlanStep, ...]:
 
 
 def one_head(task: tuple[str, int]) -> dict[str, object]:
-    """One head."""
     kind, seed = task
-    names = (*(term.name for term in HEAD_TERMS.values()), *names_of("backlash_deg"))
-    return scored(task, simulate(head_of(kind), plan_of(kind, seed), seed), names)
+    run, names = simulate(head_of(kind), plan_of(kind, seed), seed), [term.name for term in HEAD_TERMS.values()]
+    row = {"kind": kind, "seed": seed, "commit": commit()}
+    return row | tried(run.campaign, run.truth, "importance", names=names)
 
 
-TEXT = """# Coverage over drawn pan-tilt heads
-
-Made by `python -m experiments.intervals.heads`. Heads drawn from the default priors of their kind (ratios 0.05(2)
-deg/step of heads with sightings), simulated with the twin's optics, fitted and sampled by importance. Coverage of the
-95 % interval and RMS z of the truth, of heads whose answer was accepted or rough; *prior*: the data take away less than
-a tenth of the prior's variance in the median head, which is not judged. Bounds are two-sided at 1e-4."""
-
-
-def table(rows: list[dict]) -> None:
-    """A table for each kind."""
-    tables(rows, TEXT, {kind: f"Heads with {kind}" for kind in KINDS}, "head")
+def page(rows: list[dict]) -> None:
+    print(
+        "# Coverage over drawn pan-tilt heads\n\nMade by `python -m experiments.intervals.heads`. Heads drawn from the"
+    )
+    print("default priors of their kind (ratios 0.05(2) deg/step of heads with sightings), simulated with the twin's")
+    print(f"optics, fitted and sampled by importance; judged are those accepted or rough. {NOTE}.\n")
+    for kind in KINDS:
+        if mine := [row for row in rows if row["kind"] == kind]:
+            print(f"## Heads with {kind}\n\n{answers(mine, 'head')}")
+            table({kind: [row["posterior"] for row in mine if row["answer"] in USABLE]})
+            failures(mine, KEYS)
 
 
 if __name__ == "__main__":
-    study(__file__, __doc__, one_head, ("kind", "seed"), KINDS, table, 30)
+    study(__file__, __doc__, one_head, KEYS, KINDS, page, 30)

@@ -1,12 +1,9 @@
 """Is the sampled posterior the posterior? Simulation-based calibration on small rigs, by a loop of our own.
 
     python -m experiments.intervals.sbc run --n 1000 --cores 0 1       # CPU seconds a rig: see sbc.md; resumable
-    python -m experiments.intervals.sbc run --variants "prior x3" "camera dropped" --n 50 --cores 0 1
-    python -m experiments.intervals.sbc run --variants "few stops" --n 50 --cores 0 1
+    python -m experiments.intervals.sbc run --variants "few stops" "prior x3" "camera dropped" --n 50 --cores 0 1
     python -m experiments.intervals.sbc run --tier emcee --n 200 --cores 0 1
     python -m experiments.intervals.sbc table > experiments/intervals/sbc.md     # also writes sbc.png
-
-Rows are appended to `experiments/output/intervals/sbc.jsonl`; delete that file when the sampler has changed.
 
 Every simulation draws a rig from the priors of `data/rigs/mounted` (seed i), runs the 60 spots of
 `rigs.dense_plan`, fits, samples, and ranks the truth among 255 draws that weigh the same: resampled by their weights,
@@ -18,20 +15,16 @@ must reach 0.05 / number of quantities. The same test must fail on four planted 
 by 0.8 in prior coordinates (from the draws of the first clean simulations), weights without the Jacobian of the map in
 which draws are proposed (from those of `few stops`, where noise scales are least known), the prior of the stereo
 calibration taken three times too wide, and the right camera's centres taken as a thousand times worse than they are.
-`few stops` is clean too: 48 spots, twelve stops in every
-direction, where the Laplace interval of the backlash is too short. Test quantities are those of the true model
-throughout. Simulations whose fit did not converge or whose draws were not accepted are listed and counted; they are
-not judged. Whether draws are accepted depends on the data and not on the truth behind them, so the ranks of the others
-must be uniform all the same; a tier that refuses more than `FAILURES` of them fails the study.
+`few stops` is clean too: 48 spots, twelve stops in every direction, where the Laplace interval of the backlash is too
+short. Whether draws are accepted depends on the data and not on the truth behind them, so the ranks of the others must
+be uniform all the same; a tier that refuses more than `FAILURES` of them fails the study.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -39,12 +32,11 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import by_seed, study
+from experiments.common.coverage import SHRINK
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import physical_of
-from experiments.common.headlines import SHRINK
 from experiments.common.page import heading, line
-from experiments.common.rigs import creeping_rig, dense_plan, small_plan, unseen
-from experiments.common.rows import output
+from experiments.common.rigs import creeping_rig, dense_plan, small_plan
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
@@ -59,13 +51,8 @@ from tvsbayes.report.drawing import BLUE
 from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate
 
-ROWS = output(__file__, "sbc.jsonl")
-PICTURE = Path(__file__).with_suffix(".png")
-SHEETS = ("d1", "d2")
-WIDER = 3.0
-WORSE = 1000.0
-MAX_MINUTES = 8.0
-END = "p log-likelihood | p log-posterior | quantities failing | verdict | wanted"
+KEYS, PICTURE = ("tier", "variant", "seed"), Path(__file__).with_suffix(".png")
+SHEETS, WIDER, WORSE, MAX_MINUTES = ("d1", "d2"), 3.0, 1000.0, 8.0
 CLEAN, FEW, PRIOR, CAMERA = "clean", "few stops", "prior x3", "camera dropped"
 SHRUNK, JACOBIAN = f"sd x {SHRINK}", "Jacobian dropped"
 VARIANTS = (CLEAN, FEW, PRIOR, CAMERA)
@@ -79,6 +66,7 @@ FAULT_SIMULATIONS = 50
 BAND_SEED, BAND_SAMPLES, PIT_SEED = 214, 20_000, 215
 FAILURES = 0.05
 """Largest share of simulations that are not judged."""
+DENSITIES = ("log-likelihood", "log-posterior")
 
 
 class Band:
@@ -109,13 +97,6 @@ class Band:
         return np.argmax(inside, axis=0) / self.n, (self.n - np.argmax(inside[::-1], axis=0)) / self.n
 
 
-def pit_values(rows: Sequence[dict], key: str) -> dict[str, np.ndarray]:
-    """(rank + U) / (draws + 1) by quantity; the ranks of a row stand under `key`."""
-    u = np.random.default_rng(PIT_SEED)
-    names = list(rows[0][key])
-    return {name: (np.array([r[key][name] for r in rows]) + u.uniform(size=len(rows))) / (DRAWS + 1) for name in names}
-
-
 def faulty(campaign, variant: str):
     """The campaign that the fit is given."""
     if variant == PRIOR:
@@ -135,8 +116,7 @@ def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
     tier, variant, seed = task
     use_compilation_cache()
     simulated = simulate(creeping_rig(), small_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
-    row: dict[str, object] = {"tier": tier, "variant": variant, "seed": seed, "converged": False, "problems": []}
-    row["unseen"] = unseen(simulated.campaign)
+    row: dict = {**dict(zip(KEYS, task, strict=True)), "converged": False, "problems": []}
     start = time.process_time()
     try:
         result = fit(faulty(simulated.campaign, variant))
@@ -146,18 +126,15 @@ def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
         run = posterior.convergence.importance
         row |= {"cpu_s": time.process_time() - start, "draws": run.draws, "effective_share": run.effective_share}
         row |= {"pareto_k": run.pareto_k, "worst_pareto_k": run.worst_pareto_k.value, "ess": run.least_ess.value}
-        chosen = posterior.coordinates(DRAWS)
-        errors_rad = posterior.thinned(DRAWS).place_errors_rad
-        row["ranks"] = ranks(simulated, result, chosen, errors_rad)
+        chosen, errors_rad = posterior.coordinates(DRAWS), posterior.thinned(DRAWS).place_errors_rad
+        row[variant] = ranks(simulated, result, chosen, errors_rad)
         if variant == CLEAN and seed < FAULT_SIMULATIONS:
-            mean = np.tensordot(posterior.weights, posterior.z, axes=2)
-            centre_rad = posterior.centre.place_errors_rad
+            mean, centre_rad = np.tensordot(posterior.weights, posterior.z, axes=2), posterior.centre.place_errors_rad
             nearer_rad = centre_rad + SHRINK * (errors_rad - centre_rad)
-            row["ranks_shrunk"] = ranks(simulated, result, mean + SHRINK * (chosen - mean), nearer_rad)
+            row[SHRUNK] = ranks(simulated, result, mean + SHRINK * (chosen - mean), nearer_rad)
         if variant == FEW and tier == TIERS[0]:
             wrong = without_jacobian(posterior)
-            errors_rad = wrong.thinned(DRAWS).place_errors_rad
-            row["ranks_jacobian"] = ranks(simulated, result, wrong.coordinates(DRAWS), errors_rad)
+            row[JACOBIAN] = ranks(simulated, result, wrong.coordinates(DRAWS), wrong.thinned(DRAWS).place_errors_rad)
     except Exception as error:
         row |= {"converged": False, "problems": [*row["problems"], repr(error)]}
     return row
@@ -207,12 +184,6 @@ def ranks(simulated, result, z: np.ndarray, place_errors_rad: np.ndarray) -> dic
     return {name: int(np.sum(v[1:] < v[0])) for name, v in values.items()}
 
 
-def sum_of_squares_p(pit: np.ndarray) -> float:
-    """Two-sided p of the sum of squared normal scores against chi-square."""
-    total = np.sum(stats.norm.ppf(pit) ** 2)
-    return float(2 * min(stats.chi2.cdf(total, len(pit)), stats.chi2.sf(total, len(pit))))
-
-
 def picture(band: Band, pit: dict[str, np.ndarray], names: list[str], limit: float) -> None:
     """ECDF minus uniform, with the bands at 95 % and at the criterion's level."""
     with page_figure(PICTURE, 5.5, width_in=10.0) as figure:
@@ -229,127 +200,79 @@ def picture(band: Band, pit: dict[str, np.ndarray], names: list[str], limit: flo
         figure.suptitle(f"{band.n} simulations; bands: 95 % (dark), criterion (light), each simultaneous")
 
 
-@dataclass(frozen=True)
-class Design:
-    """Simulations that are tested together: their name, all of them, those judged, and their PIT by quantity."""
-
-    title: str
-    chosen: list[dict]
-    good: list[dict]
-    pit: dict[str, np.ndarray]
-
-    @cached_property
-    def band(self) -> Band:
-        """Of the simulations with ranks."""
-        return Band(len(self.good))
-
-    @property
-    def clean(self) -> bool:
-        """Nothing was planted: the test has to pass."""
-        return self.title in (CLEAN, FEW)
-
-
-def designs(rows: list[dict]) -> list[Design]:
-    """Every design with at least two simulations that have ranks."""
-    of = {v: [r for r in rows if r["variant"] == v] for v in VARIANTS}
-    first = [r for r in of[CLEAN] if r["seed"] < FAULT_SIMULATIONS]
-    wanted = [(CLEAN, of[CLEAN], "ranks"), (FEW, of[FEW], "ranks"), (SHRUNK, first, "ranks_shrunk")]
-    wanted += [(JACOBIAN, of[FEW], "ranks_jacobian"), *((v, of[v], "ranks") for v in (PRIOR, CAMERA))]
-    parts = []
-    for title, chosen, key in wanted:
-        good = [r for r in chosen if r["converged"] and key in r]
-        if len(good) >= 2:
-            parts.append(Design(title, chosen, good, pit_values(good, key)))
-    return parts
-
-
-def design_row(design: Design, p: dict[str, float]) -> str:
+def design_row(title: str, chosen: Sequence[dict], judged: int, p: Mapping[str, float]) -> str:
     """The line of a design from the p of its quantities."""
-    limit, least = ALPHA / len(p), min(p, key=p.get)
-    failing = sum(v < limit for v in p.values())
-    lost = len(design.chosen) - len(design.good)
+    limit, least, clean = ALPHA / len(p), min(p, key=p.__getitem__), title in (CLEAN, FEW)
+    failing, lost = sum(v < limit for v in p.values()), len(chosen) - judged
     # A fault has to be seen in the ranks, not in lost simulations.
-    passes = failing == 0 and not (design.clean and lost > FAILURES * len(design.chosen))
-    word = "passes" if passes else "FAILS"
-    if len(design.chosen) < FAULT_SIMULATIONS:
-        word = "too few to judge"
-    cells = (design.title, len(design.chosen), lost, len(p), f"{limit:.1e}", f"{p[least]:.1e}, {least}")
-    cells += (f"{p['log-likelihood']:.1e}", f"{p['log-posterior']:.1e}", failing)
-    return line(*cells, word, "passes" if design.clean else "FAILS")
+    passes = failing == 0 and not (clean and lost > FAILURES * len(chosen))
+    word = "too few to judge" if len(chosen) < FAULT_SIMULATIONS else "passes" if passes else "FAILS"
+    cells = (title, len(chosen), lost, len(p), f"{limit:.1e}", f"{p[least]:.1e}, {least}")
+    cells += (*(f"{p[name]:.1e}" for name in DENSITIES), failing)
+    return line(*cells, word, "passes" if clean else "FAILS")
+
+
+def clean_part(band: Band, pit: Mapping[str, np.ndarray], p: Mapping[str, float]) -> None:
+    """Every quantity of the clean simulations, the two densities first, then by p."""
+    print(f"### Clean, all quantities: {band.n} simulations\n")
+    print(heading("quantity | mean PIT | sd of PIT x sqrt 12 | p of the band | p of sum z^2"))
+    for name in [*DENSITIES, *sorted((n for n in p if n not in DENSITIES), key=p.__getitem__)]:
+        total = stats.chi2(band.n).cdf(np.sum(stats.norm.ppf(pit[name]) ** 2))
+        figures = (pit[name].mean(), pit[name].std() * np.sqrt(12), p[name], 2 * min(total, 1 - total))
+        print(line(name, *(f"{figure:.3f}" for figure in figures)))
+    print()
+
+
+def tier_part(title: str, rows: Sequence[dict], pictured: bool) -> None:
+    """Every design of one tier with two simulations or more that have ranks."""
+    print(f"## {title}\n")
+    titles = "draws | simulations | not accepted | quantities | criterion p | least p, of | p log-likelihood"
+    print(heading(titles, "p log-posterior | quantities failing | verdict | wanted"))
+    of, clean = {v: [r for r in rows if r["variant"] == v] for v in VARIANTS}, None
+    first = [row for row in of[CLEAN] if row["seed"] < FAULT_SIMULATIONS]
+    for design, chosen in {CLEAN: of[CLEAN], FEW: of[FEW], SHRUNK: first, JACOBIAN: of[FEW], **of}.items():
+        good = [row[design] for row in chosen if row["converged"] and design in row]
+        if len(good) < 2:
+            continue
+        band, u = Band(len(good)), np.random.default_rng(PIT_SEED)
+        pit = {n: (np.array([r[n] for r in good]) + u.uniform(size=len(good))) / (DRAWS + 1) for n in good[0]}
+        p = {name: band.p_value(values) for name, values in pit.items()}
+        print(design_row(design, chosen, len(good), p))
+        clean = (band, pit, p) if design == CLEAN else clean
+    print(f"\np = {1 / (1 + BAND_SAMPLES):.0e} is the smallest that {BAND_SAMPLES} simulated bands can give.\n")
+    keys = ("pareto_k", "worst_pareto_k", "draws", "effective_share", "ess", "cpu_s")
+    for variant, chosen in of.items():
+        if done := [row for row in chosen if "draws" in row]:
+            medians = (
+                "Pareto k {:.2f}, worst of a headline {:.2f}, {:.0f} draws of share {:.2f}, {:.0f} effective of the "
+            )
+            medians += "worst headline, {:.1f} CPU s for fit and draws"
+            print(f"- {variant}: medians:", medians.format(*(np.median([row[key] for row in done]) for key in keys)))
+    for row in rows:
+        if not row["converged"]:
+            print(f"- not accepted: {row['variant']}, seed {row['seed']}: {'; '.join(row['problems'])}")
+    print()
+    if clean:
+        band, pit, p = clean
+        worst = sorted((n for n in p if n not in DENSITIES), key=p.__getitem__)[:4]
+        if pictured:
+            picture(band, pit, [*DENSITIES, *worst], ALPHA / len(p))
+        clean_part(band, pit, p)
 
 
 def table(rows: list[dict]) -> None:
-    """The study's page and picture."""
-    title, words = (
-        "Simulation-based calibration of the posterior",
-        "ECDF differences of the two densities and the four worst quantities",
-    )
+    title = "Simulation-based calibration of the posterior"
+    words = "ECDF differences of the two densities and the four worst quantities"
     print(title_and_figure(__file__, title, PICTURE, words))
     print("Written by `python -m experiments.intervals.sbc table` after `run`; rig i has seed i. 60 spots of the")
     print("mounted rig (48 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n")
     for tier, title in zip(TIERS, ("Tier 1, importance sampling", "Tier 2, emcee"), strict=True):
-        table_tier(title, [r for r in rows if r["tier"] == tier], tier == TIERS[0])
-
-
-def table_tier(title: str, rows: list[dict], pictured: bool) -> None:
-    """Every design of one tier; nothing of a tier that was not run."""
-    parts = designs(rows)
-    if not parts:
-        return
-    print(f"## {title}\n")
-    print(heading("draws | simulations | not accepted | quantities | criterion p | least p, of", END))
-    p_of = {}
-    for design in parts:
-        band = design.band
-        p_of[design.title] = {name: band.p_value(values) for name, values in design.pit.items()}
-        print(design_row(design, p_of[design.title]))
-    print(f"\np = {1 / (1 + BAND_SAMPLES):.0e} is the smallest that {BAND_SAMPLES} simulated bands can give.\n")
-    for design in parts:
-        if design.title in VARIANTS:
-            print(f"- {design.title}: {workings(design.chosen)}")
-    for r in rows:
-        if not r["converged"]:
-            print(f"- not accepted: {r['variant']}, seed {r['seed']}: {'; '.join(r['problems'])}")
-    print()
-    for design in parts:
-        if design.title == CLEAN:
-            clean_part(design, p_of[CLEAN], pictured)
-
-
-def workings(rows: list[dict]) -> str:
-    """Medians of the diagnostics of importance sampling, and the cost."""
-    done = [r for r in rows if "draws" in r]
-    k, worst, draws, share, ess, cpu = (
-        np.median([r[name] for r in done])
-        for name in ("pareto_k", "worst_pareto_k", "draws", "effective_share", "ess", "cpu_s")
-    )
-    return (
-        f"medians: Pareto k {k:.2f}, worst of a headline {worst:.2f}, {draws:.0f} draws of share {share:.2f}, "
-        f"{ess:.0f} effective of the worst headline, {cpu:.1f} CPU s for fit and draws"
-    )
-
-
-def clean_part(design: Design, p: dict[str, float], pictured: bool) -> None:
-    """Every quantity of the clean simulations, the two densities first, then by p; with the picture if requested."""
-    first = ["log-likelihood", "log-posterior"]
-    order = first + sorted((n for n in p if n not in first), key=p.get)
-    if pictured:
-        picture(design.band, design.pit, order[:6], ALPHA / len(p))
-    print(f"### Clean, all quantities: {len(design.good)} simulations\n")
-    print("| quantity | mean PIT | sd of PIT x sqrt 12 | p of the band | p of sum z^2 |\n|---|---|---|---|---|")
-    for name in order:
-        values = design.pit[name]
-        spread = values.std() * np.sqrt(12)
-        print(f"| {name} | {values.mean():.3f} | {spread:.3f} | {p[name]:.3f} | {sum_of_squares_p(values):.3f} |")
-    print()
-
-
-def tasks(of: argparse.Namespace) -> list[tuple]:
-    """Of one tier."""
-    return [(of.tier, *task) for task in by_seed(of.variants, of.n)]
+        if mine := [row for row in rows if row["tier"] == tier]:
+            tier_part(title, mine, tier == TIERS[0])
 
 
 if __name__ == "__main__":
     options = {"--variants": {"nargs": "+", "default": [CLEAN], "choices": VARIANTS}}
     options["--tier"] = {"default": TIERS[0], "choices": TIERS}
-    study(__file__, __doc__, one_simulation, ("tier", "variant", "seed"), tasks, table, 1000, options)
+    tasks = lambda of: [(of.tier, *task) for task in by_seed(of.variants, of.n)]  # noqa: E731
+    study(__file__, __doc__, one_simulation, KEYS, tasks, table, 1000, options)

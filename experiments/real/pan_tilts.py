@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import parser
-from experiments.common.console import quietly
+from experiments.common.commands import quietly
 from experiments.common.page import heading
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.instrument.campaign import Campaign, Move

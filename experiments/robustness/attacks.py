@@ -1,4 +1,4 @@
-"""Does a run survive what strangers do to its page, kills, and damage to its journal?
+"""Does a run survive what strangers do to its page, kills, and damage to its journal; do results, programs, inputs?
 
     python -m experiments.robustness.attacks > experiments/robustness/attacks.md
 
@@ -20,7 +20,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -29,12 +28,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from experiments.common.command_line import print_only
+from experiments.common.commands import PROGRAM, said
+from experiments.common.page import heading, line
 from experiments.common.rows import ROOT, commit
-from experiments.common.watched import listing
 from experiments.robustness.command_attacks import further
 
 RIG = ROOT / "data" / "rigs" / "mounted"
-COMMAND = (sys.executable, "-c", "from tvsbayes.cli.main import main; main()")
 SEED, FILES_MAX, IDLE, DOWNLOADS, KILLS = 20261126, 1024, 1100, 200, 10
 ATTACKED, KILLED = 400, 130
 """Rows of the plan: of the run with a page, and of those that are killed."""
@@ -48,7 +47,7 @@ def looks(folder: Path) -> dict[int, object]:
     """Pixels of every look in the whole lines of a journal, by number."""
     log = folder / "log.jsonl"
     data = log.read_bytes() if log.exists() else b""
-    events = [json.loads(line.split(b" ", 3)[3]) for line in data[: data.rfind(b"\n") + 1].splitlines()]
+    events = [json.loads(row.split(b" ", 3)[3]) for row in data[: data.rfind(b"\n") + 1].splitlines()]
     return {event["spot"]: event["pixels_px"] for event in events if event["event"] == "looked"}
 
 
@@ -65,7 +64,7 @@ class Run:
         steps.write_text("".join((RIG / "planned.csv").read_text().splitlines(keepends=True)[: rows + 1]))
         words = ["acquire", str(RIG / "rig.toml"), str(steps), str(out), "--simulate", "--seed", "3", *options]
         with self.log.open("wb") as stream:
-            self.child = subprocess.Popen([*COMMAND, *words], stdout=stream, stderr=stream, cwd=ROOT)
+            self.child = subprocess.Popen([*PROGRAM, *words], stdout=stream, stderr=stream, cwd=ROOT)
         resource.prlimit(self.child.pid, resource.RLIMIT_NOFILE, (FILES_MAX, FILES_MAX))
 
     def until[T](self, done: Callable[[], T]) -> T:
@@ -109,7 +108,6 @@ def requests(port: int, key: str, watcher: str) -> list[tuple[bytes, Sequence[in
     mine, big = {"X_Tvsbayes_Key": key}, b"0" * 10_000_000
     chunked = {**mine, "Transfer_Encoding": "chunked", "Content_Length": ""}
     hosts = ("evil", f"evil:{port}", f"0.0.0.0:{port}", f"[::1]:{port}", f"127.0.0.1.evil:{port}", "127.0.0.1")
-    origins = ("http://evil", "null", "http://127.0.0.1:1")
     paths = ("/../live", "/%2e%2e/live", "/..%2flive", "/%c0%ae%c0%ae/live", "//live", "/live/", "/live%00")
     paths += ("/log.jsonl", "/frames/000001_left.png", "/live.html%00.js", "http://evil/x", "/\\..\\live")
     tokens = (b"", b'{"token": "no"}', b'{"token": null}', b'["token"]', b'{"token": "\\ud800"}')
@@ -118,7 +116,7 @@ def requests(port: int, key: str, watcher: str) -> list[tuple[bytes, Sequence[in
     return [
         *((http(port, "/live", X_Tvsbayes_Key=k), (403,)) for k in ("", "wrong", " ", "\u00fc")),
         *((http(port, "/key", body), (403,)) for body in (*tokens, b'{"token": ' + b"[" * 4000)),
-        *((http(port, "/live", **mine, Origin=origin), (403,)) for origin in origins),
+        *((http(port, "/live", **mine, Origin=o), (403,)) for o in ("http://evil", "null", "http://127.0.0.1:1")),
         (http(port, "/live", **mine, Sec_Fetch_Site="cross-site"), (403,)),
         *((http(port, "/live", **mine, Host=host), (403,)) for host in hosts),
         (raw + f"Host: 127.0.0.1:{port}\r\nX-Tvsbayes-Key: {key}\r\n\r\n".encode(), (400,)),
@@ -165,26 +163,23 @@ def attacked(place: Path) -> list[str]:
         one.close()
     with ThreadPoolExecutor(50) as pool:
         taken = Counter(pool.map(lambda _: sent(port, http(port, "/live.js"))[0], range(DOWNLOADS)))
-    wrong = []
-    listed = requests(port, key, watcher)
+    wrong, listed = [], requests(port, key, watcher)
     for request, allowed in listed:
         status, _ = sent(port, request)
-        wrong += [] if status in allowed else [f"{status} for {request[:80]!r}"]
+        wrong += [] if status in allowed else [f"; {status} for {request[:80]!r}"]
         still_answers()
     after = run.memory_mb()
     run.looked(LATE)
     peak = run.memory_mb("VmHWM")
     codes.append(run.child.wait(LONGEST_S))
-    tables = {(place / name / "spots.csv").read_bytes() for name in ("alone", "attacked")}
+    one, other = ((place / name / "spots.csv").read_bytes() for name in ("alone", "attacked"))
     return [
         f"{IDLE} idle connections without the key: {descriptors} of {FILES_MAX} descriptors in use",
         f"{DOWNLOADS} parallel downloads: {taken[200]} answered, {taken[0]} closed",
-        f"{len(listed)} requests that must be refused: {len(listed) - len(wrong)} were"
-        + "".join(f"; {w}" for w in wrong),
+        f"{len(listed)} requests that must be refused: {len(listed) - len(wrong)} were{''.join(wrong)}",
         f"a request with the key after each: answered, after {max(waits):.0f} ms at most",
         f"memory {before:.0f} MB before, {after:.0f} after; most {peak:.0f}, of an unattacked run {peak_alone:.0f}",
-        f"exit codes {codes}, {len(looks(run.out))} looks, spots.csv "
-        + ("as unattacked" if len(tables) == 1 else "DIFFERS"),
+        f"exit codes {codes}, {len(looks(run.out))} looks, spots.csv {'as unattacked' if one == other else 'DIFFERS'}",
     ]
 
 
@@ -201,85 +196,77 @@ def killed(place: Path) -> list[str]:
     shutil.copytree(place / "run", place / "killed")
     run = Run(KILLED, place / "run", "--resume")
     code, kept = run.child.wait(LONGEST_S), looks(run.out)
-    lost = [spot for spot, pixels in acknowledged.items() if kept.get(spot) != pixels]
-    rows = len(numbers(run.out))
+    lost, rows = sum(kept.get(spot) != pixels for spot, pixels in acknowledged.items()), len(numbers(run.out))
     return [
         f"{KILLS} kills (SIGKILL), each resumed; exit code of the last {code}, {len(kept)} looks, {rows} in spots.csv",
-        f"{len(acknowledged)} looks acknowledged before a kill: {len(lost)} lost",
+        f"{len(acknowledged)} looks acknowledged before a kill: {lost} lost",
     ]
-
-
-def lines(edit: Callable[[list[bytes]], list[bytes]]) -> Callable[[Path], None]:
-    """A damage of the journal's lines."""
-    return lambda log: log.write_bytes(b"".join(edit(log.read_bytes().splitlines(keepends=True)))) and None
-
-
-def instead(make: Callable[[Path], object]) -> Callable[[Path], None]:
-    """Something else where the journal was."""
-    return lambda log: (log.unlink(), make(log)) and None
-
-
-def edited(log: Path) -> None:
-    """Another status in the table."""
-    spots = log.with_name("spots.csv")
-    spots.write_text(spots.read_text().replace(",ok", ",bad", 1))
 
 
 K = 20
 """The line that is damaged."""
-DAMAGES: dict[str, Callable[[Path], object]] = {
-    "last line torn": lines(lambda of: [*of[:-1], of[-1][:-9]]),
-    "4 KB of NUL at the end": lines(lambda of: [*of, bytes(4096)]),
-    "a byte changed": lines(lambda of: [*of[:K], b"x" + of[K][1:], *of[K + 1 :]]),
-    "a line deleted": lines(lambda of: of[:K] + of[K + 1 :]),
-    "a line doubled": lines(lambda of: of[: K + 1] + of[K:]),
-    "two lines swapped": lines(lambda of: [*of[:K], of[K + 1], of[K], *of[K + 2 :]]),
-    "a line of noise": lines(lambda of: [*of[:K], bytes(range(128, 256)) + b"\n", *of[K:]]),
-    "CRLF": lines(lambda of: [line.replace(b"\n", b"\r\n") for line in of]),
-    "a forged line": lines(lambda of: [*of, b'00000000 9 00000000 {"event":"stop"}\n']),
-    "second half missing": lines(lambda of: of[: len(of) // 2]),
-    "a line of 100 MB": lines(lambda of: [*of, b"x" * 100_000_000 + b"\n"]),
-    "100 000 brackets": lines(lambda of: [*of, b"[" * 100_000 + b"\n"]),
-    "empty": lines(lambda of: []),
-    "missing": instead(lambda log: None),
-    "a FIFO": instead(os.mkfifo),
-    "a folder": instead(Path.mkdir),
-    "a link outside": instead(lambda log: log.symlink_to("/etc/passwd")),
-    "spots.csv edited": edited,
-    "spots.csv deleted": lambda log: log.with_name("spots.csv").unlink(),
+REWRITTEN: dict[str, Callable[[list[bytes]], list[bytes]]] = {
+    "last line torn": lambda of: [*of[:-1], of[-1][:-9]],
+    "4 KB of NUL at the end": lambda of: [*of, bytes(4096)],
+    "a byte changed": lambda of: [*of[:K], b"x" + of[K][1:], *of[K + 1 :]],
+    "a line deleted": lambda of: of[:K] + of[K + 1 :],
+    "a line doubled": lambda of: of[: K + 1] + of[K:],
+    "two lines swapped": lambda of: [*of[:K], of[K + 1], of[K], *of[K + 2 :]],
+    "a line of noise": lambda of: [*of[:K], bytes(range(128, 256)) + b"\n", *of[K:]],
+    "CRLF": lambda of: [row.replace(b"\n", b"\r\n") for row in of],
+    "a forged line": lambda of: [*of, b'00000000 9 00000000 {"event":"stop"}\n'],
+    "second half missing": lambda of: of[: len(of) // 2],
+    "a line of 100 MB": lambda of: [*of, b"x" * 100_000_000 + b"\n"],
+    "100 000 brackets": lambda of: [*of, b"[" * 100_000 + b"\n"],
+    "empty": lambda of: [],
 }
+INSTEAD: dict[str, Callable[[Path], object]] = {
+    "missing": lambda log: None,
+    "a FIFO": os.mkfifo,
+    "a folder": Path.mkdir,
+    "a link outside": lambda log: log.symlink_to("/etc/passwd"),
+}
+"""What stands where the journal was."""
+DAMAGES = (*REWRITTEN, *INSTEAD, "spots.csv edited", "spots.csv deleted")
 
 
 def damaged(place: Path, what: str) -> str:
     """A row: exit codes of `check` and `acquire --resume`, and what is kept."""
-    folder = place / "damaged" / what.replace(" ", "_")
-    shutil.copytree(place / "killed", folder)
-    acknowledged = looks(folder).keys()
-    DAMAGES[what](folder / "log.jsonl")
-    checked = subprocess.run([*COMMAND, "check", folder], capture_output=True, text=True, timeout=LONGEST_S, cwd=ROOT)
-    before = listing(folder)
+    from experiments.robustness.hostile import listing
+
+    folder = shutil.copytree(place / "killed", place / "damaged" / what.replace(" ", "_"))
+    acknowledged, log, spots = looks(folder).keys(), folder / "log.jsonl", folder / "spots.csv"
+    if what in REWRITTEN:
+        log.write_bytes(b"".join(REWRITTEN[what](log.read_bytes().splitlines(keepends=True))))
+    elif what in INSTEAD:
+        log.unlink()
+        INSTEAD[what](log)
+    elif what == "spots.csv edited":
+        spots.write_text(spots.read_text().replace(",ok", ",bad", 1))
+    else:
+        spots.unlink()
+    checked, before = said("check", folder), listing(folder)
     run = Run(KILLED, folder, "--resume")
     code = run.child.wait(LONGEST_S)
     outcome = "refused, no file changed" if listing(folder) == before else "REFUSED, FILES CHANGED"
     if code == 0:
-        kept = numbers(folder)
         earlier = "".join(f", earlier rows in {path.name}" for path in folder.glob("spots.*-1.csv"))
-        outcome = f"goes on, {len(acknowledged & kept)} of {len(acknowledged)} looks kept{earlier}"
+        outcome = f"goes on, {len(acknowledged & numbers(folder))} of {len(acknowledged)} looks kept{earlier}"
     traceback = " TRACEBACK" * ("Traceback" in run.log.read_text() + checked.stderr)
-    return f"| {what} | {checked.returncode} | {code} | {outcome}{traceback} |"
+    return line(what, checked.returncode, code, outcome + traceback)
 
 
 def main() -> None:
-    """See the module."""
     print_only(__doc__)
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(scratch)
         print(f"# Attacks on a run\n\n{time.strftime('%Y-%m-%d')}, commit {commit()}.\n\n## Its page\n")
-        print(*(f"- {line}" for line in attacked(place)), sep="\n")
-        print("\n## Kills\n", *(f"- {line}" for line in killed(place)), sep="\n")
-        print("\n## Damaged journals\n\n| journal | `check` | `acquire --resume` | |\n|---|---|---|---|")
+        print(*(f"- {text}" for text in attacked(place)), sep="\n")
+        print("\n## Kills\n", *(f"- {text}" for text in killed(place)), sep="\n")
+        print("\n## Damaged journals\n\n" + heading("journal | `check` | `acquire --resume` | "))
         print(*(damaged(place, what) for what in DAMAGES), sep="\n")
-    further()
+    print("\n## Results, programs and inputs\n")
+    further(random.Random(SEED))
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ others are named. `run` unpacks HEAD into a temporary folder, writes mutmut's se
 
 mutmut runs pytest several times in one process, which jaxtyping's import hook refuses: the project's options of pytest
 are left out, and shapes are not checked. It forks for every mutant: a module that JAX compiles is traced and
-compiled again each time, and a fork that hangs counts as seen by mutmut's time limit (5 of the first 37 mutants of
-`model/laser_path.py` on a busy machine). It reads the syntax of Python 3.13.
+compiled again each time, and a fork that hangs counts as seen by mutmut's time limit. It reads the syntax of Python
+3.13.
 """
 
 from __future__ import annotations
@@ -26,14 +26,13 @@ import tempfile
 from pathlib import Path
 
 from experiments.common.command_line import act, parser
+from experiments.common.page import heading, line
 from experiments.common.rows import ROOT, append_row, commit, read_rows, rows_of
 from experiments.robustness.planted_faults import unpack
 
 SETTINGS = """[mutmut]
-source_paths=
-    tvsbayes
-only_mutate=
-    {module}
+source_paths=tvsbayes
+only_mutate={module}
 also_copy=
     data
     experiments
@@ -57,13 +56,12 @@ def mutmut(root: Path, *words: str) -> str:
     Raises:
         RuntimeError: it failed.
     """
-    # mutmut is a command; `-m` finds that of this environment.
     environment = {**os.environ, "PYTHONPATH": "", "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "mutmut", *words]
     ended = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
     if ended.returncode:
-        output = ended.stdout[-3000:] + ended.stderr
-        raise RuntimeError(f"mutmut {' '.join(words)} ended with {ended.returncode}:\n{output}")
+        printed = ended.stdout[-3000:] + ended.stderr
+        raise RuntimeError(f"mutmut {' '.join(words)} ended with {ended.returncode}:\n{printed}")
     return ended.stdout
 
 
@@ -71,7 +69,7 @@ def mutated(root: Path, name: str) -> dict[str, str]:
     """A mutant: the function, the line before and after."""
     lines = mutmut(root, "show", name).splitlines()
     old, new = (
-        " ".join(line[1:].strip() for line in lines if line.startswith(sign) and not line.startswith(3 * sign))
+        " ".join(text[1:].strip() for text in lines if text.startswith(sign) and not text.startswith(3 * sign))
         for sign in "-+"
     )
     function = name.rpartition(".")[2].rpartition("__mutmut_")[0]
@@ -80,12 +78,11 @@ def mutated(root: Path, name: str) -> dict[str, str]:
 
 def run(arguments: argparse.Namespace) -> None:
     """Append a row of a module."""
-    module = arguments.module
+    module, revision = arguments.module, commit()
     package, _, name = module.removeprefix("tvsbayes/").rpartition("/")
     tests = arguments.tests or [f"tests/{package}/test_{name}"]
     if missing := [path for path in (module, *tests) if not (ROOT / path).exists()]:
         raise SystemExit(f"no such file: {', '.join(missing)}")
-    revision = commit()
     with tempfile.TemporaryDirectory(prefix="tvsbayes-mutations-") as scratch:
         root = Path(scratch) / "tree"
         unpack(revision, root)
@@ -102,7 +99,7 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"{module}: {row['seen']} of {row['mutants']} seen, {len(survivors)} survive, {row['untested']} untested")
 
 
-TEXT = """# Mutants that no test sees
+TEXT = f"""# Mutants that no test sees
 
 Written by `python -m experiments.robustness.mutations table`: the latest run of each module. mutmut changes one
 operator, number, argument or word at a time, and runs the tests that reach the function.
@@ -115,23 +112,21 @@ mutant that JAX has to compile costs 3 to 30 CPU seconds: some 2000 CPU minutes 
 Survivors of these sorts are left: an order of equal numbers (`kind="stable"`), a bound met with probability zero
 (`>` for `>=`), a type or a default that NumPy has anyway, a constant that cancels, a guard against rounding.
 
-| module | tests | mutants | seen | survive | reached by none | CPU s | of |
-|---|---|---|---|---|---|---|---|"""
+{heading("module | tests | mutants | seen | survive | reached by none | CPU s | of")}"""
 
 
 def table(arguments: argparse.Namespace) -> None:
-    """The page: counts of every module, then what survives."""
-    rows = {row["module"]: row for row in read_rows(arguments.rows)}
+    """Counts of every module, then what survives."""
+    rows = {row["module"].removeprefix("tvsbayes/"): row for row in read_rows(arguments.rows)}
     print(TEXT)
     for module, row in sorted(rows.items()):
         tests = ", ".join(f"`{test.removeprefix('tests/')}`" for test in row["tests"])
         counts = (row["mutants"], row["seen"], len(row["survivors"]), row["untested"], f"{row['cpu_s']:.0f}")
-        print(f"| `{module.removeprefix('tvsbayes/')}` | {tests} | {' | '.join(map(str, counts))} | {row['commit']} |")
+        print(line(f"`{module}`", tests, *counts, row["commit"]))
     for module, row in sorted(rows.items()):
-        print(f"\n## {module.removeprefix('tvsbayes/')}\n\n| in | before | after |\n|---|---|---|")
+        print(f"\n## {module}\n\n{heading('in | before | after')}")
         for one in row["survivors"]:
-            before, after = (f"`{one[part]}`".replace("|", "\\|") for part in ("old", "new"))
-            print(f"| {one['function']} | {before} | {after} |")
+            print(line(one["function"], *(f"`{one[part]}`".replace("|", "\\|") for part in ("old", "new"))))
 
 
 if __name__ == "__main__":

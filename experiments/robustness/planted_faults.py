@@ -28,18 +28,18 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from experiments.common.command_line import act, parser
-from experiments.common.rows import ROOT, append_row, commit, output, read_rows, rows_of
+from experiments.common.page import heading, line
+from experiments.common.rows import ROOT, append_row, commit, commits_of, output, read_rows, rows_of
 from experiments.robustness.faults.changes import Sources
 from experiments.robustness.faults.listing import FAULTS, Fault, misfits, tests_of
 
-COMPILED = output(__file__, "planted_faults_compiled")
 LIMIT_S = 900
 """Tests that take longer count as failed: a loop that never ends is a fault that CI sees."""
 COMMAND = ("-m", "pytest", "-q", "-x", "-n", "0", "--tb=no", "-p", "no:cacheprovider", "-rfE", "-m", "not slow")
 ENVIRONMENT = {
     # An edited file may keep its size and, within a second, its time: no compiled module may outlive it.
     "PYTHONDONTWRITEBYTECODE": "1",
-    "JAX_COMPILATION_CACHE_DIR": str(COMPILED),
+    "JAX_COMPILATION_CACHE_DIR": str(output(__file__, "planted_faults_compiled")),
 }
 
 
@@ -68,10 +68,9 @@ def first_failure(root: Path, tests: Sequence[str]) -> str | None:
     Raises:
         RuntimeError: pytest could not run them.
     """
-    environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(root)}
-    command = [sys.executable, *COMMAND, *tests]
+    options = {"cwd": root, "env": {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(root)}, "timeout": LIMIT_S}
     try:
-        ended = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
+        ended = subprocess.run([sys.executable, *COMMAND, *tests], capture_output=True, text=True, **options)
     except subprocess.TimeoutExpired:
         return "(time over)"
     if ended.returncode == 0:
@@ -82,33 +81,15 @@ def first_failure(root: Path, tests: Sequence[str]) -> str | None:
     return failed[1]
 
 
-def attempt(root: Path, fault: Fault) -> dict[str, object]:
-    """Plant a fault and run its test.
-
-    Raises:
-        RuntimeError: pytest could not run it.
-    """
-    begun = time.monotonic()
-    with planted(root, fault):
-        first = first_failure(root, tests_of(fault.test, root))
-    seconds = round(time.monotonic() - begun, 1)
-    return {"sentence": fault.sentence, "failed": first is not None, "first": first or "", "seconds": seconds}
-
-
-def digests(root: Path) -> dict[str, str]:
-    """Of what an outcome depends on, by the sentence: the fault in its module, the file of its test."""
-    sources, digest_of = Sources(root), {}
+def valid_rows(path: Path, root: Path = ROOT) -> tuple[dict[str, dict], dict[str, str]]:
+    """Rows that hold, and digests of what an outcome depends on: the fault in its module, the file of its test."""
+    sources, now = Sources(root), {}
     for fault in FAULTS:
         _, text = fault.change.planted(sources, fault.place)
         files = [(root / name.partition("::")[0]).read_text(encoding="utf-8") for name in tests_of(fault.test, root)]
-        digest_of[fault.sentence] = hashlib.sha256(repr((text, fault.test, files)).encode()).hexdigest()[:16]
-    return digest_of
-
-
-def valid_rows(path: Path, root: Path = ROOT) -> dict[str, dict]:
-    """Rows that hold, by the sentence."""
-    now = digests(root)
-    return {row["sentence"]: row for row in read_rows(path) if now.get(row.get("sentence")) == row.get("digest")}
+        now[fault.sentence] = hashlib.sha256(repr((text, fault.test, files)).encode()).hexdigest()[:16]
+    rows = {row["sentence"]: row for row in read_rows(path) if now.get(row.get("sentence")) == row.get("digest")}
+    return rows, now
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -124,14 +105,19 @@ def run(arguments: argparse.Namespace) -> None:
             unpack(revision, Path(scratch) / f"tree{number}")
             trees.put(Path(scratch) / f"tree{number}")
         first_tree = Path(scratch) / "tree0"
-        now, rows = digests(first_tree), {} if arguments.again else valid_rows(arguments.rows, first_tree)
+        rows, now = valid_rows(arguments.rows, first_tree)
+        rows = {} if arguments.again else rows
 
         def one(fault: Fault) -> dict[str, object]:
-            root = trees.get()
+            root, begun = trees.get(), time.monotonic()
             try:
-                return attempt(root, fault)
+                with planted(root, fault):
+                    first = first_failure(root, tests_of(fault.test, root))
             finally:
                 trees.put(root)
+            row = {"sentence": fault.sentence, "failed": first is not None, "first": first or ""}
+            seconds = round(time.monotonic() - begun, 1)
+            return {**row, "seconds": seconds, "digest": now[fault.sentence], "commit": revision}
 
         left = [fault for fault in chosen if fault.sentence not in rows]
         tests = sorted({test for fault in left for test in tests_of(fault.test, first_tree)})
@@ -141,34 +127,31 @@ def run(arguments: argparse.Namespace) -> None:
             for row in pool.map(one, left):
                 word = f"seen by {row['first']}" if row["failed"] else "SURVIVED"
                 print(f"{row['sentence']}: {word} ({row['seconds']:.0f} s)", flush=True)
-                rows[row["sentence"]] = {**row, "digest": now[row["sentence"]], "commit": revision}
-                append_row(arguments.rows, rows[row["sentence"]])
+                rows[row["sentence"]] = row
+                append_row(arguments.rows, row)
     caught = sum(rows[fault.sentence]["failed"] for fault in chosen)
     print(f"{caught} of {len(chosen)} seen")
     raise SystemExit(caught < len(chosen))
 
 
 def table(arguments: argparse.Namespace) -> None:
-    """The Markdown table of what was run at the present state of the package and its tests."""
-    rows = valid_rows(arguments.rows)
+    """What was run at the present state of the package and its tests."""
+    rows, _ = valid_rows(arguments.rows)
     done = [rows[fault.sentence] for fault in FAULTS if fault.sentence in rows]
-    caught = sum(row["failed"] for row in done)
-    commits = ", ".join(sorted({row["commit"] for row in done}))
-    print("# Planted faults\n")
-    print(f"Written by `python -m experiments.robustness.planted_faults table` on {datetime.date.today()}", end=" ")
-    print(f"from runs at commit {commits}.\n")
-    print(f"**{caught} of {len(FAULTS)} faults seen** by the default test that the list names", end="")
-    print(f", {len(done) - caught} survive, {len(FAULTS) - len(done)} not run;", end=" ")
-    minutes = sum(row["seconds"] for row in done) / 60
-    print(f"{minutes:.0f} minutes of one process. A fault is planted by name: what", end=" ")
-    print("a definition returns, takes, reads or checks is changed in its syntax tree.")
-    print("\n| fault | place | change | test that fails | s |\n|---|---|---|---|---|")
+    caught, minutes = sum(row["failed"] for row in done), sum(row["seconds"] for row in done) / 60
+    print("# Planted faults\n\nWritten by `python -m experiments.robustness.planted_faults table` on", end=" ")
+    print(f"{datetime.date.today()} from runs at commit {commits_of(done)}.\n")
+    print(f"**{caught} of {len(FAULTS)} faults seen** by the default test that the list names,", end=" ")
+    print(f"{len(done) - caught} survive, {len(FAULTS) - len(done)} not run; {minutes:.0f} minutes of one process. A")
+    print("fault is planted by name: what a definition returns, takes, reads or checks is changed in its")
+    print("syntax tree.\n")
+    print(heading("fault | place | change | test that fails | s"))
     for fault in FAULTS:
         verdict, seconds = "not run", ""
         if row := rows.get(fault.sentence):
             verdict = f"`{row['first'].removeprefix('tests/')}`" if row["failed"] else "**SURVIVED**"
             seconds = f"{row['seconds']:.0f}"
-        print(f"| {fault.sentence} | `{fault.place}` | `{fault.change!r}` | {verdict} | {seconds} |")
+        print(line(fault.sentence, f"`{fault.place}`", f"`{fault.change!r}`", verdict, seconds))
 
 
 if __name__ == "__main__":

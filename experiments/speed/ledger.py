@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import os
 import shutil
 import sys
 import tempfile
@@ -22,15 +21,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from experiments.common.command_line import act, parser
-from experiments.common.rows import ROOT, append_row, read_rows
-from experiments.speed.benchmarks.measure import command_cost, cpu_model, state
+from experiments.common.commands import IMPORTS, PROGRAM, measured, said
+from experiments.common.page import heading, line
+from experiments.common.rows import ROOT, append_row, cpu_model, read_rows, state
 
 LEDGER = Path(__file__).with_suffix(".jsonl")
-IMPORTS = "import jax, optimistix, scipy.stats"
 REPEATS = 3
 AXES, BENCHES = 8, 8
 """Of the fixed sets: so many axes a protocol, so many benches of seed 0."""
-_COMMANDS: dict[str, tuple[str, float]] = {
+COMMANDS: dict[str, tuple[str, float]] = {
     "fit --no-sample": ("fit twin --no-sample --json", 4.8),
     "fit --quick": ("fit twin --quick --json", 13.0),
     "demo": ("demo", 12.5),
@@ -43,15 +42,14 @@ _COMMANDS: dict[str, tuple[str, float]] = {
 }
 """In a folder that holds a copy of the paper twin and a simulated axis; in this order, `report` takes up the fit. With
 the largest multiple of the imports: some 15 % above the first entry, since repeats of one commit differ by 5 %."""
-COMMANDS = {name: tuple(words.split()) for name, (words, _) in _COMMANDS.items()}
-SHARES = {"answered": (0.85, 1.0), "95 % intervals that hold": (0.85, 1.0)}
-"""Of small fixed sets: eight benches with nine headlines each, 24 axes with four; one of them failing is allowed."""
+SHARES = {"answered": ("answered", "drawn"), "95 % intervals that hold": ("held", "intervals")}
 BOUNDS: dict[str, tuple[float, float]] = {
-    **{f"CPU of {name} / imports": (0.0, most) for name, (_, most) in _COMMANDS.items()},
+    **{f"CPU of {name} / imports": (0.0, most) for name, (_, most) in COMMANDS.items()},
     "effective draws per import": (25.0, float("inf")),
-    **{f"{what}: {share}": ends for what in ("axes", "benches") for share, ends in SHARES.items()},
+    **{f"{what}: {share}": (0.85, 1.0) for what in ("axes", "benches") for share in SHARES},
 }
-"""Lowest and highest allowed value of the last entry, by the names of `figures`."""
+"""Lowest and highest allowed value of the last entry, by the names of `figures`. Shares are of small fixed sets: eight
+benches with nine headlines each, 24 axes with four; one of them failing is allowed."""
 
 
 def figures(entry: Mapping) -> dict[str, float]:
@@ -60,19 +58,15 @@ def figures(entry: Mapping) -> dict[str, float]:
     shares = {
         f"{what}: {share}": float(counts[part]) / counts[whole]
         for what, counts in entry["intervals"].items()
-        for share, part, whole in (("answered", "answered", "drawn"), ("95 % intervals that hold", "held", "intervals"))
+        for share, (part, whole) in SHARES.items()
     }
     return {**commands, "effective draws per import": float(entry["effective_draws_per_import"]), **shares}
 
 
-def _least(command: Sequence[str], folder: Path) -> tuple[str, float]:
+def least(command: Sequence[object], folder: Path) -> tuple[str, float]:
     """What a command prints last, and its least CPU seconds."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    costs = []
-    for _ in range(REPEATS):
-        printed, cost = command_cost(("/usr/bin/env", "-C", str(folder), *command), environment)
-        costs.append(cost["cpu_s"])
-    return printed, min(costs)
+    costs = [measured(command, cwd=folder) for _ in range(REPEATS)]
+    return costs[-1][0], min(cost["cpu_s"] for _, cost in costs)
 
 
 def write_axis(folder: Path) -> None:
@@ -85,46 +79,34 @@ def write_axis(folder: Path) -> None:
     (template / "readings.csv").write_text("reading,move,value,u,status\n")
     header = ('format = "tvsbayes-axis/1"', 'unit = "deg"', "[axis]", "per_command = { value = 0.01, u = 0.001 }", "")
     (template / "campaign.toml").write_text("\n".join(header))
-    words = ("simulate", str(template), str(folder / "axis"), "--seed", "1")
-    command_cost((sys.executable, "-m", "tvsbayes", *words))
+    said("simulate", template, folder / "axis", "--seed", 1)
 
 
-def _effective_draws(fit: Mapping) -> float:
-    return float(fit["sampling"]["importance"]["least_ess"]["value"])
-
-
-def _study(module: str, number: int, *words: str) -> list[dict]:
+def study(module: str, number: int) -> list[dict]:
     """Rows of a study in a file of their own: what another state of the package left is not taken up."""
     with tempfile.TemporaryDirectory() as folder:
         rows = Path(folder) / "rows.jsonl"
-        command = (sys.executable, "-m", f"experiments.intervals.{module}", "run", "--n", str(number))
-        command_cost((*command, *words, "--rows", str(rows)), limit_s=3600.0)
+        words = ("-m", f"experiments.intervals.{module}", "run", "--n", number, "--rows", rows)
+        measured((sys.executable, *words), limit_s=3600.0)
         return read_rows(rows)
 
 
-def _counts(rows: Sequence[Mapping], answered: Sequence[Mapping], held: Iterable[bool]) -> dict[str, int]:
+def counts(rows: Sequence[Mapping], answered: Sequence[Mapping], held: Iterable[bool]) -> dict[str, int]:
     each = list(held)
     return {"drawn": len(rows), "answered": len(answered), "intervals": len(each), "held": sum(each)}
 
 
-def axes() -> dict[str, int]:
-    """Drawn axes that creep and make waves: every parameter's 95 % interval."""
-    rows = _study("axis_in_time", AXES)
-    answered = [row for row in rows if not row["problems"]]
-    scores = (value for row in answered for value in row.values() if isinstance(value, dict) and "below" in value)
-    return _counts(rows, answered, (abs(score["below"] - 0.5) <= 0.475 for score in scores))
-
-
-def benches() -> dict[str, int]:
-    """Strangers' benches: every headline's 95 % interval."""
-    rows = _study("strangers", BENCHES)
-    answered = [row for row in rows if row["answer"] in ("accepted", "rough")]
-    headlines = (each for row in answered for each in row["headlines"].values() if each["sd"] > 0)
-    return _counts(rows, answered, (each["low"] <= each["truth"] <= each["high"] for each in headlines))
+def intervals() -> dict[str, dict[str, int]]:
+    """Of drawn axes every parameter's 95 % interval, of strangers' benches every headline's."""
+    axes, benches = study("axis_in_time", AXES), study("strangers", BENCHES)
+    fitted = [row for row in axes if not row["problems"]]
+    usable = [row for row in benches if row["answer"] in ("accepted", "rough")]
+    held = (abs(each["pit"] - 0.5) <= 0.475 for row in fitted for each in row["quantities"].values())
+    kept = (each["held"] for row in usable for each in row["headlines"].values())
+    return {"axes": counts(axes, fitted, held), "benches": counts(benches, usable, kept)}
 
 
 def lines(folder: Path) -> int:
-    """Lines of Python in a folder."""
     return sum(len(path.read_bytes().splitlines()) for path in folder.rglob("*.py"))
 
 
@@ -132,21 +114,21 @@ def append(_: argparse.Namespace) -> None:
     """Measure this state of the package and write its entry."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        _, unit = _least((sys.executable, "-c", IMPORTS), folder)
+        _, unit = least(IMPORTS, folder)
         shutil.copytree(ROOT / "data" / "twins" / "paper_twin", folder / "twin")
         write_axis(folder)
         entry: dict = {"commit": state(), "at": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M}"}
         entry |= {"processor": cpu_model(), "import_cpu_s": round(unit, 2), "commands": {}}
-        for name, words in COMMANDS.items():
-            printed, cost = _least((sys.executable, "-m", "tvsbayes", *words), folder)
+        for name, (words, _) in COMMANDS.items():
+            printed, cost = least((*PROGRAM, *words.split()), folder)
             entry["commands"][name] = round(cost / unit, 2)
             if name == "fit --quick":
-                entry["effective_draws_per_import"] = round(_effective_draws(json.loads(printed)) / cost * unit)
-    entry["intervals"] = {"axes": axes(), "benches": benches()}
+                draws = float(json.loads(printed)["sampling"]["importance"]["least_ess"]["value"])
+                entry["effective_draws_per_import"] = round(draws / cost * unit)
+    entry["intervals"] = intervals()
     entry["lines"] = {folder: lines(ROOT / folder) for folder in ("tvsbayes", "tests", "experiments")}
     append_row(LEDGER, entry)
-    for problem in problems(entry):
-        print(problem)
+    print(*problems(entry), sep="\n")
 
 
 def problems(entry: Mapping) -> list[str]:
@@ -163,15 +145,14 @@ def table(_: argparse.Namespace) -> None:
     entries = read_rows(LEDGER)
     print("# Ledger\n\nA column is a commit, measured by `python -m experiments.speed.ledger append`; what a row means")
     print("stands in the script. Bounds are those of the last entry.\n")
-    names = [f"{entry['commit']}, {entry['at'][:10]}" for entry in entries]
-    print(f"| | {' | '.join(names)} | bounds |\n|{'---|' * (len(names) + 2)}")
-    print(f"| CPU s of the imports | {' | '.join(str(entry['import_cpu_s']) for entry in entries)} | |")
+    print(heading("", *(f"{entry['commit']}, {entry['at'][:10]}" for entry in entries), "bounds"))
+    print(line("CPU s of the imports", *(entry["import_cpu_s"] for entry in entries), ""))
     for name, (low, high) in BOUNDS.items():
         values = [figures(entry).get(name) for entry in entries]
-        cells = ["" if value is None else f"{value:.3g}" for value in values]
-        print(f"| {name} | {' | '.join(cells)} | {low:.3g} to {high:.3g} |")
+        cells = ("" if value is None else f"{value:.3g}" for value in values)
+        print(line(name, *cells, f"{low:.3g} to {high:.3g}"))
     for folder in entries[-1]["lines"]:
-        print(f"| lines of {folder}/ | {' | '.join(str(entry['lines'].get(folder, '')) for entry in entries)} | |")
+        print(line(f"lines of {folder}/", *(entry["lines"].get(folder, "") for entry in entries), ""))
 
 
 if __name__ == "__main__":

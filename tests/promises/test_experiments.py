@@ -79,7 +79,7 @@ def test_the_index_names_every_script_and_only_scripts():
     index = (FOLDER / "README.md").read_text(encoding="utf-8")
     named = set(re.findall(rf"`((?:{'|'.join(QUESTIONS)})\.\w+)", index))
     runnable = {name.removeprefix("experiments.").removesuffix(".__main__") for name in SCRIPTS}
-    assert named == runnable - {"speed.benchmarks.child"}
+    assert named == runnable
 
 
 @pytest.mark.parametrize("page", sorted(FOLDER.rglob("*.md")), ids=lambda path: str(path.relative_to(FOLDER)))
@@ -117,7 +117,7 @@ def test_a_page_begins_with_its_figure(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SCRIPTS if not name.endswith("child")])
+@pytest.mark.parametrize("name", SCRIPTS)
 def test_a_script_starts(name):
     command = [sys.executable, "-m", name.removesuffix(".__main__"), "--help"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.common.console import quietly
+from experiments.common.commands import quietly
 from experiments.inputs.strangers_tables.kinds import Drawn
 from experiments.inputs.strangers_tables.measured import DOMAIN, SCALE, Reading, Truth
 

@@ -10,25 +10,16 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 
 class NoPlace(LookupError):
     """A name that stands for no definition or for several, or a change that finds nothing in its definition."""
 
 
-@dataclass(frozen=True)
-class Definition:
-    """A function, class or constant.
-
-    Attributes:
-        path: of its module.
-        tree: of its module.
-        node: of the definition, in the tree.
-        body: the list of statements that holds the node.
-        name: qualified, from the package on.
-    """
+class Definition(NamedTuple):
+    """A function, class or constant: its module, the statement, the list that holds it, its name from the package."""
 
     path: Path
     tree: ast.Module
@@ -37,26 +28,21 @@ class Definition:
     name: str
 
 
-def _names(statement: ast.stmt) -> list[str]:
-    """What a statement defines."""
-    if isinstance(statement, ast.FunctionDef | ast.ClassDef):
-        return [statement.name]
-    targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
-    return [node.id for target in targets if target for node in ast.walk(target) if isinstance(node, ast.Name)]
-
-
-def _definitions(path: Path, prefix: str) -> list[Definition]:
-    """All of a module; of overloads the last counts."""
+def _definitions(path: Path, prefix: str) -> Iterator[Definition]:
+    """All of a module, in its order."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-
-    def within(body: list[ast.stmt], prefix: str) -> Iterator[Definition]:
-        for statement in body:
-            for name in _names(statement):
-                yield Definition(path, tree, statement, body, f"{prefix}.{name}")
-            if isinstance(statement, ast.FunctionDef | ast.ClassDef):
-                yield from within(statement.body, f"{prefix}.{statement.name}")
-
-    return list(within(tree.body, prefix))
+    left = [(tree.body, prefix)]
+    while left:
+        body, prefix = left.pop(0)
+        for node in body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                yield Definition(path, tree, node, body, f"{prefix}.{node.name}")
+                left.append((node.body, f"{prefix}.{node.name}"))
+            else:
+                targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+                for part in (part for target in targets if target for part in ast.walk(target)):
+                    if isinstance(part, ast.Name):
+                        yield Definition(path, tree, node, body, f"{prefix}.{part.id}")
 
 
 class Sources:
@@ -64,13 +50,16 @@ class Sources:
 
     def __init__(self, root: Path):
         package = root / "tvsbayes"
-        prefixes = {path: ".".join(path.relative_to(root).with_suffix("").parts) for path in package.rglob("*.py")}
-        self._modules = {one.name: path for path, prefix in prefixes.items() for one in _definitions(path, prefix)}
-        self._prefixes = prefixes
+        self._prefixes = {
+            path: ".".join(path.relative_to(root).with_suffix("").parts) for path in package.rglob("*.py")
+        }
+        self._modules = {
+            one.name: path for path, prefix in self._prefixes.items() for one in _definitions(path, prefix)
+        }
         self.firmware = sorted(path for path in package.rglob("*") if path.suffix in (".cpp", ".ino"))
 
     def definition(self, name: str) -> Definition:
-        """The one definition that a name stands for, in a tree of its own.
+        """The one definition that a name stands for, in a tree of its own; of overloads the last.
 
         Raises:
             NoPlace: there is none, or there are several.
@@ -101,10 +90,11 @@ def _last_name(node: ast.expr) -> str:
 
 
 class Change(ast.NodeTransformer):
-    """What becomes of a definition; counts the places that it has changed."""
+    """What becomes of a definition: of what goes by a name, and an expression; either may be missing."""
 
-    def __init__(self) -> None:
-        self.count = 0
+    def __init__(self, *arguments: str):
+        self.arguments, self.count = arguments, 0
+        self.name, self.expression = arguments[0], arguments[-1]
 
     def planted(self, sources: Sources, name: str) -> tuple[Path, str]:
         """The module of a definition, and its text with the change.
@@ -119,7 +109,6 @@ class Change(ast.NodeTransformer):
         return place.path, ast.unparse(ast.fix_missing_locations(place.tree)) + "\n"
 
     def change(self, place: Definition) -> None:
-        """Change what is inside."""
         self.generic_visit(place.node)
 
     def changed[Node](self, node: Node) -> Node:
@@ -127,84 +116,62 @@ class Change(ast.NodeTransformer):
         self.count += 1
         return node
 
+    def assigned(self, name: str) -> ast.stmt:
+        """Another value for a name that has one."""
+        value = _with(self.expression, value=_expression(name))
+        return self.changed(ast.parse(f"{name} = {ast.unparse(value)}").body[0])
+
     def __repr__(self) -> str:
-        arguments = (f"{value!r}" for name, value in vars(self).items() if name != "count")
-        return f"{type(self).__name__}({', '.join(arguments)})"
-
-
-class Named(Change):
-    """A change of what goes by a name inside a definition."""
-
-    def __init__(self, name: str, expression: str):
-        super().__init__()
-        self.name, self.expression = name, expression
+        return f"{type(self).__name__}({', '.join(map(repr, self.arguments))})"
 
 
 class Constant(Change):
-    """A constant of a module or class, or a field's default, has another value."""
-
-    def __init__(self, expression: str):
-        super().__init__()
-        self.expression = expression
+    """A constant of a module or class, or a field's default, has another value: another assignment follows it."""
 
     def change(self, place: Definition) -> None:
-        """Follow the definition with another."""
-        name = place.name.rpartition(".")[2]
-        new = ast.Assign([ast.Name(name, ast.Store())], _with(self.expression, value=ast.Name(name, ast.Load())))
         if isinstance(place.node, ast.Assign | ast.AnnAssign):
-            place.body.insert(place.body.index(place.node) + 1, self.changed(new))
+            new = self.assigned(place.name.rpartition(".")[2])
+            place.body.insert(place.body.index(place.node) + 1, new)
 
 
-class Argument(Named):
-    """A function takes one of its arguments for something else."""
+class Argument(Change):
+    """A function takes one of its arguments for something else: its body begins with an assignment."""
 
     def change(self, place: Definition) -> None:
-        """Begin the body with an assignment."""
         node = place.node
-        if not isinstance(node, ast.FunctionDef):
-            return
-        if self.name in {arg.arg for arg in ast.walk(node.args) if isinstance(arg, ast.arg)}:
-            value = _with(self.expression, value=ast.Name(self.name, ast.Load()))
-            new = ast.Assign([ast.Name(self.name, ast.Store())], value)
-            node.body.insert(int(ast.get_docstring(node) is not None), self.changed(new))
+        if isinstance(node, ast.FunctionDef) and self.name in {
+            arg.arg for arg in ast.walk(node.args) if isinstance(arg, ast.arg)
+        }:
+            node.body.insert(int(ast.get_docstring(node) is not None), self.assigned(self.name))
 
 
 class Returns(Change):
     """A function returns something else: an expression of `value`, its arguments and its variables."""
 
-    def __init__(self, expression: str):
-        super().__init__()
-        self.expression = expression
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.stmt:
+    def _itself(self, node: ast.AST) -> ast.AST:
         """Functions inside return to this one."""
         return node
 
-    def visit_Lambda(self, node: ast.Lambda) -> ast.expr:
-        """The same."""
-        return node
+    visit_FunctionDef = visit_Lambda = _itself
 
     def visit_Return(self, node: ast.Return) -> ast.stmt:
-        """Every end of the function."""
         if node.value is None:
             return node
         return self.changed(ast.Return(_with(self.expression, value=node.value)))
 
 
-class Local(Named):
+class Local(Change):
     """A variable or attribute has another value wherever it is assigned in a definition."""
 
     def _follow(self, node: ast.Assign | ast.AugAssign | ast.AnnAssign) -> ast.stmt | list[ast.stmt]:
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-        if self.name not in {ast.unparse(part) for target in targets for part in ast.walk(target)}:
-            return node
-        value = _with(self.expression, value=_expression(self.name))
-        return [node, self.changed(ast.parse(f"{self.name} = {ast.unparse(value)}").body[0])]
+        assigns = self.name in {ast.unparse(part) for target in targets for part in ast.walk(target)}
+        return [node, self.assigned(self.name)] if assigns else node
 
     visit_Assign = visit_AugAssign = visit_AnnAssign = _follow
 
 
-class Reads(Named):
+class Reads(Change):
     """A variable, attribute or element is taken for something else wherever a definition reads it."""
 
     def _read(self, node: ast.Name | ast.Attribute | ast.Subscript) -> ast.expr:
@@ -215,11 +182,10 @@ class Reads(Named):
     visit_Name = visit_Attribute = visit_Subscript = _read
 
 
-class Call(Named):
+class Call(Change):
     """The call of a function becomes another expression: of `value`, the call itself, `function`, `arg0`, `arg1`."""
 
     def visit_Call(self, node: ast.Call) -> ast.expr:
-        """Every call of that name."""
         self.generic_visit(node)
         if _last_name(node.func) != self.name:
             return node
@@ -227,11 +193,10 @@ class Call(Named):
         return self.changed(_with(self.expression, value=node, function=node.func, **arguments))
 
 
-class Keyword(Named):
+class Keyword(Change):
     """What is handed on under a name is something else."""
 
     def visit_keyword(self, node: ast.keyword) -> ast.keyword:
-        """Every argument of that name."""
         self.generic_visit(node)
         if node.arg != self.name:
             return node
@@ -241,30 +206,20 @@ class Keyword(Named):
 class Never(Change):
     """A condition that a name takes part in is never met: a check that is left out."""
 
-    def __init__(self, name: str):
-        super().__init__()
-        self.name = name
-
     def _decided[Node: (ast.If, ast.IfExp, ast.While, ast.comprehension)](self, node: Node) -> Node:
         self.generic_visit(node)
-        tests = node.ifs if isinstance(node, ast.comprehension) else [node.test]
-        for test in tests:
-            if self.name in {_last_name(part) for part in ast.walk(test) if isinstance(part, ast.Name | ast.Attribute)}:
-                self.changed(node)
-                if isinstance(node, ast.comprehension):
-                    node.ifs = [_expression("False")]
-                else:
-                    node.test = _expression("False")
+        loop = isinstance(node, ast.comprehension)
+        parts = [part for test in (node.ifs if loop else [node.test]) for part in ast.walk(test)]
+        if self.name in {_last_name(part) for part in parts if isinstance(part, ast.Name | ast.Attribute)}:
+            self.changed(node)
+            setattr(node, "ifs" if loop else "test", [_expression("False")] if loop else _expression("False"))
         return node
 
     visit_If = visit_IfExp = visit_While = visit_comprehension = _decided
 
 
-class Uncalled:
+class Uncalled(Change):
     """A function of the firmware, in C++, no longer calls another."""
-
-    def __init__(self, called: str):
-        self.called = called
 
     def planted(self, sources: Sources, name: str) -> tuple[Path, str]:
         """The file of a function, and its text without the calls.
@@ -276,10 +231,8 @@ class Uncalled:
         for path in sources.firmware:
             text = path.read_text(encoding="utf-8")
             for match in whole.finditer(text):
-                body, count = re.subn(rf"^\s*{re.escape(self.called)}\([^;]*\);\n", "", match[0], flags=re.MULTILINE)
+                call = rf"^\s*{re.escape(self.name)}\([^;]*\);\n"
+                body, count = re.subn(call, "", match[0], flags=re.MULTILINE)
                 if count:
                     return path, text[: match.start()] + body + text[match.end() :]
-        raise NoPlace(f"no function {name} of the firmware calls {self.called}")
-
-    def __repr__(self) -> str:
-        return f"Uncalled({self.called!r})"
+        raise NoPlace(f"no function {name} of the firmware calls {self.name}")

@@ -6,8 +6,8 @@ A place is a qualified name and a test the name of a function: moving or renamin
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from experiments.common.rows import ROOT
 from experiments.robustness.faults.changes import (
@@ -26,20 +26,12 @@ from experiments.robustness.faults.changes import (
 )
 
 
-@dataclass(frozen=True)
-class Fault:
-    """A bug as behaviour.
-
-    Attributes:
-        sentence: what it does, unique.
-        place: the qualified name of the function, class or constant, as short as it is unique.
-        change: what becomes of it.
-        test: the test that must fail.
-    """
+class Fault(NamedTuple):
+    """A bug as behaviour: what it does, in a unique sentence; where; what becomes of it; the test that must fail."""
 
     sentence: str
     place: str
-    change: Change | Uncalled
+    change: Change
     test: str
 
 

@@ -1,0 +1,267 @@
+"""Contenders of the benchmarks that compare code: ours and its peers, ready to take turns on one thread.
+
+A function prepares the works of one part in a temporary folder; a work gets the number of its repeat and returns a row.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from experiments.common.clock import timed
+from experiments.common.coverage import rms
+from experiments.common.of_tests import module_of_tests
+from experiments.common.rigs import dense_plan, mounted_rig, pixels_of, small_plan
+
+Work = Callable[[int], Mapping[str, object]]
+OURS = "tvsbayes"
+
+
+TIGHT, DIGITS = 1e-15, 6.0
+STRD = {"scipy lm": "lm", "scipy trf": "trf"}
+USUAL = "scipy lm, NumPy and finite differences"
+
+
+def certified(_: Path) -> Mapping[str, Work]:
+    """NIST's problems of `tests/support/certified_problems.py`, from both starts, by our descent and by scipy."""
+    import jax
+    import jax.numpy as jnp
+    from scipy import optimize
+
+    from tvsbayes.statistics.least_squares import least_squares_covariance, residuals_and_jacobian
+
+    jax.config.update("jax_enable_x64", True)
+    strd = module_of_tests("support.certified_problems")
+    if not strd.FOLDER.is_dir():
+        raise SystemExit(f"NIST's files are not at {strd.FOLDER}: choose --parts without strd")
+    problems = {name: strd.read_problem(name) for name in strd.MODELS}
+    data = {name: (jnp.asarray(p.x), jnp.asarray(p.y)) for name, p in problems.items()}
+    plain = {name: jax.jit(residual) for name, residual in strd.RESIDUALS.items()}
+    options = {"xtol": TIGHT, "ftol": TIGHT, "gtol": TIGHT, "x_scale": "jac", "max_nfev": 100_000}
+
+    def residuals(name: str, value: np.ndarray) -> np.ndarray:
+        return np.asarray(plain[name](jnp.asarray(value), data[name]))
+
+    def jacobian(name: str, value: np.ndarray) -> np.ndarray:
+        return np.asarray(residuals_and_jacobian(strd.RESIDUALS[name], jnp.asarray(value), data[name]).jacobian)
+
+    def ours(name: str, start: np.ndarray) -> np.ndarray:
+        return strd.descended(strd.RESIDUALS[name], start, data[name]).value
+
+    def peer(method: str, name: str, start: np.ndarray) -> np.ndarray:
+        both = {"fun": lambda b: residuals(name, b), "jac": lambda b: jacobian(name, b)}
+        return optimize.least_squares(x0=start, method=method, **both, **options).x
+
+    def usual(name: str, start: np.ndarray) -> np.ndarray:
+        with mock.patch.object(strd, "jnp", np):
+            about = (problems[name].x, problems[name].y)
+            return optimize.least_squares(strd.RESIDUALS[name], start, args=(about,), method="lm", **options).x
+
+    def solved(solve: Callable[[str, np.ndarray], np.ndarray]) -> dict[tuple[str, int], np.ndarray]:
+        found = {}
+        for name, start in ((name, start) for name in problems for start in (0, 1)):
+            try:
+                found[name, start] = solve(name, problems[name].starts[start])
+            except (ValueError, np.linalg.LinAlgError):
+                found[name, start] = np.full(problems[name].certified.size, np.nan)
+        return found
+
+    def digits(name: str, value: np.ndarray) -> tuple[float, float]:
+        """Of the worst parameter and of the worst standard error."""
+        problem, residual = problems[name], residuals(name, value)
+        try:
+            covariance = least_squares_covariance(jacobian(name, value)) * (residual @ residual)
+            errors = strd.digits(np.sqrt(np.diag(covariance) / (problem.x.size - value.size)), problem.sd)
+        except (np.linalg.LinAlgError, ValueError):
+            errors = 0.0
+        return max(strd.digits(value, problem.certified), 0.0), max(errors, 0.0)
+
+    def work(solve: Callable, _: int) -> Mapping[str, object]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            found, cost = timed(lambda: solved(solve))
+            of = {key: digits(key[0], value) for key, value in found.items()}
+        parameters, errors = np.array(list(of.values())).T
+        missed = ", ".join(f"{name} {start + 1}" for (name, start), d in of.items() if d[0] < DIGITS)
+        row = {**cost, "good": int(np.sum(parameters >= DIGITS)), "missed": missed, "least": float(parameters.min())}
+        return {**row, "median": float(np.median(parameters)), "least_error": float(errors.min())}
+
+    works = {OURS: partial(work, ours), USUAL: partial(work, usual)}
+    works |= {name: partial(work, partial(peer, method)) for name, method in STRD.items()}
+    for compiled in works.values():
+        compiled(0)
+    return works
+
+
+CHAINS, WARMUP, DRAWS, TRUSTED = 4, 250, 500, 400
+"""Of NUTS; effective draws that four chains need before an interval is trusted (Vehtari et al., 10.1214/20-BA1221)."""
+FIRST_TIER, NUTS = "tvsbayes, tier 1 alone", "NumPyro NUTS, sheared"
+
+
+def samplers(_: Path) -> Mapping[str, Work]:
+    import jax
+    import jax.numpy as jnp
+    from arviz_stats.base import array_stats
+
+    from experiments.common.reference_samplers import AXES, Setting, build_transport, nuts, potential_of
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.model.compilation_cache import use_compilation_cache
+    from tvsbayes.posterior.sampling import sample
+    from tvsbayes.results.tiers import CHAIN
+    from tvsbayes.statistics.weighted_draws import weighted_summary
+    from tvsbayes.twin.simulated_campaign import simulate
+
+    use_compilation_cache()
+    jax.config.update("jax_enable_x64", True)
+    joint = fit(simulate(mounted_rig(), dense_plan(("d1", "d3")), seed=1).campaign)
+    free = np.flatnonzero(joint.free)
+
+    def worst(z: np.ndarray) -> dict[str, float]:
+        ess, rhat = array_stats.ess(z, method="bulk", **AXES), array_stats.rhat(z, **AXES)
+        return {"ess": float(np.min(ess)), "rhat": float(np.max(rhat))}
+
+    def ours(tier: str, seed: int) -> Mapping[str, object]:
+        posterior, cost = timed(lambda: sample(joint, tier, seed=seed, max_minutes=30.0))
+        if tier == CHAIN:
+            figures = worst(posterior.z[..., free])
+        else:
+            summary = weighted_summary(posterior.z[0][:, free], posterior.weights[0])
+            figures = {"ess": float(np.min(summary.ess_mean))}
+        rate = figures["ess"] / cost["cpu_s"]
+        return {**cost, **figures, "converged": posterior.converged, "rate": rate, "trusted_s": cost["cpu_s"]}
+
+    def hamiltonian(seed: int) -> Mapping[str, object]:
+        route, built = timed(lambda: build_transport(joint))
+        z_of, potential = potential_of(joint, route)
+        run = nuts(potential, route.index.size, Setting(CHAINS, WARMUP, DRAWS, seed))
+        flat = jnp.asarray(run.draws.reshape(-1, run.draws.shape[-1]))
+        z = np.asarray(jax.jit(jax.vmap(z_of))(flat)).reshape(*run.draws.shape[:2], -1)
+        figures, before_s = worst(z[..., free]), built["cpu_s"] + run.warmup_s
+        row = {**figures, "cpu_s": before_s + run.sampling_s, "compile_s": run.compile_s, "leapfrogs": run.leapfrogs}
+        row |= {"rate": figures["ess"] / row["cpu_s"], "sampling_rate": figures["ess"] / run.sampling_s}
+        row["trusted_s"] = before_s + run.sampling_s * TRUSTED / figures["ess"]
+        return row | {"divergences": run.divergences}
+
+    works = {OURS: partial(ours, CHAIN), FIRST_TIER: partial(ours, "importance"), NUTS: hamiltonian}
+    ours("importance", 0)
+    return works
+
+
+BRIGHT = 0.2
+PHOTUTILS = {"photutils centroid_com": "com", "photutils, above 20 % of the peak": "bright", "photutils 2dg": "2dg"}
+DETECT = {"tvsbayes detect": "fit", "tvsbayes detect, contour": "contour"}
+READ = "cv2.imread alone"
+
+
+def photutils_centre(path: str, kind: str) -> np.ndarray:
+    """Centre of the spot of a picture, px, NaN where our window finds none."""
+    import cv2
+    from photutils import centroids
+
+    from tvsbayes.cameras.spot_window import patch_around
+
+    patch = patch_around(cv2.imread(path))
+    if isinstance(patch, str):
+        return np.full(2, np.nan)
+    grey = patch.grey.astype(float)
+    light = grey - np.median(np.concatenate((grey[0], grey[-1], grey[:, 0], grey[:, -1])))
+    if kind == "2dg":
+        return np.asarray(centroids.centroid_2dg(light, mask=~patch.usable)) + patch.corner
+    # What is clipped is brightest: a centre of mass without it would be one of the rim.
+    light = np.where(light > BRIGHT * light.max(), light, 0.0) if kind == "bright" else light
+    return np.asarray(centroids.centroid_com(light)) + patch.corner
+
+
+def spots(folder: Path) -> Mapping[str, Work]:
+    """48 looks of a drawn rig, rendered; left before right."""
+    import cv2
+
+    from tvsbayes.cameras.detection import detect
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.twin.frames import write_frames
+    from tvsbayes.twin.physics import project
+    from tvsbayes.twin.simulated_campaign import simulate
+
+    twin = simulate(mounted_rig(), small_plan(("d1", "d3")), 4)
+    twin.undetected().write(folder / "campaign")
+    write_frames(folder / "campaign", twin.undetected(), 4)
+    true_px = project(twin.light.points_mm, twin.truth.stereo, twin.truth.parameters["focal_scale"]).reshape(-1, 2)
+    campaign, paths = read_campaign(folder / "campaign"), sorted((folder / "campaign" / "frames").glob("*.png"))
+
+    def found(work: Callable[[], object], _: int) -> Mapping[str, object]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            centres, cost = timed(work)
+        row = {**cost, "ms": 1000 * cost["cpu_s"] / len(paths), "ok": len(paths)}
+        if centres is None:
+            return row
+        off = np.array(centres).reshape(-1, 2) - true_px
+        off = off[np.isfinite(off).all(axis=1)]
+        ends = {"median_px": float(np.median(np.abs(off))), "max_px": float(np.abs(off).max())}
+        return {**row, "ok": len(off), "rms_px": rms(off), **ends}
+
+    jobs: dict[str, Callable[[], object]] = {
+        name: lambda method=method: pixels_of(detect(campaign, method, workers=1).campaign)
+        for name, method in DETECT.items()
+    }
+    jobs[READ] = lambda: [cv2.imread(str(path)) for path in paths] and None
+    for name, kind in PHOTUTILS.items():
+        jobs[name] = lambda kind=kind: [photutils_centre(str(path), kind) for path in paths]
+    works = {name: partial(found, job) for name, job in jobs.items()}
+    for work in works.values():
+        work(0)
+    return works
+
+
+SEPARATE, TOGETHER = "cv2, cameras one by one, then the pair", "cv2, then all parameters together"
+
+
+def stereo(_: Path) -> Mapping[str, Work]:
+    """Repeat k calibrates drawn rig k, from the same corners of rendered boards."""
+    import cv2
+
+    from experiments.common.board_views import BOARD, rendered_views, scenes
+    from experiments.common.opencv_stereo import calibrated
+    from tvsbayes.cameras.stereo_calibration import calibrate_stereo
+    from tvsbayes.instrument.stereo_pair import rotation_vector
+    from tvsbayes.model.compilation_cache import use_compilation_cache
+
+    use_compilation_cache()
+
+    @cache
+    def rig(seed: int):
+        """A true pair, the views that both cameras have, and our stated uncertainties, the scale of errors."""
+        drawn = scenes(seed, "rendered")
+        views = [v for v in rendered_views(drawn, seed) if v.left is not None and v.right is not None]
+        true = drawn[0].stereo
+        size = true.image_width, true.image_height
+        stated = calibrate_stereo(views, BOARD, size).stereo.parameter_covariance
+        return true, views, size, np.sqrt(np.diag(stated))
+
+    def by_opencv(flags: int, views, size, true):
+        sides = [[getattr(view, side) for view in views] for side in ("left", "right")]
+        # As many steps as it needs: the default of 30 steps or 1e-6 stops in a hurry.
+        rms_px, m1, d1, m2, d2, turn, shift = calibrated(BOARD.points_mm, sides, size, flags, ends=(200, 1e-9))
+        five = [np.asarray(d, float).ravel()[:5] for d in (d1, d2)]
+        return replace(true, M1=m1, D1=five[0], M2=m2, D2=five[1], R=turn, T=np.ravel(shift), rms_px=float(rms_px))
+
+    def work(flags: int | None, seed: int) -> Mapping[str, object]:
+        true, views, size, sd = rig(seed)
+        if flags is None:
+            found, cost = timed(lambda: calibrate_stereo(views, BOARD, size).stereo)
+        else:
+            found, cost = timed(lambda: by_opencv(flags, views, size, true))
+        error = found.vector - true.vector
+        row = {**cost, "rms_px": found.rms_px, "error_sds": rms(error / sd), "focal_px": rms(error[[0, 1, 9, 10]])}
+        row["baseline_mm"] = float(abs(np.linalg.norm(found.T) - np.linalg.norm(true.T)))
+        return row | {"rotation_mrad": float(1000 * np.linalg.norm(rotation_vector(found.R @ true.R.T)))}
+
+    rig(0)
+    ways = {OURS: None, SEPARATE: cv2.CALIB_FIX_INTRINSIC, TOGETHER: cv2.CALIB_USE_INTRINSIC_GUESS}
+    return {name: partial(work, flags) for name, flags in ways.items()}
