@@ -27,8 +27,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy import stats
 
+from experiments.common.against_truth import marked
 from experiments.common.command_line import by_seed, study
-from experiments.common.coverage import marked
 from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, pixels_of, shipped_plan, shipped_twin
 from tvsbayes.assessment.summary import summarise

@@ -17,8 +17,8 @@ import argparse
 
 import numpy as np
 
+from experiments.common.against_truth import NOTE, USABLE, answers, table, tried
 from experiments.common.command_line import study
-from experiments.common.coverage import NOTE, USABLE, answers, table, tried
 from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.true_looks import looks_around

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from experiments.common.against_truth import NOTE, against, table
 from experiments.common.command_line import study
-from experiments.common.coverage import NOTE, against, table
 from experiments.common.drawn_axes import drive
 from experiments.common.page import heading, line
 from experiments.common.rows import commit, commits_of

@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from experiments.common.against_truth import NOTE, failures, table, tried
 from experiments.common.command_line import study
-from experiments.common.coverage import NOTE, failures, table, tried
 from experiments.common.rigs import PIXELS, drawn_truth, mounted_rig, pixels_of, small_plan, with_pixels
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import ModelChoice

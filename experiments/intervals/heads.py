@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from experiments.common.against_truth import NOTE, USABLE, answers, failures, table, tried
 from experiments.common.command_line import study
-from experiments.common.coverage import NOTE, USABLE, answers, failures, table, tried
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import commit
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD

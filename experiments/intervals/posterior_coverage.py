@@ -18,8 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from experiments.common.against_truth import NOTE, USABLE, answers, failures, table, tried
 from experiments.common.command_line import by_seed, study
-from experiments.common.coverage import NOTE, USABLE, answers, failures, table, tried
 from experiments.common.page import heading, line
 from experiments.common.rigs import drawn_rig, shipped_plan
 from experiments.common.rows import commit, read_rows

@@ -31,8 +31,8 @@ import jax
 import numpy as np
 from scipy import stats
 
+from experiments.common.against_truth import SHRINK
 from experiments.common.command_line import by_seed, study
-from experiments.common.coverage import SHRINK
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import physical_of
 from experiments.common.page import heading, line

@@ -30,9 +30,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy import special
 
+from experiments.common.against_truth import NOTE, USABLE, failures, rms, table
 from experiments.common.command_line import study
 from experiments.common.commands import document_of, import_cpu_s
-from experiments.common.coverage import NOTE, USABLE, failures, rms, table
 from experiments.common.page import heading, line
 from experiments.common.rows import commit
 from experiments.intervals.strange_bench import AXES, SIDES, Bench, Calibration, bench

@@ -19,8 +19,8 @@ import time
 
 import numpy as np
 
+from experiments.common.against_truth import marked
 from experiments.common.command_line import study
-from experiments.common.coverage import marked
 from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, looks_around, or_none, squared_distance

@@ -17,8 +17,8 @@ import argparse
 
 import numpy as np
 
+from experiments.common.against_truth import rms
 from experiments.common.command_line import study
-from experiments.common.coverage import rms
 from experiments.common.fits import fit_from_truth
 from experiments.common.page import heading, line
 from experiments.common.rigs import drawn_truth, mounted_rig

@@ -68,7 +68,7 @@ def first() -> None:
         ends = stats.binomtest(hits, rigs).proportion_ci(0.95)
         cells.append(f"{name} {float(type_a):.1f} % ({100 * ends.low:.1f} to {100 * ends.high:.1f})")
     low = min(float(r[1]) for r in rows) <= 7.0 <= max(float(r[1]) for r in rows)
-    text, command = f"{rigs} rigs: {', '.join(cells)}", "intervals.laplace_coverage table"
+    text, command = f"{rigs} rigs: {', '.join(cells)}", "intervals.posterior_coverage laplace"
     verdict = "holds: nowhere near 95 %" if low else "holds in kind"
     row("1. classic 95 % type A interval, one \\|N\\|, holds the truth", "7 % of 40 rigs", text, verdict, command)
     # Median of a half-normal of scale 0.5 deg over 200 steps of 0.06 deg.

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from experiments.common.against_truth import SHRINK
 from experiments.common.command_line import by_seed, study
-from experiments.common.coverage import SHRINK
 from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.common.against_truth import NOTE, against, rms, table
 from experiments.common.command_line import study
-from experiments.common.coverage import NOTE, against, rms, table
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.page import heading, line
 from experiments.common.printed_runs import axis_of, tables_of

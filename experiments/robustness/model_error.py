@@ -19,8 +19,8 @@ from functools import partial
 
 import numpy as np
 
+from experiments.common.against_truth import failures, rms, tried
 from experiments.common.command_line import study
-from experiments.common.coverage import failures, rms, tried
 from experiments.common.fits import fit_from_truth
 from experiments.common.page import heading, line, share
 from experiments.common.rigs import PIXELS, mounted_rig, pixels_of, shipped_plan, with_pixels

@@ -14,8 +14,8 @@ from unittest import mock
 
 import numpy as np
 
+from experiments.common.against_truth import rms
 from experiments.common.clock import timed
-from experiments.common.coverage import rms
 from experiments.common.of_tests import module_of_tests
 from experiments.common.rigs import dense_plan, mounted_rig, pixels_of, small_plan
 
@@ -26,6 +26,17 @@ OURS = "tvsbayes"
 TIGHT, DIGITS = 1e-15, 6.0
 STRD = {"scipy lm": "lm", "scipy trf": "trf"}
 USUAL = "scipy lm, NumPy and finite differences"
+
+
+def solved(problems: Mapping, solve: Callable[[str, np.ndarray], np.ndarray]) -> dict[tuple[str, int], np.ndarray]:
+    """Every problem from both starts, NaN where a solver gave up."""
+    found = {}
+    for name, start in ((name, start) for name in problems for start in (0, 1)):
+        try:
+            found[name, start] = solve(name, problems[name].starts[start])
+        except (ValueError, np.linalg.LinAlgError):
+            found[name, start] = np.full(problems[name].certified.size, np.nan)
+    return found
 
 
 def certified(_: Path) -> Mapping[str, Work]:
@@ -63,15 +74,6 @@ def certified(_: Path) -> Mapping[str, Work]:
             about = (problems[name].x, problems[name].y)
             return optimize.least_squares(strd.RESIDUALS[name], start, args=(about,), method="lm", **options).x
 
-    def solved(solve: Callable[[str, np.ndarray], np.ndarray]) -> dict[tuple[str, int], np.ndarray]:
-        found = {}
-        for name, start in ((name, start) for name in problems for start in (0, 1)):
-            try:
-                found[name, start] = solve(name, problems[name].starts[start])
-            except (ValueError, np.linalg.LinAlgError):
-                found[name, start] = np.full(problems[name].certified.size, np.nan)
-        return found
-
     def digits(name: str, value: np.ndarray) -> tuple[float, float]:
         """Of the worst parameter and of the worst standard error."""
         problem, residual = problems[name], residuals(name, value)
@@ -85,7 +87,7 @@ def certified(_: Path) -> Mapping[str, Work]:
     def work(solve: Callable, _: int) -> Mapping[str, object]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            found, cost = timed(lambda: solved(solve))
+            found, cost = timed(lambda: solved(problems, solve))
             of = {key: digits(key[0], value) for key, value in found.items()}
         parameters, errors = np.array(list(of.values())).T
         missed = ", ".join(f"{name} {start + 1}" for (name, start), d in of.items() if d[0] < DIGITS)
