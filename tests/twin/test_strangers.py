@@ -168,34 +168,12 @@ def test_commands_take_a_bench_as_its_owner_has_it(drawn, tmp_path):
     assert pair.assumed and np.allclose(pair.T, one.calibration.matrices["T"].ravel())
 
 
-def answer(**entries: object) -> str:
-    return strangers.answer_of({"estimator": "laplace", "converged": False, "sampling": None, **entries})["answer"]
-
-
-<<<<<<< HEAD
-def test_headlines_stand_beside_their_truths():
-    entry = {"value": 1.0, "sd": 0.5, "interval95": [0.0, 2.0], "contraction": 0.9}
-    document = {
-        strangers.RATIO: dict.fromkeys(("left", "right", "up"), entry) | {"down": None},
-        strangers.CONTRAST: {"pan": entry, "tilt": None},
-        "parameters": {"backlash_deg.pan": entry, "effective_mirror_offset_mm": entry},
-    }
-    truth = {strangers.RATIO: {"pan": 0.06, "tilt": 0.07}, "backlash_deg": {"pan": 0.1, "tilt": 0.2}}
-    headlines = strangers.headlines_of(document, truth | {"mirror_offset_mm": 30.0})
-    assert {name: e["truth"] for name, e in headlines.items()} == {
-=======
-def test_an_answer_needs_convergence():
-    assert answer(answer="rough") == "not converged" and answer(answer="rough", converged=True) == "rough"
-    assert strangers.answer_of({"error": {"message": "no"}})["answer"] == "refused"
-
-
 ENTRY = {"value": 1.0, "sd": 0.5, "interval95": [0.0, 2.0], "contraction": 0.9}
 
 
 def test_headlines_stand_beside_their_truths(monkeypatch):
     """Draws to either side of each truth: another truth lies outside of both."""
     expected = {
->>>>>>> c4236a35 (experiments: one table of coverage, one way to run commands, speed and robustness anew, records of releases without scripts (19 903 -> 17049 lines))
         f"{strangers.RATIO}.left": 0.06,
         f"{strangers.RATIO}.right": 0.06,
         f"{strangers.RATIO}.up": 0.07,
