@@ -136,14 +136,6 @@ def test_laser_is_never_on_when_the_operator_says_no(mounted_rig, tmp_path, exit
         assert run_.lit_while_moving == [], "nothing moves either"
 
 
-def test_laser_left_on_by_another_program_is_switched_off(mounted_rig, tmp_path):
-    run_ = Run(mounted_rig, tmp_path / "c")
-    run_.positioner.home()
-    run_.positioner.laser(True)
-    run_.engine.run()
-    assert run_.dark()
-
-
 def assert_looks_as_planned(campaign, plan):
     """Every look of the plan once, with the positioner and the sheet where the plan has them."""
     looks = {(s.experiment, s.point): s for s in plan if s.action == "look"}

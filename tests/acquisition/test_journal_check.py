@@ -69,12 +69,6 @@ def test_repair_keeps_what_is_whole_and_marks_the_gap(folder, tmp_path):
         repair(folder, tmp_path / "new")
 
 
-def test_what_was_repaired_can_be_repaired_again(folder, tmp_path):
-    repair(folder, tmp_path / "once")
-    again = repair(tmp_path / "once", tmp_path / "twice")
-    assert again.lost_lines == [] and verify(tmp_path / "twice").records == verify(tmp_path / "once").records
-
-
 def test_repair_of_a_journal_without_its_first_line(folder, tmp_path):
     (folder / LOG).write_bytes(b"x" + (folder / LOG).read_bytes())
     done = repair(folder, tmp_path / "new")

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bench_runs import Run, raise_error, small_plan
+from support.bench_runs import Run, raise_error
 
 from tvsbayes.acquisition.live_run import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, LiveRun, SeenLook, temperature
 from tvsbayes.acquisition.observation import DetectedSpot, Observation, TwinObserver
@@ -95,23 +95,6 @@ def test_unread_data_cost_no_memory():
     assert kept < 300_000
 
 
-def test_a_reader_keeps_what_it_has_read():
-    live = LiveRun()
-    live.looked(looked(1))
-    before = live.latest
-    live.looked(looked(2))
-    assert before.look.spot == 1 and live.latest.look.spot == 2 and live.latest.number == before.number + 1
-
-
-def test_the_same_estimate_counts_once():
-    live = LiveRun()
-    one = Estimate(12, {"left": 0.06}, {"left": 1e-4})
-    for _ in range(3):
-        live.estimated(one)
-    live.estimated(None)
-    assert live.latest.estimates == (one,)
-
-
 def test_only_the_last_look_has_pictures():
     live = LiveRun()
     assert live.picture(1, "left", "whole") is None
@@ -144,9 +127,3 @@ def test_temperature_of_looks_that_agree_and_of_some_that_do_not():
     sampled = replace(after, tier="importance", u_deg_per_step={"left": 7.9e-5, "up": 1e-4})
     assert temperature([before, after, sampled]) is None and temperature([before]) is temperature([]) is None
     assert temperature([before, sampled, after]) == knocked
-
-
-def test_a_run_that_is_shown_writes_the_same_journal(mounted_rig, tmp_path):
-    for name, shown in (("a", {}), ("b", {"live": LiveRun()})):
-        Run(mounted_rig, tmp_path / name, small_plan(), **shown).engine.run()
-    assert (tmp_path / "a" / "log.jsonl").read_bytes() == (tmp_path / "b" / "log.jsonl").read_bytes()

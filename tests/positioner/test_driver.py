@@ -12,7 +12,7 @@ from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.interface import PositionLost
-from tvsbayes.positioner.protocol import frame, parse_answer, request
+from tvsbayes.positioner.protocol import frame, request
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 2000}
 LIMITS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 200, "tmin": -150, "tmax": 100}
@@ -57,14 +57,6 @@ def test_a_laser_left_on_is_off_in_motion():
     assert positioner.laser(True).laser_on, "and comes on again on request"
 
 
-def test_a_second_program_goes_on_in_the_same_sequence():
-    device = simulated()
-    homed(device).close()
-    second = connected(device)
-    assert second.home().known is False, "what happened before this connection is not known"
-    assert second.move_to(5, 5).tilt_steps == 5
-
-
 @pytest.mark.parametrize(
     ("action", "code"),
     [
@@ -99,15 +91,6 @@ def test_motion_stopped_from_outside_is_no_arrival():
     with pytest.raises(DeviceFault) as caught:
         positioner.move_to(50, 0)
     assert caught.value.code == "stopped" and device.mechanics.true_steps[0] == 50
-
-
-def test_lost_steps_show_at_the_next_homing():
-    device = simulated()
-    positioner = homed(device)
-    device.mechanics.missing_steps = [4, 0]
-    positioner.move_to(100, 0)
-    report = positioner.home()
-    assert report.known and report.deviation_steps == (4, 0)
 
 
 @pytest.mark.parametrize(("order", "compared"), [(None, True), ("ABORT", False)])
@@ -167,17 +150,6 @@ def test_wrong_protocol_version_is_named():
     device.model = DeviceModel(device.mechanics, 1, 0, device._send, protocol=3)
     with pytest.raises(DeviceFault, match=r"firmware 1\.1\.0 speaks protocol 3, this program speaks 2"):
         connected(device)
-
-
-def test_other_firmware_that_only_echoes_is_refused():
-    class Echo(ModelLink):
-        def to_device(self, data):
-            self.deliver(data, False, 10)
-
-    device = simulated()
-    with pytest.raises(DeviceFault) as caught:
-        SerialPositioner(lambda: Echo(device), {}, device.clock)
-    assert caught.value.code == "no-answer"
 
 
 @pytest.mark.parametrize("last", ["9" * 95, "-1", "x", str(2**32)])
@@ -271,14 +243,6 @@ def test_another_program_meanwhile_is_noticed():
     with pytest.raises(PositionLost) as caught:
         positioner.state()
     assert caught.value.code == "foreign"
-
-
-def test_state_reads_as_the_model_says():
-    device = simulated()
-    lines: list[bytes] = []
-    device.listener = lines.append
-    device.model.receive(request(0, "ID"), 0)
-    assert parse_answer(lines[-1][:-1]).state == device.model.state
 
 
 @pytest.mark.parametrize(("axis", "last"), [(0, -300), (0, 200), (1, -150), (1, 100)])

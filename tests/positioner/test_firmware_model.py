@@ -8,10 +8,10 @@ from __future__ import annotations
 import re
 
 import pytest
-from support.firmware_sessions import BOOT, Bench, random_orders, replay
+from support.firmware_sessions import Bench, random_orders, replay
 
 from tvsbayes.positioner import firmware_folder
-from tvsbayes.positioner.protocol import SETTINGS, Unasked, parse_answer, request
+from tvsbayes.positioner.protocol import SETTINGS, parse_answer, request
 
 FIRMWARE = firmware_folder()
 
@@ -124,28 +124,6 @@ def test_watchdog_switches_the_laser_off_and_valid_frames_keep_it_on():
     assert bench.ask(40, "?").state.last_error == "watchdog"
 
 
-def test_homing_finds_lost_steps():
-    bench = Bench().homed()
-    bench.ask(5, "MA", 100, 50)
-    bench.board.missing_steps = [7, 3]
-    bench.pass_time(5)
-    assert bench.ask(6, "?").state.pan_steps == 100, "counters do not know"
-    assert bench.board.true_steps == [93, 47]
-    bench.ask(7, "HOME")
-    bench.pass_time(20)
-    state = bench.ask(8, "?").state
-    assert (state.pan_home_deviation_steps, state.tilt_home_deviation_steps) == (7, 3)
-    assert bench.board.true_steps == [-60, -40]
-
-
-def test_homing_without_a_switch_gives_up():
-    bench = Bench(home=(-60_000, -40), limit=10**6)
-    bench.ask(1, "HOME")
-    bench.pass_time(200)
-    state = bench.ask(2, "?").state
-    assert (state.status, state.last_error) == ("alarm", "home")
-
-
 def test_homing_that_opens_a_limit_ends_there_and_one_from_an_open_limit_leads_back(native):
     """A home switch that never comes is not searched for against the stop."""
     orders = [f"x {request(1, 'HOME').hex()}", "a 2000000", "q", f"x {request(2, '?').hex()}"]
@@ -157,17 +135,6 @@ def test_homing_that_opens_a_limit_ends_there_and_one_from_an_open_limit_leads_b
     bench.ask(3, "HOME")
     bench.pass_time(20)
     assert (bench.ask(4, "?").state.status, bench.board.true_steps) == ("idle", [-60, -40])
-
-
-def test_mechanics_tell_every_stretch_in_one_sense():
-    bench, heard = Bench().homed(), []
-    bench.board.moved = lambda axis, steps: heard.append((axis, steps))
-    bench.ask(5, "MA", 0, 0)
-    bench.pass_time(5)
-    bench.ask(6, "HOME")
-    bench.pass_time(20)
-    assert [steps for axis, steps in heard if axis == 0] == [60, -60, 20, -20]
-    assert [steps for axis, steps in heard if axis == 1] == [40, -40, 20, -20]
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -205,8 +172,3 @@ def test_firmware_travels_with_the_package():
     line = request(0, "ID").decode().strip()
     assert f"`{line}`" in (FIRMWARE / "README.md").read_text(), "what the user types to see the board answer"
     assert re.findall(r"Arduino\.h|\bmalloc\b|\bnew\b|\bstd::", code) == []
-
-
-def test_boot_banner():
-    banner = parse_answer(Bench().sent[0][:-1])
-    assert banner == Unasked("boot", f"b={BOOT} fw=1.1.0")

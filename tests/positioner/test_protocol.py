@@ -60,31 +60,6 @@ def test_longest_replies_fit_and_are_read_back():
         assert isinstance(reply, Reply) and reply.state == state
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        "<1 ok",
-        "<1 ok b=1",
-        "<1 maybe b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none",
-        "<1 ok b=1 st=lost p=0,0 t=0,0 d=0 l=0 h=0,0 e=none",
-        "<1 ok b=1 st=idle p=0 t=0,0 d=0 l=0 h=0,0 e=none",
-        "<1 ok b=1 st=idle p=0,9999999999 t=0,0 d=0 l=0 h=0,0 e=none",
-        "<1 ok b=1 st=idle p=0,0 t=0,0 d=0 l=2 h=0,0 e=none",
-        "<1 ok b=1 b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none",
-        "<-1 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none",
-        "<1 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none junk",
-    ],
-)
-def test_replies_that_are_not_of_the_protocol_are_refused(body):
-    with pytest.raises(FrameError):
-        parse_answer(frame(body)[:-1])
-
-
-def test_unknown_fields_are_kept_apart():
-    reply = parse_answer(frame("<1 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none fw=1.1.0 zz=9")[:-1])
-    assert isinstance(reply, Reply) and reply.extra == {"fw": "1.1.0", "zz": "9"}
-
-
 def test_settings_of_a_rig_file():
     table = {"driver": "serial", "pan_min_steps": -400, "tilt_max_steps": 10, "speed_steps_per_s": 1e6}
     assert device_settings(table) == {"pmin": -400, "tmax": 10, "vmax": 20_000}

@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.small_campaign import small_campaign
-from support.viewed_twin import PICTURED, UNDETECTED
+from support.viewed_twin import UNDETECTED
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import ordered_spots, read_campaign, with_pixels
@@ -66,11 +65,6 @@ def test_look_without_a_spot_is_there_without_numbers(shown):
     for column in (looks.pixels_px, looks.predicted_px, looks.point_mm, looks.end_mm, looks.sd_px):
         assert np.isnan(column[row]).all()
         assert np.isfinite(np.delete(column, row, axis=0)).all()
-
-
-def test_pictures_are_sorted_by_camera(shown):
-    kept = np.argwhere(shown.looks.pictures).tolist()
-    assert kept == [[shown.looks.spot.tolist().index(PICTURED), 0]]
 
 
 def test_stops_stand_at_their_looks(stored, shown):
@@ -133,14 +127,6 @@ def test_campaign_without_a_usable_spot(viewed):
     assert np.isnan(shown.origin_mm).all() and shown.sheets == () and len(shown.cameras) == 2
     page = json.loads(document(Looked((shown,))))
     assert page["scenes"][0]["rig"]["origin_mm"] is None
-
-
-def test_unknown_approaches_and_correlated_pixels():
-    shown = scene(small_campaign())
-    campaign = small_campaign()
-    after = [campaign.moves[spot.move].segment for spot in campaign.spots]
-    assert {shown.looks.direction[row][0] for row in range(len(after)) if campaign.spots[row].move == 3} == {""}
-    assert shown.name == str(campaign.header["name"])
 
 
 def unpacked(sent) -> np.ndarray:
