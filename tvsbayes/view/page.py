@@ -41,13 +41,14 @@ Pictures = Mapping[int, Mapping[str, PagePicture]]
 def _scene(shown: Scene, pictures: Pictures) -> dict[str, object]:
     """The entry of one campaign; residuals are computed in double precision."""
     columns = {**vars(shown.looks), "residual_px": shown.looks.pixels_px - shown.looks.predicted_px}
+    numbers = {name: packed(values) for name, values in columns.items() if isinstance(values, np.ndarray)}
     origin_mm = shown.origin_mm.tolist() if np.isfinite(shown.origin_mm).all() else None
     return {
         "name": shown.name,
         "fitted": shown.fitted,
         "notes": list(shown.notes),
         "image_px": list(shown.image_px),
-        "looks": {name: packed(v) if isinstance(v, np.ndarray) else list(v) for name, v in columns.items()},
+        "looks": {**numbers, **{name: list(texts) for name, texts in columns.items() if name not in numbers}},
         "pictures": {str(spot): plain(by_camera) for spot, by_camera in pictures.items()},
         "pictured": len(pictures),
         "rig": {"cameras": plain(shown.cameras), "sheets": plain(shown.sheets), "origin_mm": origin_mm},
