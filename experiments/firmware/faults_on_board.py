@@ -23,14 +23,14 @@ from experiments.common.command_line import act, parser
 from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig, numbered
 from experiments.common.rows import append_row, commit, output, read_rows
-from tvsbayes.acquisition.bench import SIMULATED_START, Bench
+from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
 from tvsbayes.acquisition.engine import Acquisition
 from tvsbayes.acquisition.journal import read_journal
-from tvsbayes.acquisition.observation import TwinObserver
-from tvsbayes.acquisition.operator import SimulatedOperator, StopKey
+from tvsbayes.acquisition.operator import StopKey
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.session import begin
+from tvsbayes.acquisition.simulated_bench import SIMULATED_START, SimulatedOperator, TwinObserver
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.positioner.emulated_board import EMULATOR, EmulatedBoard

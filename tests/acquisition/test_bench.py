@@ -12,9 +12,8 @@ from support.pseudo_terminal import needs_pseudo_terminals, served
 from support.streamed_camera import streamed
 from support.varying_gears import perfect_rig
 
-from tvsbayes.acquisition.bench import Vision
 from tvsbayes.acquisition.journal_check import verify
-from tvsbayes.acquisition.observation import DetectedSpot, live_detector, twin_renderer
+from tvsbayes.acquisition.observation import DetectedSpot, live_detector
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.acquisition.simulated_instrument import Instrument
@@ -76,8 +75,8 @@ def test_pictures_of_the_twin(small_rig, tmp_path):
     """What `acquire --simulate` does: pictures rendered, spots fitted with their sds where the twin has them."""
     # Errors that gears repeat would stand in the truth's angles and be added by `still` once more.
     small_rig, folder = perfect_rig(small_rig), tmp_path / "c"
-    vision = Vision(live_detector(small_rig.stereo), twin_renderer(small_rig, 7))
-    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, vision=vision)
+    detector = live_detector(small_rig.stereo)
+    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, detector=detector)
     assert (outcome.ok, outcome.refused) == (2, 0) and verify(folder).frames == 8
     truth = json.loads((folder / "truth.json").read_text())
     for spot in read_campaign(folder).spots:
@@ -86,7 +85,7 @@ def test_pictures_of_the_twin(small_rig, tmp_path):
         assert 0.01 < sds.min() and sds.max() < 0.2
         # Eight coordinates in all, five sds each.
         assert np.all(np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels) < 5 * sds)
-    acquire(small_rig, TWO_LOOKS, tmp_path / "d", simulate=True, seed=7, vision=vision)
+    acquire(small_rig, TWO_LOOKS, tmp_path / "d", simulate=True, seed=7, detector=detector)
     names = [f"{number:06d}_{side}.png" for number in (0, 1) for side in ("left", "right")]
     pictures = [f"{part}/{name}" for part in ("dark", "frames") for name in names]
     assert sorted(path.relative_to(folder).as_posix() for path in folder.glob("*/*.png")) == pictures
@@ -142,7 +141,7 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
             plan,
             tmp_path / "c",
             laser_class="3B",
-            vision=Vision(centroids),
+            detector=centroids,
             terminal=Terminal(lines.append, ask=ask),
         )
     assert (outcome.reason, outcome.ok, len(questions)) == ("done", 3, 2), lines
@@ -178,10 +177,8 @@ def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
             name.symlink_to(port)
             table = {"port": str(name), "settle_s": 0.0}
             rig = replace(small_rig, positioner=table, cameras={"source": address, "spot_sd_px": 0.08})
-            terminal, vision = Terminal(lines.append, ask=lambda question: ""), Vision(failing_once)
-            return acquire(
-                rig, TWO_LOOKS, tmp_path / "c", resume=resume, laser_class="3B", vision=vision, terminal=terminal
-            )
+            options = {"terminal": Terminal(lines.append, ask=lambda question: ""), "detector": failing_once}
+            return acquire(rig, TWO_LOOKS, tmp_path / "c", resume=resume, laser_class="3B", **options)
 
     with pytest.raises(DeviceFault, match="has gone"):
         go(False)

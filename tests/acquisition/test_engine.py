@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from support.bench_runs import HEADER, Run, ctrl_c, events, raise_error, small_plan
 
-from tvsbayes.acquisition.bench import SIMULATED_START
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK, _approach
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import check_journal, repair_campaign, verify
-from tvsbayes.acquisition.observation import DetectedSpot, Observation, TwinObserver
-from tvsbayes.acquisition.operator import SimulatedOperator, Terminal
+from tvsbayes.acquisition.observation import DetectedSpot, Observation
+from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import LOST_STEPS, recorded
 from tvsbayes.acquisition.session import acquire, begin
+from tvsbayes.acquisition.simulated_bench import SIMULATED_START, SimulatedOperator, TwinObserver
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.campaign import UNDETECTED, read_campaign
 from tvsbayes.positioner.protocol import request

@@ -11,8 +11,9 @@ import pytest
 from support.bench_runs import Run, raise_error
 
 from tvsbayes.acquisition.live_run import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, LiveRun, SeenLook, temperature
-from tvsbayes.acquisition.observation import DetectedSpot, Observation, TwinObserver
+from tvsbayes.acquisition.observation import DetectedSpot, Observation
 from tvsbayes.acquisition.running_estimate import Estimate
+from tvsbayes.acquisition.simulated_bench import TwinObserver
 from tvsbayes.errors import DeviceFault
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name

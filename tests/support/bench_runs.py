@@ -6,12 +6,12 @@ import datetime
 import signal
 from pathlib import Path
 
-from tvsbayes.acquisition.bench import SIMULATED_START, Bench
+from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.engine import Acquisition
 from tvsbayes.acquisition.journal import read_journal
-from tvsbayes.acquisition.observation import TwinObserver
-from tvsbayes.acquisition.operator import SimulatedOperator, StopKey
+from tvsbayes.acquisition.operator import StopKey
 from tvsbayes.acquisition.session import begin
+from tvsbayes.acquisition.simulated_bench import SIMULATED_START, SimulatedOperator, TwinObserver
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.plan import PlanStep

@@ -20,9 +20,10 @@ from support.browsers import CHROMIUM, DRIVER, SECONDS_MAX, Browsed, browser, fo
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.live_run import LiveRun
-from tvsbayes.acquisition.observation import Observation, TwinObserver
+from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
+from tvsbayes.acquisition.simulated_bench import TwinObserver
 from tvsbayes.errors import DeviceFault
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name, read_campaign

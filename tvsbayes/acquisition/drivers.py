@@ -1,4 +1,4 @@
-"""Positioners and cameras by the name of their driver in the rig file, from this package and from others.
+"""Positioners and cameras by the name of their driver in the rig file, and the bench of them.
 
 A driver is an entry point of the group `tvsbayes.positioners` or `tvsbayes.cameras`: a function that takes the `Rig`
 and returns a connected `Positioner` or an open `StereoCamera` (data/docs/instrument.md, "Your own hardware"). Drivers
@@ -7,15 +7,23 @@ of this package need no entry point, so that a source tree without an installati
 
 from __future__ import annotations
 
+import datetime
 import importlib
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from importlib import metadata
 from typing import Any
 
+from tvsbayes.acquisition.bench import Bench
+from tvsbayes.acquisition.observation import CameraObserver, Detector
+from tvsbayes.acquisition.operator import Operator
 from tvsbayes.cameras.capture import StereoCamera
 from tvsbayes.errors import InputError, TvsError, closest, entry_refusal, escaped, fault
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import DEFAULT_DRIVER, Positioner, Triggering
+from tvsbayes.results.records import plain
 
 POSITIONERS = "tvsbayes.positioners"
 CAMERAS = "tvsbayes.cameras"
@@ -24,12 +32,12 @@ OWN: Mapping[str, Mapping[str, str]] = {
     POSITIONERS: {
         "serial": "tvsbayes.positioner.serial_port:serial_positioner",
         "grbl": "tvsbayes.positioner.serial_port:grbl_positioner",
-        "simulated": "tvsbayes.acquisition.simulated_drivers:simulated_positioner",
+        "simulated": "tvsbayes.acquisition.simulated_bench:simulated_positioner",
     },
     CAMERAS: {
         "opencv": "tvsbayes.cameras.capture:opencv_cameras",
         "genicam": "tvsbayes.cameras.genicam:genicam_cameras",
-        "simulated": "tvsbayes.acquisition.simulated_drivers:simulated_cameras",
+        "simulated": "tvsbayes.acquisition.simulated_bench:simulated_cameras",
     },
 }
 """Drivers of this package by the group of entry points: "module:function" by name."""
@@ -70,6 +78,33 @@ def connect_trigger(positioner: Positioner, camera: StereoCamera) -> None:
         message, remedy = "this positioner offers no trigger line", "leave out [cameras.options] trigger"
         raise InputError("trigger", f"{message}; {remedy}", column="cameras.options.trigger", remedy=remedy)
     camera.use_trigger(positioner.trigger)  # type: ignore[attr-defined]
+
+
+@contextmanager
+def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench]:
+    """Positioner and cameras of a rig file; closed at the end.
+
+    Raises:
+        InputError: the rig file names no device.
+        DeviceFault: they cannot be opened or set.
+    """
+    positioner = positioner_of(rig)
+    try:
+        camera = cameras_of(rig)
+    except BaseException:
+        positioner.close()
+        raise
+    try:
+        connect_trigger(positioner, camera)
+        settings = camera.settings()
+        details = {"device": dict(positioner.identity), "cameras": plain(settings)}
+        observer = CameraObserver(camera, detector)
+        warnings = (*getattr(positioner, "warnings", ()), *settings.warnings)
+        utc = partial(datetime.datetime.now, datetime.UTC)
+        yield Bench(positioner, observer, operator, time, utc, details, warnings=warnings)
+    finally:
+        positioner.close()
+        camera.close()
 
 
 def known(group: str) -> dict[str, str]:

@@ -17,7 +17,6 @@ from typing import Protocol
 import numpy as np
 
 from tvsbayes.acquisition.recorder import Four
-from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import StereoCamera, StereoImage
 from tvsbayes.cameras.contour import epipolar_refused
 from tvsbayes.cameras.detection import pair_status
@@ -26,11 +25,8 @@ from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.errors import fault
 from tvsbayes.files.images import in_grey_levels, png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, frame_name
-from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.positioner.interface import Positioner
-from tvsbayes.twin.physics import Light, cameras_of
-from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
 
 CHANGE_DN = 40
 """Change of a pixel, in grey levels, that counts as lit or as another scene: noise and JPEG stay below 10."""
@@ -186,31 +182,6 @@ def rises_dn(before: StereoImage, after: StereoImage) -> tuple[int, int]:
     return left, right
 
 
-@dataclass
-class TwinObserver:
-    """Takes looks of the digital twin without pictures: the centroids of a detector, with noise.
-
-    Attributes:
-        instrument: the simulated instrument.
-        sd_px: standard uncertainty stated for every coordinate.
-    """
-
-    instrument: Instrument
-    sd_px: float
-
-    def observe(self, positioner: Positioner, spot: int) -> Observation:
-        """See `Observer.observe`."""
-        try:
-            positioner.laser(True)
-            pixels = self.instrument.noisy_centroid_px(self.sd_px)
-        finally:
-            positioner.laser(False)
-        if not np.isfinite(pixels).all():
-            return Observation(DetectedSpot("no-spot"))
-        u_left, v_left, u_right, v_right = map(float, pixels)
-        return Observation(DetectedSpot("ok", (u_left, v_left, u_right, v_right), (self.sd_px,) * 4))
-
-
 def live_detector(stereo: Stereo) -> Detector:
     """Make a detector by the method `fit`, with the noise with which `detect` starts.
 
@@ -238,21 +209,3 @@ def live_detector(stereo: Stereo) -> Detector:
         return DetectedSpot("ok", (u, v, x, y), (su, sv, sx, sy), (float(correlations[0]), float(correlations[1])))
 
     return detect
-
-
-def twin_renderer(rig: Rig, seed: int) -> Renderer:
-    """Make the renderer of the true rig drawn by a simulation with this seed.
-
-    Args:
-        rig: the declared rig.
-        seed: seed of the simulation.
-    """
-    truth = Instrument(rig, seed).truth
-    cameras = cameras_of(truth.stereo_pair, truth.parameters["focal_scale"])
-    scene, sensor = Scene(), Sensor()
-
-    def pictures(light: Light, look: int, frame: int) -> StereoImage:
-        rendered = render_spots(cameras, light, scene, sensor, seed, look, frame)
-        return StereoImage(rendered.left, rendered.right)
-
-    return pictures

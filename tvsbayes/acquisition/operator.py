@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Protocol
 
-from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.errors import InputError, escaped
 
 HAZARD = """LASER HAZARD. 808 nm is invisible and likely class 3B: beam and reflections can blind before you blink.
@@ -163,22 +162,6 @@ class TerminalOperator:
             self.stop.at_prompt = False
         self.stop.requested = True
         return "q"
-
-
-@dataclass
-class SimulatedOperator:
-    """Puts the twin's sheet at the target."""
-
-    instrument: Instrument
-
-    def accept(self, hazard: str) -> bool:
-        """Accept: a simulated laser is no hazard."""
-        return True
-
-    def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
-        """See `Operator.place`."""
-        self.instrument.place(target, placement)
-        return True
 
 
 def check_hazard(laser_class: str | None, simulate: bool) -> None:

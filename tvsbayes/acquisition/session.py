@@ -10,16 +10,18 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from tvsbayes.acquisition.bench import SIMULATED_START, Vision, hardware, simulated
+from tvsbayes.acquisition.drivers import hardware
 from tvsbayes.acquisition.engine import Acquisition, Outcome
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
 from tvsbayes.acquisition.live_run import LiveRun
+from tvsbayes.acquisition.observation import Detector, wait_for_detection
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator, check_hazard
 from tvsbayes.acquisition.place_command import PlaceCommand
 from tvsbayes.acquisition.recorder import Recorded, recorded
 from tvsbayes.acquisition.replanning import AdaptOptions, Replanning, adapted_plan, check_plan
 from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes
 from tvsbayes.acquisition.running_estimate import EstimateOptions, RunningEstimate
+from tvsbayes.acquisition.simulated_bench import SIMULATED_START, simulated
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.campaign import NAME_ACQUIRED
 from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
@@ -40,7 +42,7 @@ def acquire(
     seed: int = 0,
     estimate: EstimateOptions | None = None,
     adapt: AdaptOptions | None = None,
-    vision: Vision | None = None,
+    detector: Detector | None = None,
     terminal: Terminal | None = None,
     live: LiveRun | None = None,
     place_command: PlaceCommand | None = None,
@@ -58,7 +60,7 @@ def acquire(
         seed: seed of a simulation.
         estimate: whether the looks so far are fitted while it runs. A simulation waits for every fit.
         adapt: chooses the remaining looks from that fit; `estimate` must have a target.
-        vision: how pictures are made and searched; by default left to `detect`, and a simulation gives centroids.
+        detector: finds spots in pictures; by default that is left to `detect`, and a simulation gives centroids.
         terminal: output of messages and questions; by default nothing is shown.
         live: publishes the run.
         place_command: a program that places the sheet instead of a person.
@@ -67,7 +69,7 @@ def acquire(
         InputError: a plan that this rig cannot run, another plan than before, no operator, no emulator.
         DeviceFault: device, camera or disk failed.
     """
-    folder, vision, terminal = Path(folder), vision or Vision(), terminal or Terminal()
+    folder, terminal = Path(folder), terminal or Terminal()
     check_plan(rig, plan)
     check_hazard(laser_class, simulate)
     record = _earlier_runs(folder) if resume else Recorded()
@@ -79,10 +81,10 @@ def acquire(
         # Device and cameras first: a failure to open them leaves no folder behind.
         if simulate:
             board = stack.enter_context(EmulatedBoard()) if emulate else None
-            bench = stack.enter_context(simulated(rig, seed, record, vision, board))
+            bench = stack.enter_context(simulated(rig, seed, record, detector, board))
         else:
             operator = TerminalOperator(stop, terminal, laser_class, place_command is None)
-            bench = stack.enter_context(hardware(rig, vision.detector, operator))
+            bench = stack.enter_context(hardware(rig, detector or wait_for_detection, operator))
         for warning in bench.warnings:
             terminal.say(f"warning: {warning}")
         journal = begin(folder, rig, plan, resume, header)

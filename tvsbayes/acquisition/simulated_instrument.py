@@ -14,12 +14,10 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from tvsbayes.acquisition.recorder import TrueAngles
-from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.rig import Rig
@@ -140,13 +138,6 @@ class ModelLink:
             else:
                 self._arrived += data
         self.device.model.advance(now_us)
-
-
-class Renderer(Protocol):
-    """Pictures of a spot: the true cameras' view of a `Light`."""
-
-    def __call__(self, light: Light, look: int, frame: int) -> StereoImage:
-        """Render both pictures; `look` numbers the look (same speckle), `frame` the exposure (new noise)."""
 
 
 class _Gear:

@@ -116,8 +116,7 @@ def acquire(
         refuse_options("for a run, and --dry-run makes none", "leave out one of them", **run_options)
         _rehearse(instrument, steps, as_json)
         return
-    from tvsbayes.acquisition.bench import Vision
-    from tvsbayes.acquisition.observation import live_detector, twin_renderer
+    from tvsbayes.acquisition.observation import live_detector
     from tvsbayes.acquisition.operator import LiveLine, Terminal
     from tvsbayes.acquisition.place_command import PlaceCommand
     from tvsbayes.acquisition.replanning import AdaptOptions
@@ -126,10 +125,6 @@ def acquire(
     from tvsbayes.instrument.plan import counters_planned
 
     placement = None if place_command is None else PlaceCommand.parsed(place_command, place_seconds)
-    vision = Vision()
-    if not centroids:
-        pair = instrument.stereo_pair
-        vision = Vision(live_detector(pair), twin_renderer(instrument, seed or 0) if simulate else None)
     with LiveLine() as line, _live_page(port or 0 if live else None, no_browser) as live_run:
         outcome = run_plan(
             instrument,
@@ -144,7 +139,7 @@ def acquire(
             adapt=AdaptOptions(partial(propose_looks, rig, planned=counters_planned(steps)), minutes)
             if adapt
             else None,
-            vision=vision,
+            detector=None if centroids else live_detector(instrument.stereo_pair),
             terminal=Terminal(report_line, line.show, line.ask),
             live=live_run,
             place_command=placement,
