@@ -98,22 +98,6 @@ def matern_waves(sd_deg: float, length_deg: float, rng: np.random.Generator) -> 
     return Waves(rate / length_deg, *parts) if sd_deg > 0 else Waves()
 
 
-def _joined(*waves: Waves) -> Waves:
-    """Concatenate sums of waves."""
-    return Waves(
-        np.concatenate([wave.rate_rad_per_deg for wave in waves]),
-        np.concatenate([wave.cosine_deg for wave in waves]),
-        np.concatenate([wave.sine_deg for wave in waves]),
-    )
-
-
-def periodic_waves(amplitude_deg: Mapping[float, float], parts: np.ndarray) -> Waves:
-    """Build waves of any phase; `amplitude_deg` maps periods to the sd of parts, `parts` (2, n) are standard normal."""
-    rate = 2 * np.pi / np.array(list(amplitude_deg), float)
-    scale = np.array(list(amplitude_deg.values()), float)
-    return Waves(rate, *(scale * parts[:, : len(scale)]))
-
-
 def draw_gear_errors(
     parameters: Mapping[str, float], period_deg: Mapping[str, tuple[float, ...]], rng: np.random.Generator
 ) -> GearErrors:
@@ -131,12 +115,14 @@ def draw_gear_errors(
             matern_waves(parameters.get(f"{name}.{axis}", 0.0), length_deg, rng)
             for name in ("transmission_error_deg", "play_variation_deg")
         )
-        amplitude_deg = {
-            period: parameters.get(f"harmonic_amplitude_deg.{axis}.{number}", 0.0)
-            for number, period in enumerate(period_deg.get(axis, ()), start=1)
-        }
-        parts = rng.standard_normal((2, PERIODS_MAX))
-        errors[axis] = AxisErrors(_joined(error, periodic_waves(amplitude_deg, parts)), width)
+        periods = np.array(period_deg.get(axis, ()), float)
+        names = (f"harmonic_amplitude_deg.{axis}.{number}" for number in range(1, len(periods) + 1))
+        # Waves of any phase: both parts are normal.
+        parts = rng.standard_normal((2, PERIODS_MAX))[:, : len(periods)] * [parameters.get(name, 0.0) for name in names]
+        waves = np.concatenate(
+            [[error.rate_rad_per_deg, error.cosine_deg, error.sine_deg], [2 * np.pi / periods, *parts]], axis=1
+        )
+        errors[axis] = AxisErrors(Waves(*waves), width)
     return errors
 
 

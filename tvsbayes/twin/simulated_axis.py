@@ -28,6 +28,8 @@ READING_SHARE = 5e-5
 IN_TIME = ("creep", "creep_minutes", "thermal_per_K", "seeing_scale", "seeing_s")
 """Parameters of shifts in time."""
 TRUTH_FORMAT = "tvsbayes-axis-truth/1"
+DRIVE_READINGS, DRIVE_S = 1000, 4.0
+"""Readings of a drive whose template has none, and the time between them."""
 
 
 @dataclass(frozen=True)
@@ -152,11 +154,8 @@ def draw_axis(
     """
     at = np.unique(np.asarray(commands, dtype=float))
     priors = axis_priors(stated, travel, per_command, unit=unit)
-    names = [
-        *(name for name in priors if name not in ("per_command", "ratio_contrast", "stop_sd", *IN_TIME)),
-        "stop_sd.forward",
-        "stop_sd.backward",
-    ]
+    names = [name for name in priors if name not in ("per_command", "ratio_contrast", "stop_sd", *IN_TIME)]
+    names += ["stop_sd.forward", "stop_sd.backward"]
     true = {name: _drawn(name, priors[name.split(".")[0]], rng) for name in names}
     # A separate generator, so that a seed always draws the same gears.
     [gear_rng] = rng.spawn(1)
@@ -168,10 +167,9 @@ def draw_axis(
     error = _curve(distance, length, true["transmission_error"], rng)
     play = _curve(distance, length, true["play_variation"], rng)
     ends = (abs(per_command) * float(at[0]), abs(per_command) * float(at[-1]))
-    if periods is None or not periods:
+    if not periods:
         return AxisTruth(true, at, error, play)
-    record = {"position": ends, "encoder": tuple(sorted((per_command * at[0], per_command * at[-1])))}
-    record["seconds"] = between_s
+    record = {"position": ends, "encoder": sorted((per_command * at[0], per_command * at[-1])), "seconds": between_s}
     return AxisTruth(true, at, error, play, _drawn_waves(periods, priors, travel, record, gear_rng))
 
 
@@ -179,7 +177,7 @@ def _drawn_waves(
     stated: WavePeriods,
     priors: Mapping[str, AxisPrior],
     travel: float,
-    record: Mapping[str, tuple[float, float]],
+    record: Mapping[str, Sequence[float]],
     rng: np.random.Generator,
 ) -> tuple[TrueWave, ...]:
     """Draw waves of the stated periods; an unknown period is log-uniform in its range."""
@@ -193,11 +191,8 @@ def _drawn_waves(
         scale = unit * abs(float(rng.standard_normal())) * float(rng.random() < 0.5)
         drawn = rng.standard_normal((3, 2)) @ np.array([1, 1j])
         size = scale * np.array([1.0, SECOND, WANDER]) * np.abs(drawn)
-        angle = np.degrees(np.angle(drawn))
-        first, second, change = (float(each) for each in size)
-        at, at_second, at_change = (float(each) for each in angle)
-        begin, end = record[of]
-        waves.append(TrueWave(of, period, first, at, second, at_second, change, at_change, begin, end))
+        parts = np.column_stack([size, np.degrees(np.angle(drawn))]).ravel().tolist()
+        waves.append(TrueWave(of, period, *parts, *record[of]))
     return tuple(waves)
 
 
@@ -298,74 +293,39 @@ def simulate_axis(template: AxisCampaign, moves: Sequence[AxisMove] | None = Non
         InputError: neither `[axis]` nor readings determine the unit per command.
         NothingToEstimate: the readings do not determine it.
     """
-    rng = np.random.default_rng([seed, 11])
-    if template.rate is not None:
-        return _simulated_drive(template, template.rate, seed, rng)
-    read = {r.move for r in template.readings} if moves is None and template.readings else None
-    moves = template.moves if moves is None else tuple(moves)
-    per_command = _per_command(template)
+    rng, rate, per_command = np.random.default_rng([seed, 11]), template.rate, _per_command(template)
+    used = {r.move for r in template.readings} if moves is None else set()
+    # A drive at constant rate has one segment.
+    moves = template.moves[:1] if rate is not None else template.moves if moves is None else tuple(moves)
     commands = [m.command for m in moves]
-    commands_read = [m.command for m in moves if read is None or m.move in read]
-    travel = (max(commands_read) - min(commands_read)) * abs(per_command)
-    if not travel > 0:
-        raise NothingToEstimate("too-few-positions", "all moves are to one position", remedy="list more positions")
-    truth = draw_axis(
-        commands,
-        template.stated,
-        per_command,
-        travel,
-        rng,
-        template.periods,
-        (moves[0].time_s, moves[-1].time_s),
-        template.unit,
+    if rate is None:
+        read = [row for row, move in enumerate(moves) if not used or move.move in used]
+        travel = float(np.ptp([commands[row] for row in read])) * abs(per_command)
+        if not travel > 0:
+            raise NothingToEstimate("too-few-positions", "all moves are to one position", remedy="list more positions")
+        between_s = moves[0].time_s, moves[-1].time_s
+    else:
+        # Read at the template's times.
+        known = sorted(r.time_s for r in template.readings if r.time_s is not None and r.status == "ok")
+        times = np.array(known) if known else moves[0].time_s + DRIVE_S * np.arange(1, DRIVE_READINGS + 1)
+        travel, between_s = abs(rate * per_command) * float(np.ptp(times)), (float(times[0]), float(times[-1]))
+    truth = draw_axis(commands, template.stated, per_command, travel, rng, template.periods, between_s, template.unit)
+    stated_u = [r.u for r in template.readings if r.u > 0]
+    u = float(np.median(stated_u)) if stated_u else READING_SHARE * travel
+    if rate is None:
+        stands = stops_of(truth, moves, rng, template.powered_on_s, template.absolute)[read]
+        places: list[tuple[int, float | None]] = [(moves[row].move, None) for row in read]
+    else:
+        truth.parameters["reading_u"] = u
+        stands = drive_of(truth, moves[0], rate, times, rng)
+        places = [(0, time_s) for time_s in times.tolist()]
+    noise = truth.parameters["reading_scale"] * u * rng.standard_normal(len(stands))
+    readings = tuple(
+        Reading(k, move, _encoder_reads(truth, stand) + off, u, "ok", time_s)
+        for k, (stand, off, (move, time_s)) in enumerate(zip(stands.tolist(), noise.tolist(), places, strict=True))
     )
-    u = _reading_u(template, travel)
-    stops = stops_of(truth, moves, rng, template.powered_on_s, template.absolute)
-    readings: list[Reading] = []
-    for move, stand in zip(moves, stops, strict=True):
-        if read is None or move.move in read:
-            noise = truth.parameters["reading_scale"] * u * float(rng.standard_normal())
-            readings.append(Reading(len(readings), move.move, float(_encoder_reads(truth, stand) + noise), u))
     header = {**template.header, "synthetic": True, "seed": seed}
-    campaign = replace(template, moves=moves, readings=tuple(readings), header=header, path=None)
-    return SimulatedAxis(campaign, truth)
-
-
-DRIVE_READINGS, DRIVE_S = 1000, 4.0
-"""Readings of a drive whose template has none, and the time between them."""
-
-
-def _simulated_drive(template: AxisCampaign, rate: float, seed: int, rng: np.random.Generator) -> SimulatedAxis:
-    """Simulate a drive at constant rate, with one segment, read at the template's times."""
-    per_command = _per_command(template)
-    move = template.moves[0]
-    used = sorted(r.time_s for r in template.readings if r.time_s is not None and r.status == "ok")
-    times = np.array(used) if used else move.time_s + DRIVE_S * np.arange(1, DRIVE_READINGS + 1)
-    travel = abs(rate * per_command) * float(np.ptp(times))
-    truth = draw_axis(
-        [move.command],
-        template.stated,
-        per_command,
-        travel,
-        rng,
-        template.periods,
-        (float(times[0]), float(times[-1])),
-        template.unit,
-    )
-    u = _reading_u(template, travel)
-    truth.parameters["reading_u"] = u
-    stands = drive_of(truth, move, rate, times, rng)
-    noise = truth.parameters["reading_scale"] * u * rng.standard_normal(len(times))
-    values = [_encoder_reads(truth, float(stand)) + float(n) for stand, n in zip(stands, noise, strict=True)]
-    readings = tuple(Reading(k, 0, v, u, "ok", float(t)) for k, (v, t) in enumerate(zip(values, times, strict=True)))
-    header = {**template.header, "synthetic": True, "seed": seed}
-    return SimulatedAxis(replace(template, moves=(move,), readings=readings, header=header, path=None), truth)
-
-
-def _reading_u(template: AxisCampaign, travel: float) -> float:
-    """Return the u of simulated readings: the median of those stated."""
-    stated = [r.u for r in template.readings if r.u > 0]
-    return float(np.median(stated)) if stated else READING_SHARE * travel
+    return SimulatedAxis(replace(template, moves=moves, readings=readings, header=header, path=None), truth)
 
 
 def _per_command(template: AxisCampaign) -> float:

@@ -45,6 +45,8 @@ SHEET_DEPTH_SD_MM = 1.0
 """Standard deviation of a sheet's depth about its nominal X, placed by hand against a stop."""
 SHEET_TILT_SD_DEG = 0.5
 """Standard deviation of a placed sheet's rotation about Y and about Z, each."""
+STREAMS = "truth", "stops", "homes", "sheets", "pixels", "aperture", "drift", "gears", "sides", "looks"
+_Streams = Mapping[str, np.random.Generator]
 HOME_SIDE_CHANCES = 0.45, 0.45, 0.1
 """Probabilities that homings always end from the left (up), from the right (down), or anywhere (formulation 3.1)."""
 
@@ -81,22 +83,6 @@ class SimulatedCampaign(Shown):
         write_folder(Path(folder), self.files())
 
 
-@dataclass(frozen=True)
-class _Streams:
-    """Random streams of a simulated campaign."""
-
-    truth: np.random.Generator
-    stops: np.random.Generator
-    homes: np.random.Generator
-    sheets: np.random.Generator
-    pixels: np.random.Generator
-    aperture: np.random.Generator
-    drift: np.random.Generator
-    gears: np.random.Generator
-    sides: np.random.Generator
-    looks: np.random.Generator
-
-
 def simulate(
     rig: Rig,
     plan: Iterable[PlanStep],
@@ -130,14 +116,15 @@ def simulate(
         InputError: the plan looks before a sheet is placed, or names a sheet that the rig does not have; or the true
             rig has a transmission error whose period the declared one does not state.
     """
-    streams = _Streams(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(10)))
+    seeds = np.random.SeedSequence(seed).spawn(len(STREAMS))
+    streams = dict(zip(STREAMS, map(np.random.default_rng, seeds), strict=True))
     if truth is None:
-        truth = draw_truth(rig, streams.truth)
+        truth = draw_truth(rig, streams["truth"])
     if truth.gear_errors is None:
-        errors = draw_gear_errors(truth.parameters, rig.table.harmonic_period_deg, streams.gears)
+        errors = draw_gear_errors(truth.parameters, rig.table.harmonic_period_deg, streams["gears"])
         truth = replace(truth, gear_errors=errors)
     if home_approach is None:
-        home_approach = draw_home_approach(streams.sides)
+        home_approach = draw_home_approach(streams["sides"])
     sd_px = rig.spot_sd_px if spot_sd_px is None else float(spot_sd_px)
     log = run_plan(plan, rig, home_approach)
     fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in PERIODIC_NAMES}
@@ -147,8 +134,8 @@ def simulate(
         time_s = np.array([move.time_s for move in log.moves])
         measured = np.asarray(temperature_degC(time_s), float).tolist()
         log.moves = [replace(move, temperature_degC=one) for move, one in zip(log.moves, measured, strict=True)]
-    driven = _drive(log.moves, truth, rig.table, streams, powered_on_s(full_header))
-    truth = replace(driven.truth, homing_side=home_approach)
+    truth, resting_deg = _drive(log.moves, truth, rig.table, streams, powered_on_s(full_header))
+    truth = replace(truth, homing_side=home_approach)
     looks: tuple[Spot | Sighting, ...]
     if not rig.has_images:
         light = Light(*[np.zeros((0, 3))] * 4)
@@ -156,18 +143,21 @@ def simulate(
     else:
         light = _light(log, rig, truth, streams)
         pixels = project(light.points_mm, truth.stereo_pair, truth.parameters["focal_scale"])
-        noise_px = truth.parameters["pixel_scale"] * sd_px * streams.pixels.standard_normal(pixels.shape)
+        noise_px = truth.parameters["pixel_scale"] * sd_px * streams["pixels"].standard_normal(pixels.shape)
         pixels = inside_images(pixels + noise_px, truth.stereo_pair)
-        angles = _aperture_deg(light, truth.parameters, rig, streams.aperture) if aperture else [None] * len(pixels)
+        angles = _aperture_deg(light, truth.parameters, rig, streams["aperture"]) if aperture else [None] * len(pixels)
         looks = tuple(
             _spot(number, look, log.targets[look.placement], pixels[number], sd_px, angles[number])
             for number, look in enumerate(log.looks)
         )
     moves_seen = [look.move for look in looks if look.status == "ok"]
     if moves_seen:
-        pan, tilt = driven.resting_deg[moves_seen].mean(axis=0)
+        pan, tilt = resting_deg[moves_seen].mean(axis=0)
         truth = replace(truth, reference_pose_deg=(float(pan), float(tilt)))
-    moves = log.moves if sides_recorded else [_unrecorded(move) for move in log.moves]
+    moves = log.moves
+    if not sides_recorded:
+        unknown = {"pan_approach": "unknown", "tilt_approach": "unknown"}
+        moves = [replace(move, **unknown) if move.pan_approach else move for move in moves]  # type: ignore[arg-type]
     campaign = Campaign(tuple(moves), looks, rig.stereo, rig.table, full_header)
     return SimulatedCampaign(campaign, truth, light)
 
@@ -180,37 +170,24 @@ def draw_home_approach(rng: np.random.Generator) -> tuple[PanApproach, TiltAppro
     return pan[one], tilt[two]
 
 
-def _unrecorded(move: Move) -> Move:
-    """Return a row of moves.csv that does not record where homing ended."""
-    return replace(move, pan_approach="unknown", tilt_approach="unknown") if move.pan_approach else move
-
-
-@dataclass(frozen=True)
-class _Driven:
-    """A true rig with its angles, stop errors and home offsets as realised; the angles (n, 2) without stop errors."""
-
-    truth: Truth
-    resting_deg: np.ndarray
-
-
 def _drive(
-    moves: Sequence[Move],
-    truth: Truth,
-    rig: RigTable,
-    streams: _Streams,
-    on_s: float | None,
-) -> _Driven:
-    """Compute the mirror angles of all moves of a machine switched on at `on_s`, by default at the first."""
+    moves: Sequence[Move], truth: Truth, rig: RigTable, streams: _Streams, on_s: float | None
+) -> tuple[Truth, np.ndarray]:
+    """Drive a machine switched on at `on_s`, by default at the first move.
+
+    Returns:
+        The true rig with its angles, stop errors and home offsets as realised; the angles (n, 2) without stop errors.
+    """
     p = truth.parameters
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
     segments = np.array([m.segment for m in moves], int)
     first = np.diff(segments, prepend=-1) != 0
     home_sd_deg = [0.0 if axis in rig.absolute else p[f"home_sd_deg.{axis}"] for axis in SIDES]
-    home_draws = np.array(home_sd_deg) * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
+    home_draws = np.array(home_sd_deg) * streams["homes"].standard_normal((int(segments.max(initial=0)) + 1, 2))
     home_draws[0] = 0.0
-    stop_draws = streams.stops.standard_normal((len(moves), 2))
-    start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
-    drift_draws, time_s = streams.drift.standard_normal((len(moves), 2)), np.array([m.time_s for m in moves])
+    stop_draws = streams["stops"].standard_normal((len(moves), 2))
+    start_draws = streams["stops"].uniform(-0.5, 0.5, (len(moves), 2))
+    drift_draws, time_s = streams["drift"].standard_normal((len(moves), 2)), np.array([m.time_s for m in moves])
     warm_minutes = (time_s - (time_s[0] if on_s is None else on_s)) / 60.0
     kelvin = kelvin_of(moves)
     resting, errors, drift = np.empty_like(counters), np.empty_like(counters), np.empty_like(counters)
@@ -247,7 +224,7 @@ def _drive(
         home_offsets_deg=pan_and_tilt(home_draws.tolist()),
         drift_deg=pan_and_tilt(drift.tolist()),
     )
-    return _Driven(realised, resting)
+    return realised, resting
 
 
 def placed_sheet(nominal_mm: np.ndarray | float, draws: np.ndarray) -> Sheet:
@@ -265,14 +242,14 @@ def look_scatter_deg(parameters: Mapping[str, float], normal: np.ndarray) -> np.
 def _seen_rad(log: PlanLog, truth: Truth, streams: _Streams) -> np.ndarray:
     """Compute the angles of both axes at each look, with its scatter, shape (2, looks)."""
     move = np.array([look.move for look in log.looks], int)
-    off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(move), 2)))
+    off_deg = look_scatter_deg(truth.parameters, streams["looks"].standard_normal((len(move), 2)))
     return np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
 
 
 def _light(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> Light:
     """Compute where each look's beam meets its sheet; NaN where it never does."""
     nominal_mm = np.array([rig.sheets_mm[name] for name in log.targets])
-    sheets = placed_sheet(nominal_mm, streams.sheets.standard_normal((len(log.targets), 3)))
+    sheets = placed_sheet(nominal_mm, streams["sheets"].standard_normal((len(log.targets), 3)))
     placement = np.array([look.placement for look in log.looks], int)
     psi, beta = _seen_rad(log, truth, streams)
     return light_on_sheet(psi, beta, truth.parameters, Sheet(sheets.depth_mm[placement], sheets.normal[placement]))
@@ -282,7 +259,7 @@ def _sightings(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> tuple
     """Compute the sighting of each look; the noise is that of `[cameras] sighting_sd_deg`."""
     psi, beta = _seen_rad(log, truth, streams)
     directions = mirror_chain(psi, beta, truth.parameters).direction
-    noise = truth.parameters["pixel_scale"] * rig.sighting_sd_deg * streams.pixels.standard_normal((len(psi), 2))
+    noise = truth.parameters["pixel_scale"] * rig.sighting_sd_deg * streams["pixels"].standard_normal((len(psi), 2))
     angles, u_deg = sighted_angles(directions, noise).tolist(), rig.sighting_sd_deg
     return tuple(
         Sighting(sighting=k, move=look.move, azimuth_deg=azimuth, elevation_deg=elevation, u_deg=u_deg)
@@ -302,15 +279,8 @@ def _spot(
     number: int, look: PlannedLook, target: str, pixels: np.ndarray, sd_px: float, aperture_deg: float | None
 ) -> Spot:
     """Build a row of spots.csv; a spot that the cameras do not see has no aperture reading either."""
-    step = look.step
-    row = Spot(
-        spot=number,
-        move=look.move,
-        target=target,
-        experiment=step.experiment,
-        point=step.point,
-        status=UNDETECTED,
-    )
+    numbers = {"experiment": look.step.experiment, "point": look.step.point}
+    row = Spot(spot=number, move=look.move, target=target, status=UNDETECTED, **numbers)
     if not np.isfinite(pixels).all():
         return row
     return with_pixels(replace(row, aperture_deg=aperture_deg), "ok", pixels.tolist(), (sd_px,) * 4)

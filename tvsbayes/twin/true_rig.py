@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NotRequired, TypedDict, cast
+from typing import Any
 
 import numpy as np
 
@@ -36,33 +36,6 @@ from tvsbayes.twin.true_headlines import effective_deg_per_step
 TRUTH_FORMAT = "tvsbayes-truth/1"
 Pair = tuple[float, float]
 """Numbers for pan and tilt."""
-
-
-class GearErrorTable(TypedDict):
-    """Repeating errors of an axis at the counters of a campaign: error of the output, play less its mean."""
-
-    steps: list[int]
-    error_deg: list[float]
-    play_deg: list[float]
-
-
-class TruthDocument(TypedDict):
-    """Content of truth.json; see `Truth`."""
-
-    format: str
-    note: str
-    parameters: dict[str, float]
-    stereo: dict[str, float]
-    mirror_angles_deg: Sequence[Pair]
-    stop_errors_deg: Sequence[Pair]
-    home_offsets_deg: Sequence[Pair]
-    drift_deg: NotRequired[Sequence[Pair]]
-    homing_side: NotRequired[dict[str, str] | None]
-    reference_pose_deg: Pair | None
-    gear_error: NotRequired[dict[str, GearErrorTable]]
-    effective_deg_per_step: NotRequired[dict[str, float]]
-    local_deg_per_step: NotRequired[dict[str, float]]
-    effective_mirror_offset_mm: NotRequired[float]
 
 
 @dataclass(frozen=True)
@@ -119,12 +92,12 @@ class Truth(WithStereo):
             "effective_mirror_offset_mm": effective_mirror_offset_mm(self.parameters, pose_deg),
         }
 
-    def as_json(self, campaign: Campaign) -> TruthDocument:
+    def as_json(self, campaign: Campaign) -> dict[str, Any]:
         """Return the document of truth.json for a campaign of this rig, with effective ratios if it has looks."""
         mechanism = campaign.rig.mechanism
         constants, stereo = mechanism.fixed, self.stereo
         cameras = {} if stereo is None else dict(zip(STEREO_PARAMETER_NAMES, stereo.vector.tolist(), strict=True))
-        document: TruthDocument = {
+        document: dict[str, Any] = {
             "format": TRUTH_FORMAT,
             "note": self.note,
             "parameters": {name: float(v) for name, v in self.parameters.items() if name not in constants},
@@ -146,7 +119,7 @@ class Truth(WithStereo):
                 document["effective_mirror_offset_mm"] = effective_mirror_offset_mm(self.parameters, pose_deg)
         return document
 
-    def _gear_error(self, axis: str, campaign: Campaign) -> GearErrorTable:
+    def _gear_error(self, axis: str, campaign: Campaign) -> dict[str, list[float]]:
         steps = sorted({getattr(move, f"{axis}_steps") for move in campaign.moves})
         angle_deg = self.parameters[f"degrees_per_step.{axis}"] * np.array(steps, float)
         errors = (self.gear_errors or PERFECT)[axis]
@@ -157,7 +130,7 @@ class Truth(WithStereo):
         }
 
     @classmethod
-    def from_json(cls, document: TruthDocument, stated: Stereo | None) -> Truth:
+    def from_json(cls, document: Mapping[str, Any], stated: Stereo | None) -> Truth:
         """Rebuild from truth.json; image size and covariance come from the campaign's `stated` stereo."""
         pose, known = document["reference_pose_deg"], document["stereo"]
         # Older files without errors of gears, scatter of looks and shifts of zeros have none of them.
@@ -181,7 +154,7 @@ class Truth(WithStereo):
         )
 
 
-def _tabulated(tables: Mapping[str, GearErrorTable], parameters: Mapping[str, float]) -> GearErrors:
+def _tabulated(tables: Mapping[str, Mapping[str, Sequence[float]]], parameters: Mapping[str, float]) -> GearErrors:
     """Build gear errors from the tables of a truth.json."""
     errors: dict[str, AxisErrors] = {}
     for axis in AXES:
@@ -209,8 +182,7 @@ def read_truth(path: str | Path, stated: Stereo | None) -> Truth:
     keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
     keys.word("format", (TRUTH_FORMAT,))
     try:
-        # Entries that cannot be converted are refused below.
-        return Truth.from_json(cast("TruthDocument", keys.values), stated)
+        return Truth.from_json(keys.values, stated)
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
             "truth",
