@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict, cast
+from typing import Any
 
 import numpy as np
 
@@ -41,67 +41,18 @@ DRAWS = Path("draws.npz")
 _ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
 
 
-class _Tables(TypedDict):
-    """JSON part of `draws.npz` beside the arrays; fields as in `Calibration`."""
-
-    noise_variance: Mapping[str, float]
-    overshoot_steps: Mapping[str, int]
-    period_deg: Mapping[str, float]
-    inputs_sha256: Mapping[str, str]
-    causes: list[str]
-    gear_steps: NotRequired[Mapping[str, list[float]]]
-    states: NotRequired[Mapping[str, Mapping[str, float]]]
-
-
-class _Moments(TypedDict):
-    """Names of the inputs and their covariance matrix."""
-
-    names: list[str]
-    matrix: list[list[float]]
-
-
-class GearErrors(TypedDict):
-    """Errors of one axis at regular counters, and beyond them, with their standard uncertainties; deg."""
-
-    steps: list[float]
-    transmission_error_deg: list[float]
-    u_transmission_error_deg: list[float]
-    play_variation_deg: list[float]
-    u_play_variation_deg: list[float]
-    beyond_u_transmission_error_deg: float
-    beyond_u_play_variation_deg: float
-
-
-class CalibrationDocument(TypedDict):
-    """A calibration without its draws, as JSON."""
-
-    format: str
-    estimator: str
-    aperture_convention: str
-    harmonic_period_deg: Mapping[str, float]
-    estimates: Mapping[str, float]
-    covariance: _Moments
-    noise_variance_deg2: Mapping[str, float]
-    overshoot_steps: Mapping[str, int]
-    range_steps: Mapping[str, list[float]]
-    gear_errors: NotRequired[Mapping[str, GearErrors]]
-    state: NotRequired[Mapping[str, Mapping[str, float]]]
-    inputs: Mapping[str, str]
-    expected_error: dict[str, object]
-    origin: NotRequired[dict[str, str]]
-
-
 def calibration_arrays(calibration: Calibration) -> dict[str, np.ndarray]:
     """A calibration as arrays of `draws.npz`."""
-    tables = _Tables(
-        noise_variance=calibration.noise_variance,
-        overshoot_steps=calibration.overshoot_steps,
-        period_deg=calibration.period_deg,
-        inputs_sha256=calibration.inputs_sha256,
-        causes=list(calibration.causes),
-        gear_steps=_gear_steps(calibration),
-        states={axis: state._asdict() for axis, state in calibration.states.items()},
-    )
+    # What is no array, under the names of `Calibration`.
+    tables = {
+        "noise_variance": calibration.noise_variance,
+        "overshoot_steps": calibration.overshoot_steps,
+        "period_deg": calibration.period_deg,
+        "inputs_sha256": calibration.inputs_sha256,
+        "causes": list(calibration.causes),
+        "gear_steps": {axis: list(steps) for axis, steps in zip(AXES, calibration.gears.steps, strict=True)},
+        "states": {axis: state._asdict() for axis, state in calibration.states.items()},
+    }
     others = {
         "format": CALIBRATION_FORMAT,
         "input_names": calibration.names,
@@ -159,48 +110,44 @@ def content_sha256(document: Mapping[str, object]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def calibration_json(calibration: Calibration, origin: Origin | None = None) -> CalibrationDocument:
+def calibration_json(calibration: Calibration, origin: Origin | None = None) -> dict[str, Any]:
     """Build the JSON of a calibration without its draws, for a ROS node or another language.
 
     `read_calibration_json` reads it. `origin` is added with the SHA-256 of all other content. Numbers have `DIGITS`.
     """
-    document = _plain(_document(calibration))
+    document: dict[str, Any] = _plain(
+        {
+            "format": CALIBRATION_FORMAT,
+            "estimator": calibration.estimator,
+            "aperture_convention": "azimuth" if calibration.azimuth else "in-plane",
+            "harmonic_period_deg": dict(calibration.period_deg),
+            "estimates": calibration.estimates,
+            "covariance": {
+                "names": [*calibration.names, *calibration.gears.names],
+                "matrix": calibration.covariance.tolist(),
+            },
+            "noise_variance_deg2": dict(calibration.noise_variance),
+            "overshoot_steps": dict(calibration.overshoot_steps),
+            "range_steps": {axis: list(steps) for axis, steps in calibration.seen_steps.items()},
+            "gear_errors": gear_errors(calibration),
+            "state": {axis: state._asdict() for axis, state in calibration.states.items()},
+            "inputs": dict(calibration.inputs_sha256),
+            "expected_error": asdict(expected_error(calibration)),
+        }
+    )
     if origin is not None:
         document["origin"] = {**asdict(origin), "sha256": content_sha256(document)}
-    return cast(CalibrationDocument, document)
+    return document
 
 
-def _document(calibration: Calibration) -> CalibrationDocument:
-    return {
-        "format": CALIBRATION_FORMAT,
-        "estimator": calibration.estimator,
-        "aperture_convention": "azimuth" if calibration.azimuth else "in-plane",
-        "harmonic_period_deg": dict(calibration.period_deg),
-        "estimates": calibration.estimates,
-        "covariance": {
-            "names": [*calibration.names, *calibration.gears.names],
-            "matrix": calibration.covariance.tolist(),
-        },
-        "noise_variance_deg2": dict(calibration.noise_variance),
-        "overshoot_steps": dict(calibration.overshoot_steps),
-        "range_steps": {axis: list(steps) for axis, steps in calibration.seen_steps.items()},
-        "gear_errors": gear_errors(calibration),
-        "state": {axis: state._asdict() for axis, state in calibration.states.items()},
-        "inputs": dict(calibration.inputs_sha256),
-        "expected_error": asdict(expected_error(calibration)),
-    }
+def gear_errors(calibration: Calibration) -> dict[str, dict[str, Any]]:
+    """Return the errors of each axis at regular counters, and beyond them, with their standard uncertainties, deg.
 
-
-def _gear_steps(calibration: Calibration) -> dict[str, list[float]]:
-    """Return table counters by axis."""
-    return {axis: list(steps) for axis, steps in zip(AXES, calibration.gears.steps, strict=True)}
-
-
-def gear_errors(calibration: Calibration) -> dict[str, GearErrors]:
-    """Return the table of gear errors by axis; empty without repeating errors."""
+    Empty without repeating errors.
+    """
     first, table = len(INPUT_NAMES), calibration.gears
     u = np.sqrt(np.maximum(np.diag(calibration.covariance)[first:], 0.0))
-    errors: dict[str, GearErrors] = {}
+    errors: dict[str, dict[str, Any]] = {}
     for axis, steps in zip(AXES, table.steps, strict=True):
         if not table.size:
             break
@@ -343,10 +290,10 @@ def _states(stored: Mapping[str, Mapping[str, float]]) -> dict[Axis, State]:
     return {axis: State(**{name: float(n) for name, n in stored[axis].items()}) for axis in AXES if stored}
 
 
-def _tables(text: str, path: Path) -> _Tables:
+def _tables(text: str, path: Path) -> Mapping[str, Any]:
     """Parse the tables as JSON without further checks; `_shaped` refuses invalid ones."""
     try:
-        return cast(_Tables, parse_json(text.encode(), escaped(path.name)).values)
+        return parse_json(text.encode(), escaped(path.name)).values
     except InputError as error:
         raise damaged_calibration(path, f"its tables are no JSON of tvsbayes: {error.found}") from error
 
@@ -358,7 +305,7 @@ def read_calibration_json(path: Path) -> Calibration:
     convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
     try:
         # Wrong types fail below or in `_shaped`.
-        d = cast(CalibrationDocument, keys.values)
+        d: Mapping[str, Any] = keys.values
         errors = {} if known == FORMATS[0] else d["gear_errors"]
         gears = table_of({axis: errors[axis]["steps"] for axis in AXES}) if errors else NO_GEARS
         named = tuple(d["covariance"]["names"])

@@ -38,44 +38,15 @@ class ErrorMap:
     distance_mm: Mapping[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class _Truth:
-    """Truth of every drawn rig: points reached (3, draws, points), mm, and the aperture's readings there, deg."""
-
-    xyz_mm: np.ndarray
-    aperture_deg: np.ndarray
-
-
 def _truth(
     calibration: Calibration, pan: np.ndarray, tilt: np.ndarray, range_mm: np.ndarray, approach: Sides, rigs: Drawn
-) -> _Truth:
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points reached by every drawn rig (3, draws, points), mm, and the aperture's readings there, deg."""
     values = rigs.values_at(calibration, (pan, tilt))
     noise = rigs.noise.T[..., None]
     points = calibration.noisy_beam(values, noise, (pan, tilt), approach).at(range_mm)
     reading = aperture_angle_deg((points[0], points[1], points[2]), values["baseline_mm"], calibration.azimuth)
-    return _Truth(points, reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[APERTURE])
-
-
-@dataclass(frozen=True)
-class _Errors:
-    """Errors of one estimator over the points; fields as in `ErrorMap`, `usable` as its `valid`."""
-
-    rms_mm: np.ndarray
-    distance_mm: np.ndarray
-    usable: np.ndarray
-
-
-def _errors(assumed: AssumedGeometry, truth: _Truth, azimuth: bool) -> _Errors:
-    error = assumed.points(truth.aperture_deg, azimuth) - truth.xyz_mm
-    meets = np.isfinite(error[0])
-    kept, count = np.where(meets, error, 0.0), np.maximum(meets.sum(axis=0), 1)
-    usable = (~meets).mean(axis=0) <= DIVERGING_SHARE
-    square = np.sum(kept**2, axis=(0, 1)) / count
-    return _Errors(
-        rms_mm=np.where(usable, np.sqrt(square), np.nan),
-        distance_mm=np.where(meets, np.linalg.norm(error, axis=0), np.inf),
-        usable=usable,
-    )
+    return points, reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[APERTURE]
 
 
 @dataclass(frozen=True)
@@ -147,18 +118,19 @@ def error_map(
     """
     axes = [np.asarray(x, dtype=float) for x in (pan_steps, tilt_steps, range_mm)]
     pan, tilt, ranges = (x.ravel() for x in np.meshgrid(*axes, indexing="ij"))
-    truth = _truth(calibration, pan, tilt, ranges, approach, drawn(calibration, draws, seed=0))
+    true_mm, reading_deg = _truth(calibration, pan, tilt, ranges, approach, drawn(calibration, draws, seed=0))
     best = calibration.estimates
     beam = calibration.beam_at((pan, tilt), approach)
     geometries = {"joint": AssumedGeometry(beam, best["baseline_mm"], best["aperture_zero_deg"])}
     geometries |= {name: assumed_geometry(one, pan, tilt) for name, one in simple.items()}
-    errors = {name: _errors(assumed, truth, calibration.azimuth) for name, assumed in geometries.items()}
     shape = tuple(len(x) for x in axes)
-    return ErrorMap(
-        pan_steps=axes[0],
-        tilt_steps=axes[1],
-        range_mm=axes[2],
-        rms_mm={name: part.rms_mm.reshape(shape) for name, part in errors.items()},
-        valid=np.all([part.usable for part in errors.values()], axis=0).reshape(shape),
-        distance_mm={name: part.distance_mm.reshape(-1, *shape) for name, part in errors.items()},
-    )
+    rms, distance, valid = {}, {}, np.ones(shape, bool)
+    for name, assumed in geometries.items():
+        error = assumed.points(reading_deg, calibration.azimuth) - true_mm
+        meets = np.isfinite(error[0])
+        usable = (~meets).mean(axis=0) <= DIVERGING_SHARE
+        square = np.sum(np.where(meets, error, 0.0) ** 2, axis=(0, 1)) / np.maximum(meets.sum(axis=0), 1)
+        rms[name] = np.where(usable, np.sqrt(square), np.nan).reshape(shape)
+        distance[name] = np.where(meets, np.linalg.norm(error, axis=0), np.inf).reshape(-1, *shape)
+        valid &= usable.reshape(shape)
+    return ErrorMap(*axes, rms_mm=rms, valid=valid, distance_mm=distance)
