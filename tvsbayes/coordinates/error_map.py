@@ -133,4 +133,4 @@ def error_map(
         rms[name] = np.where(usable, np.sqrt(square), np.nan).reshape(shape)
         distance[name] = np.where(meets, np.linalg.norm(error, axis=0), np.inf).reshape(-1, *shape)
         valid &= usable.reshape(shape)
-    return ErrorMap(*axes, rms_mm=rms, valid=valid, distance_mm=distance)
+    return ErrorMap(axes[0], axes[1], axes[2], rms, valid, distance)
