@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support.drawn_pictures import drawn
 
-from tvsbayes.cameras.picture_pairs import Pairing, natural_order, paired_pictures, read_folder
+from tvsbayes.cameras.picture_pairs import Pairing, paired_pictures, read_folder
 from tvsbayes.errors import InputError, Question
 
 SIDES = ("left", "right")
@@ -71,10 +71,6 @@ def test_two_pictures_of_one_view_and_no_folder_are_refused(tmp_path):
         paired_pictures(tmp_path, most=10)
     with pytest.raises(InputError, match="readable folder"):
         paired_pictures(tmp_path / "absent", most=1)
-
-
-def test_natural_order_is_numeric():
-    assert sorted(["a10", "a9", "b1", "a2b"], key=natural_order) == ["a2b", "a9", "a10", "b1"]
 
 
 def test_pairs_in_the_folder_come_before_those_below(tmp_path):

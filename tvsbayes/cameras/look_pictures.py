@@ -195,28 +195,38 @@ def pair_looks(
     slot = None if matching == "order" else _number_position(views, ids)
     names, renumbered = [""] * len(views), None
     if slot is not None:
-        stated, names = [view.numbers[slot] for view in views], [view.without_number(slot) for view in views]
+        numbers, names = [view.numbers[slot] for view in views], [view.without_number(slot) for view in views]
         if matching is None and (counted := _counted(views, slot, names)):
-            raise _question(views[0], stated[0], counted)
-        # A day before a time of day counts too.
-        times = [tuple(view.numbers[: slot + 1]) for view in views]
-        numbers = stated
-        if ids is None and max(stated) >= 2 * len(set(stated)) + SPARSE_MARGIN:
+            raise _question(views[0], numbers[0], counted)
+        if ids is None and max(numbers) >= 2 * len(set(numbers)) + SPARSE_MARGIN:
+            renumbered = min(numbers), max(numbers)
+            # A day before a time of day counts too.
+            times = [tuple(view.numbers[: slot + 1]) for view in views]
             ranks = {time: rank for rank, time in enumerate(sorted(set(times)))}
-            numbers, renumbered = [ranks[time] for time in times], (min(stated), max(stated))
+            numbers = [ranks[time] for time in times]
     elif matching == "number" or (ids is not None and len(views) != len(ids)):
         raise _unmatched(views, ids or (), file)
     else:
         numbers = list(range(len(views)) if ids is None else ids)
     method: Matching = "order" if slot is None else "number"
+    pictures: dict[int, View] = {}
     if rows:
-        return _pair_rows(views, numbers, rows, waiting, method)
-    order = sorted(range(len(views)), key=lambda k: (numbers[k], natural_order(views[k].name)))
-    targets = _differences(names)
-    spots = [Spot(spot=n, move=numbers[k], target=targets[k], status=UNDETECTED) for n, k in enumerate(order)]
-    used = set(numbers)
-    without = tuple(move for move in (range(1 + max(used)) if moves is None else moves) if move not in used)
-    return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, method, (), without, renumbered)
+        # The first view of a number is its row's.
+        left_over = [
+            view.name for n, view in zip(numbers, views, strict=True) if pictures.setdefault(n, view) is not view
+        ]
+        without = tuple(spot for spot in waiting if spot not in pictures)
+        return PairedLooks(tuple(rows), pictures, method, tuple(left_over), without)
+    words = [name.split() for name in names]
+    common = set.intersection(*map(set, words))
+    spots = []
+    for spot, k in enumerate(sorted(range(len(views)), key=lambda k: (numbers[k], natural_order(views[k].name)))):
+        # Words that not all names share, cut to the length of a target.
+        target = " ".join(word for word in words[k] if word not in common)[:100]
+        spots.append(Spot(spot=spot, move=numbers[k], target=target, status=UNDETECTED))
+        pictures[spot] = views[k]
+    without = tuple(sorted({*(range(1 + max(numbers)) if moves is None else moves)} - {*numbers}))
+    return PairedLooks(tuple(spots), pictures, method, (), without, renumbered)
 
 
 def _counted(views: Sequence[View], slot: int, names: Sequence[str]) -> str:
@@ -246,26 +256,6 @@ def _question(view: View, number: int, counted: str) -> InputError:
             Candidate(f"{number} is the number of the move all the same", ("--pair", "number")),
         ),
     )
-
-
-def _differences(names: Sequence[str]) -> list[str]:
-    """Words of each name that not all names share, cut to the length of a target."""
-    words = [name.split() for name in names]
-    common = set.intersection(*map(set, words))
-    return [" ".join(word for word in own_words if word not in common)[:100] for own_words in words]
-
-
-def _pair_rows(
-    views: Sequence[View], numbers: Sequence[int], rows: Sequence[Spot], waiting: Sequence[int], matching: Matching
-) -> PairedLooks:
-    """Pair each waiting row with the first view of its number."""
-    pictures: dict[int, View] = {}
-    left_over = []
-    for number, view in zip(numbers, views, strict=True):
-        if pictures.setdefault(number, view) is not view:
-            left_over.append(view.name)
-    without = tuple(spot for spot in waiting if spot not in pictures)
-    return PairedLooks(tuple(rows), pictures, matching, tuple(left_over), without)
 
 
 def _unmatched(views: Sequence[View], ids: Sequence[int], file: str) -> InputError:

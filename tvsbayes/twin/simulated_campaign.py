@@ -279,8 +279,8 @@ def _spot(
     number: int, look: PlannedLook, target: str, pixels: np.ndarray, sd_px: float, aperture_deg: float | None
 ) -> Spot:
     """Build a row of spots.csv; a spot that the cameras do not see has no aperture reading either."""
-    numbers = {"experiment": look.step.experiment, "point": look.step.point}
-    row = Spot(spot=number, move=look.move, target=target, status=UNDETECTED, **numbers)
+    numbers = look.step.experiment, look.step.point
+    row = Spot(spot=number, move=look.move, target=target, experiment=numbers[0], point=numbers[1], status=UNDETECTED)
     if not np.isfinite(pixels).all():
         return row
     return with_pixels(replace(row, aperture_deg=aperture_deg), "ok", pixels.tolist(), (sd_px,) * 4)
