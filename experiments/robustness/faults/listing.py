@@ -91,7 +91,7 @@ FAULTS = (
           "test_one_direction_is_a_camera_only_without_up_and_down"),
     Fault("a direction before an experiment is taken for the camera", "picture_pairs._marks",
           Local("is_prefix", "False"), "test_a_direction_is_no_camera"),
-    Fault("numbers of experiments in names of pictures are taken for moves", "_are_experiments", Returns("False"),
+    Fault("numbers of experiments in names of pictures are taken for moves", "look_pictures._counted", Returns("''"),
           "test_numbers_of_experiments_are_no_moves"),
     Fault("pairs of pictures that are guessed are not asked about", "paired_pictures", Local("guessed", "{}"),
           "test_names_that_do_not_decide_are_asked"),
