@@ -3,8 +3,9 @@
     python -m experiments.robustness.house [FOLDER ...]       # tvsbayes, tests and experiments where none is named
 
 Lines are split into code, imports, docstrings, and blank lines with comments. A public name with one reference is a
-function or class at the top of a module whose name is read once in all Python of the repository. A bag is a dataclass or named tuple without a method that is built in one place. A name defined twice is
-that of functions or classes at the top of two modules of the package.
+function or class at the top of a module whose name is read once in all Python of the repository. A bag is a dataclass
+or named tuple without a method that is built in one place. A name defined twice is that of functions or classes at
+the top of two modules of the package.
 """
 
 from __future__ import annotations
