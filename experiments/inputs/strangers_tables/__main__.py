@@ -25,8 +25,7 @@ from experiments.common.rows import ROOT
 from experiments.inputs.strangers_tables import kinds, logs, reports, runs, sheets
 from experiments.inputs.strangers_tables.judge import Verdict, judge
 from experiments.inputs.strangers_tables.kinds import Drawn
-from experiments.inputs.strangers_tables.measured import pick
-from experiments.inputs.strangers_tables.words import LANGUAGES
+from experiments.inputs.strangers_tables.measured import LANGUAGES, Stranger
 
 OUTPUT = ROOT / "experiments" / "output" / "strangers_tables"
 DRAWS = {
@@ -54,7 +53,7 @@ def drawn_table(seed: int) -> Drawn:
     rng = np.random.default_rng(seed)
     weights = np.array(list(DRAWS.values()), float)
     draw = list(DRAWS)[int(rng.choice(len(DRAWS), p=weights / weights.sum()))]
-    return draw(rng, pick(rng, LANGUAGES))
+    return draw(Stranger(rng, LANGUAGES[int(rng.integers(len(LANGUAGES)))]))
 
 
 def judged(seed: int) -> tuple[Drawn, Verdict]:

@@ -9,89 +9,90 @@ from decimal import Decimal
 
 import numpy as np
 
-from experiments.inputs.strangers_tables import sheets, words
-from experiments.inputs.strangers_tables.kinds import START, Drawn, names_of, read_all, truth_of
+from experiments.inputs.strangers_tables import sheets
+from experiments.inputs.strangers_tables.kinds import START, Drawn, driven, truth_of
 from experiments.inputs.strangers_tables.measured import (
     ANGLE,
     ASCII,
+    WORDS,
     Answer,
     Axis,
     Reading,
+    Stranger,
     Sweep,
     Truth,
-    chance,
     decimal,
     draw_axis,
-    pick,
     sweeps,
-    unit_text,
 )
-from experiments.inputs.strangers_tables.sheets import Cell, File
+from experiments.inputs.strangers_tables.sheets import Cell, Columns, File
 
 
-def telemetry(rng: np.random.Generator, language: str) -> Drawn:
+def telemetry(by: Stranger) -> Drawn:
     """Rows ten times a second, also while the axis moves: those at rest are its readings."""
-    unit = pick(rng, ("deg", "mm", "count", "count"))
-    named = unit != "count" or chance(rng, 0.3)
-    digits, per_command = (0, 1.0) if unit == "count" else (2, 1 + rng.normal(0, 0.002))
+    unit = by.pick(("deg", "mm", "count", "count"))
+    named = unit != "count" or by.chance(0.3)
+    digits, per_command = (0, 1.0) if unit == "count" else (2, 1 + by.rng.normal(0, 0.002))
     step, play = (200, 12.0) if unit == "count" else (10, 0.4)
-    commands = tuple(Decimal(1000 * (unit == "count") + step * k) for k in range(int(rng.integers(5, 9))))
-    sweep = sweeps(rng, commands, False)
+    commands = tuple(Decimal(1000 * (unit == "count") + step * k) for k in range(int(by.rng.integers(5, 9))))
+    sweep = sweeps(by, commands, False)
     rows: list[tuple[Decimal, Decimal, int]] = []
     readings, at = [], per_command * float(commands[0]) - 3 * play
     for k, stop in enumerate(sweep.stops):
-        final = round(per_command * float(stop.command) - 0.5 * stop.side * play + rng.normal(0, 0.05 * play), digits)
+        final = round(
+            per_command * float(stop.command) - 0.5 * stop.side * play + by.rng.normal(0, 0.05 * play), digits
+        )
         speed = 0.15 * step
         for _ in range(int(abs(final - at) / speed)):
             at += speed if final > at else -speed
             rows.append((stop.command, decimal(at, digits), 1))
-        rest = int(rng.integers(6, 20))
-        jitter = rng.integers(-1, 2, rest) * (0.1**digits) * chance(rng, 0.3)
+        rest = int(by.rng.integers(6, 20))
+        jitter = by.rng.integers(-1, 2, rest) * (0.1**digits) * by.chance(0.3)
         rows += [(stop.command, decimal(final + d, digits), 0) for d in jitter]
         at = final
         readings.append(Reading(float(stop.command), final, sweep.told_side(k)))
     count = len(rows)
     moments = [START + datetime.timedelta(seconds=0.1 * k) for k in range(count)]
-    tail = pick(rng, ("", " (5)", "_1")) if unit == "count" else ""
-    columns: dict[str, Sequence[Cell]] = {
+    tail = by.pick(("", " (5)", "_1")) if unit == "count" else ""
+    columns: Columns = {
         "timestamp": [m.isoformat(timespec="milliseconds") + "Z" for m in moments]
-        if chance(rng, 0.6)
+        if by.chance(0.6)
         else [decimal(0.1 * k, 1) for k in range(count)],
         f"target pos{tail}" if not named else f"target_{ASCII[unit]}": [c for c, _, _ in rows],
         f"pos{tail}" if not named else f"position_{ASCII[unit]}": [v for _, v, _ in rows],
-        f"load{tail}": [Decimal(int(x)) for x in rng.integers(0, 90, count)],
-        f"current{tail}": [Decimal(int(x)) for x in rng.integers(0, 4, count)],
+        f"load{tail}": [Decimal(int(x)) for x in by.rng.integers(0, 90, count)],
+        f"current{tail}": [Decimal(int(x)) for x in by.rng.integers(0, 4, count)],
     }
-    if chance(rng, 0.6):
+    if by.chance(0.6):
         columns[f"temp{tail}"] = [Decimal(37)] * count
-    if chance(rng, 0.6):
+    if by.chance(0.6):
         columns[f"status{tail}"] = [Decimal(0)] * count
-    if chance(rng, 0.6):
+    if by.chance(0.6):
         columns[f"moving{tail}"] = [Decimal(m) for _, _, m in rows]
     truth = Truth(tuple(readings), unit if named else None, None, 10.0**-digits, spread=1.5 * 10.0**-digits)
     truth = replace(truth, answer="right" if named else "either", ratio=per_command, play=play)
-    return Drawn("telemetry, also in motion", sheets.any_file(rng, sheets.columns_sheet(columns, "en"), False), truth)
+    file = sheets.columns_file(by._replace(language="en"), columns, markdowns=False)
+    return Drawn("telemetry, also in motion", file, truth)
 
 
-def stage(rng: np.random.Generator, stated: bool = False) -> tuple[Axis, Sweep, list[Decimal], list[Reading]]:
+def stage(by: Stranger, stated: bool = False) -> tuple[Axis, Sweep, list[Decimal], list[Reading]]:
     """An axis in mm or degrees, driven in the same unit, and its readings."""
-    rotary = chance(rng, 0.3)
+    rotary = by.chance(0.3)
     unit = "deg" if rotary else "mm"
-    axis = draw_axis(rng, rotary, unit, unit)
-    sweep = sweeps(rng, axis.commands, stated)
-    return axis, sweep, *read_all(rng, axis, sweep)
+    axis = draw_axis(by, rotary, unit, unit)
+    return axis, *driven(by, axis, stated)
 
 
-def labview(rng: np.random.Generator, language: str) -> Drawn:
+def labview(by: Stranger) -> Drawn:
     """The rows of an .lvm file, X_Value being the clock; sometimes with both headers above."""
-    axis, sweep, values, readings = stage(rng)
-    times = np.round(np.cumsum(rng.uniform(1.9, 2.1, len(values))), 3)
+    axis, sweep, values, readings = stage(by)
+    times = np.round(np.cumsum(by.rng.uniform(1.9, 2.1, len(values))), 3)
     readings = [r._replace(time_s=float(t - times[0])) for r, t in zip(readings, times, strict=True)]
-    names = list(names_of(rng, axis, language))
-    whole, comma = chance(rng, 0.3), language != "en" and chance(rng, 0.7)
-    named = whole or chance(rng, 0.7)
+    names = list(by.names(axis))
+    whole, comma = by.chance(0.3), by.language != "en" and by.chance(0.7)
+    named = whole or by.chance(0.7)
     if named and not whole:
-        names = [f"{name} ({unit_text(rng, axis.unit, language)})" for name in names]
+        names = [f"{name} ({by.unit(axis.unit)})" for name in names]
     point = "," if comma else "."
     lines = ["\t".join(["X_Value", *names, "Comment"])]
     lines += [
@@ -103,7 +104,7 @@ def labview(rng: np.random.Generator, language: str) -> Drawn:
     truth = truth_of(axis, readings, clock=1.1)
     if not named:
         truth = replace(truth, unit=None, command_unit=None, answer="either")
-    data = sheets.encoded(rng, "\n".join(lines) + "\n")
+    data = sheets.encoded(by, "\n".join(lines) + "\n")
     return Drawn("LabVIEW", File("run.lvm" if whole else "run.txt", data), truth)
 
 
@@ -120,17 +121,17 @@ def lvm_headers(point: str, unit: str, count: int) -> list[str]:
     ]
 
 
-def remark_names(rng: np.random.Generator, language: str) -> Drawn:
+def remark_names(by: Stranger) -> Drawn:
     """Names in the last line of remarks: numpy.savetxt, SPEC, rostopic, CS-Studio, gnuplot."""
-    axis, sweep, values, readings = stage(rng)
+    axis, sweep, values, readings = stage(by)
     unit = ASCII[axis.unit]
-    style = pick(rng, ("savetxt", "savetxt", "spec", "rostopic", "databrowser", "gnuplot"))
+    style = by.pick(("savetxt", "savetxt", "spec", "rostopic", "databrowser", "gnuplot"))
     pairs = list(zip(sweep.stops, values, strict=True))
     truth, name = truth_of(axis, readings), "data.txt"
     if style == "savetxt":
-        form = pick(rng, ("{:.18e}", "{:.6f}", "{:.4f}"))
-        between = pick(rng, (" ", " ", ",", "\t"))
-        names = pick(rng, (("commanded", "measured"), ("target", "actual"), ("cmd", "meas"), ("setpoint", "encoder")))
+        form = by.pick(("{:.18e}", "{:.6f}", "{:.4f}"))
+        between = by.pick((" ", " ", ",", "\t"))
+        names = by.pick((("commanded", "measured"), ("target", "actual"), ("cmd", "meas"), ("setpoint", "encoder")))
         lines = [f"# {between.join(f'{n}_{unit}' for n in names)}"]
         lines += [form.format(float(s.command)) + between + form.format(float(v)) for s, v in pairs]
     elif style == "spec":
@@ -157,44 +158,44 @@ def remark_names(rng: np.random.Generator, language: str) -> Drawn:
         readings = [r._replace(time_s=10.0 * k) for k, r in enumerate(readings)]
         truth = replace(truth, readings=tuple(readings), clock=1.1)
     else:
-        text = unit_text(rng, axis.unit, language)
-        heads = [f"{names_of(rng, axis, language)[0]} ({text})", f"{names_of(rng, axis, language)[1]} ({text})"]
+        text = by.unit(axis.unit)
+        heads = [f"{by.names(axis)[0]} ({text})", f"{by.names(axis)[1]} ({text})"]
         lines = ["# measured with the new dial", "# " + "\t".join(heads), *(f"{s.command}\t{v}" for s, v in pairs)]
-    return Drawn("names in a remark", File(name, sheets.encoded(rng, "\n".join(lines) + "\n")), truth)
+    return Drawn("names in a remark", File(name, sheets.encoded(by, "\n".join(lines) + "\n")), truth)
 
 
 SERIAL_NAMES = (("Target", "Position"), ("target", "pos"), ("cmd", "enc"), ("Set", "Actual"), ("Step", "Angle"))
 
 
-def serial(rng: np.random.Generator, language: str) -> Drawn:
+def serial(by: Stranger) -> Drawn:
     """Lines of a serial monitor: command and reading on one line or on two, with lines lost, repeated or cut."""
-    axis, sweep, values, readings = stage(rng)
-    command, value = pick(rng, SERIAL_NAMES)
-    sign = pick(rng, (": ", "=", ": "))
-    unit = pick(rng, (" {}", "_", "")).format(axis.unit)
+    axis, sweep, values, readings = stage(by)
+    command, value = by.pick(SERIAL_NAMES)
+    sign = by.pick((": ", "=", ": "))
+    unit = by.pick((" {}", "_", "")).format(axis.unit)
     if unit == "_":
         value, unit = f"{value}_{ASCII[axis.unit]}", ""
     named = bool(unit) or "_" in value
-    two = chance(rng, 0.6)
+    two = by.chance(0.6)
     lines: list[str] = []
     for stop, v in zip(sweep.stops, values, strict=True):
         cells = [f"{command}{sign}{stop.command}", f"{value}{sign}{v}{unit}"]
-        lines += cells if two else [pick(rng, (", ", " ", "; ")).join(cells) if not lines else _as(lines[0], cells)]
-    damaged = two and chance(rng, 0.5)
+        lines += cells if two else [by.pick((", ", " ", "; ")).join(cells) if not lines else _as(lines[0], cells)]
+    damaged = two and by.chance(0.5)
     truth = truth_of(axis, readings, command_unit=None)
     if damaged:
-        lines = damage(rng, lines, sweep)
+        lines = damage(by, lines, sweep)
         truth = replace(truth, kept=len(readings) - 4)
-    if chance(rng, 0.3):
+    if by.chance(0.3):
         lines = [
             f"{(START + datetime.timedelta(seconds=k)).strftime('%H:%M:%S')}.000 -> {x}" for k, x in enumerate(lines)
         ]
-    if chance(rng, 0.4):
-        lines = ["ready", *lines] if chance(rng, 0.7) else [*lines, "done"]
+    if by.chance(0.4):
+        lines = ["ready", *lines] if by.chance(0.7) else [*lines, "done"]
     if not named:
         truth = replace(truth, unit=None, answer="either")
     kind = "serial monitor, lines lost, repeated or cut" if damaged else "serial monitor"
-    return Drawn(kind, File("monitor.txt", sheets.encoded(rng, "\n".join(lines) + "\n")), truth)
+    return Drawn(kind, File("monitor.txt", sheets.encoded(by, "\n".join(lines) + "\n")), truth)
 
 
 def _as(first: str, cells: Sequence[str]) -> str:
@@ -202,36 +203,36 @@ def _as(first: str, cells: Sequence[str]) -> str:
     return next(between for between in (", ", "; ", " ") if between in first.replace(": ", ":")).join(cells)
 
 
-def damage(rng: np.random.Generator, lines: list[str], sweep: Sweep) -> list[str]:
+def damage(by: Stranger, lines: list[str], sweep: Sweep) -> list[str]:
     """One or two lines lost, repeated or cut short: none where the motion turns, which no reader could know."""
     commands = [stop.command for stop in sweep.stops]
     straight = [
         k for k in range(2, len(commands) - 2) if (commands[k] - commands[k - 1]) * (commands[k + 1] - commands[k]) > 0
     ]
-    for place in sorted(rng.choice(straight, int(rng.integers(1, 3)), replace=False).tolist(), reverse=True):
-        number = 2 * place + int(rng.integers(2))
-        what = pick(rng, ("lost", "lost", "repeated", "cut"))
+    for place in sorted(by.rng.choice(straight, int(by.rng.integers(1, 3)), replace=False).tolist(), reverse=True):
+        number = 2 * place + int(by.rng.integers(2))
+        what = by.pick(("lost", "lost", "repeated", "cut"))
         if what == "lost":
             del lines[number]
         elif what == "repeated":
             lines.insert(number, lines[number])
-        elif number % 2 and chance(rng, 0.5) and "." in lines[number][-5:]:
+        elif number % 2 and by.chance(0.5) and "." in lines[number][-5:]:
             # Decimals are missing.
             lines[number] = lines[number][:-2]
         else:
-            lines[number] = lines[number][: int(rng.integers(2, max(3, len(lines[number]) // 2)))]
+            lines[number] = lines[number][: int(by.rng.integers(2, max(3, len(lines[number]) // 2)))]
     return lines
 
 
-def camonitor(rng: np.random.Generator, language: str) -> Drawn:
+def camonitor(by: Stranger) -> Drawn:
     """Series of EPICS, a command and a reading after each; in some the clock steps back by an hour or some seconds."""
-    axis, sweep, values, readings = stage(rng)
-    record = pick(rng, ("M:axis", "BL7:m1", "T:Stage1"))
-    names = pick(rng, ((".VAL", ".RBV"), (".VAL", ".RBV"), ("-PosSet", "-PosAct"), (":Setpoint", ":Readback")))
-    step_back = pick(rng, (0.0, 0.0, 3600.0, 1.5))
-    every = float(pick(rng, (10, 20, 21)))
+    axis, sweep, values, readings = stage(by)
+    record = by.pick(("M:axis", "BL7:m1", "T:Stage1"))
+    names = by.pick(((".VAL", ".RBV"), (".VAL", ".RBV"), ("-PosSet", "-PosAct"), (":Setpoint", ":Readback")))
+    step_back = by.pick((0.0, 0.0, 3600.0, 1.5))
+    every = float(by.pick((10, 20, 21)))
     begin = datetime.datetime(2026, 10, 25, 2, 50)
-    change = every * len(values) * rng.uniform(0.3, 0.7)
+    change = every * len(values) * by.rng.uniform(0.3, 0.7)
     lines = []
     for k, (stop, value) in enumerate(zip(sweep.stops, values, strict=True)):
         for name, late, cell in ((names[0], 0.0, stop.command), (names[1], 0.5 * every, value)):
@@ -245,47 +246,47 @@ def camonitor(rng: np.random.Generator, language: str) -> Drawn:
         axis, readings, unit=None, command_unit=None, clock=tolerance_s, answer="either", kept=len(readings) - 2
     )
     kind = "EPICS, the clock steps back" if step_back else "EPICS"
-    return Drawn(kind, File("camonitor.txt", sheets.encoded(rng, "\n".join(lines) + "\n")), truth)
+    return Drawn(kind, File("camonitor.txt", sheets.encoded(by, "\n".join(lines) + "\n")), truth)
 
 
-def sightings(rng: np.random.Generator, language: str) -> Drawn:
+def sightings(by: Stranger) -> Drawn:
     """Counters of a head, and where it was found to point; sometimes without a unit."""
-    unit = pick(rng, ("deg",) * 4 + ("rad", "arcmin", "gon", "mrad"))
+    unit = by.pick(("deg",) * 4 + ("rad", "arcmin", "gon", "mrad"))
     # Nobody leaves out that angles are gon.
-    named = unit == "gon" or chance(rng, 0.75)
-    count, ratio = int(rng.integers(8, 30)), pick(rng, (0.02, 0.05, 0.03))
-    pan, tilt = rng.integers(-60, 60, count) * 50, rng.integers(0, 30, count) * 50
-    azimuth = 40 * chance(rng, 0.5) + ratio * pan + rng.normal(0, 0.01, count)
-    azimuth = azimuth % 360 if chance(rng, 0.5) else (azimuth + 180) % 360 - 180
-    elevation = 5 + ratio * tilt + rng.normal(0, 0.01, count)
+    named = unit == "gon" or by.chance(0.75)
+    count, ratio = int(by.rng.integers(8, 30)), by.pick((0.02, 0.05, 0.03))
+    pan, tilt = by.rng.integers(-60, 60, count) * 50, by.rng.integers(0, 30, count) * 50
+    azimuth = 40 * by.chance(0.5) + ratio * pan + by.rng.normal(0, 0.01, count)
+    azimuth = azimuth % 360 if by.chance(0.5) else (azimuth + 180) % 360 - 180
+    elevation = 5 + ratio * tilt + by.rng.normal(0, 0.01, count)
     digits = {"deg": 4, "rad": 7, "arcmin": 2, "gon": 4, "mrad": 3}[unit]
     cells = [[decimal(a / ANGLE[unit], digits) for a in angles] for angles in (azimuth, elevation)]
     degrees = [[float(c) * ANGLE[unit] for c in column] for column in cells]
     written: list[Sequence[Cell]] = list(cells)
-    if unit == "deg" and not named and chance(rng, 0.3):
+    if unit == "deg" and not named and by.chance(0.3):
         # Minutes and seconds tell the unit.
         named, degrees = True, [[round(3600 * d) / 3600 for d in column] for column in degrees]
         written, digits = [[sexagesimal(d) for d in column] for column in degrees], 3
-        heads = list(pick(rng, words.AZIMUTH[language]))
+        heads = list(by.word("AZIMUTH"))
     else:
-        heads = sighting_heads(rng, unit if named else "", language)
-    counters: Sequence[str] = pick(rng, words.PAN[language])
+        heads = sighting_heads(by, unit if named else "")
+    counters: Sequence[str] = by.word("PAN")
     steps = [[Decimal(int(n)) for n in axis] for axis in (pan, tilt)]
-    if encoders := named and chance(rng, 0.12):
+    if encoders := named and by.chance(0.12):
         # Angles of encoders in place of counters, which become counters of 1e-5 deg.
-        small = pick(rng, ("deg", "rad", "deg"))
-        counters = [f"{name} ({unit_text(rng, small, language)})" for name in pick(rng, words.ENCODERS)]
+        small = by.pick(("deg", "rad", "deg"))
+        counters = [f"{name} ({by.unit(small)})" for name in by.pick(WORDS["ENCODERS"])]
         steps = [[decimal(0.05 * float(n) / ANGLE[small], 6) for n in axis] for axis in (pan, tilt)]
         pan, tilt = ([round(float(n) * ANGLE[small] * 1e5) for n in axis] for axis in steps)
-    columns: dict[str, Sequence[Cell]] = {}
-    if chance(rng, 0.4):
-        columns[pick(rng, words.SECONDS[language])] = [decimal(12.0 * k, 1) for k in range(count)]
+    columns: Columns = {}
+    if by.chance(0.4):
+        columns[by.word("SECONDS")] = [decimal(12.0 * k, 1) for k in range(count)]
     columns |= dict(zip(counters, steps, strict=True))
     columns |= dict(zip(heads, written, strict=True))
-    more, u, wrong = beside_sightings(rng, language, count)
+    more, u, wrong = beside_sightings(by, count)
     columns |= more
-    if chance(rng, 0.15):
-        columns = {name: columns[name] for name in rng.permutation(np.array(list(columns), object))}
+    if by.chance(0.15):
+        columns = {name: columns[name] for name in by.rng.permutation(np.array(list(columns), object))}
     readings = tuple(
         Reading(0.0, a, u=u, pair=(int(p), int(t), e))
         for k, (p, t, a, e) in enumerate(zip(pan, tilt, *degrees, strict=True))
@@ -301,36 +302,34 @@ def sightings(rng: np.random.Generator, language: str) -> Drawn:
         if named
         else f"sightings without a unit, {'degrees' if unit == 'deg' else 'others'}"
     )
-    return Drawn(kind, sheets.any_file(rng, sheets.columns_sheet(columns, language)), truth, ("--sightings",))
+    return Drawn(kind, sheets.columns_file(by, columns), truth, ("--sightings",))
 
 
-def beside_sightings(
-    rng: np.random.Generator, language: str, count: int
-) -> tuple[dict[str, Sequence[Cell]], float, set[int]]:
+def beside_sightings(by: Stranger, count: int) -> tuple[Columns, float, set[int]]:
     """Further columns, the standard uncertainty that they state, and the rows that do not count."""
-    columns: dict[str, Sequence[Cell]] = {}
+    columns: Columns = {}
     u, wrong = 0.0, set()
-    if chance(rng, 0.2):
-        small, name, factor = pick(rng, ("arcsec", "deg")), *pick(rng, (("u", 1), ("U95", 2), ("U (k=2)", 2)))
+    if by.chance(0.2):
+        small, name, factor = by.pick(("arcsec", "deg")), *by.pick((("u", 1), ("U95", 2), ("U (k=2)", 2)))
         u_cell = Decimal("18") if small == "arcsec" else Decimal("0.005")
-        columns[f"{name} ({unit_text(rng, small, 'en')})"] = [u_cell] * count
+        columns[f"{name} ({by._replace(language='en').unit(small)})"] = [u_cell] * count
         u = float(u_cell) * ANGLE[small] / factor
-    if chance(rng, 0.2):
-        columns[pick(rng, words.TEMPERATURE[language])] = [decimal(t, 1) for t in rng.normal(12, 0.2, count)]
-    if chance(rng, 0.15):
-        status, good, bad = pick(rng, words.STATUS[language])
-        wrong = set(rng.choice(count, int(rng.integers(0, 3)), replace=False).tolist())
+    if by.chance(0.2):
+        columns[by.word("TEMPERATURE")] = [decimal(t, 1) for t in by.rng.normal(12, 0.2, count)]
+    if by.chance(0.15):
+        status, good, bad = by.word("STATUS")
+        wrong = set(by.rng.choice(count, int(by.rng.integers(0, 3)), replace=False).tolist())
         columns[status] = [bad if k in wrong else good for k in range(count)]
     return columns, u, wrong
 
 
-def sighting_heads(rng: np.random.Generator, unit: str, language: str) -> list[str]:
+def sighting_heads(by: Stranger, unit: str) -> list[str]:
     """Names of azimuth and elevation, with their unit if any."""
-    names = pick(rng, words.AZIMUTH[language])
+    names = by.word("AZIMUTH")
     if not unit:
         return list(names)
-    text, form = unit_text(rng, unit, language), pick(rng, ("{} ({})", "{} [{}]", "{} / {}"))
-    if all(name.isascii() for name in names) and chance(rng, 0.25):
+    text, form = by.unit(unit), by.pick(("{} ({})", "{} [{}]", "{} / {}"))
+    if all(name.isascii() for name in names) and by.chance(0.25):
         form, text = "{}_{}", ASCII[unit]
     return [form.format(name, text) for name in names]
 

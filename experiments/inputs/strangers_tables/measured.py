@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
-from typing import Literal, NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -67,33 +69,67 @@ DIGITS = {
 """Decimals that suit a reading of some micrometres, or of some arc seconds."""
 
 
-def pick[Item](rng: np.random.Generator, items: Sequence[Item]) -> Item:
-    """One of some."""
-    return items[int(rng.integers(len(items)))]
+WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+LANGUAGES = ("en", "de", "es", "fr")
 
 
-def chance(rng: np.random.Generator, share: float) -> bool:
-    """True with this probability."""
-    return bool(rng.random() < share)
+class Stranger(NamedTuple):
+    """Who wrote a table: chances, and a language."""
 
+    rng: np.random.Generator
+    language: str
 
-def unit_text(rng: np.random.Generator, unit: str, language: str) -> str:
-    """A unit as somebody of this language writes it."""
-    local = LOCAL.get(language, {}).get(unit, ())
-    return pick(rng, local) if local and chance(rng, 0.5) else pick(rng, WRITTEN[unit])
+    def pick[Item](self, items: Sequence[Item]) -> Item:
+        return items[int(self.rng.integers(len(items)))]
 
+    def chance(self, share: float) -> bool:
+        return bool(self.rng.random() < share)
 
-def with_unit(rng: np.random.Generator, name: str, unit: str, language: str) -> str:
-    """The head of a column with its unit."""
-    style = int(rng.integers(10))
-    if style >= 8 and unit in ASCII and name.isascii():
-        return f"{name.replace(' ', '_').replace('.', '')}_{ASCII[unit]}"
-    text = unit_text(rng, unit, language)
-    if style == 7 and text.isalpha() and len(text) > 1:
-        return f"{name} {text}" if chance(rng, 0.5) else f"{name}, {text}"
-    return (f"{name} ({text})", f"{name} [{text}]", f"{name} / {text}", f"{name} ({text})", f"{name} in {text}")[
-        style % 4 if language in ("es", "fr") else style % 5
-    ]
+    def words(self, name: str) -> Any:
+        """A list of `words.toml` in this language."""
+        return WORDS[name][self.language]
+
+    def word(self, name: str) -> Any:
+        """One of a list."""
+        return self.pick(self.words(name))
+
+    def unit(self, unit: str) -> str:
+        """A unit as somebody of this language writes it."""
+        local = LOCAL.get(self.language, {}).get(unit, ())
+        return self.pick(local) if local and self.chance(0.5) else self.pick(WRITTEN[unit])
+
+    def with_unit(self, name: str, unit: str) -> str:
+        """The head of a column with its unit."""
+        style = int(self.rng.integers(10))
+        if style >= 8 and unit in ASCII and name.isascii():
+            return f"{name.replace(' ', '_').replace('.', '')}_{ASCII[unit]}"
+        text = self.unit(unit)
+        if style == 7 and text.isalpha() and len(text) > 1:
+            return f"{name} {text}" if self.chance(0.5) else f"{name}, {text}"
+        forms = ("{} ({})", "{} [{}]", "{} / {}", "{} ({})", "{} in {}")
+        return forms[style % 4 if self.language in ("es", "fr") else style % 5].format(name, text)
+
+    def headed(self, name: str, unit: str) -> str:
+        """With its unit; counters mostly without."""
+        return name if unit == "step" and self.chance(0.8) else self.with_unit(name, unit)
+
+    def names(self, axis: Axis) -> tuple[str, str]:
+        """Names of command and reading, without units."""
+        steps, angles = axis.command_unit == "step", DOMAIN[axis.unit] == "deg"
+        if axis.geared:
+            return self.word("MOTOR"), self.word("OUTPUT")
+        turned = steps or axis.command_unit == "turn"
+        if not turned and self.chance(0.3):
+            return self.word("PAIRS")
+        if turned:
+            command = self.word("STEPS" if steps else "MOTOR")
+        else:
+            command = self.word("ANGLE_COMMAND" if angles and self.chance(0.7) else "COMMAND")
+        return command, self.word("ANGLE_READING" if angles else "LENGTH_READING")
+
+    def sides_column(self, words: Sequence[Any], sides: Sequence[int]) -> dict[str, list[Any]]:
+        """A column of directions by its name."""
+        return {self.word("DIRECTION"): [words[side < 0] for side in sides]}
 
 
 class Reading(NamedTuple):
@@ -164,10 +200,10 @@ class Axis:
     geared: bool = False
     """The command is a motor's, before gears that change it by far."""
 
-    def value(self, command: Decimal, side: int, rng: np.random.Generator) -> Decimal:
+    def value(self, command: Decimal, side: int, by: Stranger) -> Decimal:
         """A reading as it is written down."""
         true = self.per_command * float(command) + self.zero - 0.5 * side * self.play
-        return decimal(true + rng.normal(0.0, self.scatter), self.digits)
+        return decimal(true + by.rng.normal(0.0, self.scatter), self.digits)
 
     @property
     def digits(self) -> int:
@@ -186,43 +222,43 @@ def decimal(number: float, digits: int) -> Decimal:
 
 
 def draw_axis(
-    rng: np.random.Generator,
+    by: Stranger,
     rotary: bool | None = None,
     unit: str | None = None,
     command_unit: str | None = None,
     variety: bool = False,
 ) -> Axis:
     """An axis with play of ten or more scatters, read over five to fourteen positions."""
-    rotary = chance(rng, 0.35) if rotary is None else rotary
-    count = int(rng.integers(5, 15))
+    rotary = by.chance(0.35) if rotary is None else rotary
+    count = int(by.rng.integers(5, 15))
     if rotary:
-        unit = unit or pick(rng, ("deg", "deg", "deg", "arcmin", "gon", "mrad", "rad", "turn", "arcsec"))
+        unit = unit or by.pick(("deg", "deg", "deg", "arcmin", "gon", "mrad", "rad", "turn", "arcsec"))
         others: tuple[str, ...] = ("step", "step", "deg", "deg", "deg", "gon", "mrad")
         # Below a turn, so that nothing wraps.
-        travel_deg = pick(rng, (20.0, 30.0, 60.0, 90.0, 180.0)) * (0.02 if unit == "arcsec" else 1.0)
-        play_deg, scatter_deg = rng.uniform(0.03, 0.15), rng.uniform(0.001, 0.004)
+        travel_deg = by.pick((20.0, 30.0, 60.0, 90.0, 180.0)) * (0.02 if unit == "arcsec" else 1.0)
+        play_deg, scatter_deg = by.rng.uniform(0.03, 0.15), by.rng.uniform(0.001, 0.004)
         travel, play, scatter = (x / ANGLE[unit] for x in (travel_deg, play_deg, scatter_deg))
     else:
-        unit = unit or pick(rng, ("mm", "mm", "mm", "mm", "um", "1/100 mm", "inch", "thou", "cm"))
+        unit = unit or by.pick(("mm", "mm", "mm", "mm", "um", "1/100 mm", "inch", "thou", "cm"))
         others = ("step", "step", "mm", "mm", "mm", "mm", "inch", "turn")
-        travel_mm = pick(rng, (5.0, 10.0, 50.0, 100.0, 200.0, 300.0)) * (0.1 if unit in ("um", "1/100 mm") else 1.0)
-        play_mm, scatter_mm = rng.uniform(0.02, 0.08), rng.uniform(0.001, 0.002)
+        travel_mm = by.pick((5.0, 10.0, 50.0, 100.0, 200.0, 300.0)) * (0.1 if unit in ("um", "1/100 mm") else 1.0)
+        play_mm, scatter_mm = by.rng.uniform(0.02, 0.08), by.rng.uniform(0.001, 0.002)
         travel, play, scatter = (x / LENGTH[unit] for x in (travel_mm, play_mm, scatter_mm))
-    command_unit = command_unit or pick(rng, others)
-    commands, per_command = _commands(rng, command_unit, unit, travel, count)
-    zero, geared = rng.uniform(-0.4, 0.4) * play, False
+    command_unit = command_unit or by.pick(others)
+    commands, per_command = _commands(by, command_unit, unit, travel, count)
+    zero, geared = by.rng.uniform(-0.4, 0.4) * play, False
     if variety:
         if command_unit in ("step", "turn"):
             # Readings that fall, or begin anywhere.
-            per_command *= 1 if chance(rng, 0.8) else -1
-            zero += travel * rng.uniform(-2, 2) * chance(rng, 0.3)
-        elif command_unit == unit == "mm" and chance(rng, 0.12):
+            per_command *= 1 if by.chance(0.8) else -1
+            zero += travel * by.rng.uniform(-2, 2) * by.chance(0.3)
+        elif command_unit == unit == "mm" and by.chance(0.12):
             # The dial stands elsewhere, or on the other side.
-            per_command *= 1 if chance(rng, 0.7) else -1
-            zero += pick(rng, (100.0, 25.0, -10.0))
-        elif command_unit == unit == "deg" and chance(rng, 0.15):
+            per_command *= 1 if by.chance(0.7) else -1
+            zero += by.pick((100.0, 25.0, -10.0))
+        elif command_unit == unit == "deg" and by.chance(0.15):
             geared = True
-            ratio = pick(rng, (2, 5, 10, 36, 50, 100))
+            ratio = by.pick((2, 5, 10, 36, 50, 100))
             per_command, commands = per_command / ratio, tuple(command * ratio for command in commands)
     axis = Axis(command_unit, unit, per_command, play, zero, scatter, commands, geared)
     # Dials and encoders resolve the play.
@@ -230,22 +266,22 @@ def draw_axis(
 
 
 def _commands(
-    rng: np.random.Generator, command_unit: str, unit: str, travel: float, count: int
+    by: Stranger, command_unit: str, unit: str, travel: float, count: int
 ) -> tuple[tuple[Decimal, ...], float]:
     """Round positions over a travel, and the unit per command: near its nominal."""
-    error = 1 + rng.normal(0, 0.0015)
+    error = 1 + by.rng.normal(0, 0.0015)
     if DOMAIN[command_unit] == DOMAIN[unit]:
         nominal = SCALE[command_unit] / SCALE[unit]
     elif command_unit == "step":
-        nominal = travel / pick(rng, (2000, 5000, 8000, 20000, 32000))
+        nominal = travel / by.pick((2000, 5000, 8000, 20000, 32000))
     else:
         # Turns of a screw's motor.
-        nominal = pick(rng, (1.0, 2.0, 4.0, 5.0)) / LENGTH[unit]
+        nominal = by.pick((1.0, 2.0, 4.0, 5.0)) / LENGTH[unit]
     span = travel / nominal
     digits = 0 if command_unit == "step" or span > 5 * count else 1 if span > count else 3
     step = max(decimal(span / (count - 1), digits), Decimal(1).scaleb(-digits))
-    begin = Decimal(0) if chance(rng, 0.7) else -step * (count // 2)
-    form = Decimal(1).scaleb(-int(rng.integers(digits, digits + 2))) if command_unit != "step" else Decimal(1)
+    begin = Decimal(0) if by.chance(0.7) else -step * (count // 2)
+    form = Decimal(1).scaleb(-int(by.rng.integers(digits, digits + 2))) if command_unit != "step" else Decimal(1)
     return tuple((begin + step * k).quantize(form) for k in range(count)), nominal * error
 
 
@@ -277,14 +313,14 @@ class Sweep:
         return rises or self.told_side(number - 1)
 
 
-def sweeps(rng: np.random.Generator, commands: Sequence[Decimal], stated: bool, variety: bool = False) -> Sweep:
+def sweeps(by: Stranger, commands: Sequence[Decimal], stated: bool, variety: bool = False) -> Sweep:
     """Runs up and down; with directions stated also from one side alone, and ends approached from beyond.
 
     With variety also from the top, with several readings at a stop, or with ends that are passed without a reading.
     """
-    runs, stops = int(rng.integers(2, 5)), []
-    style = int(rng.integers(3)) if stated else 0
-    passed = variety and not stated and chance(rng, 0.12)
+    runs, stops = int(by.rng.integers(2, 5)), []
+    style = int(by.rng.integers(3)) if stated else 0
+    passed = variety and not stated and by.chance(0.12)
     for run in range(runs):
         up = [Stop(command, 1, 2 * run) for command in commands]
         down = [Stop(command, -1, 2 * run + 1) for command in reversed(commands)]
@@ -299,8 +335,8 @@ def sweeps(rng: np.random.Generator, commands: Sequence[Decimal], stated: bool, 
             stops += up + down
         else:
             stops += up
-    if variety and not passed and chance(rng, 0.12):
+    if variety and not passed and by.chance(0.12):
         stops = [Stop(commands[0] + commands[-1] - stop.command, -stop.side, stop.run) for stop in stops]
-    if variety and not passed and chance(rng, 0.1):
+    if variety and not passed and by.chance(0.1):
         stops = [stop for stop in stops for _ in range(2)]
     return Sweep(stops, stated)

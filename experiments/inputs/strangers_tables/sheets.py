@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.inputs.strangers_tables import words
-from experiments.inputs.strangers_tables.measured import chance, pick
+from experiments.inputs.strangers_tables.measured import Stranger
 
 Cell = Decimal | str
 """A number, or a text."""
+Columns = dict[str, Sequence[Cell]]
+"""By their names."""
 
 
 @dataclass
@@ -25,7 +26,6 @@ class Sheet:
 
     heads: list[list[str]]
     rows: list[list[Cell]]
-    language: str = "en"
     above: list[str] = field(default_factory=list)
 
 
@@ -38,9 +38,9 @@ class File(NamedTuple):
     """Names of the columns, one line of them."""
 
 
-def columns_sheet(columns: dict[str, Sequence[Cell]], language: str) -> Sheet:
+def columns_sheet(columns: Columns) -> Sheet:
     """A sheet of columns by their names."""
-    return Sheet([list(columns)], [list(row) for row in zip(*columns.values(), strict=True)], language)
+    return Sheet([list(columns)], [list(row) for row in zip(*columns.values(), strict=True)])
 
 
 def number(cell: Cell, point: str, form: str = "plain") -> str:
@@ -57,11 +57,11 @@ def number(cell: Cell, point: str, form: str = "plain") -> str:
     return text.replace(".", point)
 
 
-def preamble(rng: np.random.Generator, language: str) -> list[str]:
+def preamble(by: Stranger) -> list[str]:
     """Lines that stand above the names."""
-    lines = list(rng.permutation(np.array(words.PREAMBLE[language]))[: int(rng.integers(1, 4))])
-    lines += [words.DATE[language]] if chance(rng, 0.6) else []
-    return [str(line) for line in lines] + [""] * chance(rng, 0.5)
+    lines = list(by.rng.permutation(np.array(by.words("PREAMBLE")))[: int(by.rng.integers(1, 4))])
+    lines += [by.words("DATE")] if by.chance(0.6) else []
+    return [str(line) for line in lines] + [""] * by.chance(0.5)
 
 
 def named(sheet: Sheet) -> tuple[str, ...]:
@@ -69,96 +69,96 @@ def named(sheet: Sheet) -> tuple[str, ...]:
     return tuple(sheet.heads[0]) if len(sheet.heads) == 1 else ()
 
 
-def text_file(rng: np.random.Generator, sheet: Sheet) -> File:
+def text_file(by: Stranger, sheet: Sheet) -> File:
     """Text with separators, in an encoding of this language."""
-    point = "," if sheet.language != "en" and chance(rng, 0.75) else "."
-    separator = pick(rng, (";", ";", "\t") if point == "," else (",", ",", ";", "\t", "|"))
-    form, all_quoted = pick(rng, ("plain",) * 20 + ("plus", "minus", "exponent")), chance(rng, 0.05)
-    separator = "," if all_quoted and chance(rng, 0.5) else separator
+    point = "," if by.language != "en" and by.chance(0.75) else "."
+    separator = by.pick((";", ";", "\t") if point == "," else (",", ",", ";", "\t", "|"))
+    form, all_quoted = by.pick(("plain",) * 20 + ("plus", "minus", "exponent")), by.chance(0.05)
+    separator = "," if all_quoted and by.chance(0.5) else separator
     stream = io.StringIO()
-    if chance(rng, 0.02):
+    if by.chance(0.02):
         stream.write(f"sep={separator}\n")
     for line in sheet.above:
         # As a spreadsheet exports it: a label and its text in two cells.
-        stream.write(line.replace(": ", separator) + "\n" if separator != "," and chance(rng, 0.3) else line + "\n")
+        stream.write(line.replace(": ", separator) + "\n" if separator != "," and by.chance(0.3) else line + "\n")
     csv.register_dialect(
         "stranger", delimiter=separator, lineterminator="\n", quoting=csv.QUOTE_ALL if all_quoted else csv.QUOTE_MINIMAL
     )
     writer = csv.writer(stream, "stranger")
-    empty = [""] * int(rng.integers(1, 4)) * chance(rng, 0.03)
+    empty = [""] * int(by.rng.integers(1, 4)) * by.chance(0.03)
     writer.writerows([*sheet.heads, *([number(cell, point, form) for cell in row] + empty for row in sheet.rows)])
-    name = f"log.{pick(rng, ('csv', 'csv', 'txt', 'dat'))}"
-    return File(name, encoded(rng, stream.getvalue()), named(sheet))
+    name = f"log.{by.pick(('csv', 'csv', 'txt', 'dat'))}"
+    return File(name, encoded(by, stream.getvalue()), named(sheet))
 
 
-def encoded(rng: np.random.Generator, text: str) -> bytes:
+def encoded(by: Stranger, text: str) -> bytes:
     """In an encoding that has all of its letters, with line ends of either kind."""
-    text = text.replace("\n", "\r\n") if chance(rng, 0.4) else text
-    encoding = pick(rng, ("utf-8", "utf-8", "utf-8", "utf-8-sig", "cp1252", "cp1252", "utf-16"))
+    text = text.replace("\n", "\r\n") if by.chance(0.4) else text
+    encoding = by.pick(("utf-8", "utf-8", "utf-8", "utf-8-sig", "cp1252", "cp1252", "utf-16"))
     try:
         return text.encode(encoding)
     except UnicodeEncodeError:
         return text.encode("utf-8")
 
 
-def workbook(rng: np.random.Generator, sheet: Sheet) -> File:
+def workbook(by: Stranger, sheet: Sheet) -> File:
     """XLSX: numbers as numbers, seldom as texts with the point of the language."""
     import openpyxl
 
     book = openpyxl.Workbook()
     active = book.active
     assert active is not None
-    as_text = chance(rng, 0.1)
-    point = "," if sheet.language != "en" else "."
+    as_text = by.chance(0.1)
+    point = "," if by.language != "en" else "."
     heads = sheet.heads
-    if chance(rng, 0.15):
+    if by.chance(0.15):
         # Names on two lines of their cell.
         heads = [[name.replace(" (", "\n(").replace(" [", "\n[") for name in head] for head in heads]
     # The table begins somewhere below and to the right.
-    left = [None] * int(rng.integers(1, 3)) * chance(rng, 0.12)
+    left = [None] * int(by.rng.integers(1, 3)) * by.chance(0.12)
     above: list[list[str]] = [[line] for line in sheet.above]
     for line in [*([[]] * 2 if left else []), *above, *heads]:
         active.append([*left, *line])
     for row in sheet.rows:
         cells = [cell if isinstance(cell, str) else number(cell, point) if as_text else float(cell) for cell in row]
         active.append([*left, *(None if cell == "" else cell for cell in cells)])
-    if chance(rng, 0.08):
+    if by.chance(0.08):
         # A summary to the right of the rows.
         for k, cell in enumerate(("Max", 0.034, "Min", -0.021)):
             active.cell(len(heads) + len(above) + 3 + k // 2, len(left) + len(sheet.rows[0]) + 2 + k % 2, cell)
-    if chance(rng, 0.2):
+    if by.chance(0.2):
         book.create_sheet("Sheet2")
-    if chance(rng, 0.08):
+    if by.chance(0.08):
         # Words come first.
         info = book.create_sheet("Info", 0)
-        for text in preamble(rng, sheet.language):
+        for text in preamble(by):
             info.append([text])
     stream = io.BytesIO()
     book.save(stream)
     return File("log.xlsx", stream.getvalue(), named(sheet))
 
 
-def markdown(rng: np.random.Generator, sheet: Sheet) -> File:
+def markdown(by: Stranger, sheet: Sheet) -> File:
     """A table of a report: names, a rule, rows; bars at the ends or between the cells alone."""
-    left, right = pick(rng, (("| ", " |"), ("| ", " |"), ("", "|"), ("", "")))
-    rule = pick(rng, ("---", "---:", ":---:", "------"))
+    left, right = by.pick((("| ", " |"), ("| ", " |"), ("", "|"), ("", "")))
+    rule = by.pick(("---", "---:", ":---:", "------"))
     names = [name.replace("|", "/") for name in sheet.heads[-1]]
     lines = [names, [rule] * len(names), *([number(cell, ".") for cell in row] for row in sheet.rows)]
     text = "\n".join(left + " | ".join(cells) + right for cells in lines) + "\n"
-    title = "# Measurements\n\nTable 1, first day.\n\n" if chance(rng, 0.4) else ""
+    title = "# Measurements\n\nTable 1, first day.\n\n" if by.chance(0.4) else ""
     above = "".join(f"{line}\n" for line in sheet.above if line)
-    return File("report.md", encoded(rng, title + above + "\n" * bool(above) + text), tuple(names))
+    return File("report.md", encoded(by, title + above + "\n" * bool(above) + text), tuple(names))
 
 
-def with_index(rng: np.random.Generator, sheet: Sheet) -> None:
+def with_index(by: Stranger, sheet: Sheet) -> None:
     """A first column without a name that counts the rows, as a data frame is saved."""
     sheet.heads = [["", *head] for head in sheet.heads]
     sheet.rows = [[Decimal(k), *row] for k, row in enumerate(sheet.rows)]
 
 
-def other_case(rng: np.random.Generator, sheet: Sheet) -> None:
+def other_case(by: Stranger, sheet: Sheet) -> None:
     """Names without a space before the unit, or in capitals."""
-    if chance(rng, 0.5):
+    if by.chance(0.5):
         sheet.heads = [[name.replace(" (", "(").replace(" [", "[") for name in head] for head in sheet.heads]
     else:
         sheet.heads = [[_capitals(name) for name in head] for head in sheet.heads]
@@ -174,60 +174,60 @@ def _capitals(name: str) -> str:
     return name if len(word.strip()) == 1 else word.upper() + name[len(word) :]
 
 
-def blank_rows(rng: np.random.Generator, sheet: Sheet) -> None:
+def blank_rows(by: Stranger, sheet: Sheet) -> None:
     """Empty rows between others."""
-    for place in sorted(rng.choice(len(sheet.rows), 2, replace=False).tolist(), reverse=True):
+    for place in sorted(by.rng.choice(len(sheet.rows), 2, replace=False).tolist(), reverse=True):
         sheet.rows.insert(place, [""] * len(sheet.rows[0]))
 
 
-def mean_row(rng: np.random.Generator, sheet: Sheet) -> None:
+def mean_row(by: Stranger, sheet: Sheet) -> None:
     """Means below the columns."""
     label = {"en": ("Mean", "Average"), "de": ("Mittelwert", "MW"), "es": ("Media", "Promedio"), "fr": ("Moyenne",)}
-    row: list[Cell] = [pick(rng, label[sheet.language])]
+    row: list[Cell] = [by.pick(label[by.language])]
     for cells in list(zip(*sheet.rows, strict=True))[1:]:
         numbers = [float(cell) for cell in cells if isinstance(cell, Decimal)]
         row.append(Decimal(f"{np.mean(numbers):.3f}") if len(numbers) == len(cells) else "")
     sheet.rows.append(row)
 
 
-def names_again(rng: np.random.Generator, sheet: Sheet) -> None:
+def names_again(by: Stranger, sheet: Sheet) -> None:
     """The names at the top of another page."""
     sheet.rows.insert(len(sheet.rows) // 2, list(sheet.heads[0]))
 
 
-def units_in_cells(rng: np.random.Generator, sheet: Sheet) -> None:
+def units_in_cells(by: Stranger, sheet: Sheet) -> None:
     """10.002 mm in each cell of a column, and no unit at its head."""
     for k, name in enumerate(sheet.heads[0]):
         found = re.fullmatch(r"(.*\w)\s*[(\[](mm|\u00b5m|cm|inch|deg|\u00b0|gon|mrad|in)[)\]]", name)
         if found and all(isinstance(row[k], Decimal) for row in sheet.rows):
             sheet.heads[0][k] = found[1]
             space = "" if found[2] == "\u00b0" else " "
-            point = "," if sheet.language != "en" else "."
+            point = "," if by.language != "en" else "."
             for row in sheet.rows:
                 row[k] = number(row[k], point) + space + found[2]
 
 
-def footer(rng: np.random.Generator, sheet: Sheet) -> None:
+def footer(by: Stranger, sheet: Sheet) -> None:
     """A line of text below the rows."""
-    for line in [[], [pick(rng, words.FOOTER[sheet.language])]][chance(rng, 0.5) :]:
+    for line in [[], [by.word("FOOTER")]][by.chance(0.5) :]:
         sheet.rows.append([*line, *[""] * (len(sheet.rows[0]) - len(line))])
 
 
 QUIRKS = (with_index, other_case, other_case, blank_rows, mean_row, names_again, units_in_cells, footer)
 
 
-def any_file(rng: np.random.Generator, sheet: Sheet, markdowns: bool = True) -> File:
+def any_file(by: Stranger, sheet: Sheet, markdowns: bool = True) -> File:
     """Mostly text, a workbook, or Markdown."""
-    if not sheet.above and chance(rng, 0.3):
-        sheet.above = preamble(rng, sheet.language)
-    if len(sheet.heads) == 1 and chance(rng, 0.25):
-        pick(rng, QUIRKS)(rng, sheet)
-    which = rng.random()
+    if not sheet.above and by.chance(0.3):
+        sheet.above = preamble(by)
+    if len(sheet.heads) == 1 and by.chance(0.25):
+        by.pick(QUIRKS)(by, sheet)
+    which = by.rng.random()
     if which < 0.12:
-        return workbook(rng, sheet)
+        return workbook(by, sheet)
     if which < 0.17 and markdowns and len(sheet.heads) == 1:
-        return markdown(rng, sheet)
-    return text_file(rng, sheet)
+        return markdown(by, sheet)
+    return text_file(by, sheet)
 
 
 def lines_of(file: File) -> list[str]:
@@ -245,3 +245,8 @@ def lines_of(file: File) -> list[str]:
         return data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         return data.decode("cp1252").splitlines()
+
+
+def columns_file(by: Stranger, columns: Columns, markdowns: bool = True) -> File:
+    """A file of columns by their names."""
+    return any_file(by, columns_sheet(columns), markdowns)
