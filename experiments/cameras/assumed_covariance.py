@@ -144,7 +144,6 @@ def sets(opencv: Path) -> dict[str, tuple[Board, Views, StereoCalibration]]:
 
 
 def poses(arguments: argparse.Namespace) -> None:
-    """The table of measured poses on stdout, as a camera halfway between both sees the boards."""
     print("set,view,centre_x_share,centre_y_share,size_share,rotation_x_rad,rotation_y_rad,rotation_z_rad")
     for name, (board, views, done) in sets(arguments.opencv).items():
         stereo = done.stereo

@@ -211,7 +211,6 @@ def summary(rows: list[dict]) -> str:
 
 
 def table(rows: list[dict]) -> None:
-    """Print the table."""
     print(TEXT)
     for row in sorted(rows, key=lambda r: (r["size"], r["contrast"], r["peak"], r["ambient"])):
         print(line(*cells_of(row)))

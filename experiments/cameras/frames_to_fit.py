@@ -126,7 +126,6 @@ def compared(summary: FitSummary, known: Mapping[str, float]) -> Iterator[tuple[
 
 
 def table(every: list[dict]) -> None:
-    """Markdown of the campaigns on stdout."""
     rows = {source: [r for r in every if r["source"] == source] for source in SOURCES}
     good = {source: {r["seed"]: r for r in rows[source] if r["converged"]} for source in SOURCES}
     both = sorted(set(good["centroids"]) & set(good["frames"]))

@@ -37,7 +37,6 @@ def axis_of(table: Path) -> AxisCampaign:
 
 
 def tables_of(folder: Path) -> list[Path]:
-    """The tables of a folder; none would be an empty study."""
     tables = sorted(folder.glob("*.csv"))
     if not tables:
         raise SystemExit(f"{folder} holds no .csv")

@@ -120,7 +120,6 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
 
 
 def table(rows: list[dict]) -> None:
-    """Print the page."""
     good = [row for row in rows if "error" not in row]
     print("# Aimed scanners: what became of the calibration\n")
     print(f"By `experiments.compensation.aimed_scanners`: {len(rows)} drawn rigs, {len(rows) - len(good)} refused; 12")

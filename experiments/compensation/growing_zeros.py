@@ -103,7 +103,6 @@ def calibrated(
 
 
 def means_table(campaign: AxisCampaign, growth: np.ndarray) -> Correction:
-    """The table of the means by position and side, with the true growth taken out."""
     command = np.array([m.command for m in campaign.moves])
     at = np.array([r.move for r in campaign.readings])
     error = np.array([r.value for r in campaign.readings], dtype=float) - growth - command[at]
@@ -162,7 +161,6 @@ def cells(rows: list[dict]) -> list[str]:
 
 
 def table(rows: list[dict]) -> None:
-    """Print the page."""
     good = [row for row in rows if "error" not in row]
     low, high = binomial_bounds(max(len(good), 1), 0.95)
     print("# Tables and promises of axes that creep and follow the temperature\n")

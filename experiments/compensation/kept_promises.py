@@ -114,7 +114,6 @@ def share(hits: int, of: int) -> str:
 
 
 def table(rows: list[dict]) -> None:
-    """Print the page."""
     good = [row for row in rows if "error" not in row]
     print("# Promised, applied, kept: drawn axes\n")
     print(f"By `experiments.compensation.kept_promises`, commit {commit()}: {len(rows)} drawn")

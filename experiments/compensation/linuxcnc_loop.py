@@ -181,7 +181,6 @@ class Loop:
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     if not installed():
         raise SystemExit("linuxcnc is not installed: apt-get install --no-install-recommends linuxcnc-uspace")

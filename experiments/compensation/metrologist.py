@@ -109,7 +109,6 @@ def signed_and_unchanged() -> str:
 
 
 def main() -> None:
-    """Print the page."""
     arguments = parser(__doc__)
     arguments.add_argument("--schema", type=Path, help="PTB's dcc.xsd")
     schema = arguments.parse_args().schema

@@ -71,7 +71,6 @@ def one_drive(task: tuple[int]) -> dict[str, object]:
 
 
 def table(rows: list[dict]) -> None:
-    """The page."""
     done = [row for row in rows if "promised" in row]
     there = [row for row in rows if row["there"]]
     print("# Tables of one period, of drives at constant rate\n")

@@ -109,7 +109,6 @@ def errors_of(row: dict, name: str) -> tuple[tuple[np.ndarray, float], tuple[np.
 
 
 def table(rows: list[dict]) -> None:
-    """Print the page."""
     good = [row for row in rows if "error" not in row]
     print("# Promised scanners: errors of fresh looks after a new homing\n")
     print(f"By `experiments.compensation.promised_scanners`: {len(rows)} campaigns, {len(rows) - len(good)} refused;")

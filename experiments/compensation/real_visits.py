@@ -120,7 +120,6 @@ By `experiments.compensation.real_visits`. RMS of the errors of readings left ou
 
 
 def main() -> None:
-    """Print the page."""
     cli = parser(__doc__)
     cli.add_argument("axes", type=Path)
     cli.add_argument("rotary", type=Path)

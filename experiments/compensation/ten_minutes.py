@@ -60,7 +60,6 @@ class Stage:
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     stage = Stage()
     with tempfile.TemporaryDirectory() as place:

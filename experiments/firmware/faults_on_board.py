@@ -151,7 +151,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def table(arguments: argparse.Namespace) -> None:
-    """The page."""
     rows = read_rows(ROWS)
     good = [row for row in rows if row["said"] == row["expected"] and not row["pin_at_end"] and not row["wrong"]]
     print("# Faults of firmware and bench in the middle of a run\n")

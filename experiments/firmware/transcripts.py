@@ -110,7 +110,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def table(arguments: argparse.Namespace) -> None:
-    """The page."""
     whole, *mutants = read_rows(ROWS)
     caught = [row for row in mutants if row["seen_in_session"]]
     print("# Transcripts on the processor\n")

@@ -388,7 +388,6 @@ KINDS = (
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     page = [BEGIN]
     for kind in KINDS:

@@ -82,7 +82,6 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
 
 
 def table(rows: list[dict]) -> None:
-    """The study's page."""
     good = [r for r in rows if r["converged"]]
     print("# Coverage of located points\n")
     print("Written by `python -m experiments.millimetres.located_points table`; what was done stands in the script.\n")

@@ -9,20 +9,17 @@ counters within the campaign's, from random sides; the true beam with a stop err
 range along it, the aperture reads it, and every calibration locates the point. Nominal and classic are the fair
 comparators of formulation 5 (`tvsbayes.coordinates.simple_calibration`). Error: distance from the true point;
 stated: the root of the trace of the joint's covariance (Laplace, law of propagation), and its 95 % intervals for x, y,
-z and ellipsoid. Expected errors over all rigs that a campaign allows stand in error_map.md, coverage over 1000 rigs in
-located_points.md.
+z and ellipsoid. Coverage over 1000 rigs stands in located_points.md.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from experiments.common.command_line import by_seed, study
-from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.page import heading
 from experiments.common.rigs import TWINS, mounted_rig, shipped_plan, shipped_twin
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
@@ -30,11 +27,9 @@ from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.report.drawing import BLACK, ESTIMATOR_STYLE
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
-FIGURE = Path(__file__).with_suffix(".png")
 RANGES_MM = 300.0, 1000.0, 2000.0, 5000.0
 PROTOCOLS = ("paper", "mixed")
 CELLS = 5
@@ -135,42 +130,13 @@ def drawn_table(protocol: str, every: Sequence[dict]) -> None:
 
 
 def table(rows: list[dict]) -> None:
-    """The page."""
     good = [r for r in rows if r["converged"]]
-    title, words = "Millimetres: nominal, classic and joint against the truth", "RMS error against range, two protocols"
-    print(title_and_figure(__file__, title, FIGURE, words))
+    print("# Millimetres: nominal, classic and joint against the truth\n")
     print("Written by `python -m experiments.millimetres.ranges table`;", end=" ")
     print("mm of 3D distance; what was done stands there.\n")
     twins_table(good)
     for protocol in PROTOCOLS:
         drawn_table(protocol, [r for r in rows if r["name"] == protocol])
-    draw(good)
-
-
-def draw(rows) -> None:
-    """RMS error of each estimator against range."""
-    with page_figure(FIGURE, 5.6) as figure:
-        panels, metres = figure.subplots(2, 1, sharex=True, sharey=True), np.array(RANGES_MM) / 1000
-        for axes, protocol in zip(panels, PROTOCOLS, strict=True):
-            chosen = [r for r in rows if r["name"] == protocol]
-            if not chosen:
-                continue
-            for name, (colour, marker) in ESTIMATOR_STYLE.items():
-                per_rig = np.array(
-                    [[_rms(_flat([r], "error_mm", k, name)) for k in range(len(metres))] for r in chosen]
-                )
-                low, middle, high = np.quantile(per_rig, (0.1, 0.5, 0.9), axis=0)
-                label = name if axes is panels[0] else None
-                axes.loglog(metres, middle, marker=marker, color=colour, markersize=4, label=label)
-                axes.fill_between(metres, low, high, color=colour, alpha=0.15, linewidth=0)
-            stated = np.median([[_rms(_flat([r], "stated_mm", k)) for k in range(len(metres))] for r in chosen], axis=0)
-            label = "joint, stated" if axes is panels[0] else None
-            axes.loglog(metres, stated, "--", color=BLACK, linewidth=1, label=label)
-            readings = "with" if protocol == "mixed" else "without"
-            axes.set(ylabel="RMS error, mm", title=f"{protocol}, {readings} aperture readings")
-        panels[-1].set(xlabel="range, m", xticks=metres, xticklabels=[f"{m:g}" for m in metres])
-        panels[-1].minorticks_off()
-        figure.legend(loc="outside lower center", ncols=4)
 
 
 if __name__ == "__main__":

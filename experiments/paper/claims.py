@@ -301,7 +301,6 @@ def what_lowers(results: dict[str, dict[str, Parts]]) -> None:
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     use_compilation_cache()
     campaign = twin_campaign("paper_twin")

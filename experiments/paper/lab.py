@@ -54,7 +54,6 @@ def misplaced(names: Mapping[int, tuple[str, str]], pictures: Path, mine: Path) 
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     paper, twin = paper_values(), shipped_twin("paper_twin")
     simulated = simulate(mounted_rig(), shipped_plan("paper_twin"), SEED, twin.truth, spot_sd_px=SPOT_SD_PX)

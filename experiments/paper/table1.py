@@ -110,7 +110,6 @@ Written by `python -m experiments.paper.table1`; deg/step. The twin was solved t
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     paper = paper_values()
     print(TEXT)

@@ -1,7 +1,7 @@
 """Two rigs, one Table 1: equal gears with lost motion seen at an azimuth, and four literal ratios: are they separable?
 
     python -m experiments.paper.two_rigs run --n 8 --cores 0        # 10 minutes, resumable
-    python -m experiments.paper.two_rigs table > experiments/paper/two_rigs.md     # writes the figure too
+    python -m experiments.paper.two_rigs table > experiments/paper/two_rigs.md
 
 Seed s draws optics, cameras and mounting from the priors of `data/rigs/mounted`; then two machines are put into that
 drawing, each solved so that the classic estimator reads Table 1's means without noise:
@@ -29,13 +29,11 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import study
-from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.rigs import mounted_rig, paper_values, unseen
 from experiments.common.rows import output
 from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
@@ -50,10 +48,9 @@ from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.report.drawing import BLACK, BLUE, RED
 from tvsbayes.twin.simulated_campaign import simulate
 
-PLANNED, FIGURE = output(__file__, "two_rigs_planned.csv"), Path(__file__).with_suffix(".png")
+PLANNED = output(__file__, "two_rigs_planned.csv")
 CAMPAIGNS = ("paper, as published", "paper, sides recorded", "mixed", "grid", "planned")
 MODELS = {"play": ModelChoice(per_axis=True), "ratios": ModelChoice(no_backlash=True), "both": ModelChoice()}
 CONTRAST_U = 0.005
@@ -198,8 +195,7 @@ def classic_part() -> None:
 
 
 def table(rows: list[dict]) -> None:
-    """The page and its figure."""
-    print(title_and_figure(__file__, "Two rigs, one Table 1", FIGURE, "Evidence for play against literal ratios"))
+    print("# Two rigs, one Table 1\n")
     print("Written by `python -m experiments.paper.two_rigs table` after `run`; what was done stands in the script.\n")
     classic_part()
     print("## The joint estimator\n")
@@ -236,28 +232,6 @@ def table(rows: list[dict]) -> None:
                 cells += ["-"] * 6
             print(f"| {name} | {kind} | {len(chosen)} | {len(weights)} | {' | '.join(cells)} |")
     print(f"\n{NOTES}")
-    draw(rows)
-
-
-def draw(rows) -> None:
-    """Weight of the evidence by campaign, and contrast against backlash of pan."""
-    looks = {"lost motion": (BLUE, "o"), "literal": (RED, "^")}
-    names = [name for name in CAMPAIGNS if any(row["campaign"] == name for row in rows)]
-    with page_figure(FIGURE, 1.4 + 0.4 * len(names)) as figure:
-        axes = figure.subplots()
-        for kind, (colour, marker) in looks.items():
-            places, weights = [], []
-            for k, name in enumerate(names):
-                chosen = [r for r in rows if r["campaign"] == name and r["kind"] == kind]
-                for w in filter(lambda w: w is not None, map(weight_log10, chosen)):
-                    places.append(k + (0.12 if kind == "literal" else -0.12))
-                    weights.append(w)
-            label = f"true: {'gears with play' if kind == 'lost motion' else 'literal ratios'}"
-            axes.plot(weights, places, marker, color=colour, markersize=5, alpha=0.7, label=label)
-        axes.axvline(0.0, color=BLACK, linewidth=0.8)
-        axes.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.5, -0.5))
-        axes.set_xlabel("log10 Bayes factor: literal ratios < 0 < play")
-        figure.legend(loc="outside lower center", ncols=2)
 
 
 if __name__ == "__main__":

@@ -183,7 +183,6 @@ def share(hits: int, count: int) -> str:
 
 
 def table(rows: list[dict]) -> None:
-    """Markdown tables."""
     groups: dict[tuple[str, str], list[dict]] = {}
     for name in (ADAPTIVE, *FIXED):
         for row in rows:

@@ -2,7 +2,7 @@
 
     python -m experiments.planning.planned_looks > experiments/planning/planned_looks.md
 
-Takes two minutes and writes the figure too. On the paper's rig (`data/rigs/mounted`: sheets at 175, 275, 375 mm, costs
+Takes two minutes. On the paper's rig (`data/rigs/mounted`: sheets at 175, 275, 375 mm, costs
 1.5 s a move, 1 s a look, 60 s a placement), expected information at the most probable instrument, no simulation. Two
 numbers are followed: u of the worst effective ratio, which falls with n, and its floor, what is left where the same
 looks are taken a hundred times (stereo, focal scale, priors of the optics). Protocols are repeated; the planned looks
@@ -14,14 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
 
 from experiments.common.command_line import print_only
-from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig
 from experiments.common.worth import UNREACHED, searched_family
@@ -34,9 +32,7 @@ from tvsbayes.planning.limits import MANY_TIMES, limit_of, split_of
 from tvsbayes.planning.looks import LookArrays, covariance_of
 from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, sensitivity
-from tvsbayes.report.drawing import BLUE, GREEN, GREY, ORANGE, RED
 
-FIGURE = Path(__file__).with_suffix(".png")
 REPEATS = (2, 4, 8, 16, 24)
 TARGET = parse_target(DEFAULT_TARGET)
 TURN = {"pan_min_steps": -100, "pan_max_steps": 7000, "tilt_min_steps": -130, "tilt_max_steps": 130}
@@ -129,7 +125,6 @@ def second_session(first: Session) -> None:
 
 
 def main() -> None:
-    """Print the tables, write the figure."""
     print_only(__doc__)
     use_compilation_cache()
     knowledge = prior_knowledge(mounted_rig())
@@ -138,8 +133,7 @@ def main() -> None:
     plans |= {"grid": [grid_protocol()], "planned": [family.arranged(n).steps for n in LADDER]}
     sessions = {name: [session(knowledge, steps) for steps in of] for name, of in plans.items()}
     curves = curves_of(sessions)
-    title, words = "Planned looks against the paper's 96 experiments", "u of the worst ratio against minutes, by plan"
-    print(title_and_figure(__file__, title, FIGURE, words))
+    print("# Planned looks against the paper's 96 experiments\n")
     print("Written by `python -m experiments.planning.planned_looks`; u of the worst effective ratio, 1e-4 deg/step.\n")
     print("| plan | spots | minutes | u | what it consists of | floor | what sets it |\n|---|---|---|---|---|---|---|")
     print("\n".join(rows_of(sessions)))
@@ -153,25 +147,6 @@ def main() -> None:
             cells = f"{enough.spots} | {enough.minutes:.1f} | {one.minutes / enough.minutes:.0f}"
         print(f"| {name} | {1e4 * one.value:.2f} | {one.spots} | {one.minutes:.1f} | {cells} |")
     second_session(sessions["planned"][LADDER.index(16)])
-    draw(curves)
-
-
-def draw(curves: Mapping[str, Sequence[Point]]) -> None:
-    """U against minutes, both logarithmic."""
-    looks = {"paper": (RED, "^"), "mixed": (ORANGE, "v"), "grid": (GREEN, "s"), "planned": (BLUE, "o")}
-    with page_figure(FIGURE, 4.0) as figure:
-        axes = figure.subplots()
-        for name, points in curves.items():
-            colour, marker = looks[name]
-            minutes, u, _ = np.array(points).T
-            axes.loglog(minutes, u, color=colour, marker=marker, markersize=4, label=name)
-            # The curves fall: below their ends is room.
-            place = {"xytext": (4, -6), "textcoords": "offset points", "ha": "right", "va": "top"}
-            axes.annotate(f"{points[-1].spots} spots", (minutes[-1], u[-1]), **place)
-        axes.margins(y=0.12)
-        axes.axhline(TARGET.limit, color=GREY, linewidth=0.8, linestyle=":")
-        axes.set(xlabel="minutes", ylabel="u of the worst effective ratio, deg/step")
-        figure.legend(loc="outside lower center", ncols=4)
 
 
 if __name__ == "__main__":

@@ -107,7 +107,6 @@ def assurance_line(name: str, stated: dict, result: StudyResult) -> str:
 
 
 def table(rows: list[dict]) -> None:
-    """Markdown of everything that came out."""
     kept, results = json.loads(DESIGNS.read_text()), {}
     print("# Predicted and actual uncertainty of plans\n")
     print("Written by `python -m experiments.planning.prediction table`; bounds at 1e-4.\n")

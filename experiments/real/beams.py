@@ -127,7 +127,6 @@ even against odd rows (u, v), then columns (u, v), in stated sds.
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     paths = sorted(BEAMS.glob("*.png"))
     beams = [beam_of(path) for path in paths]

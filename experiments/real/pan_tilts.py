@@ -54,7 +54,6 @@ def sighted(rows: np.ndarray, height: float) -> np.ndarray:
 
 
 def head_of(rows: np.ndarray, angles_deg: np.ndarray) -> Campaign:
-    """The table as a campaign of sightings; the order of its rows is not time."""
     first = {"pan_approach": "unknown", "tilt_approach": "unknown"}
     moves = [
         Move(move=k, segment=0, time_s=float(k), pan_steps=-round(pan), tilt_steps=-round(tilt), **({} if k else first))
@@ -116,7 +115,6 @@ tilt's curve, a linkage, is an error by position several times what the prior ex
 
 
 def main() -> None:
-    """See the module."""
     cli = parser(__doc__)
     cli.add_argument("folder", type=Path)
     folder = cli.parse_args().folder

@@ -128,7 +128,6 @@ def draw(splits: Sequence[Halves], named: Halves) -> None:
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     board = Board(4, 6, 30.0)
     boards = find_views(PAIRS, board)

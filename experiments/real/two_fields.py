@@ -160,7 +160,6 @@ def costs() -> None:
 
 
 def main() -> None:
-    """Print the page."""
     print_only(__doc__)
     print("# Pictures read in two fields\n")
     print(TEXT)

@@ -166,7 +166,6 @@ of both, so that more draws would have to tell. OUTSIDE: by more.
 
 
 def table(rows: list[dict]) -> None:
-    """The page."""
     print(TEXT)
     of = {(r["case"], r["tier"]): r for r in rows}
     cases = list(dict.fromkeys(r["case"] for r in rows))

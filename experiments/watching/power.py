@@ -110,7 +110,6 @@ def day(
 
 
 def table(every: list[dict]) -> None:
-    """Markdown table of alarms and powers."""
     rows = [r for r in every if r["converged"]]
     days = [day for row in rows for day in row["days"]]
     print("# False alarms and power of a watched calibration\n")

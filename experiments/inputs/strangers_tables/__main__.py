@@ -49,7 +49,6 @@ EXPLAINED = (
 
 
 def drawn_table(seed: int) -> Drawn:
-    """The table of a seed."""
     rng = np.random.default_rng(seed)
     weights = np.array(list(DRAWS.values()), float)
     draw = list(DRAWS)[int(rng.choice(len(DRAWS), p=weights / weights.sum()))]
