@@ -239,6 +239,28 @@ def test_a_block_for_each_camera_is_refused(tmp_path):
         read_foreign(tmp_path / "t.csv")
 
 
+@pytest.mark.parametrize("read", ["0.002 10,004 20,001 30.003", "0 10.000 20.010 30.000", "3 10,004 20,000 7"])
+def test_marks_that_may_be_of_thousands_are_refused(read, tmp_path):
+    with pytest.raises(InputError, match="between thousands or before decimals"):
+        rows_of("\n".join(["target;read", *(f"{10 * k};{v}" for k, v in enumerate(read.split()))]), tmp_path)
+
+
+def test_tenths_beside_inches_are_a_machinists(tmp_path):
+    rows = rows_of(sheet("X (in),dial (tenths)", [0, 1, 2, 1, 0], [0, 1, 3, 4, 2]), tmp_path, Wishes(deviations=True))
+    assert [r["value"] for r in rows.readings] == pytest.approx([0, 1.0001, 2.0003, 1.0004, 0.0002])
+
+
+def test_units_in_brackets_above_the_names(tmp_path):
+    text = "Position [mm] vs error [um], axis Z\n" + sheet("Pos,Err", PLACES, ERRORS)
+    assert [r["value"] for r in rows_of(text, tmp_path, Wishes(deviations=True)).readings] == pytest.approx(UP)
+
+
+def test_directions_in_remarks_between_rows(tmp_path):
+    up, down = (lines("{c} {v}\n").splitlines(keepends=True)[part] for part in (slice(6), slice(6, None)))
+    rows = rows_of("".join(["# run 1 up\n# pos_mm read_mm\n", *up, "# run 1 down\n", *down]), tmp_path)
+    assert len(rows.readings) == 12 and rows.moves[0]["approach"] == "forward"
+
+
 STATES = {
     "state": ("as found", "as left"),
     "Zustand": ("vorher", "nachher"),

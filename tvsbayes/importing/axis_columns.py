@@ -349,7 +349,8 @@ def _take_value(chooser: Chooser, deviations: bool | None) -> None:
     following = [name for name in others if follows(command, known[name])]
     own = [name for name in (*weak, *following) if not _repeats(command, known[name])]
     means = [name for name in chooser.of_role("mean") if follows(command, known[name])]
-    pools = (strong, [n for n in weak if n in own], [n for n in following if n in own], weak, following, means)
+    counted = [name for name in chooser.of_role("command") if follows(command, known[name])]
+    pools = (strong, [n for n in weak if n in own], [n for n in following if n in own], weak, following, means, counted)
     pool = next(filter(None, pools), [])
     if len(pool) > 1:
         found = f"{len(pool)} columns that could be the reading ({listed(pool)})"

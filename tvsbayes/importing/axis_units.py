@@ -75,10 +75,11 @@ def units_of(cells: FieldCells, written: Mapping[str, Unit | None]) -> dict[str,
 
 _SAID = (
     STATED,
+    re.compile(r"(?P<name>[^,;:=()\[\]]*)[(\[](?P<text>[^()\[\]]+)[)\]]"),
     re.compile(r"(?P<name>[^,;:=]*?)\b(?:in|en)\s+(?P<text>[^\s,;]+)"),
     re.compile(r"(?P<name>[^,;:=]*\b(?:units?|einheit(?:en)?|unidad(?:es)?|unites?))\s+(?P<text>\S+)\s*$"),
 )
-"""Units that a line states: "Unit: mm", "all values in mm", "readings in um, positions in mm", "Error units mm"."""
+"""Units that a line states: "Unit: mm", "Position [mm]", "readings in um, positions in mm", "Error units mm"."""
 
 
 def unit_above(table: ForeignTable, field: str) -> Unit | None:
@@ -176,6 +177,9 @@ def _deviation_factor(cells: FieldCells, unit: Unit | None, command_unit: Unit |
             said = {"column": cells.columns[name], "other": other.name, "field": name}
             raise cells.table.ask("unit-beside", each=usual, **said)
     if unit is None or command_unit is None:
+        cells.assumed.append(
+            "unit: of deviations that of the commands, as neither states one; --unit value=um says another"
+        )
         return 1.0
     if (factor := unit.in_units_of(command_unit)) is None:
         table, said = cells.table, {"unit": unit.name, "other": command_unit.name}

@@ -34,12 +34,14 @@ _LAST_DIGITS = re.compile(r"([-+]?\d+(?:[.,](\d+))?)\((\d+)\)")
 _DOUBTED = re.compile(r"[-+]?\d+(?:[.,]\d+)?\s*\?")
 DOUBTED_SHARE = 0.2
 """Largest share of numbers with a mark of doubt in a column, above which the mark says something else."""
-BESIDE_ANGLES = (
-    ('"', "arcsec", ""),
-    ("mils?", "angular mil", ""),
-    ("grad", "gon", r"[(\[](?:deg|degrees?|\u00b0)[)\]]"),
+BESIDE = (
+    ("angle", '"', "arcsec", ""),
+    ("angle", "mils?", "angular mil", ""),
+    ("angle", "grad", "gon", r"[(\[](?:deg|degrees?|\u00b0)[)\]]"),
+    ("inch", "tenths", "0.0001 in", ""),
+    ("inch", "thousandths", "0.001 in", ""),
 )
-"""Units in brackets that are another one beside an angle, by what one of the names must hold."""
+"""Units in brackets that are another one beside a unit or one of its kind, by what one of the names must hold."""
 WORDS_MAX = 1000
 """Largest number of different cells of a column that marks rows: with more they are measured, or written freely."""
 CODES_MAX = 4
@@ -309,14 +311,15 @@ def _units_of_columns(table: ForeignTable) -> ForeignTable:
     return _renamed(table, names, ", ".join(notes), [*units]) if units else table
 
 
-def _units_beside_angles(table: ForeignTable) -> ForeignTable:
-    """The table with units by another name where a column holds an angle: " is then a second of arc."""
-    if not any((unit := name_of(text).unit) is not None and unit.kind == "angle" for text in table.columns):
-        return table
-    names = {text: text for text in table.columns}
-    for written, word, beside in BESIDE_ANGLES:
-        if any(re.search(beside, text) for text in table.columns):
-            names = {n: re.sub(rf"([(\[])(?:{written})([)\]])", rf"\1{word}\2", text) for n, text in names.items()}
+def _units_beside_others(table: ForeignTable) -> ForeignTable:
+    """The table with units by another name where the others say so: beside an angle " is a second of arc."""
+    units = [unit for text in table.columns if (unit := name_of(text).unit) is not None]
+    others, names = {unit.kind for unit in units} | {unit.name for unit in units}, {n: n for n in table.columns}
+    for other, written, word, held in BESIDE:
+        if other in others and any(re.search(held, text) for text in table.columns):
+            names = {
+                n: re.sub(rf"([(\[])(?:{written})([)\]])", rf"\g<1>{word}\g<2>", text) for n, text in names.items()
+            }
     names = {text: name for text, name in names.items() if text != name}
     note = ", ".join(f"{escaped(text)} taken as {escaped(name)}" for text, name in names.items())
     return _renamed(table, names, note) if names else table
@@ -354,6 +357,6 @@ def _homed(table: ForeignTable) -> ForeignTable:
 
 STEPS = (
     *(_split_pairs, _without_doubted, _joined_angles, _joined_seconds, _dates),
-    *(_units_of_columns, _units_beside_angles, _in_one_unit, _filled_down, _homed, _marked, _in_order),
+    *(_units_of_columns, _units_beside_others, _in_one_unit, _filled_down, _homed, _marked, _in_order),
 )
 """What is done to a table, in this order."""

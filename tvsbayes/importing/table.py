@@ -275,8 +275,10 @@ def table_of_rows(
         description.append(f"the names again in line {line}{' ...' * (sum(again) > 1)}, left out")
     names, body, titles = _without_titles(file, names, body, above)
     description += [titles] * bool(titles)
-    cells = [cell for _, row in body for cell in row if not isinstance(cell, Number)]
-    commas, mixed = _notation(cells)
+    texts_of = [[row[k] for _, row in body if row[k] and not isinstance(row[k], Number)] for k in range(width)]
+    commas, mixed = _notation([cell for texts in texts_of for cell in texts])
+    if not mixed and (unsure := _unsure_number(texts_of)):
+        raise refused("thousands", file, line=next(row.line for row in body if unsure in row.cells), number=unsure)
     description += ["decimal commas"] * (commas and not mixed)
     columns = {}
     for k, name in enumerate(names):
@@ -301,6 +303,25 @@ def _notation(cells: Sequence[str]) -> tuple[bool, bool]:
     if commas and points and sure_points and not sure_commas:
         return False, False
     return bool(commas), bool(commas) and sure_points
+
+
+def _unsure_number(columns: Sequence[Sequence[str]]) -> str:
+    """A number whose mark may stand between thousands or before decimals; "" where there is none.
+
+    As in 0, 10.000, 20.000 where nothing else has decimals, and in a column of 0.002 and 10,004.
+    """
+    forms = _GROUPS_OF.values()
+    groups = [[cell for cell in cells if any(form.fullmatch(cell) for form in forms)] for cells in columns]
+    decimals = [[c for c in cells if is_number(c) and not c.lstrip("+-").isdigit()] for cells in columns]
+    sure = any(len(own) > len(grouped) for own, grouped in zip(decimals, groups, strict=True))
+    for cells, own, grouped in zip(columns, decimals, groups, strict=True):
+        points = [cell for cell in own if cell not in grouped and NUMBER.fullmatch(cell)]
+        whole = any(cell.lstrip("+-").isdigit() and abs(int(cell)) < 1000 for cell in cells)
+        unsure = [cell for cell in grouped if "," in cell] if points else []
+        unsure += [cell for cell in grouped if cell.endswith("0")] if whole and not sure else []
+        if unsure and not any(_COMMA.fullmatch(cell) and cell not in grouped for cell in own):
+            return unsure[0]
+    return ""
 
 
 def _is_across(rows: Sequence[Row]) -> bool:
