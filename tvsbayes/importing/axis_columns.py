@@ -227,11 +227,12 @@ def _by_steps(chooser: Chooser) -> list[str]:
     """Columns of two words, one where the commands rise and one where they fall: sides in a language of nobody."""
     steps, found = np.diff(chooser.known[chooser.taken["command"]].values), list[str]()
     for text in chooser.understood().unused:
-        cells = np.array(chooser.known[text].cells)[1:]
-        ways = [{*np.sign(steps[(cells == word) & (steps != 0)])} for word in {*cells}]
-        enough = min((np.sum((cells == word) & (steps != 0)) for word in {*cells}), default=0) >= SIDE_ROWS
-        if enough and sorted(map(list, ways)) == [[-1.0], [1.0]] and not any(map(NUMBER.fullmatch, {*cells})):
-            found.append(text)
+        words = {*chooser.known[text].cells}
+        if len(words) == 2 and not any(map(NUMBER.fullmatch, words)):
+            cells = np.array(chooser.known[text].cells[1:])
+            ways = [np.sign(steps[(cells == word) & (steps != 0)]) for word in words]
+            if min(map(len, ways)) >= SIDE_ROWS and sorted(map(set, ways), key=min) == [{-1.0}, {1.0}]:
+                found.append(text)
     return found
 
 

@@ -86,6 +86,7 @@ def _index(concept: str, file: str) -> tuple[frozenset[str], Phrases]:
     return frozenset(singles), tuple(p for p in phrases if len(p) > 1 or "*" in p[0])
 
 
+@lru_cache(maxsize=65536)
 def means(text: str, concept: str) -> bool:
     """Whether a whole cell is one of the words of a concept, signs included."""
     cell = plain(text).strip() or text.strip()
