@@ -9,6 +9,7 @@ from tvsbayes.importing.axis import axis_rows
 from tvsbayes.importing.cells import Wishes
 from tvsbayes.importing.looks import look_columns, look_rows
 from tvsbayes.importing.reader import read_foreign
+from tvsbayes.importing.sightings import sighting_rows
 
 PLACES = [0, 10, 20, 30, 40, 50]
 UP, DOWN = ([round(1.0002 * p - side, 4) for p in PLACES] for side in (0.02, -0.02))
@@ -259,6 +260,36 @@ def test_directions_in_remarks_between_rows(tmp_path):
     up, down = (lines("{c} {v}\n").splitlines(keepends=True)[part] for part in (slice(6), slice(6, None)))
     rows = rows_of("".join(["# run 1 up\n# pos_mm read_mm\n", *up, "# run 1 down\n", *down]), tmp_path)
     assert len(rows.readings) == 12 and rows.moves[0]["approach"] == "forward"
+
+
+def test_a_column_that_counts_rows_is_no_command_beside_positions(tmp_path):
+    rows = rows_of(sheet("Step,Position (mm),Measured (mm)", range(1, 13), COMMANDS, READ), tmp_path)
+    assert [m["command"] for m in rows.moves] == PLACES + PLACES[-2::-1]
+
+
+def test_turns_that_are_counted_beside_angles_are_asked_about(tmp_path):
+    angles = [0, 90, 180, 270] * 3
+    text = sheet("rev,angle,encoder_deg", marked("0", "1", "2", of=4), angles, [a + 0.01 for a in angles])
+    with pytest.raises(Question) as asked:
+        rows_of(text, tmp_path)
+    assert asked.value.candidates[0].options == ("--assume", "command_turn=360")
+
+
+def test_a_mil_of_an_angle_is_none_of_an_inch(tmp_path):
+    with pytest.raises(Question, match="angular mil"):
+        rows_of(sheet("steps,angle (mil)", COMMANDS, READ), tmp_path)
+
+
+@pytest.mark.parametrize(("name", "factor"), [("azimuth (h)", 15.0), ("azimuth (mil)", None), ("azimuth (mm)", None)])
+def test_units_of_directions_that_are_no_angles(name, factor, tmp_path):
+    angles = [round(0.5 + 0.05 * k, 3) for k in range(8)]
+    (tmp_path / "t.csv").write_text(sheet(f"pan,tilt,{name},el (deg)", range(0, 80, 10), [0] * 8, angles, [5.5] * 8))
+    if factor is None:
+        with pytest.raises(Question, match="not known"):
+            sighting_rows(read_foreign(tmp_path / "t.csv"), Wishes())
+    else:
+        found = sighting_rows(read_foreign(tmp_path / "t.csv"), Wishes()).sightings
+        assert [s["azimuth_deg"] for s in found] == pytest.approx([factor * a for a in angles])
 
 
 STATES = {

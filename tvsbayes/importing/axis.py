@@ -220,8 +220,10 @@ def _through_the_seam(cells: FieldCells, commands: list[float], unit: Unit | Non
         Question: they jump across the seam, and the part of the circle that they leave out lies elsewhere.
     """
     turn = cells.wishes.command_turn
-    if turn is None and unit is not None and unit.kind == "angle":
-        period = 360.0 / (unit.scale * unit.per_number)
+    left = [parse_unit(text) for text in cells.table.columns if text not in cells.columns.values()]
+    counted = any(of is not None and of.name == "turn" for of in left)
+    if turn is None and (unit.kind == "angle" if unit else counted):
+        period = 360.0 / (unit.scale * unit.per_number) if unit else 360.0
         places = np.unique(np.mod(commands, period))
         gaps = np.diff(np.r_[places, places[0] + period])
         jumps = np.flatnonzero(np.abs(np.diff(commands)) > 0.5 * period)
@@ -229,9 +231,10 @@ def _through_the_seam(cells: FieldCells, commands: list[float], unit: Unit | Non
         low, high = np.sort([commands[jumps[0]], commands[jumps[0] + 1]]) if len(jumps) else (0.0, 0.0)
         middle, gap = places[np.argmax(gaps)] + 0.5 * gaps.max(), gaps.max()
         inside = low < middle < high or low < middle - period < high
-        if len(jumps) and len(places) > 3 and gap > SEAM_GAPS * np.median(gaps) and inside:
+        seam = len(places) > 3 and gap > SEAM_GAPS * np.median(gaps) and inside
+        if len(jumps) and (seam or counted):
             said = {"before": commands[jumps[0]], "after": commands[jumps[0] + 1], "period": period}
-            raise cells.table.ask("seam", unit=unit.name, **said)
+            raise cells.table.ask("seam", unit=unit.name if unit else "deg", **said)
     if not turn:
         return commands
     cells.assumed.append(f"command: whole turns of {turn:g} added, because --assume command_turn says so")

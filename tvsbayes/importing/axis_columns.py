@@ -300,9 +300,10 @@ def _take_command(chooser: Chooser) -> None:
         return
     strong, weak, others = (roles.get(role, []) for role in ("command", "position", ""))
     readings = roles.get("value", []) or ([taken["value"]] if "value" in taken else [])
-    if len(numbers := [name for name in strong if not counts_rows(chooser.known[name].cells)]) == 1:
-        # "step" 1, 2, 3 ... beside "goto".
-        strong = numbers
+    counting = [name for name in strong if counts_rows(chooser.known[name].cells)]
+    if len(strong) > len(counting) or (readings and weak):
+        # "step" 1, 2, 3 ... beside "goto" or a position.
+        strong = [name for name in strong if name not in counting]
     pool = strong or weak or others
     if len(strong) > 1:
         found = f"{len(strong)} columns that could be the command ({listed(strong)})"
@@ -355,12 +356,12 @@ def _take_value(chooser: Chooser, deviations: bool | None) -> None:
     pool = next(filter(None, pools), [])
     if len(pool) > 1:
         found = f"{len(pool)} columns that could be the reading ({listed(pool)})"
-        counted = {tuple(word for word in known[name].name.words if not word.isdigit()) for name in pool}
+        skeletons = {tuple(word for word in known[name].name.words if not word.isdigit()) for name in pool}
         first = {name: known[name].first for name in pool}
         runs = [Candidate(meaning, ("--runs", order), first) for order, meaning in ORDERED.items()]
         answers = [chooser.answer({"value": n}, DEVIATIONS) for n in differences if known[n].numeric]
         answers = [*(chooser.answer({"value": name}) for name in pool), *answers]
-        are_runs = len(counted) == 1 and all(known[name].name.numbers for name in pool)
+        are_runs = len(skeletons) == 1 and all(known[name].name.numbers for name in pool)
         are_runs = are_runs or all(follows(command, known[name]) for name in pool)
         raise chooser.ask(found, [*answers[:3], *runs] if are_runs else answers)
     if pool:

@@ -81,7 +81,8 @@ def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
 
 def _of_sexagesimals(name: str, cells: Sequence[str]) -> tuple[Unit, str]:
     """The unit of 10:20:30 and what it is called."""
-    if place_of(words_of(name), "hour-angle") is not None and not any({*cell} & {*"\u00b0d"} for cell in cells):
+    of_hours = place_of(words_of(name), "hour-angle") is not None or re.search(r"\bh\W*m\W*s\b", name.lower())
+    if of_hours and not any({*cell} & {*"\u00b0d"} for cell in cells):
         return HOUR_ANGLE, "hours, minutes and seconds"
     return unit_named("deg"), "degrees, minutes and seconds"
 

@@ -42,6 +42,8 @@ BESIDE = (
     ("inch", "thousandths", "0.001 in", ""),
 )
 """Units in brackets that are another one beside a unit or one of its kind, by what one of the names must hold."""
+_OF_ANGLE = re.compile(r"(angle|winkel|angul|azim|elev|pitch|yaw|tilt)\w* *[(\[](mils?|\")[)\]]", re.IGNORECASE)
+"""A name of an angle with a unit that is one of a length elsewhere."""
 WORDS_MAX = 1000
 """Largest number of different cells of a column that marks rows: with more they are measured, or written freely."""
 CODES_MAX = 4
@@ -315,6 +317,7 @@ def _units_beside_others(table: ForeignTable) -> ForeignTable:
     """The table with units by another name where the others say so: beside an angle " is a second of arc."""
     units = [unit for text in table.columns if (unit := name_of(text).unit) is not None]
     others, names = {unit.kind for unit in units} | {unit.name for unit in units}, {n: n for n in table.columns}
+    others |= {"angle"} if any(_OF_ANGLE.search(text) for text in names) else set()
     for other, written, word, held in BESIDE:
         if other in others and any(re.search(held, text) for text in table.columns):
             names = {

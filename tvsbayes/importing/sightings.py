@@ -22,7 +22,7 @@ from tvsbayes.importing.columns import Chooser, Column, Understood, ask_of_t, co
 from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, Pair, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import Unit, name_of, place_of, unit_named
+from tvsbayes.importing.words import HOUR_ANGLE, Unit, name_of, place_of, unit_named
 
 STEP_DEG = 1e-5
 """Size of a counter step: encoders are read in degrees, and 0.04 arcsec is far below telescopes' pointing errors."""
@@ -262,9 +262,11 @@ def _units(cells: FieldCells, known: Mapping[str, Column], written: Mapping[str,
             continue
         column = known[cells.columns[name]]
         unit = written.get(name) or column.name.unit
+        unit = HOUR_ANGLE if name in ANGLES and unit is not None and unit.name == "h" else unit
+        unknown = column.name.unknown or (unit.name if unit is not None and unit.kind != "angle" else "")
         unit = unit if unit is not None and unit.kind == "angle" else None
-        if unit is None and column.name.unknown and name not in COUNTERS and stated is None:
-            first, said = {column.name.text: column.first}, {"unit": column.name.unknown, "column": column.name.text}
+        if unit is None and unknown and name not in COUNTERS and stated is None:
+            first, said = {column.name.text: column.first}, {"unit": unknown, "column": column.name.text}
             raise cells.table.ask("unknown-angles", each=("deg", "rad"), first=first, **said)
         if name in COUNTERS:
             # 200.0 is a counter that a program wrote as a float, 15.0000 an angle.

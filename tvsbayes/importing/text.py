@@ -97,6 +97,7 @@ def _is_title(remark: str) -> bool:
     """Whether a remark between rows speaks of all below it: the axis homed, a run goes in a direction, a state."""
     words = words_of(remark)
     named = any(place_of(words, concept) is not None for concept in ("condition", "machine"))
+    named |= place_of(words, "target", "looks.toml") is not None
     return named or place_of(words, "homing") == 0 or bool(side_named(remark))
 
 
