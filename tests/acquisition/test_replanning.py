@@ -165,7 +165,8 @@ def test_a_resumed_run_has_the_plan_of_the_interrupted_one(mounted_rig, tmp_path
 
 def test_a_damaged_change_of_plan_is_refused(mounted_rig, tmp_path):
     data = {"row": 3, "looks": 4, "why": "", "steps": [{"action": "fly"}]}
-    for entries, fault in ((data, "fly"), ({**data, "row": "3"}, "row")):
+    without = {**data, "steps": [{"action": "move", "pan_steps": 3}]}
+    for entries, fault in ((data, "fly"), (without, "move"), ({**data, "row": "3"}, "row")):
         with pytest.raises(InputError, match=f"line 7: .*{fault}.*entries of the event adapted"):
             adapted_plan(small_plan(1), [Record(0, "adapted", entries, 7)])
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from tvsbayes.acquisition.simulated_instrument import VirtualClock
 from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner import serial_port
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.serial_port import Port, serial_opener
+from tvsbayes.positioner.serial_port import serial_opener
 
 
 def test_a_ports_name_is_never_taken_as_an_address(tmp_path):
@@ -26,7 +28,8 @@ def test_of_two_ports_of_one_device_the_named_one_is_opened(monkeypatch):
     opened, there = [], ["/dev/ttyACM0", "/dev/ttyACM1"]
 
     def ports():
-        return [Port("/dev/ttyACM9", "", 0x16C0, 1, "B"), *(Port(name, "", 0x16C0, 1, "A") for name in there)]
+        named = [("/dev/ttyACM9", "B"), *((name, "A") for name in there)]
+        return [SimpleNamespace(device=name, vid=0x16C0, pid=1, serial_number=number) for name, number in named]
 
     monkeypatch.setattr(serial_port, "serial_ports", ports)
     monkeypatch.setattr(serial_port, "_SerialLink", lambda name, baud: opened.append(name))

@@ -32,6 +32,8 @@ from tvsbayes.positioner.interface import DEFAULT_DRIVER, SEE_DOCTOR, Clock, Pos
 from tvsbayes.positioner.protocol import FIRMWARE_VERSION
 from tvsbayes.positioner.serial_port import serial_ports
 
+PJRC = 0x16C0
+"""USB vendor of the Teensy."""
 ON_PORTS = ("serial", "grbl")
 """Drivers of a board on a serial port."""
 DISK_FREE_BYTES = 5 * 10**9
@@ -187,13 +189,13 @@ def _disk(folder: Path, clock: Clock, checks: _Checks) -> None:
 
 def _port(rig: Rig, checks: _Checks) -> None:
     ports, stated = serial_ports(), rig.positioner.get("port")
-    listed = ", ".join(f"{p.name} ({p.description}{', Teensy' if p.teensy else ''})" for p in ports) or "none"
+    listed = ", ".join(f"{p.device} ({p.description or ''}{', Teensy' * (p.vid == PJRC)})" for p in ports) or "none"
     listed = escaped(listed, 400)
     shown = escaped(str(stated))
     if not stated:
         remedy = 'write port = "..." into [positioner] of the rig file'
         checks.append(Check("port", "fault", f"ports: {listed}", remedy))
-    elif all(port.name != stated for port in ports) and not Path(str(stated)).exists():
+    elif all(port.device != stated for port in ports) and not Path(str(stated)).exists():
         remedy = "plug the device in, or correct [positioner] port; on Linux join the group dialout"
         checks.append(Check("port", "fault", f"{shown} is not there; ports: {listed}", remedy))
     else:

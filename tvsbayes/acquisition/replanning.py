@@ -166,10 +166,15 @@ def adapted_plan(plan: Sequence[PlanStep], records: Iterable[Record]) -> tuple[P
     """
     steps = tuple(plan)
     for record in records:
-        if event := event_of(record, Adapted):
-            changed = enumerate(event.steps, event.row)
-            steps = (
-                *steps[: event.row],
-                *(PlanStep(row, s.action, s.pan_steps, s.tilt_steps, s.target) for row, s in changed),
-            )
+        event = event_of(record, Adapted)
+        if event is None:
+            continue
+        for s in event.steps:
+            stated = {"place": s.target, "move": None not in (s.pan_steps, s.tilt_steps), "look": True}
+            if not stated.get(s.action):
+                raise record.refused(f"no action of a continued plan: {s.action}")
+        changed = (
+            PlanStep(row, s.action, s.pan_steps, s.tilt_steps, s.target) for row, s in enumerate(event.steps, event.row)
+        )
+        steps = (*steps[: event.row], *changed)
     return steps

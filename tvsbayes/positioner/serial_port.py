@@ -7,7 +7,7 @@ name. Seconds where a name says `_s`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.rig import Rig
@@ -20,39 +20,22 @@ BAUD = 115_200
 """Default baud rate; a USB device ignores it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Port:
-    """A serial port of this computer, with the description of its USB device (empty where it has none)."""
-
-    name: str
-    description: str
-    vid: int | None
-    pid: int | None
-    serial_number: str
-
-    @property
-    def teensy(self) -> bool:
-        """Whether the vendor is PJRC, who make the Teensy."""
-        return self.vid == 0x16C0
-
-
-def serial_ports() -> list[Port]:
-    """The serial ports of this computer, by name."""
+def serial_ports() -> list[Any]:
+    """The serial ports of this computer as pyserial describes them (`ListPortInfo`), by name."""
     from serial.tools import list_ports
 
-    ports = (Port(p.device, p.description or "", p.vid, p.pid, p.serial_number or "") for p in list_ports.comports())
-    return sorted(ports, key=lambda port: port.name)
+    return sorted(list_ports.comports(), key=lambda port: port.device)
 
 
-def _ports_of(device: Port) -> list[str]:
+def _ports_of(device: Any) -> list[str]:
     """Names of all ports of the USB device to which this port belongs."""
     usb_id = (device.vid, device.pid, device.serial_number)
-    return [p.name for p in serial_ports() if (p.vid, p.pid, p.serial_number) == usb_id]
+    return [p.device for p in serial_ports() if (p.vid, p.pid, p.serial_number) == usb_id]
 
 
 def serial_opener(port: str, baud: int) -> Callable[[], Link]:
     """Return a function that opens a port by name, or after an unplugging the same USB device under its new name."""
-    device = next((p for p in serial_ports() if p.name == port and p.serial_number), None)
+    device = next((p for p in serial_ports() if p.device == port and p.serial_number), None)
     # A device may have several ports; their names keep their order.
     index = 0 if device is None else _ports_of(device).index(port)
 
