@@ -123,6 +123,21 @@ def test_tables_hold_what_draws_hold_at_places_and_forget_it_beyond(own_scales):
     np.testing.assert_allclose(gears.expected, normal @ gears.by_places.T, atol=1e-6)
 
 
+def test_every_draw_has_scales_of_its_own():
+    """Draws of twice the sd scatter twice as much away from the looks, each with its length."""
+    fit, mode, root = fitted(STEPS, SCALES)
+    rng = np.random.default_rng(6)
+    physical = np.tile(mode, (DRAWS, 1))
+    large = np.arange(DRAWS) % 2 == 1
+    physical[large, INDEX["transmission_error_deg.pan"]] *= 2
+    gears = drawn_gears(fit, physical, rng.standard_normal((DRAWS, len(root))) @ root.T, 3)
+    part = gears.table.parts["transmission_error_at_deg.pan"]
+    for column in (part.start, part.stop - 1):
+        sds = [np.std(gears.left_open[rows, column]) for rows in (~large, large)]
+        # Each known to 3 %.
+        assert sds[1] / sds[0] == pytest.approx(2.0, rel=0.15)
+
+
 TWINS, TWIN_DRAWS = 30, 200
 POSES = {"seen": (77.0, 90.0), "between": (40.0, 45.0), "outside": (-500.0, -260.0), "beyond": (-900.0, 30.0)}
 """Counters (pan, tilt): places of `STEPS`, between them, half a table beyond, and beyond the table."""

@@ -52,3 +52,9 @@ def test_what_is_separated_or_fixed_is_not_named():
     assert sum_directions(fixed, shared, EVEN) == ()
     shared[:, INDEX[LOOK]] = 0.01
     assert sum_directions(FREE, shared, EVEN) == ()
+
+
+def test_draws_count_with_their_weights():
+    mixed, weights = np.concatenate([known_sum_of(LEFT, LOOK), independent()]), np.repeat([1 / DRAWS, 0.0], DRAWS)
+    assert sum_directions(FREE, mixed, weights)
+    assert sum_directions(FREE, mixed, weights[::-1]) == ()

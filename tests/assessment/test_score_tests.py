@@ -101,6 +101,7 @@ def test_a_creep_is_known_by_its_prior_wherever_the_fit_is_linearised(clean):
     assert second == pytest.approx(first, rel=KNOWN_DIRECTION)
 
 
+@pytest.mark.thorough
 def test_p_values_are_uniform_and_false_alarms_rare(clean):
     """Twenty-five clean campaigns with creeps by their prior: Kolmogorov-Smirnov and numbers of alarms, at 1e-4."""
     rng = np.random.default_rng(4)

@@ -9,7 +9,7 @@ import pytest
 from support.bent_rig import BENT, ROUNDING, ROUNDING_MM, calibration
 from support.geared_rig import KNOWN, SD_DEG, STEPS, constant, geared
 
-from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
+from tvsbayes.calibration.gear_table import COUNTERS_MAX, NO_GEARS, GearTable, regular_counters, table_of
 from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.coordinates.error_map import error_map
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of
@@ -141,3 +141,13 @@ def test_error_maps_know_the_gears():
     rms = error_map(one, pan, [0.0], [600.0], simple={}, draws=500).rms_mm["joint"][:, 0, 0]
     np.testing.assert_array_equal(one.covers(pan, np.zeros(3)), [False, True, False])
     assert min(rms[0], rms[2]) > 2 * rms[1]
+
+
+def test_tables_of_files_are_regular():
+    assert table_of({"pan": [], "tilt": []}) == NO_GEARS and NO_GEARS.size == 0 and NO_GEARS.inputs == ()
+    good = {"pan": [0.0, 1.0, 2.0, 3.0], "tilt": [0.0, 1.5, 3.0, 4.5, 6.0]}
+    assert table_of(good).steps == ((0.0, 1.0, 2.0, 3.0), (0.0, 1.5, 3.0, 4.5, 6.0))
+    for bad in ([0, 1, 2], [0, 1, 3, 4], [3, 2, 1, 0], [0, 1, 2, np.inf], [[0, 1, 2, 3]], [], list(range(1000))):
+        with pytest.raises(ValueError, match="table"):
+            table_of(good | {"pan": bad})
+    assert len(regular_counters(0.0, 1e6, 1.0)) == COUNTERS_MAX and len(regular_counters(0.0, 1.0, 9.0)) == 4

@@ -1,15 +1,13 @@
-"""The optics in components: transmission errors, ranges and beam angles, against the twin's and JAX."""
+"""The optics in components: transmission errors, ranges and beam angles, against the twin's."""
 
 from __future__ import annotations
 
 import math
 from itertools import product
 
-import jax
 import numpy as np
 import pytest
 from support.bent_rig import AXES, BENT, PERIODS_DEG, ROUNDING, ROUNDING_MM, SD, twin_angle_deg, twin_ray_at
-from support.jax_meeting import meeting
 from support.published_equations import published_point
 
 from tvsbayes.calibration.optics import beam_deg_per_step, output_deg, range_components
@@ -28,31 +26,6 @@ def test_transmission_error_is_that_of_wheel_or_pinion(wobbling):
     ratio, play = values["degrees_per_step.pan"], values["backlash_deg.pan"]
     gap = [output_deg(values, "pan", 55, side, 360.0) - (ratio * 55 - side * play / 2) for side in (1, -1)]
     assert abs(gap[0] - gap[1]) > 1e-4, "the wheel's error differs between the sides"
-
-
-@pytest.mark.parametrize("azimuth", [False, True])
-def test_ranges_are_those_of_jax_from_anywhere(azimuth):
-    """Beams from all around: those that meet only the other nappe of the aperture's cone meet nothing."""
-    rng = np.random.default_rng(1)
-    origin = rng.normal(size=(3, 2000)) * 60 + np.array([[0.0], [100.0], [0.0]])
-    direction = rng.normal(size=(3, 2000))
-    direction /= np.linalg.norm(direction, axis=0)
-    angle_deg = rng.uniform(1, 179, 2000)
-    with jax.enable_x64(True):
-        arrays = [jax.numpy.asarray(x) for x in (origin, direction, 200.0, np.radians(angle_deg), azimuth)]
-        expected = meeting(*arrays)
-    meets = np.asarray(expected.meets)
-    assert 400 < meets.sum() < 1600
-    ranges = range_components(tuple(origin), tuple(direction), 200.0, angle_deg, azimuth)
-    with np.errstate(invalid="ignore"):
-        # Points behind the baseline are refused by the callers that need the range.
-        np.testing.assert_array_equal((ranges > 0) & (origin[0] + ranges * direction[0] > 0), meets)
-    np.testing.assert_allclose(ranges[meets], np.asarray(expected.range_mm)[meets], rtol=1e3 * ROUNDING)
-    for k in range(100):
-        single = range_components(
-            tuple(origin[:, k].tolist()), tuple(direction[:, k].tolist()), 200.0, angle_deg[k], azimuth, math
-        )
-        assert single == pytest.approx(ranges[k], rel=1e3 * ROUNDING, nan_ok=True)
 
 
 def test_ratio_of_the_beam_is_the_twins():

@@ -11,9 +11,10 @@ import pytest
 from support.dozen_spots import coordinates
 
 from tvsbayes.assessment.summary import summarise
-from tvsbayes.comparison.gap import BACKLASH, PROJECTION, explain_gap
+from tvsbayes.comparison.gap import BACKLASH, CHANCE, PROJECTION, STEREO_SCALE, explain_gap
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import Alternative, JointFit
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.posterior import predictive
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.comparison_record import Gap
@@ -113,3 +114,23 @@ def test_terms_name_the_true_causes_with_sign_and_size(paper_fit, paper_gaps, pa
     for direction in ("up", "down"):
         assert by[direction][PROJECTION] == pytest.approx(0.0064, abs=0.0008)
     assert abs(by["left"][PROJECTION]) < 1e-4
+
+
+def test_stereo_term_follows_the_focal_scale(mixed_fit):
+    """Cameras whose focal length is 1 % longer than stated: angles seem about 1 % larger, with distortion up to 2 %."""
+    index = list(mixed_fit.names).index("focal_scale")
+    shifted = np.array(mixed_fit.z)
+    shifted[index] += 0.01 / float(mixed_fit.space.u[index])
+    plain, longer = (explain_gap(replace(mixed_fit, z=z), draws=2) for z in (mixed_fit.z, shifted))
+    for direction in DIRECTIONS:
+        first, second = ({t.name: t.value for t in g[direction].terms}[STEREO_SCALE] for g in (plain, longer))
+        assert 0.003 < (second - first) / 0.065 < 0.02
+
+
+def test_terms_and_chance_are_about_what_the_classic_saw(mixed_fit):
+    """Chance is what its own stop errors and pixels add: within 4 of its standard uncertainties (type A)."""
+    measured = classic(mixed_fit.campaign)
+    for direction, gap in explain_gap(mixed_fit, draws=64).items():
+        chance = {t.name: t for t in gap.terms}[CHANCE]
+        spread = np.hypot(chance.sd, measured.directions[direction].u_type_a_deg_per_step)
+        assert abs(chance.value) < 4 * spread

@@ -96,6 +96,16 @@ def test_linuxcnc_of_counters_that_run_backwards_exchanges_the_sides():
     assert at_unit[0] - (at_unit[2] - at_unit[0]) == pytest.approx(-sent, abs=2e-7)
 
 
+def test_settings_hold_ratio_and_play():
+    ratio = float(lines_of(written("grbl"))[0].removeprefix("$100="))
+    # 250 steps per mm made 1.002 mm; the error by position of 0.05 mm turns the line over 40 mm by 0.3 %.
+    assert ratio == pytest.approx(250 / 1.002, rel=0.004)
+    hal = dict(line.split("=") for line in lines_of(written("grblhal")))
+    assert set(hal) == {"$101", "$161"} and float(hal["$161"]) == pytest.approx(0.3, abs=0.06)
+    klipper = float(lines_of(written("klipper"))[0].removeprefix("rotation_distance: "))
+    assert klipper / 8.0 == pytest.approx(250 / ratio, rel=1e-4)
+
+
 def test_urdf_states_covariance_and_what_it_corrects():
     """The YAML beside the xacro: the same numbers, their covariance, and the hash that keeps it from acting twice."""
     beside = FORMATS["urdf"].beside

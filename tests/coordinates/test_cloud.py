@@ -10,7 +10,7 @@ import pytest
 from plyfile import PlyData
 from support.bent_rig import ROUNDING_MM, calibration
 
-from tvsbayes.coordinates.cloud import EvenSample, checked, cloud
+from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
 from tvsbayes.coordinates.cloud_files import cloud_place, columns_of, write_cloud
 from tvsbayes.coordinates.location import locate_linear
 from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOKS, LookRows, look_blocks
@@ -135,6 +135,20 @@ def test_what_fails_half_way_leaves_the_old_cloud(tmp_path):
     with pytest.raises(InputError) as refused:
         write_cloud([], tmp_path / "c.xyz", [])
     assert ".ply" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize("count", [1, CHECKED_MAX, 3 * CHECKED_MAX + 1])
+def test_the_sample_is_even_whatever_the_blocks(count):
+    rows = looks(count)
+    samples = []
+    for size in (count, 7):
+        sample = EvenSample()
+        parts = (LookRows(*(getattr(rows, name)[k : k + size] for name in vars(rows))) for k in range(0, count, size))
+        assert sum(len(part.lines) for part in sample.of(parts)) == count
+        samples.append(sample.looks)
+    assert samples[0] == samples[1] and len(samples[0]) <= CHECKED_MAX
+    stride = 1 if count <= CHECKED_MAX else 4
+    assert [look[0] for look in samples[0]] == list(rows.pan_steps[::stride])
 
 
 def test_the_law_is_checked_by_draws():

@@ -176,6 +176,17 @@ def test_impossible_arguments_are_refused():
     assert (caught.value.code, caught.value.column) == ("approach", "pan_approach")
 
 
+def test_draws_are_chosen_evenly_or_used_again():
+    one = calibration(noise_spread=0.0)
+    few, all_, more = (drawn(one, n, 0).inputs[:, : len(INPUT_NAMES)] for n in (500, DRAWS, DRAWS + 7))
+    np.testing.assert_array_equal(few[[0, -1]], one.inputs[[0, -1]])
+    assert len({tuple(row) for row in few}) == 500
+    np.testing.assert_array_equal(all_, one.inputs)
+    np.testing.assert_array_equal(more, np.concatenate([one.inputs, one.inputs[:7]]))
+    noise = drawn(one, DRAWS + 7, 0).noise
+    assert not np.any(noise[:7] == noise[DRAWS:]), "rows that come again get other noises"
+
+
 def test_the_law_is_validated_near_and_refuted_far():
     # The law holds the sds of the noises still; here they are.
     small = {name: 0.02 * sd for name, sd in NOISE_DEG.items()}

@@ -78,11 +78,24 @@ def test_a_wrong_sign_is_certain_and_mended_by_a_command(grid_twin, axis, words)
     assert f"at {-getattr(move, f'{axis}_steps')}:" in finding.message
 
 
+def test_both_signs_may_be_cameras_upside_down(grid_twin):
+    (finding,) = implausible(turned("tilt")(turned("pan")(grid_twin, RNG), RNG))
+    assert finding.certain and "--flip pan_steps --flip tilt_steps" in finding.remedy
+    assert "extrinsics.rotation_rad" in finding.remedy
+
+
 def test_cameras_of_unknown_mounting_accuse_no_sign(grid_twin):
     """Three u of 0.6 rad are more than a quarter of a turn: the cameras may hang upside down."""
     wrong = turned("pan")(grid_twin, RNG)
     unknown = Prior(0.0, 0.6)
     assert implausible(with_prior(wrong, extrinsics__rotation_rad__x=unknown)) == ()
+
+
+def test_few_stops_are_never_certain(grid_twin):
+    wrong = turned("tilt")(turned("pan")(grid_twin, RNG), RNG)
+    findings = {looks: [(f.code, f.certain) for f in implausible(cut(wrong, looks))] for looks in (7, 8, 10, 40)}
+    assert findings[40] == [("counter-sign", True)] and findings[7] == []
+    assert all(not certain for looks in (8, 10) for _, certain in findings[looks])
 
 
 def test_a_sign_that_shifted_rows_would_show_too_names_both(mounted_rig):

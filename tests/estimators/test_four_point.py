@@ -19,6 +19,7 @@ from tvsbayes.estimators.four_point import (
     classic,
     four_point_ratios,
     ratio_deg_per_step,
+    ratio_slopes,
     select_experiments,
     stereo_variance,
 )
@@ -104,6 +105,14 @@ def test_undistortion_converges_to_the_corners():
     assert np.max(np.abs(returned - pixels)) < 1e-9
     five = distort(normalised, stereo.D1 * 0) @ stereo.M1[:2, :2].T + stereo.M1[:2, 2]
     assert np.max(np.abs(five - pixels)) > 100, "the distortion of this test is strong at the corners"
+
+
+def test_undistortion_reports_a_pixel_without_origin():
+    """Beyond the radius where the polynomial turns back there is no answer: NaN, not a guess."""
+    camera = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
+    folding = np.array([-0.5, 0.0, 0.0, 0.0, 0.0])  # r (1 - r^2/2) peaks at 0.544
+    result = undistort(np.array([[640.0 + 800 * 0.5, 360.0], [640.0 + 800 * 0.6, 360.0]]), camera, folding)
+    assert np.isfinite(result[0]).all() and np.isnan(result[1]).all()
 
 
 @pytest.mark.parametrize("focal_scale", [1.0, 1.004])
@@ -212,6 +221,31 @@ def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
     # The near and far points share the intercept, which scales with depth and leaves the slope alone.
     assert ratio == pytest.approx((angles[1] - angles[0]) / 200, abs=ROUNDING_DEG)
     assert ratio / 0.0595 - 1 == pytest.approx(-0.0033, abs=0.00005)  # two digits
+
+
+def test_slopes_by_pixels_are_those_of_the_closed_form():
+    """Ideal parallel cameras: depth and width by the disparity in one row, differentiated by the complex step.
+
+    Vertical pixels count for nothing in a pan; the DLT agrees with the closed form in them, where both rows are equal,
+    to first order.
+    """
+    pixels = project(four_points(18.5, 30.4, "pan"), IDEAL).reshape(4, 4)
+
+    def ratio(spots: np.ndarray) -> complex:
+        left, right = ((spots[:, k] - m[0, 2]) / m[0, 0] for k, m in ((0, IDEAL.M1), (2, IDEAL.M2)))
+        depth = 85.0 / (left - right)
+        across = -left * depth
+        after, before = ((across[j] - across[i]) / (depth[j] - depth[i]) for i, j in ((3, 2), (0, 1)))
+        return np.degrees(1) * (np.arctan(after) - np.arctan(before)) / 200
+
+    step = 1e-30
+    expected = [
+        [ratio(pixels + 1j * step * np.eye(16)[4 * p + k].reshape(4, 4)).imag / step for k in (0, 2)] for p in range(4)
+    ]
+    slopes = ratio_slopes(pixels, np.array([200]), "pan", IDEAL)
+    assert slopes.ratio[0] == pytest.approx(ratio(pixels).real, abs=ROUNDING_DEG)
+    # A difference quotient over 0.01 px of what bends within 10 px: 1e-3 at most.
+    assert slopes.by_pixel[0][:, [0, 2]] == pytest.approx(np.array(expected), rel=1e-3)
 
 
 def test_a_step_out_of_the_lens_model_is_shortened():

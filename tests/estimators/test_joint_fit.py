@@ -8,10 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.special import ndtri
+from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.estimators.joint_fit import DIAGNOSING, NEWTON, fit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
+from tvsbayes.estimators.mode_search import SEARCHING
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import ModelChoice
@@ -34,6 +36,11 @@ FAR = 5 * SD
 def with_priors(campaign: Campaign, **priors: Prior) -> Campaign:
     named = {name.replace("__", "."): prior for name, prior in priors.items()}
     return replace(campaign, rig=replace(campaign.rig, priors={**campaign.rig.priors, **named}))
+
+
+def test_a_fit_reports_what_it_does(mixed_fit, mixed_waits):
+    check_forward(mixed_waits)
+    assert doings(mixed_waits)[-3:] == [SEARCHING, NEWTON, DIAGNOSING]
 
 
 def test_truth_is_found_within_its_uncertainty(mixed_run, mixed_fit):

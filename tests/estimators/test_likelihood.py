@@ -143,6 +143,16 @@ def test_padding_changes_nothing(grid_campaign, monkeypatch):
     assert np.all(long.moves.steps[moves:] == long.moves.steps[moves - 1])
 
 
+def test_order_of_rows_is_irrelevant(dozen):
+    """spots.csv may list its rows in any order; what is not ok is not read."""
+    spots = list(dozen.campaign.spots)
+    np.random.default_rng(3).shuffle(spots)
+    refused = replace(spots[0], spot=999, status="saturated", u_left_px=-1e6, v_right_px=None)
+    shuffled = campaign_arrays(replace(dozen.campaign, spots=(refused, *spots)))
+    for one, two in zip(jax.tree.leaves(dozen.arrays), jax.tree.leaves(shuffled), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
 def test_excluded_spot_leaves_no_trace(dozen, evaluate):
     """`valid` 0 equals a campaign without the spot (one that is not the first of its stop)."""
     spots = ordered_spots(dozen.campaign)

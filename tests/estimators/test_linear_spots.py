@@ -87,20 +87,6 @@ def test_groups_hold_the_dense_quantities(seed, places):
         np.testing.assert_allclose(group.precision, precision[rows, rows], rtol=DENSE, atol=DENSE)
 
 
-@pytest.mark.parametrize("places", [0, 5])
-def test_errors_at_places_are_what_the_residuals_leave_of_them(places):
-    """N(0, 1) a priori: their mean and covariance given residual r - J dz, by the dense joint normal density."""
-    spots = campaign(places=places)
-    residual, jacobian = spots.residual.ravel(), spots.jacobian.reshape(-1, PARAMETERS)
-    # Covariance of errors and residuals is the errors' own columns.
-    gain = np.linalg.solve(dense_covariance(spots), spots.places.reshape(len(residual), places)).T
-    information = stop_information(spots)
-    np.testing.assert_allclose(information.place_mean, gain @ residual, rtol=DENSE, atol=DENSE)
-    np.testing.assert_allclose(information.place_slope, -gain @ jacobian, rtol=DENSE, atol=DENSE)
-    left = np.eye(places) - gain @ spots.places.reshape(len(residual), places)
-    np.testing.assert_allclose(information.place_covariance, left, rtol=DENSE, atol=DENSE)
-
-
 def test_leave_one_out_is_the_prediction_by_all_others():
     """Conditional mean and covariance of each spot given the rest, computed by brute force."""
     spots = campaign(places=3)
@@ -116,6 +102,21 @@ def test_leave_one_out_is_the_prediction_by_all_others():
     np.testing.assert_allclose(
         leave_one_out_chi2(stop_information(spots), np.ones(len(expected))), expected, rtol=DENSE
     )
+
+
+def test_leave_one_out_of_weighted_spots_is_that_of_full_weight():
+    """Robust weights scale a spot's noise; its distance is that at its full weight again."""
+    spots = campaign()
+    weight = np.random.default_rng(11).uniform(0.2, 1.0, len(spots.residual))
+    root = np.sqrt(weight)[:, None]
+    weighted = replace(spots, residual=root * spots.residual, load=root[..., None] * spots.load)
+    chi2 = leave_one_out_chi2(stop_information(weighted), weight)
+    for k in range(len(weight)):
+        alone = root.copy()
+        alone[k] = 1.0
+        full = replace(spots, residual=alone * spots.residual, load=alone[..., None] * spots.load)
+        expected = leave_one_out_chi2(stop_information(full), np.ones(len(weight)))[k]
+        assert chi2[k] == pytest.approx(expected, rel=DENSE)
 
 
 def test_standard_deviations_without_a_stop_are_those_of_a_fit_without_it():
@@ -134,6 +135,17 @@ def test_standard_deviations_without_a_stop_are_those_of_a_fit_without_it():
         sds = standard_deviations_without(group, posterior, gradients)
         np.testing.assert_allclose(sds, expected, rtol=DENSE)
         assert np.all(sds >= np.sqrt(np.einsum("qi,ij,qj->q", gradients, posterior, gradients)))
+
+
+def test_sd_is_infinite_where_nothing_else_informs():
+    """One stop alone informs a parameter that has no prior."""
+    spots = campaign(stops=2)
+    jacobian = np.zeros_like(spots.jacobian[..., :1])
+    jacobian[stop_of_looks(2) == 1] = 1.0
+    spots = replace(spots, jacobian=jacobian)
+    information = stop_information(spots)
+    sds = standard_deviations_without(information.groups[1], np.linalg.inv(information.fisher), np.ones((1, 1)))
+    assert sds[0] > 1e6  # infinite up to rounding of the information, 1e-15
 
 
 @pytest.mark.parametrize("blamed", [0, 1])

@@ -52,19 +52,3 @@ def test_parts_make_the_whole(both, dozen):
     assert not moving[[INDEX[name] for name in NOISE_NAMES]].any()
     # Neither the noise scales nor the harmonics (8) nor, without temperatures, the shifts by them (2) move a look.
     assert moving.sum() == len(NAMES) - len(NOISE_NAMES) - 8 - 2
-
-
-@pytest.mark.thorough
-def test_slopes_are_the_derivatives_by_angles_and_range(both, dozen):
-    """Of the ideal look along pan, tilt and range, by central differences: truncation and rounding 1e-6 of them."""
-    looks = both[2]
-    z = dozen.z + 0.5 * np.random.default_rng(61).standard_normal(len(NAMES))
-    pose = np.stack([looks.pan_rad, looks.tilt_rad, looks.range_mm])
-    with jax.enable_x64(True):
-        model = dozen.space.model(jnp.asarray(z))
-        observed = jax.jit(lambda at: observe(model, at, dozen.arrays.azimuth_convention))
-        for axis, (slopes, step) in enumerate(((looks.by_pan, 1e-5), (looks.by_tilt, 1e-5), (looks.by_range, 1e-2))):
-            nudge = step * np.eye(3)[axis][:, None]
-            expected = (np.asarray(observed(pose + nudge)) - np.asarray(observed(pose - nudge))) / (2 * step)
-            jacobian = np.stack(slopes)
-            assert np.max(np.abs(jacobian - expected)) < 1e-6 * np.max(np.abs(expected))

@@ -10,6 +10,7 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.files.documents import (
     JSON_BYTES_MAX,
+    LINES_CHARS_MAX,
     TOML_BYTES_MAX,
     Keys,
     parse_json,
@@ -139,6 +140,12 @@ def test_toml_messages_name_the_line_of_the_key_itself(name):
     text, path, line = TOML_PLACES[name]
     keys = Keys({}, "t.toml", parse_toml(text.encode(), "t.toml").text, path[:-1])
     assert keys.refuse(path[-1], "code", "allowed", "remedy").line == line
+
+
+def test_lines_are_searched_at_the_beginning_of_a_file_alone():
+    text = '{"a": {"c": 1},\n"b": "' + " " * LINES_CHARS_MAX + '",\n"c": {"a": 1}}'
+    values = parse_json(text.encode(), "t.json")
+    assert [values.refuse(key, "code", "allowed", "remedy").line for key in ("a", "b", "c")] == [1, 2, None]
 
 
 def test_json_messages_name_the_line_of_the_key_itself():

@@ -93,6 +93,18 @@ def test_jpegs_of_unusual_kinds_are_refused():
         refused(data[:length])
 
 
+def test_deep_pngs_keep_every_bit_at_half_the_size():
+    deep = picture().astype(np.uint16) * 16 + 5
+    np.testing.assert_array_equal(decode_image(png_bytes(deep), "a.png"), deep)
+    np.testing.assert_array_equal(decode_image(png_bytes(deep[..., 0]), "a.png"), np.repeat(deep[..., :1], 3, axis=2))
+    data = bytearray(png_bytes(deep))
+    side = int((IMAGE_PIXELS_MAX // 2) ** 0.5)
+    data[16:24] = side.to_bytes(4) * 2
+    assert image_size(bytes(data), "a.png") == (side, side)
+    data[16:24] = (side + 1).to_bytes(4) * 2
+    assert refused(bytes(data)).code == "image-size"
+
+
 def test_grey_levels_of_deep_pictures():
     """Full scale is 255 at any bit depth; eight bits are unchanged."""
     shallow = picture()
@@ -116,3 +128,10 @@ def test_pictures_are_small_and_the_window_is_on_the_spot():
     assert (row, column) == (WINDOW_PX / 2, WINDOW_PX / 2)
     corner = decode_image(small_picture(image, (0.0, 719.0)), "corner")
     assert corner.shape == window.shape
+
+
+def test_pictures_of_twelve_bits_are_shown():
+    image = np.full((40, 40, 3), 4000, np.uint16)
+    assert decode_image(small_picture(image), "picture").mean() > 240
+    with pytest.raises(ValueError, match="no pixel"):
+        small_picture(image, (40.0, 3.0))

@@ -164,6 +164,14 @@ def test_a_chain_that_says_something_else_is_known_no_better_than_both_agree(jud
     assert message.startswith(words)
 
 
+def test_where_every_headline_is_fixed_the_others_must_agree(judged, monkeypatch):
+    """A rig whose geometry is stated as known: the campaign determines its noise."""
+    monkeypatch.setattr(TwoNormals, "headlines", ("effective_mirror_offset_mm",))
+    assert judged(chain_of(independent()), weighted()).convergence.converged
+    sample = judged(chain_of(independent()), weighted(-0.15))
+    assert sample.convergence.missing and NAMES[RATIO] in sample.convergence.agreement.worst.quantity
+
+
 @pytest.mark.parametrize(
     ("weighted", "chain", "agrees", "chosen"),
     [

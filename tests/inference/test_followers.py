@@ -9,7 +9,7 @@ import pytest
 from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
-from tvsbayes.inference.proposal import Independence, first_proposal, forest
+from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.inference.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 
 GRID = np.linspace(-12.0, 16.0, 561)
@@ -98,45 +98,6 @@ def test_a_pair_that_explains_the_same_scatter_is_proposed_as_the_target_has_it(
     assert followed > 0.2 > 20 * effective_share(target, 2)
 
 
-def test_coordinates_follow_those_that_they_depend_on_most(monkeypatch):
-    """A chain of three, the middle one known by both others, and a fourth that depends on none."""
-
-    def target(w: np.ndarray) -> np.ndarray:
-        chained = (w[:, 0] - w[:, 1]) ** 2 + (w[:, 2] - w[:, 1]) ** 2
-        # Little between the ends: what the middle one leaves of their dependence.
-        return -0.5 * (w[:, 1] ** 2 + chained / 0.5**2 + w[:, 3] ** 2) + 0.1 * w[:, 0] * w[:, 2]
-
-    assert set(forest(target, np.arange(4), 4)) == {(1, 0), (1, 2)}
-    # Rows, not places: of other tabulated coordinates they are others.
-    assert {frozenset(pair) for pair in forest(target, np.array([3, 1, 2]), 4)} == {frozenset((1, 2))}
-    assert forest(target, np.array([3]), 4) == [] and forest(target, np.array([1, 3]), 4) == []
-    followed = effective_share(target, 4)
-    monkeypatch.setattr("tvsbayes.inference.proposal.forest", lambda *_: [])
-    assert followed > 0.3 > 2 * effective_share(target, 4)
-
-
-def test_between_cuts_a_density_goes_on_as_it_does_at_them():
-    """A normal density; Gumbel's, a noise scale's, better than by lines; none where there is none."""
-    parabola, width = -0.5 * ((NODES - 0.3) / 0.9) ** 2, 0.8
-    gumbel = -NODES / width - np.exp(-NODES / width)
-    cuts = np.isin(NODES, CUT_NODES)
-    values = between_cuts(np.array([parabola, gumbel])[:, cuts])
-    # Rounding of the largest value, some operations long; cuts up to 3 stand 1 apart, and a slope needs two beside.
-    rounding = 64 * np.spacing(np.abs(parabola).max())
-    near = np.abs(NODES) <= 1
-    np.testing.assert_allclose(values[0, near], parabola[near], atol=rounding)
-    np.testing.assert_allclose(values[0, np.abs(NODES) <= 3], parabola[np.abs(NODES) <= 3], atol=0.02)
-    np.testing.assert_allclose(values[0], parabola, atol=0.2)
-    np.testing.assert_allclose(values[1, cuts], gumbel[cuts], rtol=1e-12)
-    line = np.interp(NODES, CUT_NODES, gumbel[cuts])
-    near = ~cuts & (gumbel > gumbel.max() - 8)
-    # A thousandth is nothing in a logarithm, and where Gumbel's is nearly a line neither errs by more.
-    assert np.all(np.abs(values[1] - gumbel)[near] <= np.maximum(0.7 * np.abs(line - gumbel)[near], 1e-3))
-    some = between_cuts(np.where(CUT_NODES < 3, parabola[cuts], np.nan))
-    np.testing.assert_array_equal(np.isfinite(some), NODES < 2.5)
-    assert not np.isfinite(between_cuts(np.full((2, len(CUT_NODES)), -np.inf))).any()
-
-
 def test_a_hole_between_cuts_swings_nothing_above_its_neighbours():
     """The target may fall by 1e5 where the map's steps diverge: a cubic through it would rise as far beside."""
     cuts = -0.5 * CUT_NODES**2
@@ -148,3 +109,13 @@ def test_a_hole_between_cuts_swings_nothing_above_its_neighbours():
     # The inner one, at 2, is filled to the lower of its neighbours, at 3.
     at = np.argmin(np.abs(NODES - CUT_NODES[inner]))
     assert values[at] == pytest.approx(-0.5 * CUT_NODES[inner + 1] ** 2)
+
+
+def test_a_cliff_far_from_the_mode_leaves_the_density_beside_it_as_it_is():
+    """Where the map's steps diverge a target falls by 1e15: Akima's weights must not take all other slopes as equal."""
+    cuts = -0.5 * CUT_NODES**2
+    cuts[CUT_NODES >= 5] = [-7e2, -3e4, -5e15]
+    values = between_cuts(cuts[None])[0]
+    # Akima weighs the slope before a node by how far the two after it differ: those of the cliff by 700 against 1.
+    np.testing.assert_allclose(values[NODES < 3], -0.5 * NODES[NODES < 3] ** 2, atol=0.2)
+    assert np.all(values[NODES >= 3] <= cuts[CUT_NODES == 3])

@@ -7,6 +7,8 @@ from tvsbayes.instrument.parameters import (
     BLOCKS,
     KINDS,
     NAMES,
+    NOISE_NAMES,
+    RECEIVER_NAMES,
     REGISTRY,
     RIG_NAMES,
     RIG_PRIORS,
@@ -41,6 +43,14 @@ def test_every_default_lies_in_its_range():
         assert parameter.low <= prior.value <= parameter.high and 0 <= prior.u <= parameter.u_max, name
         assert prior.distribution in KINDS
         assert prior.distribution != "half-normal" or parameter.low == parameter.high == 0
+
+
+def test_noise_and_receiver():
+    gears = "transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"
+    plain = (*BLOCKS["stop_sd_deg"], "pixel_scale", "aperture_sd_deg")
+    assert NOISE_NAMES == (*plain, *names_of(*gears, "harmonic_amplitude_deg", "look_scatter_deg", "home_sd_deg"))
+    assert RECEIVER_NAMES == ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg", "aperture_sd_deg")
+    assert {RIG_PRIORS[name].distribution for name in plain} == {"log-normal"}
 
 
 def test_every_prior_is_in_one_group():

@@ -44,6 +44,12 @@ def test_any_parameter_may_stand_in_the_priors():
     assert one == other and other.priors["baseline_mm"] == Prior(199.0, 0.2)
 
 
+def test_one_camera_of_both_pictures_may_be_a_number(tmp_path):
+    """As in the template."""
+    text = re.sub(r"(?m)^(source|left|right) = .*\n", "", RIG_FILE).replace("[cameras]", "[cameras]\nsource = 3")
+    assert read_rig(write_rig(tmp_path, text)).cameras["source"] == 3
+
+
 def test_rig_table_round_trip():
     priors = {
         name: Prior(p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution)

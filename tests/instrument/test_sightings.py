@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.plausibility import check_campaign
+from tvsbayes.estimators.plausibility import check_campaign, misfit_causes
 from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.mechanisms import MECHANISMS, SIGHTING_HEAD, TWO_MIRROR
@@ -64,6 +64,10 @@ def test_folder_of_sightings_round_trips(simulated, tmp_path):
 def test_functions_of_spots_refuse_sightings(simulated, of_spots):
     with pytest.raises(InputError, match=r"found sightings of a head.*; allowed: spots that a stereo pair sees; give"):
         of_spots(simulated.campaign)
+
+
+def test_causes_of_a_failed_fit_need_no_spots(simulated):
+    assert misfit_causes(simulated.campaign, 3.0) == ()
 
 
 def test_two_tables_of_looks_are_refused(simulated, tmp_path):

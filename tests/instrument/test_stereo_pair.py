@@ -39,6 +39,12 @@ def test_rotation_vector_inverts_rotation_matrix(length):
             assert np.abs(rotation_vector(matrix) - vector).max() < ROUNDING
 
 
+def test_rotation_vector_takes_the_nearest_rotation():
+    matrix = rotation_matrix(np.array([0.1, 0.2, -0.3]))
+    # A symmetric stretch has no rotation: the polar factor is the rotation itself.
+    assert rotation_vector(matrix @ np.diag([1 + 1e-7, 1 - 1e-7, 1.0])) == pytest.approx([0.1, 0.2, -0.3], abs=ROUNDING)
+
+
 def test_stereo_vector_has_the_names_order_and_inverts():
     stereo = small_stereo()
     named = dict(zip(STEREO_PARAMETER_NAMES, stereo.vector, strict=True))

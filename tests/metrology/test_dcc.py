@@ -287,6 +287,19 @@ def test_the_number_of_the_report_is_in_the_certificate_that_carries_it():
     assert len(names) == 4
 
 
+def test_development_versions_are_cut_to_a_release():
+    case = certified()
+    for version, release in (
+        ("0.1.0.dev3+g1a2b", "v0.1.0"),
+        ("2026.1.0", "v0"),
+        ("12", "v12"),
+        ("1.2.3.4.5", "v1.2.3.4"),
+    ):
+        root = case.with_provenance(versions={**case.fit.provenance.versions, "tvsbayes": version}).root()
+        assert structure_problems(root) == [], version
+        assert set(texts(root, ".//dcc:release")) == {release}
+
+
 def test_a_failed_validation_is_declared_with_its_factor():
     failed = Validation(False, 0.01, "the cameras moved: from spot 9 on", 3.25, ())
     root = certified().with_summary(validation=failed).root()

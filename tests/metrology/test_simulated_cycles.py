@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from support.bent_rig import BENT, WOBBLE
 from support.known_calibration import known_calibration
 
-from tvsbayes.metrology.simulated_cycles import simulated_runs
+from tvsbayes.metrology.simulated_cycles import simulated_runs, target_steps
 from tvsbayes.twin.physics import harmonics_deg, mirror_chain, transmission
 
 
@@ -73,3 +74,11 @@ def test_stop_errors_scatter_runs_by_side():
     for values, sd in ((up, 0.2), (down, 0.05)):
         assert values.std() == pytest.approx(sd, rel=4 / np.sqrt(2 * count))
     assert abs(np.corrcoef(up.ravel(), down.ravel())[0, 1]) < 4 / np.sqrt(count)
+
+
+def test_targets_avoid_the_turn_round_points_and_repeat():
+    steps = target_steps(-100, 300, 0.06)
+    assert steps == target_steps(-100, 300, 0.06) and len(steps) == 5
+    assert -100 < steps[0] and steps[-1] < 300 and list(steps) == sorted(set(steps))
+    assert len({b - a for a, b in pairwise(steps)}) > 1
+    assert target_steps(0, 2, 0.06) == ()

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import equinox as eqx
@@ -82,6 +83,13 @@ def test_double_precision_and_any_kind_of_number(traces):
     results = [function(pair(), 1.0), function(of_jax, weak), function(pair(), np.float64(1.0)), function(of_jax, 1.0)]
     assert all(same(result, results[0]) for result in results) and results[0].double.dtype == np.float64
     assert function.traces == 1
+
+
+def test_every_shape_is_traced_once(traces):
+    function = Compiled(sums, Sums)
+    for count in (3, 4, 3, 4):
+        assert function(pair(count), 0.0).double.shape == (count,)
+    assert function.traces == 2 and len(stored(traces)) == 2
 
 
 def test_its_own_results_as_arguments_are_compiled_for_once(traces):
@@ -224,6 +232,16 @@ def test_what_cannot_be_exported_is_compiled_as_ever(traces):
     function = Compiled(called_back, jax.Array)
     np.testing.assert_array_equal(function(np.arange(3.0)), np.sin(np.arange(3.0)))
     assert not stored(traces)
+
+
+def test_threads_trace_once(traces):
+    function = Compiled(sums, Sums)
+    threads = [threading.Thread(target=function, args=(pair(), 1.0)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert function.traces == 1
 
 
 CHILD = """

@@ -12,7 +12,7 @@ from support.small_campaign import small_stereo
 
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.gear_processes import BlockRoot, GearScales, Places, column_blocks, place_root
+from tvsbayes.model.gear_processes import GearScales, Places, place_root
 from tvsbayes.model.headlines import SeenLine, effective_deg_per_step, line_deg_per_step
 from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.model.parameter_space import parameter_space
@@ -70,29 +70,6 @@ def test_the_factor_is_that_of_the_covariance_of_both_processes():
         # Padding belongs to no other place.
         rest = np.setdiff1d(np.arange(2 * size), known)
         assert not (covariance[np.ix_(rest, known)]).any()
-
-
-def test_blocks_are_those_of_the_factor():
-    """Its products too, of two points at once; errors and plays of three places of pan and two of tilt."""
-    rng, angle_rad, on_tilt = np.random.default_rng(5), ANGLE_RAD[VALID], ON_TILT[VALID]
-    dense = place_root(scales(), angle_rad, on_tilt, VALID[VALID])
-    of_play = np.repeat([False, True], len(on_tilt))
-    root = column_blocks(scales(), np.tile(angle_rad, 2), np.tile(on_tilt, 2), of_play)
-    assert [block.shape for block in root.blocks] == [(2, 3, 3), (2, 2, 2)] * 2 and root.size == 10
-    x, y = rng.standard_normal((2, 10)), rng.standard_normal((2, 10, 4))
-    symmetric = y @ np.swapaxes(y, 1, 2)
-    back = np.swapaxes(dense, 1, 2)
-    for one in (root, BlockRoot((dense,))):
-        for value, expected in (
-            (one.times(x), (dense @ x[..., None])[..., 0]),
-            (one.transposed_times(y), back @ y),
-            (one.congruent(symmetric), back @ symmetric @ dense),
-        ):
-            np.testing.assert_allclose(value, expected, rtol=RELATIVE, atol=RELATIVE * np.abs(expected).max())
-    plays_of_tilt = column_blocks(scales(), angle_rad[3:], on_tilt[3:], np.ones(2, dtype=bool))
-    np.testing.assert_allclose(plays_of_tilt.blocks[0], dense[:, 8:, 8:], rtol=RELATIVE)
-    with pytest.raises(ValueError, match="plays of pan and of tilt"):
-        column_blocks(scales(), angle_rad, on_tilt[::-1], np.zeros(5, dtype=bool))
 
 
 @pytest.fixture(scope="module")

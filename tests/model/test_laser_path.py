@@ -195,6 +195,15 @@ def test_wheel_error_enters_behind_the_play(gears):
     np.testing.assert_allclose(angle, expected, atol=100 * ANGLE_ROUNDING_RAD)
 
 
+def test_unknown_play_takes_the_error_at_the_middle_of_its_band(gears):
+    """The band stays as wide as the play whatever the error; at mid-play both members have turned by q."""
+    values = np.concatenate([np.radians([22.5, 90, 0, 0, 0.4, 0.4, 0]), WOBBLE_RAD, WOBBLE_RAD])
+    angle, play_sd, _ = gears(values, [[1, 1]], [True], [[0, 0]])
+    expected = np.radians([22.5 + H1S - H2C, 90 + H1S - H2C])
+    np.testing.assert_allclose(angle[0], expected, atol=ANGLE_ROUNDING_RAD)
+    np.testing.assert_allclose(play_sd[0], UNIFORM_SD * np.radians(0.4), atol=ANGLE_ROUNDING_RAD)
+
+
 def test_beam_angles_of_the_nominal_chain():
     """Unit Jacobian, azimuth psi, elevation beta, effective mirror offset +L at every pose."""
     compute = jax.jit(jax.vmap(lambda v: beam_angles(optics_of(v[:10]), v[10], v[11])))

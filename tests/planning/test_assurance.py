@@ -9,11 +9,11 @@ import pytest
 from support.coarse_planning import ROUNDING
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX
+from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, RIG_NAMES
 from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.planning.assurance import Assurance, Family, judged_z
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
-from tvsbayes.planning.expectation import PARAMETERS, information_of
+from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, information_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
@@ -112,3 +112,28 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, s
     per_direction = len(many) / 2
     # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
     assert scales(many, 1.0) - scales(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
+
+
+def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, pool, seen):
+    """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
+    columns = STOP_COLUMNS.ravel()
+    true = knowledge.z.copy()
+    true[columns] = 1.5
+    truth = believers(knowledge, true)
+    chosen = np.resize(np.arange(len(pool.looks)), 60)
+
+    def scatter(covariance):
+        low, high = (
+            judged_z(truth, seen[None], pool.looks.side, chosen, covariance[None], knowledge, np.full((1, 5), x))
+            for x in (0.0, 1.0)
+        )
+        return (high - low)[0, columns]
+
+    exact = np.zeros((PARAMETERS, PARAMETERS))
+    geometry = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    # No information is gained where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
+    precision = np.diag(knowledge.precision)
+    unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
+    left_over = 1 - np.sum(geometry & (precision > 0)) / (2 * seen.seen[chosen].sum())
+    # Scatter is 1 / sqrt(information) but for the prior, which 30 stops of a direction outweigh 50 times.
+    assert scatter(exact) / scatter(unknown) == pytest.approx(1 / math.sqrt(left_over), rel=0.03)

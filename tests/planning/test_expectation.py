@@ -14,11 +14,12 @@ from support.dozen_spots import dozen_plan
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.gears.priors import half_normal_coordinate
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import (
     NOISE_COLUMNS,
+    design_arrays,
     expect,
     information_of,
 )
@@ -71,6 +72,15 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
     np.testing.assert_allclose(both, sum_alone, atol=1e-9 * np.abs(sum_alone).max())
     ratio = INDEX["degrees_per_step.pan"]
     assert both[ratio, ratio] < 0.9 * less[ratio, ratio]
+
+
+@pytest.mark.parametrize("moves", [256, 257])
+def test_arrays_hold_every_move_of_a_plan(mounted_rig, moves):
+    """One move more than twice the smallest number of looks: a homing and two moves per look, 128 times."""
+    orders = (("home", 0, 0), ("place", "d1"), *(("move", n, 0) for n in range(2, moves + 1)), ("look",))
+    log = run_plan(steps(*orders), mounted_rig, ("left", "up"))
+    arrays = design_arrays(log.moves, [moves - 1], mounted_rig, homed_from=1, aperture=False)
+    assert len(log.moves) == moves and np.array_equal(arrays.moves.steps[:moves, 0], [m.pan_steps for m in log.moves])
 
 
 def test_plans_of_any_ordinary_size_share_one_trace(knowledge):

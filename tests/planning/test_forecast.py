@@ -17,7 +17,6 @@ from tvsbayes.planning.forecast import (
     classic_answer,
     classic_count,
     classic_forecast,
-    value_of_classic,
 )
 from tvsbayes.planning.target import parse_target
 from tvsbayes.twin.physics import local_deg_per_step
@@ -63,18 +62,6 @@ def test_the_classics_forecast_is_what_its_experiments_do(mounted_rig, knowledge
         assert abs(error) > 10 * sd / math.sqrt(count), "the error shows, or its sign would be free"
         # Scatter moves pixels and so the derivatives: by its share of the ratio, 1 %, over sqrt(400).
         assert forecast.stereo_u[index] == pytest.approx(result.u_stereo_deg_per_step, rel=0.02), name
-
-
-def test_the_classics_value_adds_stereo_to_the_mean_of_its_experiments():
-    """16 experiments are 4 of a direction: hypot(6e-4 / 2, 4e-4) = 5e-4; the worse direction, its median instrument."""
-    sd = np.array([[6e-4, 1e-4, 0, 0], [6e-4, 1e-4, 0, 0], [60e-4, 1e-4, 0, 0]])
-    forecast = ClassicForecast(sd, np.zeros((3, 4)), np.array([4e-4, 1e-4, 0, 0]))
-    worst, left = (parse_target(f"{name} <= 1e-4 deg/step") for name in ("u(worst)", "U95(left)"))
-    assert value_of_classic(forecast, worst, 16) == pytest.approx(5e-4, rel=1e-12)
-    assert value_of_classic(forecast, left, 16) == pytest.approx(1.96 * 5e-4, rel=1e-4)
-    for other in (parse_target("u(backlash.pan) <= 1 deg"), parse_target("u(x) at 1000,0,0 mm <= 1 mm")):
-        assert value_of_classic(forecast, other, 16) is None
-    assert value_of_classic(forecast, worst, 7) is None, "one experiment has no scatter"
 
 
 @pytest.fixture(scope="module")

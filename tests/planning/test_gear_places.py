@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -13,7 +15,11 @@ from support.commands import steps
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, Prior, names_of
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
+from tvsbayes.model.gear_processes import Places
+from tvsbayes.model.headlines import SeenLine, line_deg_per_step
+from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.planning.assurance import Assurance, Family, instrument_gears, judged_z
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
@@ -111,6 +117,39 @@ def test_a_line_through_looks_is_the_least_squares_line_of_what_places_carry():
 
 
 @pytest.mark.thorough
+def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
+    """The slope and its derivatives along any line, at one instrument: by the formula of fits itself, by differences.
+
+    An axis without a line has the slope of its mirrors at the pose.
+    """
+    known, _ = real
+    gears, pose = known.gears, np.radians([7.0, 3.0])
+    z = known.z + 0.3 * np.random.default_rng(2).standard_normal(PARAMETERS)
+    share = gears.line_through(np.array([[0, -60], [60, 20], [200, 75]]), np.ones(3))
+    places = Places(placed(gears.steps), placed(gears.on_tilt), placed(np.ones(len(gears.steps), dtype=bool)))
+
+    @jax.jit
+    def traced(z, errors_rad, share):
+        model = known.space.model(z)
+        mirrors = beam_angles(model.optics, *jnp.asarray(pose))
+        return line_deg_per_step(model, SeenLine(jnp.asarray(pose), places, share), errors_rad, mirrors)
+
+    def slopes(z, errors, share):
+        with jax.enable_x64(True):
+            return np.asarray(traced(z, gears.root @ errors, share))
+
+    nothing = np.zeros(gears.size)
+    for one in (share, np.where(gears.on_tilt, 0.0, share), gears.share):
+        headlines = replace(gears, share=one).headlines(z, known.space, pose)
+        np.testing.assert_allclose(np.asarray(headlines.value)[:4], slopes(z, nothing, one), rtol=1e-12)
+        step = np.random.default_rng(3).standard_normal(known.size)
+        ends = [slopes(z + h * step[:PARAMETERS], h * step[PARAMETERS:], one) for h in (1e-5, -1e-5)]
+        wanted = (ends[0] - ends[1]) / 2e-5
+        # Central differences of angles near 1 rad in float64: 1e-16 / 1e-5 in 100 steps, some 1e-11 deg/step.
+        np.testing.assert_allclose(np.asarray(headlines.gradient)[:4] @ step, wanted, atol=1e-9)
+
+
+@pytest.mark.thorough
 def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_own_scales(real):
     """Assurance of designs equals the plan judged move by move, on gears whose errors are as large as drawn.
 
@@ -186,6 +225,7 @@ def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
     assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("ratio", "axis"), [("left", 0), ("up", 1)])
 def test_a_plan_for_real_gears_looks_from_more_counters(mounted_rig, monkeypatch, ratio, axis):
     """Where mirrors are known and stops precise: a line along errors of 0.08 deg needs more counters than a gear's.
@@ -211,6 +251,7 @@ def test_a_plan_for_real_gears_looks_from_more_counters(mounted_rig, monkeypatch
     assert counts[1][0] > counts[0][0] and counts[1][1] > counts[0][1], counts
 
 
+@pytest.mark.thorough
 def test_the_papers_two_counters_are_worse_off_elsewhere_and_named(real, real_rig):
     known, _ = real
     paper = baseline_of("paper", information_of(paper_protocol(12), known), known, WORST)
@@ -223,6 +264,7 @@ def test_the_papers_two_counters_are_worse_off_elsewhere_and_named(real, real_ri
     assert not [text for text in check_plan(real_rig, grid).warnings if "gear error" in text]
 
 
+@pytest.mark.thorough
 def test_a_point_between_the_places_has_what_they_leave_open(real):
     known, _ = real
     pose = np.zeros(2)
@@ -240,6 +282,7 @@ def test_a_point_between_the_places_has_what_they_leave_open(real):
     assert left_open[0.0] < 0.1 * left_open[900.0]
 
 
+@pytest.mark.thorough
 def test_limits_name_the_transmission_error(real):
     known, _ = real
     looks = [order for pan, tilt in [(0, -90), (240, 90)] * 6 for order in (("move", pan, tilt), ("look",))]

@@ -158,6 +158,14 @@ def test_shares_of_two_parameters_by_hand(knowledge):
     assert list(shares) == ["looks", "stereo calibration", STOP_AT_POINT, "focal scale"], "largest first"
 
 
+def test_after_data_priors_and_campaign_are_one_share(knowledge):
+    """Precision 2 of all and data diag(2, 0): S = diag(1/4, 1/2), S g = (1/2, 3/2); 2 (1/4 + 9/4) and 2 / 4."""
+    known = replace(knowledge, precision=2 * np.eye(PARAMETERS), after_data=True)
+    gradient = at({SCALE: 2.0, STEREO: 3.0})[None]
+    shares = split_of(known, np.diag(at({SCALE: 2.0})), None, Sensitivity(gradient))
+    assert shares == pytest.approx({"the campaign and its priors": 5.0 / 5.5, "looks": 0.5 / 5.5})
+
+
 def target_of(limit: float) -> Target:
     return Target("", "left", limit, "deg/step")
 

@@ -10,15 +10,17 @@ import pytest
 from support.coarse_planning import ROUNDING
 
 from tvsbayes.instrument.plan import plan_minutes
+from tvsbayes.planning.candidates import Positions
+from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
+    LookArrays,
+    Looks,
     Seen,
     arrange,
-    covariance_of,
     information_of_looks,
 )
-from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -39,24 +41,6 @@ def test_looks_add_up_to_the_plan_they_make(knowledge, pool, seen):
             seen, picks, arranged.path, knowledge.space, variances, arranged.warm_minutes(knowledge.rig)
         )
         assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
-
-
-def test_order_of_experiments_does_not_matter(knowledge, pool, seen):
-    generator = np.random.default_rng(6)
-    picks = generator.permutation(len(pool.looks))[:16]
-    at = sensitivity(
-        parse_target(DEFAULT_TARGET),
-        knowledge.z,
-        knowledge.space,
-        knowledge.rig.table,
-        seen.mirror_angles_rad.mean(axis=0),
-    )
-    values = []
-    for order in (picks, generator.permutation(picks)):
-        path = arrange(pool.looks[order], knowledge.sheets, pool.run_up).path
-        information = information_of_looks(seen, order, path, knowledge.space, None)
-        values.append(at.value(covariance_of(knowledge.precision + information)))
-    assert values[1] == pytest.approx(values[0], rel=ROUNDING)
 
 
 def test_every_look_is_reached_from_its_side(pool, knowledge):
@@ -120,3 +104,12 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
                 whole = np.linalg.inv(covariance) - np.eye(PARAMETERS)
             whole = whole[:PARAMETERS, :PARAMETERS]
             assert np.abs(information - whole).max() < ROUNDING * np.abs(whole).max()
+
+
+def test_a_position_is_visible_to_the_share_of_instruments_that_see_it(knowledge):
+    z = draw_instruments(knowledge, 4, seed=1).z
+    positions = Positions(np.array([[0, 0], [240, 0], [900, 0]]), np.array([0, 0, 1]))
+    looks = Looks(positions.steps, np.ones((3, 2), dtype=int), positions.sheet)
+    shown = [LookArrays(looks, knowledge, False).at(point, knowledge.space).seen for point in z]
+    share = positions.visible(knowledge, z)
+    assert share == pytest.approx(np.mean(shown, axis=0), abs=1e-12) and share[2] == 0 < share[0]

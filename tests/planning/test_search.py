@@ -72,6 +72,18 @@ def test_greedy_choices_are_those_of_inverted_covariances(criterion, share):
     assert search.among(np.zeros(30, dtype=bool)).greedy(3) == []
 
 
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_a_quantity_without_variance_does_not_steer_a_search(criterion):
+    generator = np.random.default_rng(10)
+    rows, gradient = generator.normal(size=(12, 4, 6)), generator.normal(size=(3, 6))
+    gradient[1] = 0
+    with_fixed, without = (
+        Search(rows, np.eye(6), g, np.zeros(len(g)), criterion) for g in (gradient, gradient[[0, 2]])
+    )
+    assert with_fixed.greedy(4) == without.greedy(4)
+    assert math.isfinite(with_fixed.value([0, 1]))
+
+
 def test_criteria_are_what_they_say():
     covariance, reference = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([8.0, 2.0])
     assert scores(covariance, reference, "c") == pytest.approx(4.0 + MEAN_WEIGHT * 3.0)

@@ -83,6 +83,17 @@ def test_independent_stops_add_up_to_the_plan_itself(designs):
     assert designs.powers(one_homing, 1)[turned] < many[turned]
 
 
+def test_candidates_keep_to_the_limits(designs, watched_fit, monkeypatch):
+    reached = {axis: [getattr(m, f"{axis}_steps") for m in watched_fit.campaign.moves] for axis in ("pan", "tilt")}
+    steps = designs.steps(designs.grown(("d2",), 1.0)[-1], 2)
+    for axis, counters in reached.items():
+        moved = [getattr(step, f"{axis}_steps") for step in steps if step.action in ("home", "move")]
+        assert min(counters) <= min(moved) and max(moved) <= max(counters)
+    # A run-up longer than the travel leads beyond it, whatever the look.
+    monkeypatch.setitem(designs.__dict__, "_run_up", np.array([1000, 1000]))
+    assert not any(map(designs._reachable, designs.candidates))
+
+
 def test_looks_keep_to_the_sheets_of_the_rig(watched_fit):
     """The campaign looked at d1 and d2."""
     rig = read_rig(RIG)

@@ -79,6 +79,18 @@ def test_independent_draws_add_their_squared_errors(first, second, monkeypatch):
     assert mixture.summary.mcse_mean[column] == pytest.approx(together, rel=0.05)
 
 
+def test_shares_of_the_error_of_a_mean_do_not_depend_on_its_origin(first, second, monkeypatch):
+    monkeypatch.setattr(homing_mixture, "END_ERROR_MAX", 1e9)
+    shares = Mixture((first, second), 0).shares_of_error
+    moved = tuple(replace(way) for way in (first, second))
+    for way, each in zip(moved, (first, second), strict=True):
+        way.weighed.__dict__["columns"] = {name: 1.0 + x for name, x in each.weighed.columns.items()}
+    # Rounding of numbers of 1e-4 beside 1.
+    np.testing.assert_allclose(Mixture(moved, 0).shares_of_error, shares, rtol=1e-9)
+    monkeypatch.undo()
+    assert not np.allclose(Mixture((first, second), 0).shares_of_error, shares, rtol=1e-3), "ends weigh draws otherwise"
+
+
 def test_a_way_is_as_probable_as_firmware_homes_that_way(first):
     """Of equal evidence: always from one side 0.45, from anywhere 0.1 (formulation 3.1)."""
     ways = (
@@ -120,6 +132,17 @@ def test_weights_that_cannot_be_trusted_are_replaced(first, monkeypatch):
     assert refitted.ways[1].pool.proposals[0] is not alone.ways[1].pool.proposals[0] and refitted.left == 0
     assert refitted.ways[1].pool.counts == (ROUND,), "draws that a proposal was fitted to are in the answer"
     assert refitted.improved() is None
+
+
+def test_an_improbable_way_need_not_be_reliable(first, second, monkeypatch):
+    """Its tail index is not that of the mixture."""
+    heavy = replace(second)
+    heavy.weighed.__dict__["smoothed"] = replace(second.weighed.smoothed, pareto_k=0.9)
+    for chance, k in ((0.05, first.weighed.smoothed.pareto_k), (0.2, 0.9)):
+        mixture = Mixture((first, heavy), 0)
+        mixture.__dict__["probabilities"] = np.array([1 - chance, chance])
+        assert mixture.acceptance.pareto_k == k
+        assert bool(mixture.acceptance.missing) == (k == 0.9)
 
 
 def test_the_posterior_says_how_probable_each_way_is(first, second):

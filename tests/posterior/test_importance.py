@@ -315,6 +315,13 @@ def test_the_tail_index_that_draws_can_bear_grows_with_their_number():
     assert k_max(2000) < 0.7 == k_max(2200) == k_max(10**6)
 
 
+def test_the_draws_that_an_accepted_answer_takes_follow_from_the_worst_error():
+    """Errors fall with the root of the number of draws."""
+    assert MonteCarloError(0.2, (0.1, 0.2)).rounds_factor == pytest.approx(4.0)
+    assert MonteCarloError(0.1, (0.1, 0.6)).rounds_factor == pytest.approx(9.0)
+    assert MonteCarloError(0.1, (0.2, 0.2)).within(0.1, 0.2) and not MonteCarloError(0.1, (0.2, 0.21)).within(0.1, 0.2)
+
+
 def test_a_density_without_values_is_refused(fitted, monkeypatch):
     def valued(target, w, generator):
         return Points(w, np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0), {})
@@ -322,6 +329,14 @@ def test_a_density_without_values_is_refused(fitted, monkeypatch):
     monkeypatch.setattr(Target, "valued", valued)
     with pytest.raises(NotConverged, match="not finite"):
         importance_run(fitted, SEED)
+
+
+def test_no_chain_is_kept_or_resumed_without_one(fitted, tmp_path):
+    for options in ({"checkpoint": tmp_path / "chain.npz"}, {"resume": True}):
+        with pytest.raises(ValueError, match=r"chain|checkpoint"):
+            sample(fitted, "importance", **options)
+    with pytest.raises(ValueError, match="allowed: importance, emcee"):
+        sample(fitted, "nested")
 
 
 @pytest.mark.thorough

@@ -91,6 +91,23 @@ def test_every_look_scatters_by_its_direction_its_homing_and_its_play(dozen, err
     assert np.abs(errors.mean(axis=0)).max() < 5 * np.sqrt(expected.max() / DRAWS)
 
 
+def test_an_error_is_held_while_its_axis_stands(dozen, errors_deg):
+    errors, _ = errors_deg
+    spots, moves = ordered_spots(dozen.campaign), dozen.campaign.moves
+    held = 0
+    for row in range(1, len(spots)):
+        between = moves[spots[row - 1].move : spots[row].move + 1]
+        for axis, name in enumerate(("pan_steps", "tilt_steps")):
+            same = len({getattr(m, name) for m in between}) == 1 and not any(m.pan_approach for m in between[1:])
+            change = np.abs(errors[:, row, axis] - errors[:, row - 1, axis]).max()
+            if same and row not in (4, 6):
+                assert change < 1e-12
+                held += 1
+            elif not same:
+                assert change > 0
+    assert held >= 5
+
+
 def test_an_absolute_zero_walks_on_over_homings(dozen):
     """From the first move on; that of the other axis is set by its homings and walks from there."""
     campaign = replace(dozen.campaign, rig=replace(dozen.campaign.rig, absolute=("pan",)))

@@ -13,6 +13,7 @@ from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.inference.diagnosis import diagnose
+from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import DRAWING, sample, walking
 from tvsbayes.posterior.target import Target
@@ -175,6 +176,12 @@ def test_what_is_missing_when_the_time_is_over_is_reported(fitted, monkeypatch):
     missing = "; ".join(result.convergence.missing)
     for word in ("R-hat", "autocorrelation times"):
         assert word in missing
+
+
+@pytest.mark.thorough
+def test_a_chain_of_another_tier_is_not_resumed(fitted, long):
+    with pytest.raises(InputError, match="sampled from other data"):
+        stored_chain(long[1], fitted, SEED, "other")
 
 
 def test_a_linear_function_is_propagated(long):

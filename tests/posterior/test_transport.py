@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from support.small_posterior import ROUNDING, play_priors, small_fit
+from support.small_posterior import ROUNDING, small_fit
 from support.two_parameters import (
     BACKLASH,
     CURVE,
@@ -22,12 +22,9 @@ from support.two_parameters import (
     play_near_zero,
     ridge,
     ridge_density,
-    ridge_residual,
     route,
 )
 
-from tvsbayes.estimators.annealed_stage import linearised_at
-from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.target import Target
@@ -36,13 +33,9 @@ from tvsbayes.posterior.transport import (
     FAR_ABOVE,
     Transport,
     by_width,
-    centred_count,
-    curvatures,
     positive_factor,
 )
 
-PRECISION = 1e-5
-"""Relative, of the map at other scales."""
 FLOOR = 1e-9
 """Of a centred map, in y: Gauss and Newton take differences of residuals of 1e4 units of noise."""
 
@@ -52,17 +45,10 @@ def uncentred(path: Transport) -> Transport:
     return replace(path, narrow=0, bend=path.bend[:, :0, :0])
 
 
-def test_coordinates_are_ordered_by_the_variance_left_to_them():
-    root = np.random.default_rng(7).normal(size=(9, 9)) * np.geomspace(1e-3, 1.0, 9)
-    covariance = root @ root.T
-    order = by_width(covariance)
-    assert sorted(order) == list(range(9))
-    for place in range(9):
-        before, after = order[:place], order[place:]
-        cross = covariance[np.ix_(before, after)]
-        explained = cross * np.linalg.solve(covariance[np.ix_(before, before)], cross)
-        left = np.diag(covariance)[after] - explained.sum(axis=0)
-        assert np.argmax(left) == 0, place
+def test_no_coordinates_have_an_order():
+    """Where only the noise is estimated, nothing is left to whiten."""
+    order = by_width(np.zeros((0, 0)))
+    assert order.shape == (0,) and np.zeros(3)[order].shape == (0,)
 
 
 def test_to_w_undoes_the_map():
@@ -100,58 +86,12 @@ def test_centring_makes_a_curved_ridge_normal():
     np.testing.assert_allclose(path.to_w(points.z), w, atol=FLOOR)
 
 
-def test_a_kink_at_the_mode_turns_no_slope_over():
-    """As of a move as long as the play: it bends the residuals at once, not ever more with the distance."""
-    path, kink = replace(ridge(), bend=np.zeros((2, 1, 1))), 0.4
-    sd = path.root[1, 1]
-
-    def kinked(z: np.ndarray) -> np.ndarray:
-        residual = ridge_residual(z)
-        residual[:, 0] -= kink * np.abs(z[:, path.free[0]] - z[:, path.free[1]] / sd)
-        return residual
-
-    # The slope along the narrow coordinate is 0.6 on one side of the kink and 1.4 on the other: never below zero.
-    assert np.abs(curvatures(replace(path, residuals=kinked))[0, 1, 1] - TURN) * 2 < 1
-
-
-def test_a_coordinate_that_bends_the_ridge_of_a_narrower_one_stays_wide():
-    """Unless it is moved itself by more than it bends."""
-    moved = np.zeros((3, 3, 3))
-    moved[0, 0, 2] = 1.0
-    assert centred_count(moved) == 1
-    moved[0, 1, 1] = moved[1, 0, 1] = 2.0
-    assert centred_count(moved) == 2
-    moved[1, 1, 2] = 2.0
-    assert centred_count(moved) == 2, "half the square of 2 is less than the square of 2"
-    moved[1, 2, 2] = moved[2, 1, 2] = 2.0
-    assert centred_count(moved) == 1
-
-
 def test_centring_straightens_the_posterior_of_a_campaign():
     fitted, path = small_fit()
     w = np.random.default_rng(10).normal(size=(4 * BATCH, path.dimension))
     with jax.enable_x64(True):
         spread = [np.std(Target(fitted, p)(w) + 0.5 * np.sum(w**2, axis=1)) for p in (path, uncentred(path))]
     assert spread[0] < spread[1] / 3 and spread[0] < 2, spread
-
-
-def test_the_precision_at_other_noise_scales_is_the_smoothers():
-    """The eliminated states against the filter and smoother, at other scales of stops, pixels and scatter of looks."""
-    fitted, path = small_fit()
-    others, wide = path.free[path.noise :], path.root[path.noise :, path.noise :]
-    assert path.linear.states.gram[np.triu_indices(len(path.linear.states.gram), 1)].any(), "looks share no stop"
-    for w in np.random.default_rng(12).normal(size=(4, path.noise)):
-        z = path.from_whitened(np.concatenate([w, np.zeros(len(others))])[None])[0]
-        with jax.enable_x64(True):
-            lin = linearised_at(z, fitted.space, fitted.arrays)
-        spots = linear_spots(lin, fitted.arrays, -np.asarray(lin.residual_jacobian))
-        fisher = stop_information(spots).fisher[np.ix_(others, others)]
-        expected = wide.T @ (np.diag(play_priors(path)[0]) + fisher) @ wide
-        factor = path.conditional(w[None]).own[0]
-        # The map has the narrowest coordinate first. The information spans ten decades in z; in y it is of order 1.
-        precision = (factor @ factor.T)[::-1, ::-1]
-        np.testing.assert_allclose(precision, expected, rtol=0, atol=PRECISION * np.abs(expected).max())
-        assert np.abs(expected - np.eye(len(others))).max() > 0.1, "the scales are those of the mode"
 
 
 def test_w_keeps_the_curvature_far_from_the_mode():

@@ -76,6 +76,13 @@ def test_a_change_without_a_place_is_refused(sources, place, change, message):
         change.planted(sources, place)
 
 
+@pytest.mark.usefixtures("sources")
+def test_a_name_of_two_definitions_is_refused(tmp_path):
+    (tmp_path / "tvsbayes" / "axis.py").write_text("def slope(a):\n    return a\n")
+    with pytest.raises(changes.NoPlace, match=r"slope stands for 2 definitions: .*axis\.slope"):
+        changes.Sources(tmp_path).definition("slope")
+
+
 def test_a_fault_is_planted_in_a_copy_and_taken_out_again(tmp_path):
     """In a package of one module with the place of an entry of the list."""
     fault = next(fault for fault in FAULTS if fault.place == "laser_path.followed")

@@ -14,10 +14,10 @@ from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, campaign_templates, read_campaign
-from tvsbayes.instrument.parameters import CREEP_NAMES, GEAR_ERROR_NAMES, LOOK_SCATTER_NAMES, REGISTRY, names_of
+from tvsbayes.instrument.parameters import CREEP_NAMES, GEAR_ERROR_NAMES, LOOK_SCATTER_NAMES, names_of
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.protocols import PROTOCOLS
-from tvsbayes.instrument.rig import Rig, RigTable, read_rig
+from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import read_truth
 
@@ -140,23 +140,6 @@ def test_plans_are_the_protocols():
     """The shipped plans are what `protocols.PROTOCOLS` makes."""
     for name, make in PROTOCOLS.items():
         assert read_plan(DATA / "rigs" / "mounted" / f"{name}.csv") == make(), name
-
-
-def test_mounted_and_nominal_rig():
-    """Mounted: extrinsics to 0.03 rad and 5 mm; else defaults; true nominal rigs stand as mounted ones."""
-    rig, nominal = mounted(), read_rig(DATA / "rigs" / "nominal" / "rig.toml")
-    assert nominal.table == RigTable()
-    assert np.array_equal(nominal.stereo.parameter_covariance, rig.stereo.parameter_covariance)
-    for name, default in RigTable().priors.items():
-        if REGISTRY[name].place != "rig.prior":
-            continue
-        prior = rig.table.priors[name]
-        if name.startswith("extrinsics."):
-            assert prior.u == (0.03 if "rotation" in name else 5.0)
-            assert nominal.truth[name] == prior
-        else:
-            assert prior == default
-    assert set(rig.sheets_mm) == {"d1", "d2", "d3"} and rig.sheets_mm["d2"] == 275.0
 
 
 def test_make_twins_writes_the_shipped_twins():

@@ -337,6 +337,14 @@ def test_verdicts_are_per_element():
     assert verdict.digits == 2
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_one_wrong_end_is_enough(sign):
+    x = stratified_normal(12)
+    verdict = judge(x + sign * 0.3 * (sign * x > 1.0), x, 0.0, 1.0)
+    assert verdict.deviation == pytest.approx(0.3)
+    assert not verdict.validated
+
+
 def test_digits_held_are_the_most_whose_tolerance_holds_the_deviation():
     """Half a unit of the second digit of u = 0.5 is 0.005, of the first 0.05."""
     x = stratified_normal(4)

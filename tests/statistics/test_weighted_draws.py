@@ -41,6 +41,18 @@ def test_equal_weights_are_none(count):
     np.testing.assert_allclose(summary.mcse_mean, values.std(axis=0) / np.sqrt(count), rtol=allowed)
 
 
+def test_quantiles_by_hand():
+    """Half weights reach 0.25, 0.65 and 0.9 at the draws 1, 2 and 3: stretched to 0, 8/13 and 1."""
+    quantiles = weighted_quantiles(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.5, 0.3]), (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(quantiles, [1.0, 1 + 0.5 * 13 / 8, 3.0], rtol=4 * ROUNDING)
+
+
+def test_ends_of_intervals_have_the_effective_draws_of_their_probability():
+    """Of 2000 equal draws all count; 51 of them, not 50, lie below an end at most: 2 % of t (1 - t)."""
+    summary = weighted_summary(np.random.default_rng(8).standard_normal(2000), np.full(2000, 1 / 2000))
+    np.testing.assert_allclose(summary.ess_interval95, 2000, rtol=0.02)
+
+
 def test_a_quantity_that_moves_says_nothing_of_one_that_does_not():
     """Both keep their shape, and what is ten times as wide has ten times the errors."""
     generator = np.random.default_rng(9)
@@ -114,6 +126,13 @@ def test_a_tail_is_fitted_where_its_first_quarter_exceeds_the_rest():
         assert (pareto_k(values) != 0, smoothed_weights(np.log(values)).pareto_k != 0) == (fitted, fitted)
 
 
+def test_a_constant_factor_of_the_weights_changes_nothing():
+    """Also one beyond the largest number."""
+    log_ratios = np.random.default_rng(11).standard_normal(500)
+    smoothed, moved = smoothed_weights(log_ratios), smoothed_weights(log_ratios + 800.0)
+    np.testing.assert_allclose(moved.weights, smoothed.weights, rtol=1e-11)
+
+
 def test_weights_without_a_tail_are_left_alone():
     smoothed = smoothed_weights(np.append(np.zeros(99), -np.inf))
     np.testing.assert_allclose(smoothed.weights, np.append(np.full(99, 1 / 99), 0.0), rtol=1e-12)
@@ -133,9 +152,3 @@ def test_systematic_resampling_takes_every_draw_by_its_weight():
     # A place at the border of two draws is the second's; one that rounds to the sum of all is the last's.
     np.testing.assert_array_equal(systematic(np.array([0.5, 0.5]), 2, 0.0), [0, 1])
     np.testing.assert_array_equal(systematic(np.array([0.5, 0.5]), 3, np.nextafter(1.0, 0.0)), [0, 1, 1])
-
-
-def test_quantiles_by_hand():
-    """Half weights reach 0.25, 0.65 and 0.9 at the draws 1, 2 and 3: stretched to 0, 8/13 and 1."""
-    quantiles = weighted_quantiles(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.5, 0.3]), (0.0, 0.5, 1.0))
-    np.testing.assert_allclose(quantiles, [1.0, 1 + 0.5 * 13 / 8, 3.0], rtol=4 * ROUNDING)

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -102,11 +103,13 @@ def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:
 
 
 @pytest.fixture(scope="session")
-def reported(tmp_path_factory) -> Path:
+def reported(tmp_path_factory, paper_fit) -> Path:
     """The paper twin with the page of its Laplace approximation."""
     place = tmp_path_factory.mktemp("report") / "twin"
     shutil.copytree(TWIN, place)
-    assert run(["fit", str(place), "--no-sample"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tvsbayes.estimators.joint_fit.fit", lambda read, **_: replace(paper_fit, campaign=read))
+        assert run(["fit", str(place), "--no-sample"]) == 0
     assert run(["report", str(place), "--limit-deg-per-step", "1e-3", "--limit-mm", "1", "--json"]) == 1
     return place
 

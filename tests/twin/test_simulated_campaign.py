@@ -247,6 +247,15 @@ def test_aperture_reads_the_spot_with_its_zero(fixed, convention: str):
     assert np.std(error, ddof=1) == pytest.approx(0.02, rel=4 * 0.12)
 
 
+def test_every_placement_is_a_new_one(fixed):
+    """The same target placed twice is not at the same depth."""
+    plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("look",), ("place", "d1"), ("look",))
+    spots = simulate(fixed, plan, 6, spot_sd_px=1e-9).campaign.spots
+    disparity = [spot.u_left_px - spot.u_right_px for spot in spots]
+    # 1 mm of depth at 175 mm is f B / Z^2 = 2.2 px of disparity; noise is 1e-9 px.
+    assert abs(disparity[0] - disparity[1]) < 1e-7 and abs(disparity[2] - disparity[0]) > 0.01
+
+
 def test_pixel_noise_is_stated_sd_times_pixel_scale(fixed):
     """400 looks at one resting spot: the spread in each coordinate, in four standard errors."""
     truth = draw_truth(fixed, np.random.default_rng(0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,10 +20,12 @@ from tvsbayes.twin.board_pictures import Board, BoardPose, board_irradiance, boa
 from tvsbayes.twin.physics import Camera, cameras_of, project
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.spot_pictures import (
+    Footprint,
     Scene,
     Sensor,
     expose,
     footprint,
+    render_spot,
     render_spots,
     speckle,
     spot_irradiance,
@@ -157,6 +160,28 @@ def test_the_same_seed_gives_the_same_picture_and_another_another(twin):
         assert not np.array_equal(one.left, other.left)
 
 
+def test_frames_of_one_look_share_speckle_and_not_noise():
+    spot = Footprint(np.array([60.3, 50.7]), 9.0 * np.eye(2), 150.0)
+    pictures = [
+        render_spot(spot, 120, 100, Scene(speckle_contrast=0.5), Sensor(), (1, 2, 0), frame).astype(float)
+        for frame in (0, 1)
+    ]
+    core = np.s_[45:56, 55:66]
+    difference, spread = np.std(pictures[0][core] - pictures[1][core]), np.std(pictures[0][core])
+    assert 0 < difference < spread / 3
+
+
+def test_the_two_cameras_see_independent_speckle(mounted_rig):
+    spot = Footprint(np.array([60.0, 50.0]), 100.0 * np.eye(2), 120.0)
+    scene = Scene(speckle_contrast=0.5)
+    ratio = []
+    for camera in (0, 1):
+        picture = render_spot(spot, 120, 100, scene, Sensor(), (1, 2, camera)).astype(float).sum(axis=2)
+        plain = render_spot(spot, 120, 100, replace(scene, speckle_contrast=0.0), Sensor(), (1, 2, camera))
+        ratio.append((picture / plain.astype(float).sum(axis=2))[40:60, 50:70].ravel())
+    assert abs(np.corrcoef(*ratio)[0, 1]) < 5 / np.sqrt(100)  # 400 pixels, about 100 independent after demosaicing
+
+
 def test_simulate_writes_frames_that_detect_reads(mounted_rig, tmp_path, capsys, monkeypatch):
     """Through the command line, at full size: names, sizes, statuses, and the true centres found again."""
     monkeypatch.setattr("tvsbayes.twin.frames.BOARD_VIEWS", 1)
@@ -192,3 +217,13 @@ def test_boards_are_wholly_inside_both_images(mounted_rig):
             assert ((pixels > 0) & (pixels < [WIDTH - 1, HEIGHT - 1])).all()
     with pytest.raises(InputError, match="fits into both images 0 of 2 times"):
         board_poses(cameras, Board(pitch_mm=100.0), 2, 1)
+
+
+def test_boards_stand_further_off_for_longer_lenses(mounted_rig):
+    """Up to ten times the focal length of the shipped rigs; theirs changes no pose that was drawn before."""
+    board = Board()
+    for longer in (2.0, 10.0):
+        assert len(board_poses(cameras_of(mounted_rig.stereo, longer), board, 20, 1)) == 20
+    # Where the corners of three boards stood, mm, before depths followed the lens; 1e-12: sums of other machines.
+    depths = [p.translation_mm[2] for p in board_poses(cameras_of(mounted_rig.stereo), board, 3, 1)]
+    assert depths == pytest.approx([345.2773895689372, 375.7078497165911, 427.5062850295981], rel=1e-12)

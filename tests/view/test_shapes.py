@@ -57,11 +57,3 @@ def test_ellipsoid_holds_95_percent_of_triangulated_points():
         assert abs(inside.mean() - 0.95) < 5 * 0.0034
         np.testing.assert_allclose(axes[k] @ axes[k].T, np.diag(np.sum(axes[k] ** 2, axis=1)), atol=1e-9)
     assert stats.chi2.cdf(np.trace(axes[0] @ np.linalg.inv(covariances[0]) @ axes[0].T) / 3, 3) > 0.9499
-
-
-def test_unknown_points_have_no_shape():
-    points = np.array([POINTS_MM[0], [np.nan] * 3])
-    covariances = point_covariance_mm2(small_stereo(), points, np.broadcast_to(0.01 * np.eye(4), (2, 4, 4)))
-    assert np.isfinite(covariances[0]).all() and np.isnan(covariances[1]).all()
-    assert np.isnan(ellipsoid_axes_mm(covariances)[1]).all()
-    assert sheets(["d1"] * 2, points) == ()
