@@ -158,7 +158,8 @@ class SpotFit:
     def gains(self) -> np.ndarray:
         """Derivatives (9, n) of the parameters by the pixels."""
         weighted = self.jacobian * self.weights
-        return np.linalg.solve(weighted @ self.jacobian.T, weighted)
+        # Less work than a solution for every pixel.
+        return np.linalg.inv(weighted @ self.jacobian.T) @ weighted
 
     def noise_parts(self, filters: np.ndarray) -> np.ndarray:
         """Variance (3, k) of filters (k, n): from the background's noise, per gain and per contrast^2."""
