@@ -114,7 +114,7 @@ def test_variance_by_cause_is_exactly_that_of_the_posterior(seed):
     for k in range(2):
         exact = model.linear(w[k : k + 1]).sd_of(functionals)[0]
         for name, functional, sd in zip(HEADLINE_DRAWS, functionals, exact, strict=True):
-            parts = _variances(fit, functional, w[k : k + 1])
+            parts = _variances(fit, functional[None], w[k : k + 1])
             assert np.sqrt(sum(parts.values())) == pytest.approx(sd, rel=1e-6), name
             assert min(parts.values()) >= 0
     assert axis_budgets(replace(fit, w=w[:0]), None, None, classic_axis(fit.rows)) == ()

@@ -68,11 +68,21 @@ def whitened(
         variance: likewise.
         noise: variance of each row, (rows, n).
     """
-    states, n = keep.shape[1:]
-    shape = n, columns.shape[2]
-    mean, covariance, load = np.zeros((states, *shape)), np.zeros((states, states, n)), np.ones((states, n))
-    white, scatter = np.empty((len(columns), *shape)), np.empty(noise.shape)
-    for row in range(len(columns)):
-        mean, covariance = state_predicted(mean, covariance, keep[row], variance[row])
-        mean, covariance, white[row], scatter[row], _ = state_updated(mean, covariance, columns[row], load, noise[row])
+    (rows, states, n), nothing = keep.shape, np.zeros((keep.shape[2], 0))
+    mean, covariance, load = np.zeros((states, n, 0)), np.zeros((states, states, n)), np.ones((states, n))
+    scatter, gains = np.empty(noise.shape), np.empty(keep.shape)
+    for row in range(rows):
+        _, covariance = state_predicted(mean, covariance, keep[row], variance[row])
+        _, covariance, _, scatter[row], gains[row] = state_updated(mean, covariance, nothing, load, noise[row])
+    # The gains depend on no column, and most states are held or drawn anew.
+    held, gains = np.all(keep == 1, axis=2), (gains / scatter[:, None])[..., None]
+    white, means = np.empty((rows, n, columns.shape[2])), np.zeros((states, n, columns.shape[2]))
+    for row, innovation in enumerate(white):
+        innovation[:] = columns[row]
+        for state, own in enumerate(means):
+            if not held[row, state]:
+                own *= keep[row, state][:, None]
+            innovation -= own
+        for own, gain in zip(means, gains[row], strict=True):
+            own += gain * innovation
     return white / np.sqrt(scatter)[..., None], np.log(scatter).sum(axis=0)

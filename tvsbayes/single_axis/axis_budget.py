@@ -62,19 +62,20 @@ def _columns(fit: AxisFit) -> dict[str, tuple[list[int], str]]:
     return {name: part for name, part in parts.items() if part[0]}
 
 
-def _variances(fit: AxisFit, functional: np.ndarray, w: np.ndarray) -> dict[str, float]:
-    """Variance of a functional (columns,) by cause at one draw w (1, d)."""
+def _variances(fit: AxisFit, functionals: np.ndarray, w: np.ndarray) -> dict[str, np.ndarray]:
+    """Variances (n,) by cause of functionals (n, columns) at draws w (n, d)."""
     model, rows = fit.model, fit.rows
-    white, factor = model.white(w)[:, 1:], model.prior_factor(w)
-    inverse_root = model.whitened_extra(w, np.eye(len(rows.move)))
-    loaded = white @ factor
+    white, factor = model.white(w, np.eye(len(rows.move))), model.prior_factor(w)
+    loaded, inverse_root = white[:, :, 1 : 1 + model.columns] @ factor, white[:, :, 1 + model.columns :]
     # Errors of the prior's own normal numbers, and the gain of the readings.
-    by_prior = np.linalg.solve(loaded.T @ loaded + np.eye(loaded.shape[1]), factor.T @ functional)
-    gain = inverse_root.T @ (loaded @ by_prior)
-    variances = {name: float(by_prior[columns] @ by_prior[columns]) for name, (columns, _) in _columns(fit).items()}
+    information = np.swapaxes(loaded, 1, 2) @ loaded + np.eye(model.columns)
+    by_prior = np.linalg.solve(information, np.swapaxes(factor, 1, 2) @ functionals[..., None])
+    gain = (np.swapaxes(inverse_root, 1, 2) @ (loaded @ by_prior))[..., 0]
+    variances = {name: np.sum(by_prior[:, columns] ** 2, axis=(1, 2)) for name, (columns, _) in _columns(fit).items()}
     readings = rows.zero, np.cumsum(rows.redrawn), rows.since_homing, rows.side, rows.variance
     noise = noise_covariances(model.coordinates.values(w), rows, *readings)
-    return variances | {name: float(gain @ noise[cause][0] @ gain) for cause, name in NOISE.items()}
+    by_noise = {name: np.einsum("ni,nij,nj->n", gain, noise[cause], gain) for cause, name in NOISE.items()}
+    return variances | by_noise
 
 
 def _sources(fit: AxisFit, functionals: np.ndarray, unit: str) -> list[Source]:
@@ -82,16 +83,14 @@ def _sources(fit: AxisFit, functionals: np.ndarray, unit: str) -> list[Source]:
     by_draw = np.broadcast_to(functionals, (len(fit.w), functionals.shape[-1]))
     total = fit.linear.sd_of(functionals[..., None, :])[:, 0] ** 2
     means = fit.linear.mean_of(functionals[..., None, :])[:, 0]
-    variances = []
-    for group in np.array_split(np.argsort(total), min(STRATA, len(total))):
-        k = group[len(group) // 2]
-        parts = _variances(fit, by_draw[k], fit.w[k : k + 1])
-        factor = float(total[group].mean() / sum(parts.values()))
-        variances.append({part: factor * variance for part, variance in parts.items()})
+    groups = np.array_split(np.argsort(total), min(STRATA, len(total)))
+    chosen = [group[len(group) // 2] for group in groups]
+    parts = _variances(fit, by_draw[chosen], fit.w[chosen])
+    factor = np.array([total[group].mean() for group in groups]) / sum(parts.values())
     kinds = {part: kind for part, (_, kind) in _columns(fit).items()} | dict.fromkeys(NOISE.values(), "A")
     sources = []
     for part, kind in kinds.items():
-        each = np.array([variance[part] for variance in variances])
+        each = factor * parts[part]
         mean, spread = float(each.mean()), float(each.var(ddof=1)) if len(each) > 1 else 0.0
         # GUM G.3: the relative sd of a variance of nu degrees of freedom is the root of 2 / nu.
         dof = max(2 * mean**2 / spread, 1.0) if spread > 1e-12 * mean**2 and kind == "A" else math.inf

@@ -417,14 +417,14 @@ class AxisModel:
             log_scatter = log_scatter - 2 * self.rows.log_density_within(values["reading_scale"])
             yield part, _Block(np.swapaxes(white, 1, 2) @ white, log_scatter, self._factor(w[part], values, informed))
 
-    def white(self, w: np.ndarray) -> np.ndarray:
-        """Whitened readings and columns (rows, 1 + columns) at one draw w (1, d)."""
+    def white(self, w: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        """Whitened readings, columns, further columns (rows, c) at draws w (n, d): (n, rows, 1 + columns + c)."""
         values = self.coordinates.values(w)
-        return self._whitened(values, self._columns(w, values, None))[0][0]
+        return self._whitened(values, self._columns(w, values, extra))[0]
 
     def prior_factor(self, w: np.ndarray) -> np.ndarray:
-        """Factor of the prior covariance of the columns (columns, columns) at one draw w (1, d)."""
-        return self._factor(w, self.coordinates.values(w))[0]
+        """Factor of the prior covariance of the columns (n, columns, columns) at draws w (n, d)."""
+        return self._factor(w, self.coordinates.values(w))
 
     def whitened_extra(self, w: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Further columns (rows, c), whitened as the model's columns at one draw w (1, d)."""

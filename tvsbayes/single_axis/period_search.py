@@ -71,7 +71,7 @@ class _WhitenedModel(NamedTuple):
 
 
 def _whitened_model(model: AxisModel, w: np.ndarray) -> _WhitenedModel:
-    white, factor = model.white(w), model.prior_factor(w)
+    [white], [factor] = model.white(w), model.prior_factor(w)
     columns = white[:, 1:] @ factor
     inverse = np.linalg.inv(columns.T @ columns + np.eye(factor.shape[1]))
     return _WhitenedModel(model, w, np.column_stack([white[:, :1], columns]), inverse)
