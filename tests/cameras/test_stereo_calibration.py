@@ -16,7 +16,7 @@ from experiments.cameras.stereo_coverage import calibrate, chi2
 from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
 from tvsbayes.cameras.board_errors import correlation_factor
 from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
-from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, projected
+from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, projected, reduced_residuals
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
 from tvsbayes.cameras.stereo_start import camera_start
 from tvsbayes.cli.main import run
@@ -220,6 +220,15 @@ def test_covariance_is_the_schur_complement_of_the_whole_adjustment(drawn, exact
     product = product @ (exact.covariance_independent / np.outer(scale, scale))
     # Central differences are good to 1e-8 of a slope; correlations near 1 amplify them a thousandfold.
     np.testing.assert_allclose(product, np.eye(24), atol=1e-4)
+
+
+def test_cameras_for_which_a_board_has_no_pose_have_no_residuals():
+    """The descent then takes a shorter step; at a distance of 1e200 mm the pose's normal matrix is exactly 0."""
+    points_mm = Board(4, 3, 10.0).points_mm
+    residuals, by_cameras = reduced_residuals(
+        PAIR.vector, points_mm, np.zeros((1, 4, len(points_mm))), np.array([[0, 0, 0, 0, 0, 1e200]])
+    )
+    assert np.isnan(residuals).all() and np.isnan(by_cameras).all()
 
 
 def test_degrees_of_freedom_are_coordinates_less_unknowns(views, calibration):

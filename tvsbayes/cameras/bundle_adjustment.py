@@ -186,6 +186,9 @@ def reduced_residuals(
         points_mm: corners in the board's frame, (corners, 3).
         corners_px: found corners, (views, 4, corners), NaN where unseen: there the results are 0.
         poses: poses near the optimum, (views, 6).
+
+    Returns:
+        NaN where cameras are so far off that a board has no pose.
     """
     stereo, seen = Stereo.of_vector(vector, (0, 0)), np.isfinite(corners_px)
     # Rotation in rad and translation in board sizes move corners equally.
@@ -197,8 +200,9 @@ def reduced_residuals(
         transposed = by_pose.transpose(0, 2, 1)
         try:
             gain = np.linalg.solve(transposed @ by_pose, transposed)
-        except np.linalg.LinAlgError as error:
-            raise undetermined("a board has no pose") from error
+        except np.linalg.LinAlgError:
+            # A board without a pose: residuals that are not finite make the descent take a shorter step.
+            gain = np.full_like(transposed, np.nan)
         steps = np.einsum("vpr,vr->vp", gain, residuals)
         if not (steps**2).sum(axis=1).max() > POSE_TOLERANCE:
             break
@@ -248,8 +252,10 @@ def _ends(end: End, at: Callable[[np.ndarray], End], dof: int) -> tuple[End, End
 
 
 def _descended(at: Callable[[np.ndarray], End], z: np.ndarray) -> End:
-    """The end of Levenberg-Marquardt steps."""
+    """The end of Levenberg-Marquardt steps; the start itself where residuals are not finite."""
     last = at(z)
+    if not np.isfinite(last.residuals).all():
+        return last
 
     def point(z: np.ndarray) -> End:
         nonlocal last
