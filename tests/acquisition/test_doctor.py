@@ -189,6 +189,29 @@ def test_dead_camera_and_dead_device(tmp_path):
     assert checks["firmware"].status == "fault" and camera.closed
 
 
+def test_a_positioner_that_fails_is_closed_before_the_cameras_are_opened(tmp_path):
+    """Its laser may be on, and cameras may take long to open."""
+    device, camera = bench()
+    order = []
+
+    class Failing(SerialPositioner):
+        def state(self):
+            raise DeviceFault("no-answer", "gone", remedy="plug it in")
+
+        def close(self):
+            order.append("closed")
+            super().close()
+
+    def open_camera():
+        order.append("cameras")
+        return camera
+
+    positioner = lambda: Failing(lambda: ModelLink(device), {}, device.clock)  # noqa: E731
+    checks = examine(RIG, tmp_path, laser=True, open_positioner=positioner, open_camera=open_camera, clock=device.clock)
+    assert order == ["closed", "cameras"] and camera.closed
+    assert {check.name: check.status for check in checks}["laser"] == "skipped"
+
+
 def test_rig_without_hardware_says_what_is_missing(tmp_path):
     checks = {check.name: check for check in examine(RIG, tmp_path)}
     assert "[positioner]" in checks["port"].remedy and checks["cameras"].status == "fault"

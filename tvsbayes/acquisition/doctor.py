@@ -230,6 +230,8 @@ def _positioner(
             state = positioner.laser(False)
             checks.judge("laser line", "it was on", "look for a program that left it on")
     except TvsError as error:
+        # Closed before the cameras are opened, which may take long: its laser may be on.
+        stack.close()
         checks.failed("positioner", error)
         return None
     # Pressed by hand, switches show their wiring before any motion.
