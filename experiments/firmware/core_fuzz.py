@@ -16,9 +16,9 @@ import tempfile
 from pathlib import Path
 
 from experiments.common.command_line import act, parser
+from experiments.common.of_tests import module_of_tests
 from experiments.common.rows import commit
 from tvsbayes.positioner import firmware_folder
-from tvsbayes.positioner.emulated_board import core_sources
 
 SOURCE = Path(__file__).with_suffix(".cpp")
 PROMISES = """\
@@ -38,7 +38,8 @@ def run(arguments: argparse.Namespace) -> None:
         sanitizers = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
         include = f"-I{firmware_folder() / 'tvs_positioner'}"
         command = ["g++", "-std=c++17", "-O1", "-g", "-Wall", "-Wextra", *sanitizers, include]
-        subprocess.run([*command, str(SOURCE), *map(str, core_sources()), "-o", str(program)], check=True)
+        sources = module_of_tests("support.emulated_board").core_sources()
+        subprocess.run([*command, str(SOURCE), *map(str, sources), "-o", str(program)], check=True)
         limits = [str(program), str(arguments.seed), str(arguments.seconds)]
         result = subprocess.run(limits, capture_output=True, text=True, check=False)
     print("# Fuzz of the firmware's core\n")

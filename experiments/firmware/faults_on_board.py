@@ -20,21 +20,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.common.command_line import act, parser
+from experiments.common.of_tests import module_of_tests
 from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig, numbered
 from experiments.common.rows import append_row, commit, output, read_rows
 from tvsbayes.acquisition.bench import Bench
-from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
 from tvsbayes.acquisition.engine import Acquisition
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.operator import StopKey
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.session import begin
 from tvsbayes.acquisition.simulated_bench import SIMULATED_START, SimulatedOperator, TwinObserver
+from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.positioner.emulated_board import EMULATOR, EmulatedBoard
 
+BOARD = module_of_tests("support.emulated_board")
 ROWS, SCRATCH = output(__file__, "faults-on-board.jsonl"), output(__file__, "faults-scratch")
 AT_LOOK = 5
 SEED = 7
@@ -73,7 +74,7 @@ FAULTS = (
 class Observer:
     """The twin's looks, with a fault at one of them, and where the motors stood at each."""
 
-    def __init__(self, instrument: EmulatedInstrument, sd_px: float, fault: Fault):
+    def __init__(self, instrument: Instrument, sd_px: float, fault: Fault):
         self.instrument, self.fault, self.twin = instrument, fault, TwinObserver(instrument, sd_px)
         # Whether counters and motors agreed, look by look; time from the fault until the pin was low.
         self.true: list[bool] = []
@@ -113,8 +114,8 @@ def run_one(fault: Fault, folder: Path) -> dict:
     """A run with a fault, and what became of it."""
     rig, steps = mounted_rig(), plan()
     header = {"name": "faults", "created": SIMULATED_START.isoformat(), "synthetic": True, "seed": SEED}
-    with EmulatedBoard() as board:
-        instrument = EmulatedInstrument(rig, SEED, 0, board)
+    with BOARD.EmulatedBoard() as board:
+        instrument = module_of_tests("support.emulated_instrument").EmulatedInstrument(rig, SEED, 0, board)
         positioner = instrument.positioner()
         observer = Observer(instrument, rig.spot_sd_px, fault)
         operator, journal = SimulatedOperator(instrument), begin(folder, rig, steps, False, header)
@@ -154,7 +155,7 @@ def table(arguments: argparse.Namespace) -> None:
     rows = read_rows(ROWS)
     good = [row for row in rows if row["said"] == row["expected"] and not row["pin_at_end"] and not row["wrong"]]
     print("# Faults of firmware and bench in the middle of a run\n")
-    print(f"Commit {rows[0]['commit']}, Python {platform.python_version()}, {EMULATOR}, machine mps2-an500.\n")
+    print(f"Commit {rows[0]['commit']}, Python {platform.python_version()}, {BOARD.EMULATOR}, machine mps2-an500.\n")
     print(f"{len(good)} of {len(rows)} runs end as they must, dark, with no look counted wrongly.", end=" ")
     print("The laser pin is read\nfrom outside the processor.", end=" ")
     print("Seconds are those of a busy computer: the board falls behind and catches up.\n")

@@ -20,8 +20,8 @@ from experiments.common.command_line import act, parser
 from experiments.common.of_tests import module_of_tests
 from experiments.common.rows import append_row, commit, output, read_rows
 from tvsbayes.positioner import firmware_folder
-from tvsbayes.positioner.emulated_board import EMULATOR, core_sources, cross_compile
 
+BOARD = module_of_tests("support.emulated_board")
 ROWS = output(__file__, "transcripts.jsonl")
 LINES = 10_000
 FIRST_SEED, SESSIONS = 1000, 30
@@ -71,14 +71,14 @@ MUTANTS = (
 def build(program: Path, file: str = "", old: str = "", new: str = "") -> bool:
     """The replay for the processor, whole or with a fault; whether it compiles."""
     sources = [firmware_folder() / "native" / "replay.cpp"]
-    for path in core_sources():
+    for path in BOARD.core_sources():
         text = path.read_text()
         if path.stem == f"tvs_{file}":
             assert text.count(old) == 1, old
             path = program.with_name(path.name)
             path.write_text(text.replace(old, new))
         sources.append(path)
-    return cross_compile(program, sources, "--specs=rdimon.specs").returncode == 0
+    return BOARD.cross_compile(program, sources, "--specs=rdimon.specs").returncode == 0
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -113,7 +113,8 @@ def table(arguments: argparse.Namespace) -> None:
     whole, *mutants = read_rows(ROWS)
     caught = [row for row in mutants if row["seen_in_session"]]
     print("# Transcripts on the processor\n")
-    print(f"Commit {whole['commit']}, Python {platform.python_version()}, {EMULATOR}, Cortex-M7, machine mps2-an500.\n")
+    machine = f"{BOARD.EMULATOR}, Cortex-M7, machine mps2-an500"
+    print(f"Commit {whole['commit']}, Python {platform.python_version()}, {machine}.\n")
     print(f"{whole['sessions']} sessions, {whole['lines']} lines of transcript: all equal.", end=" ")
     print(f"{whole['processor_s']:.0f} s")
     print(f"on the processor, {whole['s']:.0f} s with the model's, on a computer busy with other work.\n")

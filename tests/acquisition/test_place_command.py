@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from support.bench_runs import Run, events, small_plan
+from support.emulated_board import EmulatedBoard
 from support.firmware_sessions import NO_EMULATOR
 
 from tvsbayes.acquisition import place_command
@@ -21,7 +22,6 @@ from tvsbayes.acquisition.place_command import OUTPUT_BYTES_MAX, WORDS_MAX, Plac
 from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.positioner.emulated_board import EmulatedBoard
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 SAYS = "import sys; print('moved to', *sys.argv[1:])"

@@ -55,7 +55,6 @@ REFUSED = (
     ("stereo --import a.yml --finder sector --swap", "usage", "--finder and --swap are for pictures"),
     ("stereo --import a.yml --fix-k3 --robust", "usage", "--fix-k3 and --robust are for pictures"),
     ("acquire r.toml p.csv o --centroids", "usage", "--centroids is for the twin"),
-    ("acquire r.toml p.csv o --emulate", "usage", "--emulate is for the twin"),
     ("acquire r.toml p.csv o --seed 0", "usage", "--seed is for the twin"),
     ("acquire r.toml p.csv o --simulate --port 8000", "usage", "--port is for --live"),
     ("acquire r.toml p.csv o --simulate --no-browser", "usage", "--no-browser is for --live"),

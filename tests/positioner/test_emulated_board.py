@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 
 import pytest
+from support import emulated_board
+from support.emulated_board import EmulatedBoard, build_sketch
 from support.firmware_sessions import (
     FIRMWARE,
     NO_EMULATOR,
@@ -15,9 +17,7 @@ from support.firmware_sessions import (
 )
 
 from tvsbayes.errors import InputError
-from tvsbayes.positioner import emulated_board
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.emulated_board import EmulatedBoard, build_sketch
 from tvsbayes.positioner.interface import PositionLost
 from tvsbayes.positioner.serial_port import serial_opener
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from support.bent_rig import calibration
 from support.compensated import table
+from support.emulated_board import BOARD, cross_compile
 from support.firmware_sessions import NO_EMULATOR
 from support.geared_rig import geared
 
 from tvsbayes.calibration.c_header import calibration_header
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import FORMATS, Origin
-from tvsbayes.positioner.emulated_board import BOARD, cross_compile
 
 pytestmark = pytest.mark.skipif(bool(NO_EMULATOR), reason=NO_EMULATOR)
 ROUNDING = 1e-9

@@ -6,8 +6,9 @@ import random
 import subprocess
 from pathlib import Path
 
+from support.emulated_board import BOARD, core_sources, cross_compile, missing_tools
+
 from tvsbayes.positioner import firmware_folder
-from tvsbayes.positioner.emulated_board import BOARD, core_sources, cross_compile, missing_tools
 from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, Reply, frame, parse_answer, request
 

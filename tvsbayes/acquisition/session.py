@@ -27,7 +27,6 @@ from tvsbayes.instrument.campaign import NAME_ACQUIRED
 from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import legs_of
-from tvsbayes.positioner.emulated_board import EmulatedBoard
 
 
 def acquire(
@@ -36,7 +35,6 @@ def acquire(
     folder: Path,
     *,
     simulate: bool = False,
-    emulate: bool = False,
     resume: bool = False,
     laser_class: str | None = None,
     seed: int = 0,
@@ -54,7 +52,6 @@ def acquire(
         plan: its steps.
         folder: new or empty; with `resume` the folder of the interrupted run.
         simulate: the twin instead of hardware; `truth.json` is written beside the campaign.
-        emulate: for a simulation: run the firmware on an emulated processor, in real time.
         resume: continue an interrupted run.
         laser_class: states that the hazard is known; without it the operator must confirm.
         seed: seed of a simulation.
@@ -66,7 +63,7 @@ def acquire(
         place_command: a program that places the sheet instead of a person.
 
     Raises:
-        InputError: a plan that this rig cannot run, another plan than before, no operator, no emulator.
+        InputError: a plan that this rig cannot run, another plan than before, no operator.
         DeviceFault: device, camera or disk failed.
     """
     folder, terminal = Path(folder), terminal or Terminal()
@@ -80,8 +77,7 @@ def acquire(
     with ExitStack() as stack:
         # Device and cameras first: a failure to open them leaves no folder behind.
         if simulate:
-            board = stack.enter_context(EmulatedBoard()) if emulate else None
-            bench = stack.enter_context(simulated(rig, seed, record, detector, board))
+            bench = stack.enter_context(simulated(rig, seed, record, detector))
         else:
             operator = TerminalOperator(stop, terminal, laser_class, place_command is None)
             bench = stack.enter_context(hardware(rig, detector or wait_for_detection, operator))

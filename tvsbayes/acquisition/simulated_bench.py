@@ -22,7 +22,6 @@ import numpy as np
 from msgspec import UNSET
 
 from tvsbayes.acquisition.bench import Bench
-from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.observation import CameraObserver, DetectedSpot, Detector, Observation, Observer
 from tvsbayes.acquisition.recorder import Homed, Moved, Recorded, event_of, recorded
@@ -33,7 +32,6 @@ from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.rig import Rig, Setting
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.emulated_board import EmulatedBoard
 from tvsbayes.positioner.interface import Positioner
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
@@ -110,9 +108,7 @@ class SimulatedCamera:
 
 
 @contextmanager
-def simulated(
-    rig: Rig, seed: int, record: Recorded, detector: Detector | None, board: EmulatedBoard | None = None
-) -> Iterator[Bench]:
+def simulated(rig: Rig, seed: int, record: Recorded, detector: Detector | None) -> Iterator[Bench]:
     """The twin on the device model; with a detector, its cameras take pictures.
 
     Args:
@@ -120,10 +116,8 @@ def simulated(
         seed: seed of all random numbers.
         record: earlier runs, from the journal.
         detector: finds the spots in pictures; None: the twin states centroids.
-        board: runs the firmware itself, in real time, instead of its model.
     """
-    starts = record.starts
-    instrument = Instrument(rig, seed, starts) if board is None else EmulatedInstrument(rig, seed, starts, board)
+    instrument = Instrument(rig, seed, record.starts)
     positioner, clock = instrument.positioner(), instrument.clock
     # Virtual time continues from the end of the last run.
     start = SIMULATED_START + datetime.timedelta(seconds=max((move.time_s for move in record.moves), default=0.0))

@@ -58,9 +58,6 @@ def acquire(
     centroids: Annotated[
         bool, typer.Option("--centroids", help="With --simulate: the twin states centroids, no pictures are made.")
     ] = False,
-    emulate: Annotated[
-        bool, typer.Option("--emulate", help="With --simulate: the firmware itself on an emulated board, in real time.")
-    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would happen; nothing moves.")] = False,
     laser_class: LaserClass = None,
@@ -96,7 +93,7 @@ def acquire(
     if simulate:
         refuse_options("for a laser, and --simulate has none", "leave out one of them", laser_class=laser_class)
     else:
-        twin = {"centroids": centroids, "emulate": emulate, "seed": seed}
+        twin = {"centroids": centroids, "seed": seed}
         refuse_options("for the twin", "add --simulate, or leave it out", **twin)
     if target_u is not None and estimate is False:
         remedy = "leave out one of them"
@@ -131,7 +128,6 @@ def acquire(
             steps,
             out,
             simulate=simulate,
-            emulate=emulate,
             resume=resume,
             laser_class=laser_class,
             seed=seed or 0,

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import time
 
+from support.emulated_board import EmulatedBoard
+
 from tvsbayes.acquisition.simulated_instrument import Instrument, VirtualClock
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.emulated_board import EmulatedBoard
 from tvsbayes.positioner.interface import HomeReport, Link
 from tvsbayes.positioner.protocol import DeviceState, device_settings
 from tvsbayes.positioner.serial_port import BAUD, serial_opener

@@ -93,8 +93,8 @@ class EmulatedBoard:
         self.on_step, self.on_laser = on_step, on_laser
         self.starts = 0
         if missing := missing_tools():
-            remedy = f"install them (Debian, Ubuntu: apt install {PACKAGES}), or rehearse with --simulate alone"
-            raise InputError("emulator", f"--emulate needs {' and '.join(missing)}: not found", remedy=remedy)
+            remedy = f"install them (Debian, Ubuntu: apt install {PACKAGES})"
+            raise InputError("emulator", f"the emulated board needs {' and '.join(missing)}: not found", remedy=remedy)
         self._folder = tempfile.TemporaryDirectory(prefix="tvsbayes-board-")
         self._process: subprocess.Popen[bytes] | None = None
         self._files: list[int] = []
@@ -157,7 +157,7 @@ class EmulatedBoard:
         program, hand, monitor = folder / "sketch.elf", folder / "hand", folder / "monitor"
         compilation = build_sketch(program)
         if compilation.returncode:
-            remedy = f"install {PACKAGES} again, or rehearse with --simulate alone"
+            remedy = f"install {PACKAGES} again"
             raise InputError("emulator", f"the firmware does not compile: {compilation.stderr[-300:]}", remedy=remedy)
         for suffix in (".in", ".out"):
             os.mkfifo(f"{hand}{suffix}")
