@@ -28,6 +28,20 @@ def test_transmission_error_is_that_of_wheel_or_pinion(wobbling):
     assert abs(gap[0] - gap[1]) > 1e-4, "the wheel's error differs between the sides"
 
 
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_one_beam_has_the_range_that_it_has_among_many(azimuth):
+    """Beams from all around: also those that meet only the other nappe of the aperture's cone."""
+    rng = np.random.default_rng(1)
+    origin = rng.normal(size=(3, 100)) * 60 + np.array([[0.0], [100.0], [0.0]])
+    direction, angle_deg = rng.normal(size=(3, 100)), rng.uniform(1, 179, 100)
+    ranges = range_components(tuple(origin), tuple(direction), 200.0, angle_deg, azimuth)
+    assert 20 < np.sum(ranges > 0) < 80 and not np.isfinite(ranges).all()
+    for k in range(100):
+        beam = tuple(origin[:, k].tolist()), tuple(direction[:, k].tolist())
+        single = range_components(*beam, 200.0, angle_deg[k], azimuth, math)
+        assert single == pytest.approx(ranges[k], rel=1e3 * ROUNDING, nan_ok=True)
+
+
 def test_ratio_of_the_beam_is_the_twins():
     """Against the twin's own optics, whose slope is differentiated elsewhere."""
     pose = (7.0, 4.0)
