@@ -26,7 +26,7 @@ from experiments.common.rigs import PIXELS, TWINS, mounted_rig, shipped_plan, tw
 from tvsbayes.estimators.plausibility import implausible
 from tvsbayes.estimators.spot_pattern import SPOTS_MIN
 from tvsbayes.files.disk import shipped_data, write_atomically
-from tvsbayes.instrument.campaign import Campaign, Spot
+from tvsbayes.instrument.campaign import Campaign, Move, Spot
 from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.plan import PlanStep, read_plan
@@ -39,52 +39,45 @@ PLANS = ("paper", "paper_twin", "mixed", "grid")
 Change = Callable[[Campaign, np.random.Generator], Campaign]
 
 
-def scaled(campaign: Campaign, factor: float) -> Campaign:
+def of_spots(change: Callable[[int, Spot, np.random.Generator], Spot]) -> Change:
+    """A change of every spot, by its place."""
+    return lambda campaign, rng: replace(
+        campaign, spots=tuple(change(place, spot, rng) for place, spot in enumerate(campaign.spots))
+    )
+
+
+def of_moves(change: Callable[[Move], Move]) -> Change:
+    return lambda campaign, _: replace(campaign, moves=tuple(map(change, campaign.moves)))
+
+
+def scaled(factor: float) -> Change:
     """All pixels times a factor: pictures of another size."""
 
-    def change(spot: Spot) -> Spot:
+    def change(_: int, spot: Spot, __: np.random.Generator) -> Spot:
         values = {name: getattr(spot, name) for name in PIXELS}
         return replace(spot, **{name: None if value is None else factor * value for name, value in values.items()})
 
-    return replace(campaign, spots=tuple(map(change, campaign.spots)))
+    return of_spots(change)
 
 
-def swapped(campaign: Campaign, _: np.random.Generator) -> Campaign:
-    """Left and right pictures exchanged."""
-    return replace(campaign, spots=corrected(None, campaign.spots, Correction(swapped=True)).spots)
-
-
-def from_one(campaign: Campaign, _: np.random.Generator) -> Campaign:
-    """All pixels as MATLAB counts them, which only spots at the very edge of a picture show."""
-    return replace(campaign, spots=corrected(None, campaign.spots, Correction(pixels_from=-1)).spots)
+def as_corrected(correction: Correction) -> Change:
+    """Left and right pictures exchanged; or pixels as MATLAB counts them, which only spots at the very edge show."""
+    return lambda campaign, _: replace(campaign, spots=corrected(None, campaign.spots, correction).spots)
 
 
 def relative(campaign: Campaign, _: np.random.Generator) -> Campaign:
     """Counters hold the steps of each move."""
-    moves = campaign.moves
-    steps = [moves[0]] + [
-        replace(b, pan_steps=b.pan_steps - a.pan_steps, tilt_steps=b.tilt_steps - a.tilt_steps)
-        if a.segment == b.segment
-        else b
-        for a, b in pairwise(moves)
-    ]
+    steps = [campaign.moves[0]]
+    for a, b in pairwise(campaign.moves):
+        by = {"pan_steps": b.pan_steps - a.pan_steps, "tilt_steps": b.tilt_steps - a.tilt_steps}
+        steps.append(replace(b, **by) if a.segment == b.segment else b)
     return replace(campaign, moves=tuple(steps))
 
 
 def turned(axis: str) -> Change:
     """One axis counts the other way."""
-
-    def change(campaign: Campaign, _: np.random.Generator) -> Campaign:
-        name = f"{axis}_steps"
-        return replace(campaign, moves=tuple(replace(m, **{name: -getattr(m, name)}) for m in campaign.moves))
-
-    return change
-
-
-def exchanged(campaign: Campaign, _: np.random.Generator) -> Campaign:
-    """Pan and tilt counters in each other's column."""
-    moves = tuple(replace(m, pan_steps=m.tilt_steps, tilt_steps=m.pan_steps) for m in campaign.moves)
-    return replace(campaign, moves=moves)
+    name = f"{axis}_steps"
+    return of_moves(lambda move: replace(move, **{name: -getattr(move, name)}))
 
 
 def renamed(share: float) -> Change:
@@ -93,18 +86,13 @@ def renamed(share: float) -> Change:
     def change(campaign: Campaign, rng: np.random.Generator) -> Campaign:
         names = sorted({spot.target for spot in campaign.spots})
 
-        def other(spot: Spot) -> Spot:
+        def other(_: int, spot: Spot, rng: np.random.Generator) -> Spot:
             rest = [name for name in names if name != spot.target]
             return replace(spot, target=str(rng.choice(rest))) if rng.random() < share else spot
 
-        return replace(campaign, spots=tuple(map(other, campaign.spots)))
+        return of_spots(other)(campaign, rng)
 
     return change
-
-
-def unnamed(campaign: Campaign, _: np.random.Generator) -> Campaign:
-    """No sheet has a name."""
-    return replace(campaign, spots=tuple(replace(spot, target="") for spot in campaign.spots))
 
 
 def mistyped(offset_px: float) -> Change:
@@ -112,18 +100,11 @@ def mistyped(offset_px: float) -> Change:
 
     def change(campaign: Campaign, rng: np.random.Generator) -> Campaign:
         ok = [k for k, spot in enumerate(campaign.spots) if spot.status == "ok"]
-        row, name = int(rng.choice(ok)), str(rng.choice(PIXELS))
-        spots = list(campaign.spots)
+        row, name, spots = int(rng.choice(ok)), str(rng.choice(PIXELS)), list(campaign.spots)
         spots[row] = replace(spots[row], **{name: getattr(spots[row], name) + offset_px * rng.choice([-1, 1])})
         return replace(campaign, spots=tuple(spots))
 
     return change
-
-
-def shifted(campaign: Campaign, _: np.random.Generator) -> Campaign:
-    """Every spot assigned to the move before."""
-    spots = tuple(replace(spot, move=max(spot.move - 1, 0)) for spot in campaign.spots)
-    return replace(campaign, spots=spots)
 
 
 def one_missing(campaign: Campaign, _: np.random.Generator) -> Campaign:
@@ -133,22 +114,21 @@ def one_missing(campaign: Campaign, _: np.random.Generator) -> Campaign:
     return replace(campaign, spots=spots)
 
 
-def knocked(campaign: Campaign, _: np.random.Generator) -> Campaign:
+def knocked(campaign: Campaign, rng: np.random.Generator) -> Campaign:
     """The right camera turned halfway, by a sixth of a degree about its line of sight to the left one."""
     half = len(campaign.spots) // 2
 
-    def change(place: int, spot: Spot) -> Spot:
+    def change(place: int, spot: Spot, _: np.random.Generator) -> Spot:
         return spot if place < half or spot.v_right_px is None else replace(spot, v_right_px=spot.v_right_px + 3)
 
-    return replace(campaign, spots=tuple(change(k, spot) for k, spot in enumerate(campaign.spots)))
+    return of_spots(change)(campaign, rng)
 
 
 def in_metres(campaign: Campaign, _: np.random.Generator) -> Campaign:
     """The mirror offset stated in metres."""
-    priors = dict(campaign.rig.priors)
-    name = "mirror_offset_mm"
-    priors[name] = replace(priors[name], value=priors[name].value / 1000, u=priors[name].u / 1000)
-    return replace(campaign, rig=replace(campaign.rig, priors=priors))
+    name, priors = "mirror_offset_mm", campaign.rig.priors
+    small = replace(priors[name], value=priors[name].value / 1000, u=priors[name].u / 1000)
+    return replace(campaign, rig=replace(campaign.rig, priors={**priors, name: small}))
 
 
 MISTAKES: dict[str, tuple[Change, str]] = {
@@ -156,17 +136,23 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "relative counters": (relative, "steps of each move"),
     "tilt sign": (turned("tilt"), "up counts up"),
     "pan sign": (turned("pan"), "left counts up"),
-    "pan and tilt exchanged": (exchanged, "columns exchanged"),
-    "pictures of half the size": (lambda campaign, _: scaled(campaign, 0.5), "half the size"),
+    "pan and tilt exchanged": (
+        of_moves(lambda m: replace(m, pan_steps=m.tilt_steps, tilt_steps=m.pan_steps)),
+        "columns exchanged",
+    ),
+    "pictures of half the size": (scaled(0.5), "half the size"),
     "5 % of the sheet names wrong": (renamed(0.05), "sheet of another name"),
     "half of the sheet names wrong": (renamed(0.5), "sheet of another name"),
-    "sheet names blank": (unnamed, "column target is empty"),
-    "cameras swapped": (swapped, "left and right swapped"),
-    "centres in millimetres": (lambda campaign, _: scaled(campaign, 0.003), "centres in millimetres"),
-    "pixels counted from 1": (from_one, "count from 1"),
+    "sheet names blank": (of_spots(lambda _, spot, __: replace(spot, target="")), "column target is empty"),
+    "cameras swapped": (as_corrected(Correction(swapped=True)), "left and right swapped"),
+    "centres in millimetres": (scaled(0.003), "centres in millimetres"),
+    "pixels counted from 1": (as_corrected(Correction(pixels_from=-1)), "count from 1"),
     "one pixel 10 px off": (mistyped(10.0), "apart from all others"),
     "one pixel 100 px off": (mistyped(100.0), "apart from all others|triangulate outside"),
-    "spots one move early": (shifted, "the move after theirs|rows shifted by one"),
+    "spots one move early": (
+        of_spots(lambda _, spot, __: replace(spot, move=max(spot.move - 1, 0))),
+        "the move after theirs|rows shifted by one",
+    ),
     "a row of the log missing halfway": (one_missing, "the move before theirs|rows shifted by one"),
     "right camera knocked by 3 px halfway": (knocked, "was a camera knocked"),
     "mirror offset in metres": (in_metres, "in metres"),

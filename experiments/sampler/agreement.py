@@ -9,8 +9,7 @@ Eight runs of tier 1 on the twins are averaged; NUTS by NumPyro (the extra `benc
 ten CPU minutes. `table` compares all of them: every free parameter and headline; means in posterior sds, sds in per
 cent, both also in joint Monte Carlo errors. Wanted are means within 0.1 sd and sds within 6 %; beyond them "undecided"
 says that no such gap is more than four errors. Of a hundred quantities one in a hundred lies beyond 2.6 errors by
-chance, the worst near 3. CPU seconds are the process' own, from the fit on, after a first call that compiles, with
-campaigns padded to 384, 192 and 64 rows instead of 512.
+chance, the worst near 3.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ from tvsbayes.posterior.sampling import TIERS, sample
 from tvsbayes.results.records import plain
 from tvsbayes.twin.simulated_campaign import simulate
 
-DENSE, FEW = "60 spots", "12 stops"
+Quantities = Mapping[str, Mapping[str, float]]
+DENSE, FEW, SEED = "60 spots", "12 stops", 1
 CASES = (*TWINS, DENSE, FEW)
-SEED = 1
-SEEDS, POOLED = 8, "tier 1, 8 seeds"
+SEEDS, POOLED, NUTS = 8, "tier 1, 8 seeds", "NUTS"
 """Runs of importance sampling that are averaged where there is a reference: their error is a third of one's."""
 SHEETS = {DENSE: ("d1", "d3"), FEW: ("d1", "d2")}
-MEAN_WANTED, SD_WANTED = 0.1, 6.0
-"""In posterior sds, and in per cent."""
+WANTED = {"mean": 0.1, "sd": 0.06}
+"""In posterior sds, and relative."""
 CHANCE = 4.0
 """Monte Carlo errors up to which a gap decides nothing, as in `fit`: a thousand effective draws fix an sd to 2 %."""
-MAX_MINUTES = 15.0
-NUTS = "NUTS"
+MAX_MINUTES, RHAT_LIMIT = 15.0, 1.01
+"""R-hat of four chains (Vehtari et al., doi 10.1214/20-BA1221)."""
 SETTINGS = {
     DENSE: Setting(4, 500, 2500, SEED),
     FEW: Setting(4, 500, 2500, SEED),
@@ -55,9 +54,6 @@ SETTINGS = {
     TWINS[0]: Setting(4, 400, 1200, SEED),
 }
 """Chains, warm-up and draws: two to four thousand effective draws of the worst quantity, on the paper twin 600."""
-CHAIN = "chain: steps | effective | R-hat | errors from tier 1 | converged | CPU s"
-RHAT_LIMIT = 1.01
-"""Of four chains (Vehtari et al., doi 10.1214/20-BA1221)."""
 
 
 def campaign_of(case: str) -> Campaign:
@@ -71,24 +67,21 @@ def campaign_of(case: str) -> Campaign:
 def one_case(task: tuple[str, str]) -> dict[str, object]:
     """One posterior by one tier."""
     tier, case = task
-    campaign = campaign_of(case)
     use_compilation_cache()
-    joint = fit(campaign)
+    joint = fit(campaign_of(case))
+    row: dict[str, object] = {"tier": tier, "case": case, "accepted": True, "missing": []}
     if tier == NUTS:
-        return {"tier": tier, "case": case, **by_nuts(joint, SETTINGS[case])}
+        return row | by_nuts(joint, SETTINGS[case])
     # What the clock must not see: compilation.
     sample(joint, tier=TIERS[0], seed=SEED + 1)
-    cpu, wall = time.process_time(), time.perf_counter()
-    joint = fit(campaign)
-    fit_cpu_s = time.process_time() - cpu
     if tier == POOLED:
         each = [summary(sample(joint, tier=TIERS[0], seed=SEED + k)) for k in range(SEEDS)]
-        return {"tier": tier, "case": case, "accepted": True, "quantities": average(each)}
+        return row | {"quantities": average(each)}
+    began = time.process_time()
     posterior = sample(joint, tier=tier, seed=SEED, max_minutes=MAX_MINUTES)
-    row: dict[str, object] = {"tier": tier, "case": case, "cpu_s": time.process_time() - cpu, "fit_cpu_s": fit_cpu_s}
-    row |= {"wall_s": time.perf_counter() - wall, "spots": len(campaign.spots)}
-    row |= {"accepted": bool(posterior.converged), "missing": list(posterior.convergence.missing)}
-    return row | {"sampling": plain(posterior.convergence.sampling), "quantities": summary(posterior)}
+    row |= {"cpu_s": time.process_time() - began, "accepted": bool(posterior.converged)}
+    row |= {"missing": list(posterior.convergence.missing), "sampling": plain(posterior.convergence.sampling)}
+    return row | {"quantities": summary(posterior)}
 
 
 def by_nuts(joint: JointFit, setting: Setting) -> dict[str, object]:
@@ -98,121 +91,105 @@ def by_nuts(joint: JointFit, setting: Setting) -> dict[str, object]:
     rhat = max(row["rhat"] for row in rows.values())
     missing = [f"R-hat {rhat:.4f}"] if rhat > RHAT_LIMIT else []
     row = {"rhat": rhat, "ess": min(row["ess_bulk"] for row in rows.values()), "quantities": rows}
-    row |= {"warmup_s": run.warmup_s, "sampling_s": run.sampling_s, "leapfrogs": run.leapfrogs}
-    return row | {"divergences": run.divergences, "accepted": not missing, "missing": missing}
+    row |= {"cpu_s": run.warmup_s + run.sampling_s, "leapfrogs": run.leapfrogs, "divergences": run.divergences}
+    return row | {"accepted": not missing, "missing": missing}
 
 
 def summary(posterior: Posterior) -> dict[str, dict[str, float]]:
     """Mean and sd with their Monte Carlo errors, of every free parameter and headline."""
-    names = [NAMES[i] for i in np.flatnonzero(posterior.fit.free)]
-    names += [name for name in headline_names(posterior.fit) if name not in names]
+    free = [NAMES[i] for i in np.flatnonzero(posterior.fit.free)]
+    names = list(dict.fromkeys((*free, *headline_names(posterior.fit))))
     table = posterior.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
     fields = zip(names, table.mean, table.sd, table.mcse_mean, table.mcse_sd, strict=True)
     keys = ("mean", "sd", "mean_mcse", "sd_mcse")
     return {name: dict(zip(keys, map(float, values), strict=True)) for name, *values in fields}
 
 
-def average(each: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+def average(each: Sequence[Quantities]) -> dict[str, dict[str, float]]:
     """Of independent runs: means, variances and squared errors averaged."""
     means = {}
     for name in each[0]:
         of = {key: np.array([run[name][key] for run in each]) for key in each[0][name]}
-        errors = {key: np.sqrt(np.mean(of[key] ** 2) / len(each)) for key in ("mean_mcse", "sd_mcse")}
-        means[name] = {
-            k: float(v) for k, v in {"mean": of["mean"].mean(), "sd": np.sqrt(np.mean(of["sd"] ** 2)), **errors}.items()
-        }
+        row = {key: float(np.sqrt(np.mean(of[key] ** 2) / len(each))) for key in ("mean_mcse", "sd_mcse")}
+        means[name] = {"mean": float(of["mean"].mean()), "sd": float(np.sqrt(np.mean(of["sd"] ** 2))), **row}
     return means
 
 
-def compare(one: Mapping[str, Mapping[str, float]], other: Mapping[str, Mapping[str, float]]) -> str:
+def compare(one: Quantities, other: Quantities) -> list[object]:
     """Cells of a table: the worst quantity of each difference."""
     shared = [name for name in one if name in other]
-    mean = {n: abs(one[n]["mean"] - other[n]["mean"]) / other[n]["sd"] for n in shared}
-    sd = {n: 100 * abs(one[n]["sd"] / other[n]["sd"] - 1) for n in shared}
-    errors = {}
-    for key in ("mean", "sd"):
-        for n in shared:
-            error = np.hypot(one[n][f"{key}_mcse"], other[n][f"{key}_mcse"])
-            errors[f"{key} of {n}"] = abs(one[n][key] - other[n][key]) / error
-    cells = [str(len(shared))]
-    cells += [f"{gaps[worst]:.2f} `{worst}`" for gaps in (mean, sd) for worst in [max(gaps, key=gaps.get)]]
-    worst = max(errors, key=errors.get)
-    cells += [f"{np.median(list(errors.values())):.2f}, {errors[worst]:.2f} {worst}"]
-    limits = (("mean", mean, MEAN_WANTED), ("sd", sd, SD_WANTED))
-    beyond = [errors[f"{key} of {n}"] for key, gaps, wanted in limits for n in shared if gaps[n] > wanted]
+    gaps = {"mean": {n: abs(one[n]["mean"] - other[n]["mean"]) / other[n]["sd"] for n in shared}}
+    gaps["sd"] = {n: abs(one[n]["sd"] / other[n]["sd"] - 1) for n in shared}
+    errors = {
+        (key, n): abs(one[n][key] - other[n][key]) / np.hypot(one[n][f"{key}_mcse"], other[n][f"{key}_mcse"])
+        for key in gaps
+        for n in shared
+    }
+    worst = {key: max(of, key=of.__getitem__) for key, of in gaps.items()}
+    far = max(errors, key=errors.__getitem__)
+    beyond = [errors[key, n] for key, of in gaps.items() for n in shared if of[n] > WANTED[key]]
     verdict = "OUTSIDE" if max(beyond, default=0.0) > CHANCE else "undecided" if beyond else "within"
-    return " | ".join([*cells, verdict])
+    cells = [
+        f"{gaps['mean'][worst['mean']]:.2f} `{worst['mean']}`",
+        f"{100 * gaps['sd'][worst['sd']]:.2f} `{worst['sd']}`",
+    ]
+    return [
+        len(shared),
+        *cells,
+        f"{np.median(list(errors.values())):.2f}, {errors[far]:.2f} {' of '.join(far)}",
+        verdict,
+    ]
 
 
+COSTS = (
+    "case | by | accepted | CPU s",
+    "draws, steps or leapfrogs",
+    "least effective | worst k or R-hat | divergences",
+)
 TEXT = f"""# Importance sampling, the chain and NUTS
 
-Written by `python -m experiments.sampler.agreement table` after `run`.
+Written by `python -m experiments.sampler.agreement table` after `run`. NUTS: four chains in step in sheared coordinates
+(`nuts_reference.py`), of the same model and data. Where it diverges it may miss a tail (Betancourt, arXiv:1701.02434,
+section 6.2); tier 1 and chain stand beside.
 
-## What the tiers say of themselves
-
-`share`: effective draws by weights over draws; `effective`: of the worst statistic of the worst headline.
-Of the chain: steps of its walkers, worst bulk effective draws, worst R-hat, gap to tier 1 in errors.
-
-{heading("case | spots | Pareto k | worst of a headline | draws | share | effective | accepted | CPU s", CHAIN)}"""
+{heading(*COSTS)}"""
 DIFFERENCES = f"""
 ## Differences
 
-NUTS: four chains in step in sheared coordinates (`nuts_reference.py`), of the same model and data. Where it
-diverges it may miss a tail (Betancourt, arXiv:1701.02434, section 6.2); tier 1 and chain stand beside.
 Within: means within 0.1 sd and sds within 6 %. Undecided: beyond, but by no more than four Monte Carlo errors
 of both, so that more draws would have to tell. OUTSIDE: by more.
 
-{heading("case | chains x (warm-up + draws) | leapfrogs | divergences | largest R-hat | worst bulk ESS | CPU s")}"""
+{heading("case | of | from | quantities | mean, sds | sd, % | in errors: median, worst | verdict")}"""
+
+
+def workings(row: Mapping) -> list[object]:
+    """What a run says of itself."""
+    if row["tier"] == NUTS:
+        return [f"{row['leapfrogs']:.1f}", f"{row['ess']:.0f}", f"{row['rhat']:.4f}", row["divergences"]]
+    run = row["sampling"]
+    if row["tier"] == TIERS[0]:
+        of = run["importance"]
+        return [of["draws"], f"{of['least_ess']['value']:.0f}", f"{of['worst_pareto_k']['value']:.2f}", ""]
+    return [run["steps"], f"{run['least_ess_bulk']['value']:.0f}", f"{run['worst_rhat']['value']:.4f}", ""]
 
 
 def table(rows: list[dict]) -> None:
     print(TEXT)
-    of = {(r["case"], r["tier"]): r for r in rows}
-    cases = list(dict.fromkeys(r["case"] for r in rows))
-    for case in cases:
-        cells = [*first_cells(of.get((case, TIERS[0]))), *chain_cells(of.get((case, TIERS[1])))]
-        print(line(case, *cells))
+    of = {(row["case"], row["tier"]): row for row in rows}
+    for (case, tier), row in of.items():
+        if tier != POOLED:
+            print(line(case, tier, "yes" if row["accepted"] else "NO", f"{row['cpu_s']:.1f}", *workings(row)))
     print(DIFFERENCES)
-    for case in cases:
-        if row := of.get((case, NUTS)):
-            how, cpu_s = SETTINGS[case], row["warmup_s"] + row["sampling_s"]
-            sizes = f"{how.chains} x ({how.warmup} + {how.draws})"
-            cells = (f"{row['leapfrogs']:.1f}", row["divergences"], f"{row['rhat']:.4f}", f"{row['ess']:.0f}")
-            print(line(case, sizes, *cells, f"{cpu_s:.0f}"))
-    print()
-    print(heading("case | of | from | quantities | mean, sds | sd, % | in errors: median, worst | verdict"))
-    for case in cases:
-        one, two, pooled, nuts = (of.get((case, tier)) for tier in (*TIERS, POOLED, NUTS))
-        pairs = (("tier 1", one, "chain", two), ("tier 1", one, "NUTS", nuts), ("chain", two, "NUTS", nuts))
-        pairs += ((POOLED, pooled, "NUTS", nuts), ("tier 1", one, POOLED, pooled), ("chain", two, POOLED, pooled))
-        for name, these, other, those in pairs:
-            if these and those:
-                print(line(case, name, other, compare(these["quantities"], those["quantities"])))
-    for r in rows:
-        if not r["accepted"]:
-            print(f"\n- not accepted: {r['case']}, {r['tier']}: {'; '.join(r['missing'])}")
-
-
-def first_cells(row: dict | None) -> list[str]:
-    """Of tier 1."""
-    if row is None:
-        return [""] * 8
-    run = row["sampling"]["importance"]
-    worst, least = run["worst_pareto_k"], run["least_ess"]
-    cells = [str(row["spots"]), f"{run['pareto_k']:.2f}", f"{worst['value']:.2f} `{worst['quantity']}`"]
-    cells += [str(run["draws"]), f"{run['effective_share']:.2f}", f"{least['value']:.0f} `{least['quantity']}`"]
-    return [*cells, "yes" if row["accepted"] else "NO", f"{row['cpu_s']:.1f}"]
-
-
-def chain_cells(row: dict | None) -> list[str]:
-    """Of tier 2, which ends after tier 1."""
-    if row is None:
-        return [""] * 6
-    run = row["sampling"]
-    cells = [f"{run['steps']} of {run['walkers']}", f"{run['least_ess_bulk']['value']:.0f}"]
-    cells += [f"{run['worst_rhat']['value']:.4f}"]
-    cells += [f"{run['agreement']['worst']['value']:.2f}" if run["agreement"] else ""]
-    return [*cells, "yes" if row["accepted"] else "NO", f"{row['cpu_s']:.1f}"]
+    one, two = TIERS
+    pairs = ((one, two), (one, NUTS), (two, NUTS), (POOLED, NUTS), (one, POOLED), (two, POOLED))
+    for case in dict.fromkeys(row["case"] for row in rows):
+        for these, those in pairs:
+            if (case, these) in of and (case, those) in of:
+                both = (of[case, tier]["quantities"] for tier in (these, those))
+                print(line(case, these, those, *compare(*both)))
+    for row in rows:
+        if not row["accepted"]:
+            print(f"\n- not accepted: {row['case']}, {row['tier']}: {'; '.join(row['missing'])}")
 
 
 def tasks(_: argparse.Namespace) -> list[tuple[str, str]]:
