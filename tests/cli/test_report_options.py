@@ -10,7 +10,7 @@ from support.axes import runs
 from support.refusals import refusal
 from support.signers import signer
 
-from tvsbayes.cli.report_options import tolerance_of
+from tvsbayes.cli.report_page import tolerance_of
 from tvsbayes.report.axis_document import figures_by_name
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading, Reference, write_axis
 

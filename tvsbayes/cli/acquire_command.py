@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.app import (
     INTERRUPTED,
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from tvsbayes.planning.next_looks import NextLooks
 
 LaserClass = Annotated[
-    str | None, typer.Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
+    str | None, Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
 ]
 TargetU = Annotated[
     float | None,
-    typer.Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
+    Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
 ]
 Estimated = Annotated[
     bool | None,
-    typer.Option(
+    Option(
         "--estimate/--no-estimate",
         help="Fit the looks so far beside the run (default: on hardware only; a simulation waits for each fit).",
     ),
@@ -51,33 +51,30 @@ Estimated = Annotated[
 
 
 def acquire(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
-    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
-    simulate: Annotated[bool, typer.Option("--simulate", help="The digital twin instead of hardware.")] = False,
+    rig: Annotated[Path, Argument(metavar="RIG", help="Rig file.")],
+    plan: Annotated[Path, Argument(metavar="PLAN", help="plan.csv.")],
+    out: Annotated[Path, Argument(metavar="OUT", help="Campaign folder to write.")],
+    simulate: Annotated[bool, Option("--simulate", help="The digital twin instead of hardware.")] = False,
     centroids: Annotated[
-        bool, typer.Option("--centroids", help="With --simulate: the twin states centroids, no pictures are made.")
+        bool, Option("--centroids", help="With --simulate: the twin states centroids, no pictures are made.")
     ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would happen; nothing moves.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Go on with an interrupted run.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="List what would happen; nothing moves.")] = False,
     laser_class: LaserClass = None,
     target_u: TargetU = None,
     estimate: Estimated = None,
-    adapt: Annotated[bool, typer.Option("--adapt", help="With --target-u: looks chosen from the fits.")] = False,
-    minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="With --adapt: longest run.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of a simulation (default 0).")] = None,
+    adapt: Annotated[bool, Option("--adapt", help="With --target-u: looks chosen from the fits.")] = False,
+    minutes: Annotated[float | None, Option(min=0.1, help="With --adapt: longest run.")] = None,
+    seed: Annotated[int | None, Option(min=0, help="Of a simulation (default 0).")] = None,
     place_command: Annotated[
-        str | None,
-        typer.Option("--place-command", metavar="CMD", help="Program that places the sheet: CMD TARGET X_MM NUMBER."),
+        str | None, Option(metavar="CMD", help="Program that places the sheet: CMD TARGET X_MM NUMBER.")
     ] = None,
     place_seconds: Annotated[
-        float | None, typer.Option("--place-seconds", min=1.0, help="With --place-command: longest time (default 600).")
+        float | None, Option(min=1.0, help="With --place-command: longest time (default 600).")
     ] = None,
-    live: Annotated[bool, typer.Option("--live", help="A page on this machine to watch the run.")] = False,
-    port: Annotated[
-        int | None, typer.Option("--port", min=0, max=65535, help="With --live: to listen on; 0 takes a free one.")
-    ] = None,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="With --live: only print the link.")] = False,
+    live: Annotated[bool, Option("--live", help="A page on this machine to watch the run.")] = False,
+    port: Annotated[int | None, Option(min=0, max=65535, help="With --live: to listen on; 0 takes a free one.")] = None,
+    no_browser: Annotated[bool, Option("--no-browser", help="With --live: only print the link.")] = False,
     as_json: Json = False,
 ) -> None:
     """Drive positioner and cameras through a plan into a campaign. An interrupted run loses nothing.

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import styled
@@ -41,19 +42,19 @@ def _print_version(requested: bool) -> None:
 @app.callback(epilog=epilog(FIRST))
 def _options(
     _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     pass
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace a file that tvsbayes did not write.")]
-Anyway = Annotated[bool, typer.Option("--anyway", help="Go on at what `check` is certain of.")]
-OldOut = Annotated[Path | None, typer.Option("--output", hidden=True)]
+Json = Annotated[bool, Option("--json", help="Print one JSON document on stdout.")]
+Seed = Annotated[int, Option("--seed", min=0, help="Seed of everything random.")]
+Force = Annotated[bool, Option("--force", help="Replace a file that tvsbayes did not write.")]
+Anyway = Annotated[bool, Option("--anyway", help="Go on at what `check` is certain of.")]
+OldOut = Annotated[Path | None, Option("--output", hidden=True)]
 """The former name of --out."""
-CampaignFolder = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder.")]
+CampaignFolder = Annotated[Path, Argument(metavar="CAMPAIGN", help="Campaign folder.")]
 
 
 class Ended(Exception):

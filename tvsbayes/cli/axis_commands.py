@@ -1,25 +1,31 @@
-"""Commands for an axis folder: check, fit, calibrate, compare, report, plan, simulate, new.
+"""Commands of an axis folder.
 
 The modules of the commands contain their options; `cli/instruments` calls these functions for an axis folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from tvsbayes.cli.app import TARGET_MISSED, Ended, command_line, finish, finish_kept, keep, report_line, write_new
+from tvsbayes.cli.app import (
+    check_output,
+    command_line,
+    finish,
+    finish_kept,
+    keep,
+    report_line,
+    write_new,
+)
+from tvsbayes.cli.outcomes import WATCHING, finish_watch, finish_watch_plan, write_kept
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.cli.report_options import Certification, parties_of, tolerance_of
-from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
-from tvsbayes.cli.watched import WATCHING, finish_watch
-from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
+from tvsbayes.cli.report_page import DRAWING, Certification, Page, Part, print_parts, tolerance_of
+from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import output_place, read_bytes, write_atomically
-from tvsbayes.metrology.conformity import CONFORMS, Criterion, Tolerance
 from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
 from tvsbayes.results.records import plain
@@ -29,12 +35,24 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, axis_t
 from tvsbayes.single_axis.axis_rows import rows_of
 
 if TYPE_CHECKING:
-    from tvsbayes.metrology.dcc import Embedded
+    from tvsbayes.compensation.formats import Wish
+    from tvsbayes.metrology.conformity import Tolerance
+    from tvsbayes.metrology.dcc import Embedded, Parties
     from tvsbayes.report.document import Document, Issue
+    from tvsbayes.results.compensation_record import Compensation
     from tvsbayes.results.records import Tier
-    from tvsbayes.single_axis.axis_record import AxisResults, AxisSummary
+    from tvsbayes.single_axis.axis_record import AxisResults
 
-FITTING, PLANNING = "fit", "choosing stops"
+FITTING, PLANNING, CHOOSING, MAKING = "fit", "choosing stops", "choosing looks", "compensation"
+
+
+@contextmanager
+def _fitted(data: AxisCampaign, stage: str, seed: int, share: float = 1.0) -> Iterator[tuple[AxisResults, Job]]:
+    """The stored fit of an axis, or a new one; the block takes `share` times as long, as `stage` of the job."""
+    from tvsbayes.single_axis.axis_record import results_for
+
+    with waiting() as progress, Job({FITTING: 1.0, stage: share}, progress) as job:
+        yield results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line), job
 
 
 def new(out: Path, as_json: bool) -> None:
@@ -76,7 +94,6 @@ def classic(folder: Path, as_json: bool) -> None:
 
 
 def _classic(data: AxisCampaign) -> Part:
-    """The result of `classic`."""
     from tvsbayes.report.axis_document import classic_text
     from tvsbayes.single_axis.classic_line import classic_axis
 
@@ -96,71 +113,53 @@ def fit(
     as_json: bool,
 ) -> None:
     """Fit an axis; write results into its folder or `out`."""
-    from tvsbayes.report.axis_document import axis_fit_text
-
     place = out or output_place(folder, "results")
-    stored = _kept_fit(read_axis(folder), place, tier, no_sample, max_minutes, seed)
-    text = axis_fit_text(stored.summary, details, list(stored.files.values()))
-    if stored.error is None and out is None:
-        text += f"\nnext: {command_line('report', folder)}"
-    finish(stored.as_json(seed), text, as_json, stored.error)
+    fitted = _fit(read_axis(folder), place, tier, no_sample, max_minutes, seed, details)
+    hint = f"\nnext: {command_line('report', folder)}" if fitted.error is None and out is None else ""
+    finish(fitted.document or {}, fitted.text + hint, as_json, fitted.error)
 
 
-@dataclass(frozen=True)
-class StoredFit:
-    """A fit in its folder: summary, files by kind, and the error of a fit that must not be used, else None."""
-
-    summary: AxisSummary
-    files: dict[str, str]
-    error: TvsError | None
-
-    def as_json(self, seed: int) -> dict[str, Any]:
-        """The document of `fit --json`."""
-        return {**self.summary.as_json(), "seed": seed, "files": self.files}
-
-
-def _kept_fit(
-    data: AxisCampaign, to: Path, tier: Tier | None, no_sample: bool, max_minutes: float, seed: int
-) -> StoredFit:
+def _fit(
+    data: AxisCampaign,
+    to: Path,
+    tier: Tier | None,
+    no_sample: bool,
+    max_minutes: float,
+    seed: int,
+    details: bool = False,
+) -> Part:
     """Fit an axis and write the results into a folder; options as in `fit`."""
+    from tvsbayes.report.axis_document import axis_fit_text
     from tvsbayes.single_axis.axis_fit import fit_axis
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
 
     with sole_writer(to):
         with waiting() as progress:
             result = fit_axis(
-                data,
-                tier=tier,
-                sampled=not no_sample,
-                max_minutes=max_minutes,
-                seed=seed,
-                progress=progress,
+                data, tier=tier, sampled=not no_sample, max_minutes=max_minutes, seed=seed, progress=progress
             )
         summary = summarise_axis(result)
-        return StoredFit(summary, keep_fit(result, summary, to), result.error or uninformed(summary))
+        files = keep_fit(result, summary, to)
+    document = {**summary.as_json(), "seed": seed, "files": files}
+    text = axis_fit_text(summary, details, list(files.values()))
+    return Part("fit", document, text, result.error or uninformed(summary))
 
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
     """Run check, classic, fit and report of an axis in one command."""
-    print_parts(_parts(folder, issue, quick, no_sample, seed, pdf), as_json)
 
+    def parts() -> Iterator[Part]:
+        from tvsbayes.report.command_text import check_text
 
-def _parts(folder: Path, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool) -> Iterator[Part]:
-    """The parts of `calibrate`; options as of it."""
-    from tvsbayes.report.axis_document import axis_fit_text
-    from tvsbayes.report.command_text import check_text
+        data, check = read_axis(folder), contents(folder)
+        yield Part("check", check, check_text(check))
+        yield _classic(data)
+        yield _fit(data, output_place(folder, "results"), IMPORTANCE if quick else CHAIN, no_sample, MAX_MINUTES, seed)
+        page = AxisPage(folder, issue, False, data).written(pdf)
+        page.report_removed()
+        yield page.part()
 
-    data = read_axis(folder)
-    check = contents(folder)
-    yield Part("check", check, check_text(check))
-    yield _classic(data)
-    tier = IMPORTANCE if quick else CHAIN
-    stored = _kept_fit(data, output_place(folder, "results"), tier, no_sample, MAX_MINUTES, seed)
-    text = axis_fit_text(stored.summary, written=list(stored.files.values()))
-    yield Part("fit", stored.as_json(seed), text, stored.error)
-    page = _page(data, folder, issue, pdf).page
-    page.report_removed()
-    yield page.part()
+    print_parts(parts(), as_json)
 
 
 def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_json: bool) -> None:
@@ -205,14 +204,47 @@ def _compare_later(folder: Path, other: Path, seed: int, as_json: bool) -> None:
 def watch(folder: Path, *, looks: Path, append: Path | None, seed: int, as_json: bool) -> None:
     """Test whether the fit of an axis still holds for the readings of a second folder."""
     from tvsbayes.comparison.axis_sessions import watch_axis
-    from tvsbayes.single_axis.axis_record import results_for
 
-    known, new = read_axis(folder), read_axis(looks)
-    with waiting() as progress, Job({FITTING: 1.0, WATCHING: 1.0}, progress) as job:
-        results = results_for(known, progress=job.part(FITTING), seed=seed, notify=report_line)
+    known, fresh = read_axis(folder), read_axis(looks)
+    with _fitted(known, WATCHING, seed) as (results, job):
         job.begin(WATCHING)
-        result = watch_axis(results.fit, new, seed=seed)
+        result = watch_axis(results.fit, fresh, seed=seed)
     finish_watch(result, append, as_json, "stops")
+
+
+def plan_watch(folder: Path, minutes: float | None, out: Path | None, seed: int, as_json: bool) -> None:
+    """`plan AXIS --watch`: the fewest stops by which `watch` notices a change of ratio, play or zero."""
+    from tvsbayes.comparison.axis_sessions import plan_watch_axis
+    from tvsbayes.compensation.promise import SURER, refuse_answer
+
+    with _fitted(read_axis(folder), CHOOSING, seed) as (results, job):
+        refuse_answer(results.summary.answer, SURER, "what a watch would notice cannot be trusted")
+        job.begin(CHOOSING)
+        plan, stops = plan_watch_axis(results.fit, minutes=minutes, seed=seed)
+
+    def write(path: Path) -> None:
+        write_atomically(path, stops.plan_bytes())
+
+    finish_watch_plan(plan, "stops", out, write, as_json)
+
+
+def plan_verify(folder: Path, out: Path | None, seed: int, as_json: bool) -> None:
+    """`plan AXIS --verify`: the fewest readings that verify its table."""
+    from tvsbayes.compensation.verification import plan_verification, refuse_drive, stored_compensation
+    from tvsbayes.report.compensation_text import verify_plan_text
+
+    data = read_axis(folder)
+    compensation = stored_compensation(data)
+    refuse_drive(compensation)
+    with _fitted(data, PLANNING, seed) as (results, job):
+        job.begin(PLANNING)
+        stops = plan_verification(results.fit, compensation, seed=seed)
+    document, text = plain(stops), verify_plan_text(stops)
+    if out is not None:
+        write_atomically(out, stops.plan_bytes())
+        document["plan"] = str(out)
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    finish({**document, "seed": seed}, text, as_json)
 
 
 def report(
@@ -233,67 +265,47 @@ def report(
 ) -> None:
     """Write the page of an axis, and its certificate."""
     from tvsbayes.report.axis_document import figures_by_name
-    from tvsbayes.report.evidence import criterion_text
 
     data = read_axis(folder)
     wish = tolerance_of(tolerance, of, rule, guard, figures_by_name(data.unit))
-    made = _page(data, folder, issue, pdf, out, IMPORTANCE if quick else CHAIN, wish)
-    page, lines, result, missed = made.page, [*map(criterion_text, made.criteria)], {}, False
-    if certification is not None and (dcc or dcc_schema):
-        done = certification.written(page, out, partial(made.certificate, certification.countries))
-        lines, result, missed = [*lines, *done.lines], done.result, done.missed
-    page.report_removed(certificates=True)
-    lines += [f"report {page.number}", f"written: {', '.join(page.files.values())}"]
-    finish(page.as_json(made.criteria) | result, "\n".join(lines), as_json)
-    if missed or any(c.verdict != CONFORMS for c in made.criteria):
-        raise Ended(TARGET_MISSED)
+    AxisPage(folder, issue, quick, data, wish).finish(pdf, out, as_json, certification)
 
 
 @dataclass
-class AxisPage:
-    """The page of an axis once it is written, with what it shows."""
+class AxisPage(Page):
+    """The page of an axis; `results` are there once the document is made."""
 
-    page: WrittenPage
-    results: AxisResults
-    issue: Issue
-    criteria: tuple[Criterion, ...]
+    data: AxisCampaign
+    tolerance: Tolerance | None = None
+    results: AxisResults = field(init=False)
+    stages: ClassVar = {FITTING: 3.0, DRAWING: 1.5}
 
-    def certificate(self, countries: Mapping[str, str], report: Embedded, signed: bool) -> bytes:
+    def document(self, job: Job) -> Document:
+        """Make the document; fits first where results are missing."""
+        from tvsbayes.report.axis_document import axis_document, criteria_of, curve_commands
+        from tvsbayes.single_axis.axis_record import results_for
+
+        commands = rows_of(self.data).command
+        curve = curve_commands(float(commands.min()), float(commands.max()))
+        self.results = results_for(self.data, curve, job.part(FITTING), notify=report_line, tier=self.tier)
+        self.criteria = criteria_of(self.results.summary, self.tolerance)
+        job.begin(DRAWING)
+        return axis_document(self.results, self.issue, self.criteria)
+
+    def lines(self, number: str, certified: Sequence[str] = ()) -> list[str]:
+        """Verdicts on the limits, then the certificate, then the page's number."""
+        from tvsbayes.report.evidence import criterion_text
+
+        return [*map(criterion_text, self.criteria), *super().lines(number, certified)]
+
+    def certificate(self, parties: Parties, report: Embedded, signed: bool) -> bytes:
         """DCC-schema XML with the page inside, issued on its day (UTC)."""
         from tvsbayes.single_axis.axis_certificate import axis_certificate
 
-        parties, issued = parties_of(self.issue, countries), self.issue.day
+        issued, criteria = self.issue.day, self.criteria
         return axis_certificate(
-            self.results, issued=issued, parties=parties, report=report, criteria=self.criteria, signed=signed
+            self.results, issued=issued, parties=parties, report=report, criteria=criteria, signed=signed
         )
-
-
-def _page(
-    data: AxisCampaign,
-    folder: Path,
-    issue: Issue,
-    pdf: bool,
-    out: Path | None = None,
-    tier: Tier = CHAIN,
-    wish: Tolerance | None = None,
-) -> AxisPage:
-    """Write the page of an axis, and print it with `pdf`."""
-    from tvsbayes.report.axis_document import axis_document, criteria_of, curve_commands
-    from tvsbayes.single_axis.axis_record import results_for
-
-    shown: dict[str, Any] = {}
-
-    def make(job: Job) -> Document:
-        commands = rows_of(data).command
-        curve = curve_commands(float(commands.min()), float(commands.max()))
-        results = results_for(data, curve, job.part(FITTING), notify=report_line, tier=tier)
-        criteria = criteria_of(results.summary, wish)
-        shown.update(results=results, criteria=criteria)
-        job.begin(DRAWING)
-        return axis_document(results, issue, criteria)
-
-    page = written_page(folder, out, pdf, {FITTING: 3.0, DRAWING: 1.5}, make)
-    return AxisPage(page, issue=issue, **shown)
 
 
 def plan(
@@ -304,7 +316,6 @@ def plan(
         message, remedy = "an axis is planned from its folder alone", "give --given FOLDER without RIG"
         raise InputError("usage", message, remedy=remedy)
     from tvsbayes.report.axis_document import axis_plan_text
-    from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.next_stops import TARGETS, plan_next, unit_of
 
     goal = target or TARGETS[0]
@@ -312,8 +323,7 @@ def plan(
         message, allowed = f"--target {escaped(goal)}: unknown for an axis", ", ".join(TARGETS)
         raise InputError("target", message, column="--target", allowed=allowed, remedy=f"name one of {allowed}")
     data = read_axis(folder)
-    with waiting() as progress, Job({FITTING: 1.0, PLANNING: 3.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
+    with _fitted(data, PLANNING, seed, 3.0) as (results, job):
         stops = plan_next(results.fit, goal, minutes=minutes, progress=job.part(PLANNING))
     document, text = {**stops.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(stops, data.unit)
     document["u_unit"] = unit_of(stops.target, data.unit)
@@ -323,8 +333,8 @@ def plan(
         text += f"\nwritten: {escaped(str(out), 200)}"
     elif out is not None:
         text += f"\nnothing written to {escaped(str(out), 200)}"
-    if keep(document, output_place(folder, "results") / "plan.json"):
-        document["files"] = {"next": str(output_place(folder, "results") / "plan.json")}
+    if keep(document, place := output_place(folder, "results") / "plan.json"):
+        document["files"] = {"next": str(place)}
     finish(document, text, as_json)
 
 
@@ -340,3 +350,55 @@ def simulate(folder: Path, *, moves: Path | None, out: Path, seed: int, as_json:
     document = {"campaign": str(out), "moves": count, "readings": read, "ok": read, "seed": seed}
     text = f"{escaped(str(out), 200)}: {count} moves, {read} readings; the truth is in truth.json"
     finish(document, text, as_json)
+
+
+def make_table(folder: Path, wish: Wish, out: Path | None, force: bool, seed: int, as_json: bool) -> None:
+    """Make the table of a controller with its promise, and write both where a file is named: `compensate`."""
+    from tvsbayes.compensation.formats import checked
+    from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
+    from tvsbayes.compensation.verification import compensation_in, table_in
+    from tvsbayes.report.compensation_text import compensation_text
+    from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
+    from tvsbayes.results.fit_record import provenance
+
+    form = checked(wish)
+    second = out.with_name(f"{out.name}.yaml") if out is not None and form.beside is not None else None
+    check_output(out, kind="compensation", force=force)
+    check_output(second, kind="compensation", force=force and second is not None)
+    data = read_axis(folder)
+    before = compensation_in(data)
+    replaced = table_in(data, out) if out is not None and out.is_file() else None
+    with _fitted(data, MAKING, seed) as (results, job):
+        compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
+    origin = plain(provenance(axis_hashes(data), seed, results.fit_id))
+    document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **origin}
+    content = file_text(compensation, data)
+    record_path = output_place(folder, "results") / "compensation.json"
+    held = record_path.read_bytes() if out is not None and before is not None else b""
+    contents = {wish.target: (out, content), "yaml": (second, file_beside(compensation, data) or "")}
+    files = write_kept(folder, document, contents)
+    if "compensation" in files:
+        _name_other_promises(compensation, before, replaced, record_path.parent, held)
+    text = compensation_text(compensation, list(files.values()))
+    if out is None:
+        text += f"\nnothing written: give -o FILE; it would hold:\n\n{content}".rstrip("\n")
+    else:
+        next_step = compensation.shown_by if compensation.in_motion else command_line("verify", folder, "FRESH")
+        text += f"\nnext: apply it, then {next_step}"
+    finish({**document, "files": files}, text, as_json)
+
+
+def _name_other_promises(
+    made: Compensation, before: Compensation | None, replaced: Compensation | None, results: Path, held: bytes
+) -> None:
+    """Say which promise ends, since its file was replaced, and keep that of the table made before, `held`, beside."""
+    from tvsbayes.compensation.verification import kept_name
+
+    if replaced is not None and replaced.digest != made.digest:
+        (results / kept_name(replaced)).unlink(missing_ok=True)
+        table = f"the table made before (--to {replaced.target}, {replaced.table_id})"
+        report_line(f"note: the promise of {table} ends: its file is replaced")
+    if before is not None and before.digest not in (made.digest, getattr(replaced, "digest", "")):
+        write_atomically(results / kept_name(before), held)
+        table = f"the table made before (--to {before.target}, {before.table_id})"
+        report_line(f"note: the promise of {table} stays: `verify --table FILE` tests it, `verify` alone this one")

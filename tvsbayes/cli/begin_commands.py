@@ -1,7 +1,4 @@
-"""The command that creates a campaign: new.
-
-Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
-"""
+"""The command that creates a campaign: new."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.app import CAMERAS, Json, check_word, finish, refuse_options, write_new
 from tvsbayes.cli.instruments import INSTRUMENTS
@@ -31,25 +28,21 @@ NAMES_LISTED = 6
 
 
 def new(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create; with --pictures also one of `new`.")],
-    axis: Annotated[bool, typer.Option("--axis", help="One axis and its readings, no optics.")] = False,
+    out: Annotated[Path, Argument(metavar="OUT", help="Folder to create; with --pictures also one of `new`.")],
+    axis: Annotated[bool, Option("--axis", help="One axis and its readings, no optics.")] = False,
     mechanism: Annotated[
-        str, typer.Option("--mechanism", help="two-mirror (the scanner), or pan-tilt: a head, seen by a stereo pair.")
+        str, Option(help="two-mirror (the scanner), or pan-tilt: a head, seen by a stereo pair.")
     ] = "two-mirror",
     sightings: Annotated[
-        bool, typer.Option("--sightings", help="With pan-tilt: the head's own camera says where it points.")
+        bool, Option("--sightings", help="With pan-tilt: the head's own camera says where it points.")
     ] = False,
-    pictures: Annotated[
-        Path | None, typer.Option("--pictures", help="Folder of spot pictures, left and right or side by side.")
-    ] = None,
-    pair: Annotated[
-        str | None, typer.Option("--pair", help="number: in the name, that of the move; order: of the names.")
-    ] = None,
-    swap: Annotated[bool, typer.Option("--swap", help="Wide pictures hold the left camera's on the right.")] = False,
+    pictures: Annotated[Path | None, Option(help="Folder of spot pictures, left and right or side by side.")] = None,
+    pair: Annotated[str | None, Option(help="number: in the name, that of the move; order: of the names.")] = None,
+    swap: Annotated[bool, Option("--swap", help="Wide pictures hold the left camera's on the right.")] = False,
     left: Annotated[
-        str | None, typer.Option("--left", help='Pictures of the left camera: "a/*.png"; as --right: side by side.')
+        str | None, Option(help='Pictures of the left camera: "a/*.png"; as --right: side by side.')
     ] = None,
-    right: Annotated[str | None, typer.Option("--right", help="Likewise of the right camera.")] = None,
+    right: Annotated[str | None, Option(help="Likewise of the right camera.")] = None,
     as_json: Json = False,
 ) -> None:
     """An empty campaign, explained in campaign.toml, and a rig file. With --pictures: its looks and their frames."""

@@ -1,7 +1,4 @@
-"""Commands at the bench: stereo, doctor, export.
-
-Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
-"""
+"""Commands at the bench: stereo, doctor, export."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.app import Json, finish, finite, missing_options, option_of, refuse_options
 from tvsbayes.cli.begin_commands import stated_globs
@@ -33,65 +30,42 @@ IMAGE_SIDE_MAX = 65_535
 
 
 def stereo(
-    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="Folder of checkerboard pictures.")] = None,
-    board: Annotated[str | None, typer.Option("--board", help="Inner corners, columns x rows: 9x6.")] = None,
-    pitch_mm: Annotated[float | None, typer.Option("--pitch-mm", help="Side of a square.")] = None,
-    pitch_u_mm: Annotated[
-        float | None, typer.Option("--pitch-u-mm", help="Its standard uncertainty (mean of all; default 0).")
-    ] = None,
+    folder: Annotated[Path | None, Argument(metavar="FOLDER", help="Folder of checkerboard pictures.")] = None,
+    board: Annotated[str | None, Option(help="Inner corners, columns x rows: 9x6.")] = None,
+    pitch_mm: Annotated[float | None, Option(help="Side of a square.")] = None,
+    pitch_u_mm: Annotated[float | None, Option(help="Its standard uncertainty (mean of all; default 0).")] = None,
     charuco: Annotated[
-        str | None, typer.Option("--charuco", help="Squares of a ChArUco board, columns x rows, instead of --board.")
+        str | None, Option(help="Squares of a ChArUco board, columns x rows, instead of --board.")
     ] = None,
-    dictionary: Annotated[
-        str | None, typer.Option("--dictionary", help="Of its markers, as in OpenCV: 5X5_100.")
-    ] = None,
-    marker_mm: Annotated[
-        float | None, typer.Option("--marker-mm", help="Side of a marker (default: found from the pictures).")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="stereo.json to write.")] = None,
+    dictionary: Annotated[str | None, Option(help="Of its markers, as in OpenCV: 5X5_100.")] = None,
+    marker_mm: Annotated[float | None, Option(help="Side of a marker (default: found from the pictures).")] = None,
+    out: Annotated[Path | None, Option("-o", "--out", help="stereo.json to write.")] = None,
     imports: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--import", help="Calibration of another program, or stereo.json, instead of pictures; repeatable."
-        ),
+        Option("--import", help="Calibration of another program, or stereo.json, instead of pictures; repeatable."),
     ] = None,
-    export: Annotated[str | None, typer.Option("--export", help="opencv or ros: also for these, beside -o.")] = None,
-    finder: Annotated[
-        str | None, typer.Option("--finder", help="classic (default) or sector; the other is the fallback.")
-    ] = None,
-    swap: Annotated[
-        bool, typer.Option("--swap", help="Wide frames hold the left camera's image on the right.")
-    ] = False,
-    pair: Annotated[
-        str | None, typer.Option("--pair", help="name (default) or order: of the names of each camera.")
-    ] = None,
-    left: Annotated[
-        str | None, typer.Option("--left", help='Pictures of the left camera in FOLDER: "a/*.png".')
-    ] = None,
-    right: Annotated[str | None, typer.Option("--right", help="Likewise of the right camera.")] = None,
-    fix_k3: Annotated[bool, typer.Option("--fix-k3", help="Keep k3 at 0.")] = False,
-    robust: Annotated[bool, typer.Option("--robust", help="Leave out outlying views, by name.")] = False,
-    image_size: Annotated[str | None, typer.Option("--image-size", help="1280x720, where imports lack it.")] = None,
-    import_unit: Annotated[
-        str | None, typer.Option("--import-unit", help="Unit of an imported T: mm, cm, m, or its mm: 25.")
-    ] = None,
+    export: Annotated[str | None, Option(help="opencv or ros: also for these, beside -o.")] = None,
+    finder: Annotated[str | None, Option(help="classic (default) or sector; the other is the fallback.")] = None,
+    swap: Annotated[bool, Option("--swap", help="Wide frames hold the left camera's image on the right.")] = False,
+    pair: Annotated[str | None, Option(help="name (default) or order: of the names of each camera.")] = None,
+    left: Annotated[str | None, Option(help='Pictures of the left camera in FOLDER: "a/*.png".')] = None,
+    right: Annotated[str | None, Option(help="Likewise of the right camera.")] = None,
+    fix_k3: Annotated[bool, Option("--fix-k3", help="Keep k3 at 0.")] = False,
+    robust: Annotated[bool, Option("--robust", help="Leave out outlying views, by name.")] = False,
+    image_size: Annotated[str | None, Option(help="1280x720, where imports lack it.")] = None,
+    import_unit: Annotated[str | None, Option(help="Unit of an imported T: mm, cm, m, or its mm: 25.")] = None,
     key: Annotated[
-        list[str] | None, typer.Option("--key", help="M1=NAME: what holds M1, D1, M2, D2, R (R=NAME.T: transposed), T.")
+        list[str] | None, Option("--key", help="M1=NAME: what holds M1, D1, M2, D2, R (R=NAME.T: transposed), T.")
     ] = None,
-    rms_px: Annotated[
-        float | None, typer.Option("--rms-px", help="RMS of an imported calibration, as OpenCV gives it.")
-    ] = None,
-    views: Annotated[int | None, typer.Option("--views", min=1, help="Views that it was made of.")] = None,
+    rms_px: Annotated[float | None, Option(help="RMS of an imported calibration, as OpenCV gives it.")] = None,
+    views: Annotated[int | None, Option(min=1, help="Views that it was made of.")] = None,
     fixed_intrinsics: Annotated[
-        bool | None,
-        typer.Option("--fixed-intrinsics/--joint", help="Each camera by itself, then R and T; or all at once."),
+        bool | None, Option("--fixed-intrinsics/--joint", help="Each camera by itself, then R and T; or all at once.")
     ] = None,
-    u_focal_percent: Annotated[
-        float | None, typer.Option("--u-focal-percent", help="Standard uncertainty of fx, fy of an import.")
-    ] = None,
-    u_principal_px: Annotated[float | None, typer.Option("--u-principal-px", help="Of its cx, cy.")] = None,
-    u_rotation_mrad: Annotated[float | None, typer.Option("--u-rotation-mrad", help="Of each turn in its R.")] = None,
-    u_baseline_mm: Annotated[float | None, typer.Option("--u-baseline-mm", help="Of each component of its T.")] = None,
+    u_focal_percent: Annotated[float | None, Option(help="Standard uncertainty of fx, fy of an import.")] = None,
+    u_principal_px: Annotated[float | None, Option(help="Of its cx, cy.")] = None,
+    u_rotation_mrad: Annotated[float | None, Option(help="Of each turn in its R.")] = None,
+    u_baseline_mm: Annotated[float | None, Option(help="Of each component of its T.")] = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
@@ -297,12 +271,12 @@ def _image_size(text: str | None) -> tuple[int, int] | None:
 
 
 def doctor(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    rig: Annotated[Path, Argument(metavar="RIG", help="Rig file.")],
     laser: Annotated[
-        bool, typer.Option("--laser", help="LASER ON for one picture, invisible and likely class 3B: goggles on.")
+        bool, Option("--laser", help="LASER ON for one picture, invisible and likely class 3B: goggles on.")
     ] = False,
     contract: Annotated[
-        bool, typer.Option("--contract", help="With --laser: MOTORS MOVE, LASER ON; test the contract of the drivers.")
+        bool, Option("--contract", help="With --laser: MOTORS MOVE, LASER ON; test the contract of the drivers.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -339,8 +313,8 @@ def doctor(
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder.")],
-    nexus: Annotated[Path, typer.Option("--nexus", help="NeXus file (HDF5) to write, such as run.nxs.")],
+    folder: Annotated[Path, Argument(metavar="CAMPAIGN", help="Campaign folder.")],
+    nexus: Annotated[Path, Option(help="NeXus file (HDF5) to write, such as run.nxs.")],
     as_json: Json = False,
 ) -> None:
     """A campaign with its journal as one file of another format. Replaces no file."""

@@ -1,14 +1,11 @@
-"""Commands on campaigns: demo, simulate, detect, check.
-
-Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
-"""
+"""Commands on campaigns: demo, simulate, detect, check."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.app import CampaignFolder, Json, Seed, check_order, finish, finite, is_part, report_line
 from tvsbayes.cli.instruments import instrument_of, serve
@@ -29,7 +26,7 @@ DEMO_NOTE = "The twin's move history is our assumption, made so that the classic
 
 
 def demo(
-    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to keep the campaign in.")] = None,
+    out: Annotated[Path | None, Argument(metavar="OUT", help="Folder to keep the campaign in.")] = None,
     as_json: Json = False,
 ) -> None:
     """Both estimators on the shipped paper twin, beside its truth."""
@@ -77,13 +74,13 @@ def _sampled(campaign: Campaign, progress: Show | None) -> FitSummary:
 
 
 def simulate(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, or an axis folder.")],
-    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv; of an axis its moves.csv, or left out.")],
-    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Campaign folder to write.")] = None,
-    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
-    frames: Annotated[bool, typer.Option("--frames", help="Pictures for `detect` and `stereo`, no centroids.")] = False,
+    rig: Annotated[Path, Argument(metavar="RIG", help="Rig file, or an axis folder.")],
+    plan: Annotated[Path, Argument(metavar="PLAN", help="plan.csv; of an axis its moves.csv, or left out.")],
+    out: Annotated[Path | None, Argument(metavar="OUT", help="Campaign folder to write.")] = None,
+    aperture: Annotated[bool, Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    frames: Annotated[bool, Option("--frames", help="Pictures for `detect` and `stereo`, no centroids.")] = False,
     unrecorded_sides: Annotated[
-        bool, typer.Option("--unrecorded-sides", help="Homing ends on sides that are drawn and not recorded.")
+        bool, Option("--unrecorded-sides", help="Homing ends on sides that are drawn and not recorded.")
     ] = False,
     seed: Seed = 0,
     as_json: Json = False,
@@ -131,18 +128,14 @@ def simulate(
 
 def detect(
     campaign: CampaignFolder,
-    method: Annotated[str, typer.Option("--method", help="fit, or contour (the paper's).")] = "fit",
+    method: Annotated[str, Option(help="fit, or contour (the paper's).")] = "fit",
     speckle_contrast: Annotated[
-        float | None,
-        typer.Option("--speckle-contrast", min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4)."),
+        float | None, Option(min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4).")
     ] = None,
     dark: Annotated[
-        Path | None,
-        typer.Option(
-            "--dark", help="Folder of pictures with the laser off, to subtract: as in frames/, or left.png ..."
-        ),
+        Path | None, Option(help="Folder of pictures with the laser off, to subtract: as in frames/, or left.png ...")
     ] = None,
-    overlay: Annotated[bool, typer.Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
+    overlay: Annotated[bool, Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
     as_json: Json = False,
 ) -> None:
     """Find the laser spots in a campaign's frames. Writes centres and uncertainties into spots.csv, in place."""
@@ -168,13 +161,11 @@ def detect(
 
 
 def check(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
+    path: Annotated[Path, Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
     plan_file: Annotated[
-        Path | None, typer.Argument(metavar="PLAN", help="With a rig file: what the plan does not separate.")
+        Path | None, Argument(metavar="PLAN", help="With a rig file: what the plan does not separate.")
     ] = None,
-    repair_to: Annotated[
-        Path | None, typer.Option("--repair-to", help="New folder for the intact part of a damaged journal.")
-    ] = None,
+    repair_to: Annotated[Path | None, Option(help="New folder for the intact part of a damaged journal.")] = None,
     as_json: Json = False,
 ) -> None:
     """Contents and faults of a campaign, rig, plan or journal. Reads strictly, changes nothing."""

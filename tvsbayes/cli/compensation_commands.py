@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.app import (
     TARGET_MISSED,
@@ -17,25 +17,22 @@ from tvsbayes.cli.app import (
     Json,
     Seed,
     check_output,
-    command_line,
     finish,
     keep,
     report_line,
 )
-from tvsbayes.cli.kept_promise import finish_promised, promise_of, write_kept
+from tvsbayes.cli.outcomes import finish_plan, finish_promised, promise_of
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
-from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.files.disk import output_place
 from tvsbayes.instrument.mechanisms import MECHANISMS
 from tvsbayes.pipeline import StoredOrFitted, inputs_of
 from tvsbayes.pipeline import verify as verified
-from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
+    from tvsbayes.compensation.formats import AppliedBy
     from tvsbayes.instrument.mechanisms import Mechanism
-    from tvsbayes.results.compensation_record import Compensation
 
-FITTING, MAKING = "fit", "compensation"
 EXPORTS = {"header": "calibration in C", "json": "calibration"}
 """Kinds of file of an exported calibration, by the option's word."""
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
@@ -50,24 +47,15 @@ def _two_axis_mechanism(folder: Path) -> Mechanism | None:
 
 def compensate(
     campaign: CampaignFolder,
-    to: Annotated[
-        str, typer.Option("--to", help="csv, linuxcnc, grbl, grblhal, klipper, header (C), urdf (xacro) or pec.")
-    ],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the file here, and keep the promise.")] = None,
-    applied_by: Annotated[str, typer.Option("--applied-by", help="Who adds it: controller or host.")] = "controller",
-    per_command: Annotated[
-        float | None, typer.Option("--per-command", help="Nominal reading per command that is aimed at.")
-    ] = None,
-    resolution: Annotated[
-        float, typer.Option("--resolution", min=0.0, help="Least command that the controller carries out.")
-    ] = 0.0,
-    in_force: Annotated[
-        float | None, typer.Option("--in-force", help="Value of $100 or rotation_distance that is set now.")
-    ] = None,
-    letter: Annotated[str, typer.Option("--letter", help="Axis in settings of grbl: X, Y, Z, A, B or C.")] = "X",
+    to: Annotated[str, Option(help="csv, linuxcnc, grbl, grblhal, klipper, header (C), urdf (xacro) or pec.")],
+    out: Annotated[Path | None, Option("-o", "--out", help="Write the file here, and keep the promise.")] = None,
+    applied_by: Annotated[str, Option(help="Who adds it: controller or host.")] = "controller",
+    per_command: Annotated[float | None, Option(help="Nominal reading per command that is aimed at.")] = None,
+    resolution: Annotated[float, Option(min=0.0, help="Least command that the controller carries out.")] = 0.0,
+    in_force: Annotated[float | None, Option(help="Value of $100 or rotation_distance that is set now.")] = None,
+    letter: Annotated[str, Option(help="Axis in settings of grbl: X, Y, Z, A, B or C.")] = "X",
     period: Annotated[
-        float | None,
-        typer.Option("--period", help="Of a table by phase: pec, csv or header, in commands (pec: strongest wave)."),
+        float | None, Option(help="Of a table by phase: pec, csv or header, in commands (pec: strongest wave).")
     ] = None,
     force: Force = False,
     seed: Seed = 0,
@@ -79,16 +67,6 @@ def compensate(
     scanner `--to header` gives its calibration for a microcontroller. Of a pan-tilt head `--to urdf` gives its model:
     zeros, axes and reductions of the joints, and YAML with their covariance.
     """
-    from tvsbayes.compensation.formats import Wish, checked
-    from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
-    from tvsbayes.compensation.verification import compensation_in, table_in
-    from tvsbayes.report.compensation_text import compensation_text
-    from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
-    from tvsbayes.results.fit_record import provenance
-    from tvsbayes.results.records import plain
-    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
-    from tvsbayes.single_axis.axis_record import results_for
-
     if (mechanism := _two_axis_mechanism(campaign)) is not None:
         # Counters of two axes follow from the whole calibration, which is the table.
         default = "urdf" if mechanism.terms else "header"
@@ -108,49 +86,13 @@ def compensate(
         return
     _check_choice("--applied-by", applied_by, APPLIERS)
     _check_choice("--letter", letter, tuple(LETTERS))
-    wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
-    form = checked(wish)
-    second = out.with_name(f"{out.name}.yaml") if out is not None and form.beside is not None else None
-    check_output(out, kind="compensation", force=force)
-    check_output(second, kind="compensation", force=force and second is not None)
-    data = read_axis(campaign)
-    before = compensation_in(data)
-    replaced = table_in(data, out) if out is not None and out.is_file() else None
-    with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
-        compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
-    origin = plain(provenance(axis_hashes(data), seed, results.fit_id))
-    document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **origin}
-    content = file_text(compensation, data)
-    contents = {to: (out, content), "yaml": (second, file_beside(compensation, data) or "")}
-    record_path = output_place(campaign, "results") / "compensation.json"
-    held = record_path.read_bytes() if out is not None and before is not None else b""
-    files = write_kept(campaign, document, contents)
-    if "compensation" in files:
-        _name_other_promises(compensation, before, replaced, record_path.parent, held)
-    text = compensation_text(compensation, list(files.values()))
-    if out is None:
-        text += f"\nnothing written: give -o FILE; it would hold:\n\n{content}".rstrip("\n")
-    else:
-        next_step = compensation.shown_by if compensation.in_motion else command_line("verify", campaign, "FRESH")
-        text += f"\nnext: apply it, then {next_step}"
-    finish({**document, "files": files}, text, as_json)
+    from tvsbayes.cli.axis_commands import make_table
+    from tvsbayes.compensation.formats import Wish
 
-
-def _name_other_promises(
-    made: Compensation, before: Compensation | None, replaced: Compensation | None, results: Path, held: bytes
-) -> None:
-    """Say which promise ends, since its file was replaced, and keep that of the table made before, `held`, beside."""
-    from tvsbayes.compensation.verification import kept_name
-
-    if replaced is not None and replaced.digest != made.digest:
-        (results / kept_name(replaced)).unlink(missing_ok=True)
-        table = f"the table made before (--to {replaced.target}, {replaced.table_id})"
-        report_line(f"note: the promise of {table} ends: its file is replaced")
-    if before is not None and before.digest not in (made.digest, getattr(replaced, "digest", "")):
-        write_atomically(results / kept_name(before), held)
-        table = f"the table made before (--to {before.target}, {before.table_id})"
-        report_line(f"note: the promise of {table} stays: `verify --table FILE` tests it, `verify` alone this one")
+    applier: AppliedBy = "host" if applied_by == "host" else "controller"
+    make_table(
+        campaign, Wish(to, applier, per_command, resolution, in_force, letter, period), out, force, seed, as_json
+    )
 
 
 def export_calibration(
@@ -190,13 +132,13 @@ def _check_choice(option: str, given: str, allowed: tuple[str, ...]) -> None:
 def verify(
     campaign: CampaignFolder,
     fresh: Annotated[
-        Path, typer.Argument(metavar="FRESH", help="Fresh readings or looks, with table or calibration in force.")
+        Path, Argument(metavar="FRESH", help="Fresh readings or looks, with table or calibration in force.")
     ],
     distance_mm: Annotated[
-        float | None, typer.Option("--distance-mm", min=1.0, help="Of a scanner: errors of points there, mm (1000).")
+        float | None, Option(min=1.0, help="Of a scanner: errors of points there, mm (1000).")
     ] = None,
     table_file: Annotated[
-        Path | None, typer.Option("--table", help="Of an axis: file of the table in force (the last one made).")
+        Path | None, Option("--table", help="Of an axis: file of the table in force (the last one made).")
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -247,48 +189,29 @@ def verify(
 
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
-    """`plan FOLDER --verify`: plan the fewest readings that verify a table."""
-    from tvsbayes.compensation.verification import plan_verification, refuse_drive, stored_compensation
-    from tvsbayes.report.compensation_text import verify_plan_text
-    from tvsbayes.results.records import plain
-    from tvsbayes.single_axis.axis_campaign import read_axis
-    from tvsbayes.single_axis.axis_record import results_for
+    """`plan FOLDER --verify`: the fewest readings that verify a table, or looks that verify a scanner or head.
 
-    if folder is None:
-        remedy = "write tvsbayes plan FOLDER --verify -o plan.csv"
-        raise InputError("usage", "--verify needs a folder with a table or a calibration in force", remedy=remedy)
-    if _two_axis_mechanism(folder) is not None:
-        _plan_looks(folder, out, as_json)
-        return
-    data = read_axis(folder)
-    compensation = stored_compensation(data)
-    refuse_drive(compensation)
-    with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
-        job.begin("choosing stops")
-        stops = plan_verification(results.fit, compensation, seed=seed)
-    document, text = plain(stops), verify_plan_text(stops)
-    if out is not None:
-        write_atomically(out, stops.plan_bytes())
-        document["plan"] = str(out)
-        text += f"\nwritten: {escaped(str(out), 200)}"
-    finish({**document, "seed": seed}, text, as_json)
-
-
-def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
-    """Plan the fewest looks that verify a scanner or head, at the target with most looks in the campaign."""
+    Looks are at the target with most looks in the campaign.
+    """
     from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.plan import write_plan
     from tvsbayes.report.compensation_text import aim_plan_text
     from tvsbayes.results.records import plain
 
+    if folder is None:
+        remedy = "write tvsbayes plan FOLDER --verify -o plan.csv"
+        raise InputError("usage", "--verify needs a folder with a table or a calibration in force", remedy=remedy)
+    if _two_axis_mechanism(folder) is None:
+        from tvsbayes.cli.axis_commands import plan_verify as plan_axis
+
+        plan_axis(folder, out, seed, as_json)
+        return
     data = read_campaign(folder)
     looks = plan_looks(data, accepted_calibration(data))
-    document, text = plain(looks), aim_plan_text(looks)
-    if out is not None:
+
+    def write(path: Path) -> None:
         target = Counter(spot.target for spot in data.spots).most_common(1)[0][0]
-        write_plan(looks.steps(target), out, data.rig.mechanism)
-        document["plan"] = str(out)
-        text += f"\nwritten: {escaped(str(out), 200)}"
-    finish(document, text, as_json)
+        write_plan(looks.steps(target), path, data.rig.mechanism)
+
+    finish_plan(plain(looks), aim_plan_text(looks), out, write, as_json)

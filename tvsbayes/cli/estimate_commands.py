@@ -1,14 +1,11 @@
-"""Commands that estimate and compare: classic, fit, compare.
-
-Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
-"""
+"""Commands that estimate and compare: classic, fit, compare."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.app import (
     Anyway,
@@ -78,27 +75,23 @@ def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
 
 def fit(
     campaign: CampaignFolder,
-    quick: Annotated[bool, typer.Option("--quick", help="Weighted draws alone, never a chain.")] = False,
-    no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
+    quick: Annotated[bool, Option("--quick", help="Weighted draws alone, never a chain.")] = False,
+    no_sample: Annotated[bool, Option("--no-sample", help="Laplace approximation only.")] = False,
     chain: Annotated[
-        bool, typer.Option("--chain", help="Also run a chain of emcee, and say how it agrees with the weighted draws.")
+        bool, Option("--chain", help="Also run a chain of emcee, and say how it agrees with the weighted draws.")
     ] = False,
-    max_minutes: Annotated[
-        float | None, typer.Option("--max-minutes", min=0.01, help="Time for sampling with a chain (default 10).")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier chain; implies --chain.")] = False,
-    robust: Annotated[bool, typer.Option("--robust", help="Downweight and exclude outlying spots, by name.")] = False,
-    per_axis: Annotated[bool, typer.Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
-    harmonics: Annotated[bool, typer.Option("--harmonics", help="Free transmission errors of known period.")] = False,
-    no_backlash: Annotated[bool, typer.Option("--no-backlash", help="No play: backlash fixed at 0.")] = False,
+    max_minutes: Annotated[float | None, Option(min=0.01, help="Time for sampling with a chain (default 10).")] = None,
+    resume: Annotated[bool, Option("--resume", help="Continue an earlier chain; implies --chain.")] = False,
+    robust: Annotated[bool, Option("--robust", help="Downweight and exclude outlying spots, by name.")] = False,
+    per_axis: Annotated[bool, Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
+    harmonics: Annotated[bool, Option("--harmonics", help="Free transmission errors of known period.")] = False,
+    no_backlash: Annotated[bool, Option("--no-backlash", help="No play: backlash fixed at 0.")] = False,
     perfect_gears: Annotated[
-        bool, typer.Option("--perfect-gears", help="No errors by position but stated or freed harmonics; no drift.")
+        bool, Option("--perfect-gears", help="No errors by position but stated or freed harmonics; no drift.")
     ] = False,
     anyway: Anyway = False,
-    details: Annotated[bool, typer.Option("--details", help="Also print gears, priors and weak directions.")] = False,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for results (default CAMPAIGN/results).")
-    ] = None,
+    details: Annotated[bool, Option("--details", help="Also print gears, priors and weak directions.")] = False,
+    out: Annotated[Path | None, Option("-o", "--out", help="Folder for results (default CAMPAIGN/results).")] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -166,11 +159,9 @@ def _print_first(summary: FitSummary) -> None:
 
 def compare(
     campaign: CampaignFolder,
-    other: Annotated[Path | None, typer.Argument(metavar="B", help="Later campaign of the same instrument.")] = None,
-    by: Annotated[
-        str | None, typer.Option("--by", help="Left out together: steps (default), regions; positions.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Seed of everything random (default 0).")] = None,
+    other: Annotated[Path | None, Argument(metavar="B", help="Later campaign of the same instrument.")] = None,
+    by: Annotated[str | None, Option(help="Left out together: steps (default), regions; positions.")] = None,
+    seed: Annotated[int | None, Option(min=0, help="Seed of everything random (default 0).")] = None,
     as_json: Json = False,
 ) -> None:
     """Classic against joint on experiments that were left out.

@@ -1,7 +1,4 @@
-"""Commands of a head with sightings, where they differ from the scanner's.
-
-Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
-"""
+"""Commands of a head with sightings, where they differ from the scanner's."""
 
 from __future__ import annotations
 
@@ -10,14 +7,14 @@ import re
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from tvsbayes.cli.app import check_output, finish, report_line, write_files
 from tvsbayes.cli.confirmed_import import Import, occupied
-from tvsbayes.cli.kept_promise import Contents, finish_promised, promise_of
-from tvsbayes.cli.report_page import DRAWING, written_page
+from tvsbayes.cli.outcomes import Contents, finish_promised, promise_of
+from tvsbayes.cli.report_page import DRAWING, Page
 from tvsbayes.display import concise
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_kind import templates
@@ -41,7 +38,6 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sightings_of
 from tvsbayes.pipeline import FITTING, StoredOrFitted
 from tvsbayes.progress import Job
-from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.report.document import Document, Issue
@@ -340,14 +336,22 @@ def classic(folder: Path, as_json: bool) -> None:
 
 def report(folder: Path, issue: Issue, quick: bool, pdf: bool, out: Path | None, as_json: bool) -> None:
     """Write the page of a head; fit first where results are missing."""
-    from tvsbayes.estimators.plausibility import check_campaign
-    from tvsbayes.report.head_document import head_document
+    HeadPage(folder, issue, quick).finish(pdf, out, as_json)
 
-    def make(job: Job) -> Document:
-        data = read_campaign(folder)
-        tier = IMPORTANCE if quick else CHAIN
-        record = StoredOrFitted(data, report_line, job.part(FITTING), tier).reported.record
+
+@dataclass
+class HeadPage(Page):
+    """The page of a head, which has no certificate."""
+
+    stages: ClassVar = {FITTING: 3.0, DRAWING: 1.0}
+    certifiable: ClassVar = False
+
+    def document(self, job: Job) -> Document:
+        """Make the document; fits first where results are missing."""
+        from tvsbayes.estimators.plausibility import check_campaign
+        from tvsbayes.report.head_document import head_document
+
+        data = read_campaign(self.folder)
+        record = StoredOrFitted(data, report_line, job.part(FITTING), self.tier).reported.record
         job.begin(DRAWING)
-        return head_document(data, record, issue, check_campaign(data).warnings)
-
-    written_page(folder, out, pdf, {FITTING: 3.0, DRAWING: 1.0}, make).finish(as_json)
+        return head_document(data, record, self.issue, check_campaign(data).warnings)

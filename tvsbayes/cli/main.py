@@ -40,9 +40,8 @@ from tvsbayes.cli.compensation_commands import compensate, verify
 from tvsbayes.cli.estimate_commands import classic, compare, fit
 from tvsbayes.cli.examples import EXAMPLES, epilog
 from tvsbayes.cli.import_command import import_
-from tvsbayes.cli.report_commands import calibrate, report
+from tvsbayes.cli.report_commands import calibrate, report, view
 from tvsbayes.cli.use_commands import locate, plan, steps_for, study
-from tvsbayes.cli.view_command import view
 from tvsbayes.cli.watch_command import watch
 from tvsbayes.errors import InputError, Question, TvsError
 

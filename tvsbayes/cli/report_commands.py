@@ -1,17 +1,13 @@
-"""The commands report, and calibrate, which also runs all steps before the report.
-
-Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
-"""
+"""The pages of a campaign: report, calibrate, which also runs all steps before it, and view."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-import typer
+from typer import Option
 
 from tvsbayes.cli.app import (
     TARGET_MISSED,
@@ -31,11 +27,10 @@ from tvsbayes.cli.app import (
 from tvsbayes.cli.campaign_commands import campaign_contents
 from tvsbayes.cli.estimate_commands import OVERRIDE_HINT
 from tvsbayes.cli.instruments import serve
-from tvsbayes.cli.progress_bar import chain_progress
-from tvsbayes.cli.report_options import certification_of, parties_of, tolerance_of
-from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
+from tvsbayes.cli.progress_bar import chain_progress, waiting
+from tvsbayes.cli.report_page import DRAWING, Page, Part, certification_of, print_parts, tolerance_of
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.files.disk import output_place
+from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
@@ -45,9 +40,8 @@ from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.metrology.conformity import Tolerance
-    from tvsbayes.metrology.dcc import Embedded
+    from tvsbayes.metrology.dcc import Embedded, Parties
     from tvsbayes.report.document import Document, Issue
-    from tvsbayes.report.evidence import Evidence
     from tvsbayes.results.fit_record import FitRecord
 
 RANGE_MM = 1e3
@@ -56,16 +50,16 @@ LIMITED = {**{direction: (direction, "deg/step") for direction in DIRECTIONS}, "
 GATHERING = "gathering evidence"
 
 LimitRatio = Annotated[
-    float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict.")
+    float | None, Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict.")
 ]
-LimitMm = Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")]
-Range = Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")]
-Pdf = Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")]
-Laboratory = Annotated[str | None, typer.Option("--laboratory", help="Who measured: on the first page.")]
-Customer = Annotated[str | None, typer.Option("--customer", help="For whom: on the first page.")]
-Quick = Annotated[bool, typer.Option("--quick", help="Weighted draws alone, never a chain: seconds.")]
+LimitMm = Annotated[float | None, Option("--limit-mm", min=0, help="Largest 3D error allowed.")]
+Range = Annotated[float, Option("--range-mm", min=1, help="Range at which millimetres are stated.")]
+Pdf = Annotated[bool, Option("--pdf", help="Also print to PDF with an installed Chromium.")]
+Laboratory = Annotated[str | None, Option("--laboratory", help="Who measured: on the first page.")]
+Customer = Annotated[str | None, Option("--customer", help="For whom: on the first page.")]
+Quick = Annotated[bool, Option("--quick", help="Weighted draws alone, never a chain: seconds.")]
 Schema = Annotated[
-    Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
+    Path | None, Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
 ]
 
 
@@ -76,57 +70,33 @@ def report(
     limit_mm: LimitMm = None,
     range_mm: Range = RANGE_MM,
     pdf: Pdf = False,
-    dcc: Annotated[bool, typer.Option("--dcc", help="Also write DCC-schema XML (unsigned, not accredited).")] = False,
+    dcc: Annotated[bool, Option("--dcc", help="Also write DCC-schema XML (unsigned, not accredited).")] = False,
     laboratory: Laboratory = None,
     customer: Customer = None,
-    country: Annotated[
-        str | None, typer.Option("--country", help="Two letters of the place (ISO 3166-1), for --dcc.")
-    ] = None,
-    customer_country: Annotated[
-        str | None, typer.Option("--customer-country", help="Two letters of the customer's country, for --dcc.")
-    ] = None,
+    country: Annotated[str | None, Option(help="Two letters of the place (ISO 3166-1), for --dcc.")] = None,
+    customer_country: Annotated[str | None, Option(help="Two letters of the customer's country, for --dcc.")] = None,
     dcc_schema: Schema = None,
-    sign: Annotated[Path | None, typer.Option("--sign", help="Private key, PEM: sign the certificate (--dcc).")] = None,
-    certificate: Annotated[
-        Path | None, typer.Option("--certificate", help="Certificate of that key, PEM, for --sign.")
-    ] = None,
-    tolerance: Annotated[
-        str | None,
-        typer.Option("--tolerance", help="Largest value allowed, such as 15um: conformity."),
-    ] = None,
+    sign: Annotated[Path | None, Option(help="Private key, PEM: sign the certificate (--dcc).")] = None,
+    certificate: Annotated[Path | None, Option(help="Certificate of that key, PEM, for --sign.")] = None,
+    tolerance: Annotated[str | None, Option(help="Largest value allowed, such as 15um: conformity.")] = None,
     of: Annotated[
-        str | None,
-        typer.Option("--of", help="Axis: A, E, R, B, M, 'A forward' ...; else left, right, up, down, xyz."),
+        str | None, Option(help="Axis: A, E, R, B, M, 'A forward' ...; else left, right, up, down, xyz.")
     ] = None,
-    rule: Annotated[
-        str | None, typer.Option("--rule", help="Decision rule: guarded (default), simple or probability.")
-    ] = None,
+    rule: Annotated[str | None, Option(help="Decision rule: guarded (default), simple or probability.")] = None,
     guard: Annotated[
-        float | None, typer.Option("--guard", min=0, help="Guard band in standard uncertainties (2; one-sided 1.65).")
+        float | None, Option(min=0, help="Guard band in standard uncertainties (2; one-sided 1.65).")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="HTML file (default CAMPAIGN/results/report.html).")
-    ] = None,
+    out: Annotated[Path | None, Option("-o", "--out", help="HTML file (default CAMPAIGN/results/report.html).")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """The calibration report as one HTML page. Verdict and results first, then the evidence."""
-    from tvsbayes.instrument.campaign import read_campaign
-
     finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm, guard=guard)
-    check_output(out, kind="report", force=force)
-    if out is not None and out.suffix.lower() == ".pdf":
-        message, remedy = "-o names the HTML page, and its PDF lies beside it", "write -o NAME.html --pdf"
-        raise InputError("usage", message, column="--out", allowed="NAME.html", remedy=remedy)
-    if out is not None:
-        from tvsbayes.report.page import certificate_place
-
-        beside = {"printed report": out.with_suffix(".pdf") if pdf else None}
-        beside["certificate"] = certificate_place(out, out) if dcc or dcc_schema else None
-        for kind, place in beside.items():
-            check_output(place, kind=kind, force=force and place is not None)
+    _check_places(out, pdf, dcc or dcc_schema is not None, force)
     issue = _issue(laboratory, customer)
-    certification = certification_of(dcc, dcc_schema, _countries(country, customer_country), sign, certificate)
+    countries = {"country": _text("country", country), "customer_country": _text("customer-country", customer_country)}
+    stated = {name: text for name, text in countries.items() if text}
+    certification = certification_of(dcc, dcc_schema, stated, sign, certificate)
     limits: dict[str, object] = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
     limits |= {"range_mm": range_mm if range_mm != RANGE_MM else None, "dcc": dcc, "dcc_schema": dcc_schema}
     judged = {"tolerance": tolerance, "of": of, "rule": rule, "guard": guard}
@@ -134,18 +104,29 @@ def report(
     limits |= {"quick": quick, "pdf": pdf, "out": out, "as_json": as_json}
     if serve("report", campaign, issue=issue, **limits, **judged, **asked):
         return
+    from tvsbayes.instrument.campaign import read_campaign
+
     wish = tolerance_of(tolerance, of, rule, guard, LIMITED)
-    data = read_campaign(campaign)
-    content = PageContent(campaign, data, issue, limit_deg_per_step, limit_mm, range_mm, quick, wish)
-    page = content.written(pdf, out)
-    missed, lines, result = content.missed, content.lines(page), page.as_json(content.evidence.criteria)
-    if certification.wanted:
-        done = certification.written(page, out, partial(content.certificate, certification.countries))
-        missed, lines, result = missed or done.missed, [*lines, *done.lines], result | done.result
-    page.report_removed(certificates=True)
-    finish(result, "\n".join([*lines, f"written: {', '.join(page.files.values())}"]), as_json)
-    if missed:
-        raise Ended(TARGET_MISSED)
+    page = ScannerPage(campaign, issue, quick, read_campaign(campaign), limit_deg_per_step, limit_mm, range_mm, wish)
+    page.finish(pdf, out, as_json, certification)
+
+
+def _check_places(out: Path | None, pdf: bool, certified: bool, force: bool) -> None:
+    """Refuse a page, its PDF or its certificate in the place of another file."""
+    check_output(out, kind="report", force=force)
+    if out is None:
+        return
+    if out.suffix.lower() == ".pdf":
+        message, remedy = "-o names the HTML page, and its PDF lies beside it", "write -o NAME.html --pdf"
+        raise InputError("usage", message, column="--out", allowed="NAME.html", remedy=remedy)
+    from tvsbayes.report.page import certificate_place
+
+    for kind, place, is_made in (
+        ("printed report", out.with_suffix(".pdf"), pdf),
+        ("certificate", certificate_place(out, out), certified),
+    ):
+        if is_made:
+            check_output(place, kind=kind, force=force)
 
 
 def _issue(laboratory: str | None, customer: str | None) -> Issue:
@@ -162,49 +143,34 @@ def _text(option: str, text: str | None) -> str:
     return " ".join((text or "").split())
 
 
-def _countries(place: str | None, customer: str | None) -> dict[str, str]:
-    """Stated countries by their field of `Parties`."""
-    stated = {"country": _text("country", place), "customer_country": _text("customer-country", customer)}
-    return {name: text for name, text in stated.items() if text}
-
-
 @dataclass
-class PageContent:
-    """What the page of a scanner shows; `record` and `evidence` are there once it is written.
+class ScannerPage(Page):
+    """The page of a scanner.
 
     Attributes:
-        campaign, data: folder and content of the campaign.
-        issue, limit_deg_per_step, limit_mm, range_mm, quick: as the options of `report`.
+        data: content of the campaign.
+        limit_deg_per_step, limit_mm, range_mm: as the options of `report`.
         tolerance: with its decision rule; None where none is stated.
-        record, evidence: sources of the page.
+        record: `fit.json`, once the document is made.
     """
 
-    campaign: Path
     data: Campaign
-    issue: Issue
     limit_deg_per_step: float | None
     limit_mm: float | None
     range_mm: float
-    quick: bool = False
     tolerance: Tolerance | None = None
     record: FitRecord = field(init=False)
-    evidence: Evidence = field(init=False)
+    stages: ClassVar = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5}
 
-    def written(self, pdf: bool, out: Path | None = None) -> WrittenPage:
-        """Write the page; options as of `report`."""
-        stages = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5}
-        return written_page(self.campaign, out, pdf, stages, self._document)
-
-    def _document(self, job: Job) -> Document:
+    def document(self, job: Job) -> Document:
         """Gather evidence for a document; fits first where results are missing."""
         from tvsbayes.report.evidence import gather
         from tvsbayes.report.scanner_document import report_document
 
-        tier = IMPORTANCE if self.quick else CHAIN
-        self.record, calibration, ratios = StoredOrFitted(self.data, report_line, job.part(FITTING), tier).reported
+        fit = StoredOrFitted(self.data, report_line, job.part(FITTING), self.tier)
+        self.record, calibration, ratios = fit.reported
         job.begin(GATHERING)
-        warnings = campaign_contents(self.campaign, self.data)["warnings"]
-        self.evidence = gather(
+        evidence = gather(
             self.data,
             self.record,
             calibration,
@@ -213,41 +179,33 @@ class PageContent:
             limit_deg_per_step=self.limit_deg_per_step,
             limit_mm=self.limit_mm,
             tolerance=self.tolerance,
-            doubts=warnings,
+            doubts=campaign_contents(self.folder, self.data)["warnings"],
         )
+        self.criteria = evidence.criteria
         job.begin(DRAWING)
-        return report_document(self.evidence, self.issue)
+        return report_document(evidence, self.issue)
 
-    @property
-    def missed(self) -> bool:
-        """Whether a limit that the user gave is not met."""
-        from tvsbayes.report.evidence import SATISFIED
-
-        return any(c.verdict not in SATISFIED for c in self.evidence.criteria)
-
-    def lines(self, page: WrittenPage) -> list[str]:
-        """Verdicts on the limits and the page's number, for a terminal."""
+    def lines(self, number: str, certified: Sequence[str] = ()) -> list[str]:
+        """A failed validation, verdicts on the limits, the page's number, its certificate."""
         from tvsbayes.report.evidence import criterion_text
-        from tvsbayes.report.fit_text import validation_lines
+        from tvsbayes.report.fit_text import failed, validation_lines
 
-        lines = [criterion_text(c) for c in self.evidence.criteria]
-        validation = self.record.summary.validation
-        failed = validation is not None and not validation.passed
-        tests = validation_lines(validation)[:1] if validation is not None and failed else []
-        return [*tests, *lines, f"report {page.number}"]
+        validation = failed(self.record.summary)
+        tests = [] if validation is None else validation_lines(validation)[:1]
+        return [*tests, *map(criterion_text, self.criteria), f"report {number}", *certified]
 
-    def certificate(self, countries: Mapping[str, str], report: Embedded, signed: bool) -> bytes:
+    def certificate(self, parties: Parties, report: Embedded, signed: bool) -> bytes:
         """DCC-schema XML with the page inside, issued on its day (UTC)."""
         from tvsbayes.metrology.scanner_certificate import dcc_bytes
 
-        parties, issued = parties_of(self.issue, countries), self.issue.day
+        issued = self.issue.day
         return dcc_bytes(self.data, self.record, issued=issued, parties=parties, report=report, signed=signed)
 
 
 def calibrate(
     campaign: CampaignFolder,
     quick: Quick = False,
-    no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
+    no_sample: Annotated[bool, Option("--no-sample", help="Laplace approximation only.")] = False,
     limit_deg_per_step: LimitRatio = None,
     limit_mm: LimitMm = None,
     range_mm: Range = RANGE_MM,
@@ -275,25 +233,30 @@ def calibrate(
         return
     from tvsbayes.instrument.campaign import read_campaign
 
-    content = PageContent(campaign, read_campaign(campaign), issue, limit_deg_per_step, limit_mm, range_mm)
-    print_parts(_parts(content, quick, no_sample, seed, pdf, anyway), as_json)
-    if content.missed:
+    page = ScannerPage(campaign, issue, False, read_campaign(campaign), limit_deg_per_step, limit_mm, range_mm)
+    print_parts(_parts(page, quick, no_sample, seed, pdf, anyway), as_json)
+    if page.missed:
         raise Ended(TARGET_MISSED)
 
 
-def _parts(content: PageContent, quick: bool, no_sample: bool, seed: int, pdf: bool, anyway: bool) -> Iterator[Part]:
+def _parts(content: ScannerPage, quick: bool, no_sample: bool, seed: int, pdf: bool, anyway: bool) -> Iterator[Part]:
     """The parts of `calibrate`; options as of it."""
     from tvsbayes.estimators.findings import stop_at
+    from tvsbayes.estimators.four_point import classic
     from tvsbayes.estimators.plausibility import implausible
     from tvsbayes.report.command_text import check_text
-    from tvsbayes.report.fit_text import fit_text
+    from tvsbayes.report.fit_text import classic_text, fit_text
 
-    campaign, data = content.campaign, content.data
+    campaign, data = content.folder, content.data
     check = campaign_contents(campaign, data)
     yield Part("check", check, check_text(check))
     if not anyway:
         stop_at(implausible(data), OVERRIDE_HINT)
-    yield _classic(data)
+    try:
+        four_point = classic(data)
+        yield Part("classic", four_point.as_json(), classic_text(four_point))
+    except NothingToEstimate as error:
+        yield Part("classic", None, f"classic four-point estimator: {error.message}")
     compile_for(report_line)
     with chain_progress(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
         results = calibrate_campaign(
@@ -310,16 +273,43 @@ def _parts(content: PageContent, quick: bool, no_sample: bool, seed: int, pdf: b
     yield Part("fit", {**summary.as_json(), "seed": seed, "files": results.files}, text, results.error)
     page = content.written(pdf)
     page.report_removed(certificates=True)
-    yield page.part(content.lines(page), content.evidence.criteria)
+    yield page.part(content.lines(page.number), content.criteria)
 
 
-def _classic(data: Campaign) -> Part:
-    """The part of the four-point estimator; without a complete experiment the reason in place of a document."""
-    from tvsbayes.estimators.four_point import classic
-    from tvsbayes.report.fit_text import classic_text
+def view(
+    campaign: CampaignFolder,
+    beside: Annotated[Path | None, Option(metavar="CAMPAIGN", help="A later campaign of the same instrument.")] = None,
+    out: Annotated[Path | None, Option("-o", "--out", help="HTML file (default CAMPAIGN/results/view.html).")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """One HTML file to look at a campaign: rig in 3D, all looks.
 
-    try:
-        result = classic(data)
-    except NothingToEstimate as error:
-        return Part("classic", None, f"classic four-point estimator: {error.message}")
-    return Part("classic", result.as_json(), classic_text(result))
+    Every look has its pictures and residuals. A double click opens the file in a browser, without a network.
+    """
+    if serve("view", **locals()) or serve("view", beside):
+        return
+    folders = [folder for folder in (campaign, beside) if folder is not None]
+    check_output(out, kind="page of view", force=force)
+    from tvsbayes.view.scene import look_at
+
+    result_scenes = look_at(campaign, beside, report_line)
+    from tvsbayes.view.page import document, page_html
+    from tvsbayes.view.pictures import PICTURES_BYTES_MAX, look_pictures
+
+    pictures, share = [], PICTURES_BYTES_MAX // len(folders)
+    stages = ("pictures", "pictures of the second campaign")[: len(folders)]
+    with waiting() as progress, Job(dict.fromkeys(stages, 1.0), progress) as job:
+        for folder, scene, stage in zip(folders, result_scenes.scenes, stages, strict=True):
+            job.begin(stage)
+            pictures.append(look_pictures(folder, scene.looks, share, job.at))
+    html = page_html(document(result_scenes, pictures))
+    path = out or output_place(campaign, "results") / "view.html"
+    if out is None:
+        make_folder(path.parent)
+    write_atomically(path, html)
+    counts = [len(scene.looks.spot) for scene in result_scenes.scenes]
+    picture_counts, fitted = [len(chosen) for chosen in pictures], [scene.fitted for scene in result_scenes.scenes]
+    result = {"view": str(path), "bytes": len(html), "looks": counts, "pictures": picture_counts, "fitted": fitted}
+    notes = "".join(f"note: {note}\n" for scene in result_scenes.scenes for note in scene.notes)
+    finish(result, f"{notes}written: {path} ({len(html) / 1e6:.1f} MB); open it in a browser", as_json)

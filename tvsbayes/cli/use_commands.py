@@ -1,7 +1,4 @@
-"""Commands that use a calibration or plan looks: locate, steps-for, plan, study.
-
-Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
-"""
+"""Commands that use a calibration or plan looks: locate, steps-for, plan, study."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from tvsbayes.cli.app import (
     TARGET_MISSED,
@@ -57,25 +54,19 @@ PLANNING, LOCATING = "plan", "points"
 
 def locate(
     campaign: CampaignFolder,
-    pan_steps: Annotated[float | None, typer.Option("--pan-steps", help="Absolute counter.")] = None,
-    tilt_steps: Annotated[float | None, typer.Option("--tilt-steps", help="Absolute counter.")] = None,
-    pan_approach: Annotated[
-        str | None, typer.Option("--pan-approach", help="left (default), right or unknown.")
-    ] = None,
-    tilt_approach: Annotated[str | None, typer.Option("--tilt-approach", help="up (default), down or unknown.")] = None,
-    aperture_deg: Annotated[float | None, typer.Option("--aperture-deg", help="Reading B of the aperture.")] = None,
+    pan_steps: Annotated[float | None, Option(help="Absolute counter.")] = None,
+    tilt_steps: Annotated[float | None, Option(help="Absolute counter.")] = None,
+    pan_approach: Annotated[str | None, Option(help="left (default), right or unknown.")] = None,
+    tilt_approach: Annotated[str | None, Option(help="up (default), down or unknown.")] = None,
+    aperture_deg: Annotated[float | None, Option(help="Reading B of the aperture.")] = None,
     points: Annotated[
-        Path | None,
-        typer.Option(
-            "--points", help="CSV with columns pan_steps, tilt_steps, pan_approach, tilt_approach, aperture_deg."
-        ),
+        Path | None, Option(help="CSV with columns pan_steps, tilt_steps, pan_approach, tilt_approach, aperture_deg.")
     ] = None,
     cloud: Annotated[
-        Path | None,
-        typer.Option("--cloud", help="Write the points of --points here, in the format of the ending: OUT.ply."),
+        Path | None, Option(help="Write the points of --points here, in the format of the ending: OUT.ply.")
     ] = None,
-    draws: Annotated[int, typer.Option("--draws", min=500, max=100_000, help="Draws per point.")] = 1000,
-    budget: Annotated[bool, typer.Option("--budget", help="Also print the uncertainty budget of the point.")] = False,
+    draws: Annotated[int, Option(min=500, max=100_000, help="Draws per point.")] = 1000,
+    budget: Annotated[bool, Option("--budget", help="Also print the uncertainty budget of the point.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -184,16 +175,16 @@ def _refuse_head(calibration: Calibration) -> None:
 
 def steps_for(
     campaign: CampaignFolder,
-    x_mm: Annotated[float | None, typer.Option("--x-mm", help="Wanted point, frame T: depth.")] = None,
-    y_mm: Annotated[float | None, typer.Option("--y-mm", help="Along the baseline, towards the positioner.")] = None,
-    z_mm: Annotated[float | None, typer.Option("--z-mm", help="Up.")] = None,
-    azimuth_deg: Annotated[float | None, typer.Option("--azimuth-deg", help="Wanted direction: C - 90 deg.")] = None,
-    elevation_deg: Annotated[float | None, typer.Option("--elevation-deg", help="Above the horizontal.")] = None,
-    pan_approach: Annotated[str | None, typer.Option("--pan-approach", help="left or right (default: left).")] = None,
-    tilt_approach: Annotated[str | None, typer.Option("--tilt-approach", help="up or down (default: up).")] = None,
-    rig: Annotated[Path | None, typer.Option("--rig", help="Rig file whose [positioner] limits are kept.")] = None,
-    export: Annotated[str | None, typer.Option("--export", help="header or json: the calibration itself.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="File for --export (default: printed).")] = None,
+    x_mm: Annotated[float | None, Option(help="Wanted point, frame T: depth.")] = None,
+    y_mm: Annotated[float | None, Option(help="Along the baseline, towards the positioner.")] = None,
+    z_mm: Annotated[float | None, Option(help="Up.")] = None,
+    azimuth_deg: Annotated[float | None, Option(help="Wanted direction: C - 90 deg.")] = None,
+    elevation_deg: Annotated[float | None, Option(help="Above the horizontal.")] = None,
+    pan_approach: Annotated[str | None, Option(help="left or right (default: left).")] = None,
+    tilt_approach: Annotated[str | None, Option(help="up or down (default: up).")] = None,
+    rig: Annotated[Path | None, Option(help="Rig file whose [positioner] limits are kept.")] = None,
+    export: Annotated[str | None, Option(help="header or json: the calibration itself.")] = None,
+    out: Annotated[Path | None, Option("-o", "--out", help="File for --export (default: printed).")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -249,37 +240,32 @@ def steps_for(
 
 
 TargetText = Annotated[
-    str | None, typer.Option("--target", help="As 'u(worst) <= 2e-4 deg/step' or 'U95(x) at 1000,0,0 mm <= 60 mm'.")
+    str | None, Option("--target", help="As 'u(worst) <= 2e-4 deg/step' or 'U95(x) at 1000,0,0 mm <= 60 mm'.")
 ]
 
 
 def plan(
     rig: Annotated[
-        Path | None, typer.Argument(metavar="RIG", help="Rig file; none with an axis folder; CAMPAIGN with --watch.")
+        Path | None, Argument(metavar="RIG", help="Rig file; none with an axis folder; CAMPAIGN with --watch.")
     ] = None,
-    given: Annotated[Path | None, typer.Option("--given", help="Existing campaign: plan what to measure next.")] = None,
-    like: Annotated[
-        Path | None, typer.Option("--like", help="Campaign of a rig of the same build: plan for the next one.")
-    ] = None,
+    given: Annotated[Path | None, Option(help="Existing campaign: plan what to measure next.")] = None,
+    like: Annotated[Path | None, Option(help="Campaign of a rig of the same build: plan for the next one.")] = None,
     target: TargetText = None,
-    minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the plan here (plan.csv).")] = None,
+    minutes: Annotated[float | None, Option(min=0.1, help="Longest plan.")] = None,
+    out: Annotated[Path | None, Option("-o", "--out", help="Write the plan here (plan.csv).")] = None,
     output: OldOut = None,
-    criterion: Annotated[str, typer.Option("--criterion", help="c (the target), D or A (all results).")] = "c",
-    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
-    draws: Annotated[
-        int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the chances.")
-    ] = PLAN_DRAWS,
+    criterion: Annotated[str, Option(help="c (the target), D or A (all results).")] = "c",
+    aperture: Annotated[bool, Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    draws: Annotated[int, Option(min=20, max=10_000, help="Instruments for the chances.")] = PLAN_DRAWS,
     count: Annotated[
-        int | None, typer.Option("--next", min=1, max=200, help="With --given: only the next so many looks, no homing.")
+        int | None, Option("--next", min=1, max=200, help="With --given: only the next so many looks, no homing.")
     ] = None,
     confirm: Annotated[
-        float | None,
-        typer.Option("--confirm", min=0, help="With --next: sample the posterior where u is at most this, deg/step."),
+        float | None, Option(min=0, help="With --next: sample the posterior where u is at most this, deg/step.")
     ] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
+    watch: Annotated[bool, Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Fewest readings or looks for `verify`: plan FOLDER --verify.")
+        bool, Option("--verify", help="Fewest readings or looks for `verify`: plan FOLDER --verify.")
     ] = False,
     force: Force = False,
     seed: Seed = 0,
@@ -391,23 +377,17 @@ def _next_looks(
 
 
 def study(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
-    plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
-    n: Annotated[int, typer.Option("--n", min=1, max=1_000_000, help="Simulated campaigns.")] = 100,
-    engine: Annotated[str, typer.Option("--engine", help="serial, processes or dask.")] = "serial",
-    workers: Annotated[
-        int | None, typer.Option("--workers", min=1, max=1024, help="Worker processes (default 2).")
-    ] = None,
-    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
-    rows: Annotated[Path | None, typer.Option("--rows", help="File of rows (default: PLAN with .study.jsonl).")] = None,
+    rig: Annotated[Path, Argument(metavar="RIG", help="Rig file.")],
+    plan_file: Annotated[Path, Argument(metavar="PLAN", help="plan.csv.")],
+    n: Annotated[int, Option(min=1, max=1_000_000, help="Simulated campaigns.")] = 100,
+    engine: Annotated[str, Option(help="serial, processes or dask.")] = "serial",
+    workers: Annotated[int | None, Option(min=1, max=1024, help="Worker processes (default 2).")] = None,
+    scheduler: Annotated[str | None, Option(help="Address of a Dask scheduler.")] = None,
+    rows: Annotated[Path | None, Option(help="File of rows (default: PLAN with .study.jsonl).")] = None,
     target: TargetText = None,
-    estimator: Annotated[
-        str, typer.Option("--estimator", help="importance (the posterior), or laplace, in half the time.")
-    ] = "importance",
-    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
-    max_minutes: Annotated[
-        float | None, typer.Option("--max-minutes", min=0.01, help="Stop after so long; the same command goes on.")
-    ] = None,
+    estimator: Annotated[str, Option(help="importance (the posterior), or laplace, in half the time.")] = "importance",
+    aperture: Annotated[bool, Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    max_minutes: Annotated[float | None, Option(min=0.01, help="Stop after so long; the same command goes on.")] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, refuse_options, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, refuse_options, report_line
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, refuse_mixed, serve
+from tvsbayes.cli.outcomes import WATCHING, finish_watch, finish_watch_plan
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.cli.watched import WATCHING, finish_watch
-from tvsbayes.errors import InputError, escaped
-from tvsbayes.files.disk import write_atomically
+from tvsbayes.errors import InputError
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
@@ -21,9 +20,9 @@ PLANNING = "choosing looks"
 
 def watch(
     campaign: CampaignFolder,
-    looks: Annotated[Path, typer.Argument(metavar="LOOKS", help="Campaign folder of at least 4 new looks or stops.")],
+    looks: Annotated[Path, Argument(metavar="LOOKS", help="Campaign folder of at least 4 new looks or stops.")],
     append: Annotated[
-        Path | None, typer.Option("--append", metavar="TABLE.csv", help="Add a line to this table, for a nightly job.")
+        Path | None, Option(metavar="TABLE.csv", help="Add a line to this table, for a nightly job.")
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -65,8 +64,6 @@ def plan_watch(
         seed: seed of the search.
         as_json: print the document.
     """
-    from msgspec import structs
-
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.plan import write_plan
     from tvsbayes.instrument.rig import read_rig
@@ -78,7 +75,7 @@ def plan_watch(
     if instrument_of(campaign) is INSTRUMENTS["axis"]:
         options: dict[str, object] = {"rig": path if given else None}
         refuse_options("for a scanner or a head", "an axis is planned from its folder alone", **options)
-        _plan_axis_watch(campaign, minutes, out, seed, as_json)
+        INSTRUMENTS["axis"].command("plan_watch")(campaign, minutes, out, seed, as_json)
         return
     known, rig = read_campaign(campaign), None if given is None or path is None else read_rig(path)
     compile_for(report_line)
@@ -88,35 +85,8 @@ def plan_watch(
         from tvsbayes.planning.watch_plan import MINUTES, watch_plan
 
         looks = watch_plan(fitted, rig, minutes=MINUTES if minutes is None else minutes, seed=seed)
-    from tvsbayes.report.command_text import watch_plan_text
 
-    text = watch_plan_text(looks)
-    if out is not None:
-        write_plan(looks.steps, out, known.rig.mechanism)
-        looks = structs.replace(looks, plan=str(out))
-        text += f"\nwritten: {escaped(str(out), 200)}"
-    finish(looks.as_json(), text, as_json)
+    def write(place: Path) -> None:
+        write_plan(looks.steps, place, known.rig.mechanism)
 
-
-def _plan_axis_watch(folder: Path, minutes: float | None, out: Path | None, seed: int, as_json: bool) -> None:
-    """`plan AXIS --watch`: the fewest stops by which `watch` notices a change of ratio, play or zero."""
-    from msgspec import structs
-
-    from tvsbayes.comparison.axis_sessions import plan_watch_axis
-    from tvsbayes.compensation.promise import SURER, refuse_answer
-    from tvsbayes.report.command_text import watch_plan_text
-    from tvsbayes.single_axis.axis_campaign import read_axis
-    from tvsbayes.single_axis.axis_record import results_for
-
-    known = read_axis(folder)
-    with waiting() as progress, Job({FITTING: 1.0, PLANNING: 1.0}, progress) as job:
-        results = results_for(known, progress=job.part(FITTING), seed=seed, notify=report_line)
-        refuse_answer(results.summary.answer, SURER, "what a watch would notice cannot be trusted")
-        job.begin(PLANNING)
-        plan, stops = plan_watch_axis(results.fit, minutes=minutes, seed=seed)
-    text = watch_plan_text(plan, "stops")
-    if out is not None:
-        write_atomically(out, stops.plan_bytes())
-        plan = structs.replace(plan, plan=str(out))
-        text += f"\nwritten: {escaped(str(out), 200)}"
-    finish(plan.as_json(), text, as_json)
+    finish_watch_plan(looks, "looks", out, write, as_json)

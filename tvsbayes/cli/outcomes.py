@@ -1,23 +1,75 @@
-"""Tables and calibrations for controllers: the one writer of their files and of the promise kept with them."""
+"""What commands end with: the promise of a calibration and its files, verdicts of `watch`, plans."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import datetime
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tvsbayes.cli.app import command_line, finish, keep, report_line
-from tvsbayes.errors import NothingToEstimate, Reason, escaped
+from msgspec import structs
+
+from tvsbayes.cli.app import TARGET_MISSED, Ended, command_line, finish, keep, report_line
+from tvsbayes.errors import InputError, NothingToEstimate, Reason, escaped
+from tvsbayes.files.csv_table import append_line
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import StoredOrFitted, inputs_of
 
 if TYPE_CHECKING:
     from tvsbayes.results.compensation_record import AimedPromise
+    from tvsbayes.results.watch_record import Watch, WatchPlan
 
+WATCHING = "looking at the new looks"
+TABLE_COLUMNS = ("time", "verdict", "p", "looks", "moved")
 USE = {"header": "aim with it", "urdf": "load it in place of the old model"}
 """What to do with the file of a calibration, before `verify`."""
 type Contents = Mapping[str, tuple[Path | None, str | bytes]]
 """Files by name: place, None to write none, and content."""
+
+
+def finish_watch(result: Watch, append: Path | None, as_json: bool, looks: str = "looks") -> None:
+    """Print the result, add it to a table, and end with its exit code; `looks` is what the new data are."""
+    from tvsbayes.comparison.departures import POWER_MIN
+    from tvsbayes.report.command_text import watch_text
+    from tvsbayes.results.watch_record import CANNOT_TELL, OK
+
+    error = None if append is None else _append(append, result)
+    finish(result.as_json(), watch_text(result, POWER_MIN, looks), as_json, error)
+    if result.verdict != OK:
+        raise Ended(NothingToEstimate.exit_code if result.verdict == CANNOT_TELL else TARGET_MISSED)
+
+
+def _append(table: Path, result: Watch) -> InputError | None:
+    """Append the current line (time in UTC); returns the error of a failure, so that the result is still printed."""
+    from tvsbayes.report.command_text import moved_text
+
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    moved = "; ".join(map(moved_text, result.moved))
+    try:
+        append_line(table, TABLE_COLUMNS, (now, result.verdict, float(f"{result.p:.3g}"), result.looks, moved))
+    except InputError as error:
+        return error
+    return None
+
+
+def finish_plan(
+    document: Mapping[str, object], text: str, out: Path | None, write: Callable[[Path], None], as_json: bool
+) -> None:
+    """Write a plan where a file is named, and print it."""
+    if out is not None:
+        write(out)
+        document, text = {**document, "plan": str(out)}, f"{text}\nwritten: {escaped(str(out), 200)}"
+    finish(document, text, as_json)
+
+
+def finish_watch_plan(
+    plan: WatchPlan, looks: str, out: Path | None, write: Callable[[Path], None], as_json: bool
+) -> None:
+    """The same for a plan of `watch`; `looks` is what it takes."""
+    from tvsbayes.report.command_text import watch_plan_text
+
+    stated = plan if out is None else structs.replace(plan, plan=str(out))
+    finish_plan(stated.as_json(), watch_plan_text(plan, looks), out, write, as_json)
 
 
 def promise_of(
