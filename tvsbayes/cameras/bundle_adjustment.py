@@ -29,8 +29,8 @@ from tvsbayes.instrument.stereo_pair import Stereo
 
 POSE_STEPS, POSE_TOLERANCE = 40, 1e-20
 """Largest number of Gauss-Newton steps of a pose, and the squared step at convergence, in rad and board sizes."""
-TOLERANCE, STEPS_MAX = 1e-12, 200
-"""Convergence limits of the descent in whitened coordinates; ends are checked."""
+TOLERANCE, STEPS_MAX = 1e-14, 200
+"""Convergence limits of the descent; ends lie within 1e-7 standard errors of the minimum, and are checked."""
 RESTART_SD = 3.0
 """The repeated adjustment starts this many standard errors away in every parameter."""
 RESTART_AGREEMENT_SD = 1e-2
@@ -269,7 +269,9 @@ def _descended(at: Callable[[np.ndarray], End], z: np.ndarray) -> End:
         lambda z: point(z).jacobian,
         **{"method": "lm", "max_nfev": STEPS_MAX, "ftol": TOLERANCE, "xtol": TOLERANCE, "gtol": TOLERANCE},
     )
-    return point(found.x)
+    # The sum of squares stops to fall 1e-6 standard errors from its minimum: one Gauss-Newton step more.
+    end = point(found.x)
+    return at(end.z - np.linalg.lstsq(end.jacobian, end.residuals)[0])
 
 
 def undetermined(reason: str) -> NothingToEstimate:
