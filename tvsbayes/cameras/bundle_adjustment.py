@@ -271,6 +271,8 @@ def _descended(at: Callable[[np.ndarray], End], z: np.ndarray) -> End:
     )
     # The sum of squares stops to fall 1e-6 standard errors from its minimum: one Gauss-Newton step more.
     end = point(found.x)
+    if not np.isfinite(end.jacobian).all():
+        return end
     further = at(end.z - np.linalg.lstsq(end.jacobian, end.residuals)[0])
     # From an end that is no minimum a whole step may lead anywhere.
     return further if further.noise_sd(1) <= (1 + LOWER_SHARE) * end.noise_sd(1) + EXACT_PX else end
