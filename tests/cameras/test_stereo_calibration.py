@@ -16,7 +16,14 @@ from experiments.cameras.stereo_coverage import calibrate, chi2
 from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
 from tvsbayes.cameras.board_errors import correlation_factor
 from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
-from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, projected, reduced_residuals
+from tvsbayes.cameras.bundle_adjustment import (
+    RESTARTS_MAX,
+    End,
+    _ends,
+    bundle_adjustment,
+    projected,
+    reduced_residuals,
+)
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
 from tvsbayes.cameras.stereo_start import camera_start
 from tvsbayes.cli.main import run
@@ -477,3 +484,14 @@ def test_command_warns_of_an_implausible_import(ask, capsys, tmp_path):
     assert code == 0 and [w for w in document["warnings"] if "swapped" in w] == document["warnings"] != []
     assert run(["stereo", "--import", str(tmp_path / "swapped.json")]) == 0
     assert "warning: the second camera stands" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("falls", [0, 1, RESTARTS_MAX, RESTARTS_MAX + 1])
+def test_the_accepted_end_was_repeated(monkeypatch, falls):
+    """Every descent ends lower than the one before: the last end is compared with another one."""
+    ends = [End(np.full(24, float(k)), np.full(8, 0.5 ** min(k, falls)), np.zeros((8, 24))) for k in range(9)]
+    following = iter(ends[1:])
+    monkeypatch.setattr("tvsbayes.cameras.bundle_adjustment._descended", lambda at, z: next(following))
+    end, again = _ends(ends[0], lambda z: ends[0], dof=4)
+    reached = min(falls, RESTARTS_MAX)
+    assert (end.z[0], again.z[0]) == (reached, reached + 1)
