@@ -322,3 +322,20 @@ def test_a_target_beside_the_camera_of_a_row(cameras, targets, tmp_path):
     (tmp_path / "t.csv").write_text("\n".join(["pan,tilt,target,camera,u,v", *rows, ""]))
     looks = look_rows(look_columns(read_foreign(tmp_path / "t.csv"), {}), Wishes()).looks
     assert [(k["target"], k["u_left_px"], k["u_right_px"]) for k in looks] == [(t, 630, 600) for t in targets * 2]
+
+
+@pytest.mark.parametrize("said", ["Units: um deviations, positions in mm", "Deviations in um, positions in mm"])
+def test_a_unit_before_what_is_in_it(said, tmp_path):
+    text = f"{said}\n" + sheet("Target,Deviation", COMMANDS, [round(1e3 * (v - c), 1) for c, v in ROWS])
+    rows = rows_of(text, tmp_path, Wishes(deviations=True))
+    assert [r["value"] for r in rows.readings] == pytest.approx(READ, abs=1e-9)
+
+
+def test_a_status_of_no_word_that_is_known_is_none(tmp_path):
+    columns = (range(0, 800, 200), range(0, 400, 100), range(10, 50, 10), range(20, 60, 10))
+    for word, used in (("converged", True), ("failed", False)):
+        text = sheet("pan_steps,tilt_steps,azimuth_deg,elevation_deg,status", *columns, [word] * 4)
+        (tmp_path / f"{word}.csv").write_text(text)
+        found = sighting_rows(read_foreign(tmp_path / f"{word}.csv"), Wishes())
+        assert [s["status"] == "ok" for s in found.sightings] == [used] * 4
+        assert used == any("would leave out every sighting, so it is none" in line for line in found.assumed)

@@ -59,7 +59,7 @@ def once(monkeypatch):
 def numbers(path) -> dict[str, object]:
     """What `stereo.json` says, to seven digits; of the covariance the standard deviations.
 
-    Lenses fitted by least squares have rounding in the ninth. Coefficients below 1e-7, a ten thousandth of a pixel, are 0.
+    Lenses fitted by least squares round in the ninth. Coefficients below 1e-7, a ten thousandth of a pixel, are 0.
     """
     stereo, lines = read_stereo(path), {}
     for name in ("M1", "D1", "M2", "D2", "R", "T"):

@@ -80,6 +80,10 @@ _SAID = (
     re.compile(r"(?P<name>[^,;:=]*\b(?:units?|einheit(?:en)?|unidad(?:es)?|unites?))\s+(?P<text>\S+)\s*$"),
 )
 """Units that a line states: "Unit: mm", "Position [mm]", "readings in um, positions in mm", "Error units mm"."""
+_UNIT_FIRST = re.compile(
+    r"(?<!\bin )(?<!\ben )(?<![^\s,;:=])(?P<text>[a-z]+)\s+(?P<name>[a-z]+)(?![^\s,;]|\s*[:=]|\s+(?:in|en)\b)"
+)
+"""A unit before what is in it: "um deviations"."""
 
 
 def unit_above(table: ForeignTable, field: str) -> Unit | None:
@@ -88,16 +92,24 @@ def unit_above(table: ForeignTable, field: str) -> Unit | None:
     "Position: mm" is that of commands, "Deviation: um" that of readings.
     """
     units: dict[str, set[Unit]] = {"command": set(), "value": set(), "": set()}
+
+    def of_field(words: list[str]) -> str:
+        names = {"value": ("value", "deviation"), "command": ("command", "position")}
+        return next((of for of, own in names.items() if any(place_of(words, n) is not None for n in own)), "")
+
     for line in table.above:
+        rest = line
+        for match in _UNIT_FIRST.finditer(plain(line)):
+            unit, of = parse_unit(match["text"]), of_field(words_of(match["name"]))
+            if of and unit and unit.kind in ("length", "angle", "count"):
+                units[of].add(unit)
+                rest = plain(rest).replace(match[0], ",")
         for form in _SAID:
-            for match in form.finditer(line if form is STATED else plain(line)):
+            for match in form.finditer(rest if form is STATED else plain(rest)):
                 unit, words = parse_unit(match["text"]), words_of(match["name"])
-                of_reading, of_command, of_all = (
-                    any(place_of(words, name) is not None for name in names)
-                    for names in (("value", "deviation"), ("command", "position"), ("unit",))
-                )
-                of = "value" if of_reading else "command" if of_command else ""
-                if (of or of_all or form is not STATED) and unit and unit.kind in ("length", "angle", "count"):
+                of = of_field(words)
+                stated = of or place_of(words, "unit") is not None or form is not STATED
+                if stated and unit and unit.kind in ("length", "angle", "count"):
                     units[of].add(unit)
     found = units[field] or (units[""] if field == "value" else set())
     return found.pop() if len(found) == 1 else None

@@ -288,6 +288,12 @@ def say_left_out(cells: FieldCells, statuses: Sequence[str], noun: str) -> None:
         cells.assumed.append(f"status: {rows} left out by column {cells.shown('status')}: {words}{more}")
 
 
+def without_status(cells: FieldCells, noun: str) -> FieldCells:
+    """The cells without a column of statuses in which no word is known: it would leave out every row."""
+    cells.assumed.append(f"status: column {cells.shown('status')} would leave out every {noun}, so it is none")
+    return replace(cells, columns={name: text for name, text in cells.columns.items() if name != "status"})
+
+
 def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], noun: str) -> str:
     """The status "ok", or the reason why a row cannot be used, as this package's tables allow it.
 

@@ -17,12 +17,12 @@ import numpy as np
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
-from tvsbayes.importing.cells import FieldCells, Wishes, homings_of, say_left_out, status_of
+from tvsbayes.importing.cells import FieldCells, Wishes, homings_of, say_left_out, status_of, without_status
 from tvsbayes.importing.columns import Chooser, Column, Understood, ask_of_t, columns_of, restarts
 from tvsbayes.importing.counters import AXES, COUNTER_MAX, COUNTERS, Pair, are_moves, moves_of_rows, whole_counters
 from tvsbayes.importing.counters import FIELDS as MOVE_FIELDS
 from tvsbayes.importing.table import ForeignTable
-from tvsbayes.importing.words import HOUR_ANGLE, Unit, name_of, place_of, unit_named
+from tvsbayes.importing.words import HOUR_ANGLE, Unit, means, name_of, place_of, unit_named
 
 STEP_DEG = 1e-5
 """Size of a counter step: encoders are read in degrees, and 0.04 arcsec is far below telescopes' pointing errors."""
@@ -105,6 +105,10 @@ def sighting_rows(table: ForeignTable, wishes: Wishes) -> SightingRows:
         angles["u_deg"] = [None if u is None else u / coverage for u in angles["u_deg"]]
         cells.assumed.append(f"u_deg: column {cells.shown('u_deg')} is an expanded uncertainty, over {coverage:g}")
     statuses, sightings = cells.text("status"), list[dict[str, Any]]()
+    unknown = [text.strip() and not means(text, "good") and not means(text, "bad") for text in statuses]
+    if "status" not in wishes.columns and all(unknown):
+        cells = without_status(cells, "sighting")
+        statuses = cells.text("status")
     for row in range(len(table)):
         values = {name: column[row] for name, column in angles.items()}
         if not statuses[row] and all(values[name] is None for name in ANGLES):

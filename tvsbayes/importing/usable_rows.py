@@ -10,7 +10,7 @@ import numpy as np
 
 from tvsbayes.errors import escaped
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.importing.cells import FieldCells
+from tvsbayes.importing.cells import FieldCells, without_status
 from tvsbayes.importing.columns import columns_of, fill_values, first_values, line_through
 from tvsbayes.importing.prepared import continued
 from tvsbayes.importing.words import means, name_of
@@ -55,8 +55,7 @@ def good_rows(cells: FieldCells) -> FieldCells:
     if "status" in wishes.columns or not any(bad):
         return cells
     if all(bad) and len(codes) < 2:
-        cells.assumed.append(f"status: column {cells.shown('status')} would leave out every reading, so it is none")
-        return replace(cells, columns={name: text for name, text in cells.columns.items() if name != "status"})
+        return without_status(cells, "reading")
     coded = all(number is not None or not text for number, text in zip(numbers, texts, strict=True))
     if coded and sum(bad) >= STATUS_SHARE * len(texts):
         name = cells.columns["status"]
