@@ -1,8 +1,8 @@
 """Minima of sums of squares and of negative log densities, with the covariance at them; float64 throughout.
 
 optimistix' `LevenbergMarquardt` reports success on wrong answers at loose tolerances, so its flag is ignored. The joint
-fit continues with Newton steps on the density and tests the size of the last step. Residuals are dimensionless (divided by
-their standard deviations) or in the data's unit; the covariance follows.
+fit continues with Newton steps on the density and tests the size of the last step. Residuals are dimensionless
+(divided by their standard deviations) or in the data's unit; the covariance follows.
 """
 
 from __future__ import annotations
