@@ -45,7 +45,7 @@ def certified(_: Path) -> Mapping[str, Work]:
     import jax.numpy as jnp
     from scipy import optimize
 
-    from tvsbayes.statistics.least_squares import least_squares_covariance, residuals_and_jacobian
+    from tvsbayes.statistics.least_squares import residuals_and_jacobian
 
     jax.config.update("jax_enable_x64", True)
     strd = module_of_tests("support.certified_problems")
@@ -78,7 +78,7 @@ def certified(_: Path) -> Mapping[str, Work]:
         """Of the worst parameter and of the worst standard error."""
         problem, residual = problems[name], residuals(name, value)
         try:
-            covariance = least_squares_covariance(jacobian(name, value)) * (residual @ residual)
+            covariance = strd.least_squares_covariance(jacobian(name, value)) * (residual @ residual)
             errors = strd.digits(np.sqrt(np.diag(covariance) / (problem.x.size - value.size)), problem.sd)
         except (np.linalg.LinAlgError, ValueError):
             errors = 0.0

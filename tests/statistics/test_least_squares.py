@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import optimize
-from support.certified_problems import MODELS, score
+from support.certified_problems import MODELS, least_squares_covariance, score
 
-from tvsbayes.statistics.least_squares import KINK_FALL, least_squares_covariance, newton_mode
+from tvsbayes.statistics.least_squares import KINK_FALL, newton_mode
 
 PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0
 """Digits required of every parameter and of every standard error."""

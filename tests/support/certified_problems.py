@@ -16,12 +16,34 @@ import numpy as np
 import pytest
 
 from tvsbayes.model.descent import descend
-from tvsbayes.statistics.least_squares import least_squares_covariance, residuals_and_jacobian
+from tvsbayes.statistics.least_squares import residuals_and_jacobian
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "strd"
 PRINTED_DIGITS = 11.0
 TOLERANCE, STEPS = 1e-12, 10_000
 """Relative and absolute tolerance in the problems' own units; 1e-8 still accepts one wrong answer."""
+
+
+def least_squares_covariance(jacobian: np.ndarray) -> np.ndarray:
+    """Compute (J^T J)^-1 by a singular value decomposition of the column-scaled Jacobian.
+
+    Args:
+        jacobian: shape (n, p), of full column rank.
+
+    Returns:
+        Covariance for residuals of unit variance, shape (p, p).
+
+    Raises:
+        np.linalg.LinAlgError: if the scaled condition number exceeds 1e13; no covariance exists then.
+    """
+    scale = np.linalg.norm(jacobian, axis=0)
+    if not np.all(scale > 0):
+        raise np.linalg.LinAlgError("a parameter has no influence on any residual")
+    _, singular, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    if singular[-1] < 1e-13 * singular[0]:
+        raise np.linalg.LinAlgError(f"scaled condition number {singular[0] / max(singular[-1], 1e-300):.1e}")
+    root = vt.T / singular / scale[:, None]
+    return root @ root.T
 
 
 def _rational(b, x, degree):

@@ -29,7 +29,6 @@ from tvsbayes.cameras.picture_pairs import (
 from tvsbayes.errors import Candidate, InputError, escaped, question, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, IMAGE_PIXELS_MAX, PNG_SIGNATURE, decode_image, png_bytes
-from tvsbayes.importing.words import vocabulary
 from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Spot, frame_name
 from tvsbayes.progress import Advance, unshown
 
@@ -97,7 +96,7 @@ class ViewedFolder:
     unnamed: tuple[str, ...]
     other_size: tuple[str, ...]
     unread: tuple[str, ...]
-    without_spot: tuple[str, ...] = ()
+    without_spot: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -234,9 +233,8 @@ def _counted(views: Sequence[View], slot: int, names: Sequence[str]) -> str:
     words = {view.word_before(slot) for view in views}
     if words & picture_words()["counter"]:
         return "counters"
-    numbered = [any(is_experiment(view.word_before(k)) for k in range(len(view.numbers))) for view in views]
-    points = {"p", *(word for (word,) in vocabulary("point", "looks.toml"))}
-    if any(numbered) and words <= points:
+    numbered = any(is_experiment(view.word_before(k)) for view in views for k in range(len(view.numbers)))
+    if numbered and words <= picture_words()["point"]:
         return "points of experiments"
     repeated = len({view.numbers[slot] for view in views}) < len(views)
     if repeated and (any(map(directions_in, names)) or any(map(is_experiment, words))):

@@ -22,7 +22,7 @@ from tvsbayes.cli.app import (
 )
 from tvsbayes.cli.outcomes import WATCHING, finish_watch, finish_watch_plan, write_kept
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.cli.report_page import DRAWING, Certification, Page, Part, print_parts, tolerance_of
+from tvsbayes.cli.report_page import DRAWING, Certification, CertifiedPage, Part, print_parts, tolerance_of
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import output_place, read_bytes, write_atomically
@@ -272,7 +272,7 @@ def report(
 
 
 @dataclass
-class AxisPage(Page):
+class AxisPage(CertifiedPage):
     """The page of an axis; `results` are there once the document is made."""
 
     data: AxisCampaign

@@ -344,7 +344,6 @@ class HeadPage(Page):
     """The page of a head, which has no certificate."""
 
     stages: ClassVar = {FITTING: 3.0, DRAWING: 1.0}
-    certifiable: ClassVar = False
 
     def document(self, job: Job) -> Document:
         """Make the document; fits first where results are missing."""

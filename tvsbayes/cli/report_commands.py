@@ -28,7 +28,7 @@ from tvsbayes.cli.campaign_commands import campaign_contents
 from tvsbayes.cli.estimate_commands import OVERRIDE_HINT
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_progress, waiting
-from tvsbayes.cli.report_page import DRAWING, Page, Part, certification_of, print_parts, tolerance_of
+from tvsbayes.cli.report_page import DRAWING, CertifiedPage, Part, certification_of, print_parts, tolerance_of
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -144,7 +144,7 @@ def _text(option: str, text: str | None) -> str:
 
 
 @dataclass
-class ScannerPage(Page):
+class ScannerPage(CertifiedPage):
     """The page of a scanner.
 
     Attributes:

@@ -130,7 +130,7 @@ class Page(ABC):
         quick: whether a fit that has to be made first makes no chain.
         criteria: limits with their verdicts, once the document is made.
         stages: expected durations of the stages of the document.
-        certifiable: whether there are certificates.
+        certifiable: whether there are certificates, as of a `CertifiedPage`.
     """
 
     folder: Path
@@ -138,7 +138,7 @@ class Page(ABC):
     quick: bool
     criteria: Sequence[Criterion] = field(default=(), init=False)
     stages: ClassVar[Mapping[str, float]]
-    certifiable: ClassVar[bool] = True
+    certifiable: ClassVar[bool] = False
 
     @property
     def tier(self) -> Tier:
@@ -153,9 +153,11 @@ class Page(ABC):
         """What a terminal says of the page: its number, verdicts, and what was said of its certificate."""
         return [*certified, f"report {number}"]
 
-    def certificate(self, parties: Parties, report: Embedded, signed: bool) -> bytes:
-        """DCC-schema XML with the page inside, issued on its day (UTC)."""
-        raise NotImplementedError
+    def certified(
+        self, page: WrittenPage, out: Path | None, certification: Certification | None
+    ) -> tuple[list[str], dict[str, Any], bool]:
+        """What was said of a certificate, its part of the document, and whether it failed; nothing without one."""
+        return [], {}, False
 
     @property
     def missed(self) -> bool:
@@ -170,15 +172,32 @@ class Page(ABC):
 
     def finish(self, pdf: bool, out: Path | None, as_json: bool, certification: Certification | None = None) -> None:
         """Write the page, with its certificate where one is asked for, and print the result: the end of `report`."""
-        page, said, result, failed = self.written(pdf, out), list[str](), dict[str, Any](), False
-        if certification is not None and certification.wanted:
-            parties = parties_of(self.issue, certification.countries)
-            said, result, failed = certification.written(page, out, partial(self.certificate, parties))
+        page = self.written(pdf, out)
+        said, result, failed = self.certified(page, out, certification)
         page.report_removed(certificates=self.certifiable)
         lines = [*self.lines(page.number, said), f"written: {', '.join(page.files.values())}"]
         finish(page.as_json(self.criteria) | result, "\n".join(lines), as_json)
         if failed or self.missed:
             raise Ended(TARGET_MISSED)
+
+
+class CertifiedPage(Page):
+    """The page of an instrument that has certificates."""
+
+    certifiable = True
+
+    @abstractmethod
+    def certificate(self, parties: Parties, report: Embedded, signed: bool) -> bytes:
+        """DCC-schema XML with the page inside, issued on its day (UTC)."""
+
+    def certified(
+        self, page: WrittenPage, out: Path | None, certification: Certification | None
+    ) -> tuple[list[str], dict[str, Any], bool]:
+        """As of every page; writes the certificate where one is asked for."""
+        if certification is None or not certification.wanted:
+            return super().certified(page, out, certification)
+        parties = parties_of(self.issue, certification.countries)
+        return certification.written(page, out, partial(self.certificate, parties))
 
 
 def tolerance_of(

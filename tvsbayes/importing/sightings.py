@@ -106,7 +106,7 @@ def sighting_rows(table: ForeignTable, wishes: Wishes) -> SightingRows:
         cells.assumed.append(f"u_deg: column {cells.shown('u_deg')} is an expanded uncertainty, over {coverage:g}")
     statuses, sightings = cells.text("status"), list[dict[str, Any]]()
     unknown = [text.strip() and not means(text, "good") and not means(text, "bad") for text in statuses]
-    if "status" not in wishes.columns and all(unknown):
+    if "status" in cells and "status" not in wishes.columns and all(unknown):
         cells = without_status(cells, "sighting")
         statuses = cells.text("status")
     for row in range(len(table)):

@@ -249,25 +249,3 @@ def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarra
     normal = np.concatenate([half, -half])
     normal = normal @ np.linalg.inv(np.linalg.cholesky(normal.T @ normal / len(normal))).T
     return z + normal @ np.linalg.cholesky(covariance).T
-
-
-def least_squares_covariance(jacobian: np.ndarray) -> np.ndarray:
-    """Compute (J^T J)^-1 by a singular value decomposition of the column-scaled Jacobian.
-
-    Args:
-        jacobian: shape (n, p), of full column rank.
-
-    Returns:
-        Covariance for residuals of unit variance, shape (p, p).
-
-    Raises:
-        np.linalg.LinAlgError: if the scaled condition number exceeds 1e13; no covariance exists then.
-    """
-    scale = np.linalg.norm(jacobian, axis=0)
-    if not np.all(scale > 0):
-        raise np.linalg.LinAlgError("a parameter has no influence on any residual")
-    _, singular, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    if singular[-1] < 1e-13 * singular[0]:
-        raise np.linalg.LinAlgError(f"scaled condition number {singular[0] / max(singular[-1], 1e-300):.1e}")
-    root = vt.T / singular / scale[:, None]
-    return root @ root.T
