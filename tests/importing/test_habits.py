@@ -324,7 +324,13 @@ def test_a_target_beside_the_camera_of_a_row(cameras, targets, tmp_path):
     assert [(k["target"], k["u_left_px"], k["u_right_px"]) for k in looks] == [(t, 630, 600) for t in targets * 2]
 
 
-@pytest.mark.parametrize("said", ["Units: um deviations, positions in mm", "Deviations in um, positions in mm"])
+@pytest.mark.parametrize(
+    "said",
+    [
+        *("Units: um deviations, positions in mm", "Deviations in um, positions in mm"),
+        *("Positions [mm], mm deviations in um", "Position : mm, deviation : um"),
+    ],
+)
 def test_a_unit_before_what_is_in_it(said, tmp_path):
     text = f"{said}\n" + sheet("Target,Deviation", COMMANDS, [round(1e3 * (v - c), 1) for c, v in ROWS])
     rows = rows_of(text, tmp_path, Wishes(deviations=True))
