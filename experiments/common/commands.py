@@ -5,15 +5,17 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from experiments.common.command_line import parser
 from experiments.common.rows import ROOT
 
 PROGRAM = (sys.executable, "-m", "tvsbayes")
@@ -54,18 +56,51 @@ def document_of(*words: object) -> dict[str, Any]:
     return {**json.loads(out), "exit": code}
 
 
-def console(*line: str, last: int = 0, first: int | None = None) -> str:
-    """A command as it is typed and what it prints, as a block of Markdown; of a refusal the message.
+BLOCK = re.compile(r"```(text|console)\n(.*?)```\n", re.DOTALL)
+SHOWN = re.compile(r"\$ tvsbayes (.*?)(?: \| (head|tail) -(\d+))?\n")
+
+
+def renewed(page: str, files: Iterable[str] = (), before: Mapping[str, Callable[[], object]] | None = None) -> str:
+    """A page whose blocks show what files hold and commands print now, in the working directory; of refusals the words.
 
     Args:
-        line: what follows `tvsbayes`.
-        last: how many of the last lines are shown; 0: all.
-        first: how many of the first ones are shown; None: all.
+        page: in Markdown; a `text` block that ends with dots shows the beginning of its file.
+        files: of its `text` blocks, in order.
+        before: what is done before commands that begin so.
     """
-    code, out, err = quietly(*line)
-    printed = [text.rstrip() for text in (out if code < 2 else err).splitlines()]
-    shown = f" | tail -{last}" if last else "" if first is None else f" | head -{first}"
-    return "\n".join(["```console", f"$ tvsbayes {' '.join(line)}{shown}", *printed[-last:][:first], "```", ""])
+    left = iter(files)
+
+    def anew(block: re.Match[str]) -> str:
+        kind, text = block.groups()
+        if kind == "text":
+            lines = Path(next(left)).read_text(encoding="utf-8").splitlines()
+            if text.endswith("...\n"):
+                lines = [*(line[:110] for line in lines[: text.count("\n") - 1]), "..."]
+        else:
+            words, end, count = SHOWN.match(text).groups()
+            for beginning, work in (before or {}).items():
+                if words.startswith(beginning):
+                    work()
+            code, out, err = quietly(*words.split())
+            lines = [line.rstrip() for line in (out if code < 2 else err).splitlines()]
+            lines = lines[: int(count)] if end == "head" else lines[-int(count) :] if end else lines
+            lines = [text.partition("\n")[0], *lines]
+        return "\n".join([f"```{kind}", *lines, "```", ""])
+
+    return BLOCK.sub(anew, page)
+
+
+def renew_page(doc: str | None, page: Path, renew: Callable[[str], str]) -> None:
+    """The command line of a script whose page is its own source: the page is printed, or written."""
+    cli = parser(doc)
+    cli.add_argument("--write", action="store_true", help=f"into {page.relative_to(ROOT)} instead of printing it")
+    write, text = cli.parse_args().write, page.read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory() as place, chdir(place):
+        text = renew(text)
+    if write:
+        page.write_text(text, encoding="utf-8")
+    else:
+        print(text, end="")
 
 
 def said(*words: object, cwd: Path = ROOT, limit_s: float = 1200.0) -> subprocess.CompletedProcess[str]:

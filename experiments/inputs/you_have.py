@@ -1,28 +1,25 @@
-"""What a file becomes, kind by kind: the page of the documentation, with what the commands print.
+"""What a file becomes, kind by kind: a page of the documentation, with what its commands print now.
 
-    python -m experiments.inputs.you_have > data/docs/you-have.md
+    python -m experiments.inputs.you_have [--write]
 
-Files are those of `tests/data/foreign` and `data/`, or are drawn here from stated numbers. The default tests run the
-commands that take a second or two and compare.
+The page, data/docs/you-have.md, has the words and the commands. Files are those of `tests/data/foreign` and `data/`, or
+are drawn here from stated numbers. The default tests run the commands that take a second or two and compare.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
-import os
+import re
 import shutil
-import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from experiments.common.command_line import print_only
-from experiments.common.commands import console, quietly
+from experiments.common.commands import quietly, renew_page, renewed
 from experiments.common.paper_lab import LABS, write_lab
 from experiments.common.rigs import mounted_rig
 from experiments.common.rows import ROOT
@@ -34,6 +31,7 @@ from tvsbayes.twin.frames import write_frames
 from tvsbayes.twin.simulated_campaign import simulate
 
 FOREIGN, DATA = ROOT / "tests" / "data" / "foreign", ROOT / "data"
+PAGE = DATA / "docs" / "you-have.md"
 TWIN = DATA / "twins" / "grid_twin"
 SEED = 3
 WORM_S, WORM_ARCSEC = 240.0, 8.0
@@ -150,7 +148,7 @@ def lab_book() -> bytes:
     return Path("book.csv").read_bytes()
 
 
-def sightings() -> None:
+def sightings() -> str:
     """A log of a head whose nominal geometry is that of the URDF, and looks of the same head later; by the twin."""
     quietly("import", "--urdf", "unit.urdf", "--to", "nominal", "--steps-per-turn", "200", "--yes")
     grid = [(pan, tilt) for pan in range(-900, 901, 300) for tilt in (-150, 50, 250, 450)]
@@ -171,241 +169,64 @@ def sightings() -> None:
         cells = [row[name] for name in ("time_s", "pan_steps", "tilt_steps")]
         cells += [sighting.get(name, "") for name in ("azimuth_deg", "elevation_deg", "u_deg")]
         lines.append(",".join(cells))
-    Path("log.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    return "\n".join([*lines, ""])
 
 
-def boards() -> None:
-    """The pairs that are shipped, of another camera."""
-    shutil.copytree(DATA / "real" / "stereo" / "bumblebee2", "pictures")
+FILES: dict[str, dict[str, Path | Callable[[], str | bytes | None]]] = {
+    "A table of counters and centroids": {"looks.csv": looks, "cameras.json": TWIN / "stereo.json"},
+    "A stereo calibration of OpenCV": {"pair.yml": FOREIGN / "opencv_other_names" / "pair2.yml"},
+    "A stereo calibration of ROS, Kalibr or EuRoC": {
+        "left.yaml": FOREIGN / "ros_message_dump" / "left.yaml",
+        "right.yaml": FOREIGN / "ros_message_dump" / "right.yaml",
+        "cam0.yaml": FOREIGN / "euroc_sensor_pair" / "cam0.yaml",
+        "cam1.yaml": FOREIGN / "euroc_sensor_pair" / "cam1.yaml",
+    },
+    "A calibration by a camera's maker": {
+        "calib.json": FOREIGN / "depthai" / "calib.json",
+        "SN1.conf": FOREIGN / "zed" / "SN1.conf",
+        "enumerate.txt": FOREIGN / "realsense" / "enumerate.txt",
+    },
+    "Pictures of a checkerboard": {"pictures": DATA / "real" / "stereo" / "bumblebee2"},
+    "Pictures of spots": {"plan.csv": spots},
+    "A lab book and its pictures": {"book.csv": lab_book},
+    "A robot's head: its URDF and a log": {"unit.urdf": ROOT / "tests" / "head" / "unit.urdf", "log.csv": sightings},
+    "A dial gauge: runs side by side": {"dial.csv": FOREIGN / "wide_forward_backward" / "dial.csv"},
+    "An encoder that counts to 4096 and begins anew": {"log.csv": FOREIGN / "counts_wrap" / "log.csv"},
+    "Target, actual and error": {"errors.csv": FOREIGN / "error_column_as_u" / "signed.csv"},
+    "A guide log of PHD2": {"PHD2_GuideLog.txt": guide_log},
+    "Series of EPICS": {"camonitor.log": camonitor},
+    "Klipper": {"klipper.json": data_logger},
+}
+"""Of each section: files by what they are copied from or made by, the one first that is shown; a maker may leave more."""
+SAMPLES = re.compile(r"```console\n\$ tvsbayes (?!import|stereo --import|check)")
+"""Where the first command stands that takes more than a second or two."""
 
 
-class Command(NamedTuple):
-    """What follows `tvsbayes`; how many of the last and of the first lines are shown; whether the tests run it."""
-
-    line: str
-    last: int = 0
-    first: int | None = None
-    quick: bool = True
+def sections(page: str) -> dict[str, str]:
+    """The sections of the page by their titles; "" is what stands before the first."""
+    begin, *parts = page.split("\n## ")
+    return {"": begin} | {part.partition("\n")[0]: part for part in parts}
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of file: title and text of its section, commands, files by what they are copied or written from.
-
-    `lines` of the first file are shown; `before` prepares what else is needed.
-    """
-
-    title: str
-    text: str
-    commands: tuple[Command, ...]
-    files: dict[str, Path | Callable[[], str | bytes]] = field(default_factory=dict)
-    lines: int = 0
-    before: Callable[[], None] | None = None
-
-    def put(self) -> None:
-        """The files, into the working directory."""
-        for name, source in self.files.items():
-            place = Path(name)
-            place.parent.mkdir(exist_ok=True, parents=True)
-            content = source.read_bytes() if isinstance(source, Path) else source()
-            place.write_bytes(content.encode() if isinstance(content, str) else content)
-        if self.before is not None:
-            self.before()
-
-    def blocks(self, *, quick: bool = False) -> Iterator[str]:
-        """The first lines of the file, and each command with what it prints; up to the first longer one if `quick`."""
-        if quick and not self.commands[0].quick:
-            return
-        self.put()
-        if self.lines:
-            text = Path(next(iter(self.files))).read_text(encoding="utf-8").splitlines()
-            yield "```text\n" + "\n".join(line[:110] for line in text[: self.lines]) + "\n...\n```\n"
-        for command in self.commands:
-            if quick and not command.quick:
-                return
-            yield console(*command.line.split(), last=command.last, first=command.first)
+def shown(title: str, part: str) -> str:
+    """A section or its beginning with what is printed now, in an empty working directory."""
+    for name, source in FILES[title].items():
+        if isinstance(source, Path):
+            (shutil.copytree if source.is_dir() else shutil.copy)(source, name)
+        elif content := source():
+            Path(name).write_bytes(content.encode() if isinstance(content, str) else content)
+    return renewed(part, FILES[title])
 
 
-def longer(line: str, last: int = 0, first: int | None = None) -> Command:
-    """What the tests leave out: its last digits may differ with the versions of libraries."""
-    return Command(line, last=last, first=first, quick=False)
+def every(page: str) -> str:
+    """The page, each section in a folder of its own."""
+    parts = sections(page)
+    for title in FILES:
+        Path(title).mkdir()
+        with contextlib.chdir(title):
+            parts[title] = shown(title, parts[title])
+    return "\n## ".join(parts.values())
 
-
-def answered(line: str) -> Command:
-    """The answer of an axis: what a fit prints first."""
-    return longer(line, first=2)
-
-
-KINDS = (
-    Kind(
-        "A table of counters and centroids",
-        "A row for each look or move, of a spreadsheet or of a script; names of columns in English, German, Spanish\n"
-        "or French. The calibration of the cameras stands beside it; it comes from any of the files below.",
-        (
-            Command("import looks.csv --to mine --yes"),
-            Command("stereo --import cameras.json -o mine/stereo.json", 1),
-            Command("check mine"),
-            longer("fit mine --quick", 6),
-        ),
-        {"looks.csv": looks, "cameras.json": TWIN / "stereo.json"},
-        5,
-    ),
-    Kind(
-        "A stereo calibration of OpenCV",
-        "FileStorage (YAML, XML, JSON), `.npz` or `.mat`, under any of the usual names. RMS and number of views are\n"
-        "those of OpenCV's calibration; they make the covariance that such a file lacks.",
-        (
-            Command("stereo --import pair.yml --rms-px 0.25 --views 20 -o stereo.json"),
-            Command("stereo --import stereo.json --export ros -o again.json", 3),
-        ),
-        {"pair.yml": FOREIGN / "opencv_other_names" / "pair2.yml"},
-        5,
-    ),
-    Kind(
-        "A stereo calibration of ROS, Kalibr or EuRoC",
-        "A file, or one for each camera. Kalibr's camchain is one file, read likewise; so are mrcal's `.cameramodel`, "
-        "and the files of\nBasalt, calib.io and Metashape.",
-        (
-            Command("stereo --import left.yaml --import right.yaml -o ros.json", 6),
-            Command("stereo --import cam0.yaml --import cam1.yaml -o euroc.json", 6),
-        ),
-        {
-            "left.yaml": FOREIGN / "ros_message_dump" / "left.yaml",
-            "right.yaml": FOREIGN / "ros_message_dump" / "right.yaml",
-            "cam0.yaml": FOREIGN / "euroc_sensor_pair" / "cam0.yaml",
-            "cam1.yaml": FOREIGN / "euroc_sensor_pair" / "cam1.yaml",
-        },
-    ),
-    Kind(
-        "A calibration by a camera's maker",
-        "DepthAI's EEPROM as JSON (`eepromToJsonFile`), a ZED's `SN*.conf`, what RealSense's\n"
-        "`rs-enumerate-devices -c` prints; BoofCV's `stereo.yaml` likewise. `--image-size` is that of the\n"
-        "pictures that show the spots.",
-        (
-            Command("stereo --import calib.json -o oak.json", 7),
-            Command("stereo --import SN1.conf --image-size 1280x720 -o zed.json", 6),
-            Command("stereo --import enumerate.txt --image-size 640x480 -o realsense.json", 7),
-        ),
-        {
-            "calib.json": FOREIGN / "depthai" / "calib.json",
-            "SN1.conf": FOREIGN / "zed" / "SN1.conf",
-            "enumerate.txt": FOREIGN / "realsense" / "enumerate.txt",
-        },
-    ),
-    Kind(
-        "Pictures of a checkerboard",
-        "Eleven real pairs of a Bumblebee2 camera (`data/real/stereo`), named `left01.jpg` and `right01.jpg`. A board\n"
-        "of another size than stated is seen. Names that do not pair up: `--pair order`, or `--left` and `--right`. A\n"
-        "ChArUco board, which may be partly outside: `--charuco 15x10 --dictionary 5X5_100` in place of `--board`.",
-        (
-            longer("stereo pictures --board 7x5 --pitch-mm 30 -o stereo.json"),
-            longer("stereo pictures --board 6x4 --pitch-mm 30 -o stereo.json"),
-        ),
-        before=boards,
-    ),
-    Kind(
-        "Pictures of spots",
-        "`left_003.png` and `right_003.png` show the spot after move 3. `mine` is from `tvsbayes new mine`, with the\n"
-        "counters in `moves.csv` and with `stereo.json`.",
-        (longer("new mine --pictures pictures"), longer("detect mine")),
-        before=spots,
-    ),
-    Kind(
-        "A lab book and its pictures",
-        "As in the paper: `pictures` holds folders left, right, up and down, cameras are `_L` and `_R`, experiments\n"
-        "count from 1 in each direction, steps are those of each move. `mine` holds `stereo.json`. More of\n"
-        "[lab books](campaign-files.md#lab-books).",
-        (
-            longer("import book.csv --to mine --relative --pictures pictures --yes"),
-            longer("detect mine"),
-            longer("classic mine"),
-        ),
-        {"book.csv": lab_book},
-        7,
-    ),
-    Kind(
-        "A robot's head: its URDF and a log",
-        "Counters of both motors, and where its camera was found to point. `fresh` are later looks at counters of\n"
-        "`steps-for`, with the calibration in force. More of [heads](head.md).",
-        (
-            Command("import --urdf unit.urdf --to head --steps-per-turn 200 --yes"),
-            Command("import log.csv --sightings --to head --yes"),
-            longer("fit head --quick"),
-            longer("compensate head --to urdf -o new.urdf"),
-            longer("verify head fresh"),
-        ),
-        {"unit.urdf": ROOT / "tests" / "head" / "unit.urdf"},
-        before=sightings,
-    ),
-    Kind(
-        "A dial gauge: runs side by side",
-        "A sheet with a column for each run. Of deviations from the positions, also in µm: `--deviations`.",
-        (Command("import dial.csv --axis --to dial --yes"), answered("fit dial --quick")),
-        {"dial.csv": FOREIGN / "wide_forward_backward" / "dial.csv"},
-        4,
-    ),
-    Kind(
-        "An encoder that counts to 4096 and begins anew",
-        "Whole turns are added; `--counts-per-turn` states another number, where it is no power of two.",
-        (Command("import log.csv --axis --to encoder --yes"), answered("fit encoder --quick")),
-        {"log.csv": FOREIGN / "counts_wrap" / "log.csv"},
-        4,
-    ),
-    Kind(
-        "Target, actual and error",
-        "A column that is actual less target is no uncertainty: it is set aside.",
-        (Command("import errors.csv --axis --to rotary --yes"), answered("fit rotary --quick")),
-        {"errors.csv": FOREIGN / "error_column_as_u" / "signed.csv"},
-        4,
-    ),
-    Kind(
-        "A guide log of PHD2",
-        "Its runs are listed; `--run` takes one. The readings are those of a mount that nobody had guided.",
-        (
-            Command("import PHD2_GuideLog.txt --axis --to mount"),
-            Command("import PHD2_GuideLog.txt --axis --to mount --run 2 --yes"),
-            longer("fit mount --quick"),
-        ),
-        {"PHD2_GuideLog.txt": guide_log},
-        7,
-    ),
-    Kind(
-        "Series of EPICS",
-        "What `camonitor` prints. Each reading gets the command of its time; where the names leave open which series\n"
-        "is which, `--column command=NAME --column value=NAME`.",
-        (Command("import camonitor.log --axis --to stage --yes"), answered("fit stage --quick")),
-        {"camonitor.log": camonitor},
-        4,
-    ),
-    Kind(
-        "Klipper",
-        "A log of `data_logger.py` with a stepper and an angle sensor, packed or not; what `ANGLE_CALIBRATE` saved in\n"
-        "`printer.cfg` is read likewise.",
-        (Command("import klipper.json --axis --to stepper --yes"), answered("fit stepper --quick")),
-        {"klipper.json": data_logger},
-    ),
-)
-
-
-def main() -> None:
-    print_only(__doc__)
-    page = [BEGIN]
-    for kind in KINDS:
-        with tempfile.TemporaryDirectory() as place:
-            os.chdir(place)
-            page += [f"## {kind.title}\n\n{kind.text}\n", *kind.blocks()]
-            os.chdir(ROOT)
-    print("\n".join(page).rstrip())
-
-
-BEGIN = """# You have ...
-
-Two commands for each kind of file, with what they print. `import` shows what it took for what, and asks before it
-writes; `--yes` is the answer. `| head -2` and `| tail -4` show the first or last lines only. The files are small ones
-of own numbers or drawn (`experiments.inputs.you_have` prints the page again); options and other kinds are those of
-[import](commands.md#import), [stereo](commands.md#stereo) and [new](commands.md#new). Afterwards: `tvsbayes calibrate`,
-the [report](commands.md#report), and for an axis [a table for its controller](compensation.md).
-"""
 
 if __name__ == "__main__":
-    main()
+    renew_page(__doc__, PAGE, every)

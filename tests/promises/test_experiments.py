@@ -90,9 +90,8 @@ def test_commands_on_pages_are_scripts(page):
 
 
 def test_figures_have_one_style():
-    """All but the drawing of the instrument, which is no plot."""
     modules = {name for name in MODULES if "matplotlib.figure" in imported(tree_of(name))}
-    assert modules == {"experiments.common.figures", "experiments.inputs.draw_rig"}
+    assert modules == {"experiments.common.figures"}
 
 
 def test_every_picture_is_on_a_page():

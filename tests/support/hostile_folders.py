@@ -1,6 +1,6 @@
 """Campaign folders from strangers: a good one, edits of its files by Hypothesis, and what edits do not reach, crafted.
 
-Used by `promises/test_hostile.py` and, with more examples, by `experiments/robustness/hostile.py`. No JAX, no OpenCV.
+Used by `promises/test_hostile.py`. No JAX, no OpenCV.
 """
 
 from __future__ import annotations

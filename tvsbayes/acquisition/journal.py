@@ -36,10 +36,7 @@ LINE_BYTES_MAX = 16_384
 LOG_BYTES_MAX = 64 * 1024 * 1024
 LOG_EVENTS_MAX = 100_000
 LOG_ENTRIES_MAX = 5_000_000
-"""Largest number of commas and opening brackets: short entries take up to 40 times their text in memory.
-
-Source: `experiments/robustness/hostile.md`.
-"""
+"""Largest number of commas and opening brackets: short entries take up to 40 times their text in memory."""
 FRAME_BYTES_MAX = 128 * 1024 * 1024
 FRAME_FOLDERS = ("frames", "dark")
 """Pictures with the laser on and, for the background, off."""

@@ -22,7 +22,7 @@ from tvsbayes.progress import Advance, unshown
 
 CSV_BYTES_MAX = 64 * 1024 * 1024
 CSV_ROWS_MAX = 200_000
-"""With this limit a table of spots takes 0.6 GB and 6 s of CPU time to read (experiments/robustness/hostile.md)."""
+"""With this limit a table of spots takes 0.6 GB and 6 s of CPU time to read."""
 CSV_LINE_CHARS_MAX = 16_384
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _DATE = re.compile(

@@ -468,7 +468,7 @@ def arrays_of(data: bytes, bytes_max: int) -> dict[str, np.ndarray]:
     """The arrays of an .npz, by name; every size is checked against the header before memory is allocated.
 
     `numpy.load` alone can expand 0.5 kB to gigabytes: by entries of no width, and by bzip2 members, which zipfile
-    unpacks without a limit whatever size they state (experiments/robustness/hostile.md).
+    unpacks without a limit whatever size they state.
 
     Raises:
         ValueError: not an .npz of plain numbers and text as NumPy writes it, or above `bytes_max`, packed or unpacked.
