@@ -2,9 +2,9 @@
 
     python -m experiments.compensation.ten_minutes [--write]
 
-The page, data/docs/compensation.md, has the words and the commands. A stage is drawn (play 0.3 mm, errors by position of
-0.05 mm, on 40 mm), read three times to and fro into `log.csv`, and driven with the table into `fresh.csv`, and once with
-its sign turned into `turned.csv`: what a controller would do.
+The page, data/docs/compensation.md, has the words and the commands. A stage is drawn (play 0.3 mm, errors by position
+of 0.05 mm, on 40 mm), read three times to and fro into `log.csv`, and driven with the table into `fresh.csv`, and once
+with its sign turned into `turned.csv`: what a controller would do.
 """
 
 from __future__ import annotations

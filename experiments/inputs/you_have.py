@@ -197,7 +197,7 @@ FILES: dict[str, dict[str, Path | Callable[[], str | bytes | None]]] = {
     "Series of EPICS": {"camonitor.log": camonitor},
     "Klipper": {"klipper.json": data_logger},
 }
-"""Of each section: files by what they are copied from or made by, the one first that is shown; a maker may leave more."""
+"""Of each section: files by what they are copied from or made by; the first is shown, and a maker may leave more."""
 SAMPLES = re.compile(r"```console\n\$ tvsbayes (?!import|stereo --import|check)")
 """Where the first command stands that takes more than a second or two."""
 

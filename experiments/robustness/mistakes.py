@@ -3,10 +3,9 @@
     python -m experiments.robustness.mistakes [--seeds 60] [--sound 500]
 
 Mistakes are made in every one of the shipped twins and of simulations of the mounted rig after its four plans. Sound
-campaigns are drawn by the twin from all protocols, from what `tvsbayes plan` proposes (plans/RIG_SEED.csv: `tvsbayes
-plan data/rigs/RIG/rig.toml --draws 20 --minutes 30 --seed SEED`) and from random grids and steps, on rigs near and far
-from the shipped ones, and cut at many looks. A finding is any of `estimators.plausibility.implausible`: warnings of
-what a plan cannot tell are none.
+campaigns are drawn by the twin from all protocols, from what `tvsbayes plan` proposes and from random grids and steps,
+on rigs near and far from the shipped ones, and cut at many looks. A finding is any of
+`estimators.plausibility.implausible`: warnings of what a plan cannot tell are none.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from tvsbayes.files.disk import shipped_data, write_atomically
 from tvsbayes.instrument.campaign import Campaign, Move, Spot
 from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.parameters import Prior, names_of
-from tvsbayes.instrument.plan import PlanStep, read_plan
+from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import PROTOCOLS, four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.instrument.stereo_pair import pair_doubts
@@ -39,25 +38,21 @@ PLANS = ("paper", "paper_twin", "mixed", "grid")
 Change = Callable[[Campaign, np.random.Generator], Campaign]
 
 
-def of_spots(change: Callable[[int, Spot, np.random.Generator], Spot]) -> Change:
-    """A change of every spot, by its place."""
+def of_spots(change: Callable[[int, Spot, Campaign, np.random.Generator], Mapping[str, object]]) -> Change:
+    """New fields of every spot, by its place, the campaign and chance."""
     return lambda campaign, rng: replace(
-        campaign, spots=tuple(change(place, spot, rng) for place, spot in enumerate(campaign.spots))
+        campaign, spots=tuple(replace(s, **change(k, s, campaign, rng)) for k, s in enumerate(campaign.spots))
     )
 
 
-def of_moves(change: Callable[[Move], Move]) -> Change:
-    return lambda campaign, _: replace(campaign, moves=tuple(map(change, campaign.moves)))
+def of_moves(change: Callable[[Move], Mapping[str, object]]) -> Change:
+    """New fields of every move."""
+    return lambda campaign, _: replace(campaign, moves=tuple(replace(move, **change(move)) for move in campaign.moves))
 
 
 def scaled(factor: float) -> Change:
     """All pixels times a factor: pictures of another size."""
-
-    def change(_: int, spot: Spot, __: np.random.Generator) -> Spot:
-        values = {name: getattr(spot, name) for name in PIXELS}
-        return replace(spot, **{name: None if value is None else factor * value for name, value in values.items()})
-
-    return of_spots(change)
+    return of_spots(lambda _, s, *__: {n: factor * v for n in PIXELS if (v := getattr(s, n)) is not None})
 
 
 def as_corrected(correction: Correction) -> Change:
@@ -76,52 +71,29 @@ def relative(campaign: Campaign, _: np.random.Generator) -> Campaign:
 
 def turned(axis: str) -> Change:
     """One axis counts the other way."""
-    name = f"{axis}_steps"
-    return of_moves(lambda move: replace(move, **{name: -getattr(move, name)}))
+    return of_moves(lambda move: {f"{axis}_steps": -getattr(move, f"{axis}_steps")})
 
 
 def renamed(share: float) -> Change:
     """Some spots called after another sheet."""
 
-    def change(campaign: Campaign, rng: np.random.Generator) -> Campaign:
-        names = sorted({spot.target for spot in campaign.spots})
+    def other(_: int, spot: Spot, campaign: Campaign, rng: np.random.Generator) -> Mapping[str, object]:
+        rest = sorted({each.target for each in campaign.spots} - {spot.target})
+        return {"target": str(rng.choice(rest))} if rng.random() < share else {}
 
-        def other(_: int, spot: Spot, rng: np.random.Generator) -> Spot:
-            rest = [name for name in names if name != spot.target]
-            return replace(spot, target=str(rng.choice(rest))) if rng.random() < share else spot
-
-        return of_spots(other)(campaign, rng)
-
-    return change
+    return of_spots(other)
 
 
 def mistyped(offset_px: float) -> Change:
     """One pixel of one spot off."""
 
     def change(campaign: Campaign, rng: np.random.Generator) -> Campaign:
-        ok = [k for k, spot in enumerate(campaign.spots) if spot.status == "ok"]
-        row, name, spots = int(rng.choice(ok)), str(rng.choice(PIXELS)), list(campaign.spots)
-        spots[row] = replace(spots[row], **{name: getattr(spots[row], name) + offset_px * rng.choice([-1, 1])})
-        return replace(campaign, spots=tuple(spots))
+        row = int(rng.choice([k for k, spot in enumerate(campaign.spots) if spot.status == "ok"]))
+        name, off_px = str(rng.choice(PIXELS)), offset_px * rng.choice([-1, 1])
+        only = of_spots(lambda k, spot, *_: {name: getattr(spot, name) + off_px} if k == row else {})
+        return only(campaign, rng)
 
     return change
-
-
-def one_missing(campaign: Campaign, _: np.random.Generator) -> Campaign:
-    """From the middle on every spot assigned to the move after its own, as where the log lacks a row."""
-    last, half = len(campaign.moves) - 1, len(campaign.moves) // 2
-    spots = tuple(replace(s, move=min(s.move + (s.move >= half), last)) for s in campaign.spots)
-    return replace(campaign, spots=spots)
-
-
-def knocked(campaign: Campaign, rng: np.random.Generator) -> Campaign:
-    """The right camera turned halfway, by a sixth of a degree about its line of sight to the left one."""
-    half = len(campaign.spots) // 2
-
-    def change(place: int, spot: Spot, _: np.random.Generator) -> Spot:
-        return spot if place < half or spot.v_right_px is None else replace(spot, v_right_px=spot.v_right_px + 3)
-
-    return of_spots(change)(campaign, rng)
 
 
 def in_metres(campaign: Campaign, _: np.random.Generator) -> Campaign:
@@ -137,24 +109,32 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "tilt sign": (turned("tilt"), "up counts up"),
     "pan sign": (turned("pan"), "left counts up"),
     "pan and tilt exchanged": (
-        of_moves(lambda m: replace(m, pan_steps=m.tilt_steps, tilt_steps=m.pan_steps)),
+        of_moves(lambda m: {"pan_steps": m.tilt_steps, "tilt_steps": m.pan_steps}),
         "columns exchanged",
     ),
     "pictures of half the size": (scaled(0.5), "half the size"),
     "5 % of the sheet names wrong": (renamed(0.05), "sheet of another name"),
     "half of the sheet names wrong": (renamed(0.5), "sheet of another name"),
-    "sheet names blank": (of_spots(lambda _, spot, __: replace(spot, target="")), "column target is empty"),
+    "sheet names blank": (of_spots(lambda *_: {"target": ""}), "column target is empty"),
     "cameras swapped": (as_corrected(Correction(swapped=True)), "left and right swapped"),
     "centres in millimetres": (scaled(0.003), "centres in millimetres"),
     "pixels counted from 1": (as_corrected(Correction(pixels_from=-1)), "count from 1"),
     "one pixel 10 px off": (mistyped(10.0), "apart from all others"),
     "one pixel 100 px off": (mistyped(100.0), "apart from all others|triangulate outside"),
     "spots one move early": (
-        of_spots(lambda _, spot, __: replace(spot, move=max(spot.move - 1, 0))),
+        of_spots(lambda _, s, *__: {"move": max(s.move - 1, 0)}),
         "the move after theirs|rows shifted by one",
     ),
-    "a row of the log missing halfway": (one_missing, "the move before theirs|rows shifted by one"),
-    "right camera knocked by 3 px halfway": (knocked, "was a camera knocked"),
+    # From the middle on every spot has the move after its own.
+    "a row of the log missing halfway": (
+        of_spots(lambda _, s, c, __: {"move": min(s.move + (s.move >= len(c.moves) // 2), len(c.moves) - 1)}),
+        "the move before theirs|rows shifted by one",
+    ),
+    # Turned by a sixth of a degree about the line of sight to the left one.
+    "right camera knocked by 3 px halfway": (
+        of_spots(lambda k, s, c, _: {"v_right_px": s.v_right_px and s.v_right_px + 3 * (k >= len(c.spots) // 2)}),
+        "was a camera knocked",
+    ),
     "mirror offset in metres": (in_metres, "in metres"),
 }
 """What is done to a campaign, and the words by which `check` would name it."""
@@ -192,61 +172,46 @@ SHEETS = {
 }
 
 
-def poorly_calibrated(campaign: Campaign, rng: np.random.Generator) -> Campaign:
-    """Cameras that are off by ten draws' worth of their stated covariance.
-
-    A draw that no lens has (distortion that folds inside the picture) is a mistake of its own, and rightly named:
-    it is drawn again.
-    """
-    while True:
-        off = 10 * rng.multivariate_normal(np.zeros(24), campaign.stereo.parameter_covariance)
-        stereo = campaign.stereo.with_vector(campaign.stereo.vector + off)
-        if not pair_doubts(stereo):
-            return replace(campaign, stereo=stereo)
-
-
 FIRST_LOOKS, CUTS = 24, 12
 """Campaigns are cut at every look up to that one, from the first that `check` looks at, and at so many later ones."""
 POORLY = "cameras off by ten times what is stated of them"
 
 
-def _rigs() -> dict[str, Rig]:
+def sound_rigs() -> dict[str, Rig]:
     """Rigs by what they are like."""
-    shipped = {f"{name} rig": read_rig(shipped_data() / "rigs" / name / "rig.toml") for name in ("mounted", "nominal")}
-    mounted = shipped["mounted rig"]
-    unlike = {name: replace(mounted, truth={**mounted.truth, **changed}) for name, changed in UNLIKE.items()}
-    unlike |= {name: replace(mounted, sheets_mm=sheets) for name, sheets in SHEETS.items()}
-    return {**shipped, **unlike, POORLY: mounted}
+    rigs = {f"{name} rig": read_rig(shipped_data() / "rigs" / name / "rig.toml") for name in ("mounted", "nominal")}
+    mounted = rigs["mounted rig"]
+    rigs |= {name: replace(mounted, truth={**mounted.truth, **changed}) for name, changed in UNLIKE.items()}
+    return rigs | {name: replace(mounted, sheets_mm=sheets) for name, sheets in SHEETS.items()} | {POORLY: mounted}
 
 
-def _random_grid(rng: np.random.Generator) -> tuple[PlanStep, ...]:
-    """A snake over a grid of a few counters at one sheet or more."""
-    targets = sorted(rng.choice(["d1", "d2", "d3"], int(rng.integers(1, 4)), replace=False).tolist())
-    pan = np.linspace(-60, int(rng.integers(40, 260)), int(rng.integers(3, 8))).astype(int)
-    tilt = np.linspace(-90, int(rng.integers(-30, 100)), int(rng.integers(2, 6))).astype(int)
-    return grid_protocol(targets=targets, pan_steps=pan.tolist(), tilt_steps=tilt.tolist())
-
-
-def _random_four_points(rng: np.random.Generator) -> tuple[PlanStep, ...]:
-    """Four-point experiments of a few lengths."""
-    steps = rng.integers(20, 220, int(rng.integers(1, 4))).tolist()
-    return four_point_protocol(int(rng.integers(3, 20)), steps=steps, targets=("d1", str(rng.choice(["d2", "d3"]))))
+def drawn_plan(rng: np.random.Generator) -> tuple[PlanStep, ...]:
+    """A protocol, what `plan` proposes for the mounted rig, a snake over a few counters, or four-point experiments."""
+    kind = str(rng.choice([*PROTOCOLS, "planned", "snake", "four points"]))
+    if kind == "snake":
+        targets = sorted(rng.choice(["d1", "d2", "d3"], int(rng.integers(1, 4)), replace=False).tolist())
+        pan = np.linspace(-60, int(rng.integers(40, 260)), int(rng.integers(3, 8))).astype(int)
+        tilt = np.linspace(-90, int(rng.integers(-30, 100)), int(rng.integers(2, 6))).astype(int)
+        return grid_protocol(targets=targets, pan_steps=pan.tolist(), tilt_steps=tilt.tolist())
+    if kind == "four points":
+        steps = rng.integers(20, 220, int(rng.integers(1, 4))).tolist()
+        return four_point_protocol(int(rng.integers(3, 20)), steps=steps, targets=("d1", str(rng.choice(["d2", "d3"]))))
+    return shipped_plan(kind) if kind == "planned" else PROTOCOLS[kind]()
 
 
 def sound_campaign(number: int, rigs: Mapping[str, Rig]) -> tuple[str, Campaign]:
     """A campaign without a mistake, a new one for every number, with the name of its rig, which take turns."""
     rng = np.random.default_rng([7, number])
-    name = list(rigs)[number % len(rigs)]
-    planned = sorted((Path(__file__).parent / "plans").glob("*.csv"))
-    kinds = [*PROTOCOLS, *planned, _random_grid, _random_four_points]
-    kind = kinds[int(rng.integers(len(kinds)))]
-    if isinstance(kind, Path):
-        plan = read_plan(kind)
-    else:
-        plan = PROTOCOLS[kind]() if isinstance(kind, str) else kind(rng)
+    name, plan = list(rigs)[number % len(rigs)], drawn_plan(rng)
     odd = {"aperture": bool(rng.integers(2)), "sides_recorded": bool(rng.integers(2)), "home_approach": None}
     campaign = simulate(rigs[name], plan, seed=1000 + number, **odd).campaign
-    return name, poorly_calibrated(campaign, rng) if name == POORLY else campaign
+    # A draw that no lens has (distortion that folds inside the picture) is a mistake of its own, and rightly named.
+    while name == POORLY:
+        off = 10 * rng.multivariate_normal(np.zeros(24), campaign.stereo.parameter_covariance)
+        stereo = campaign.stereo.with_vector(campaign.stereo.vector + off)
+        if not pair_doubts(stereo):
+            return name, replace(campaign, stereo=stereo)
+    return name, campaign
 
 
 def cut(campaign: Campaign, looks: int) -> Campaign:
@@ -264,7 +229,7 @@ def cuts_of(campaign: Campaign, rng: np.random.Generator) -> list[int]:
 
 def sound_table(count: int) -> list[str]:
     """How often sound campaigns are accused, whole and cut, by rig."""
-    rigs = _rigs()
+    rigs = sound_rigs()
     counts = {name: Counter[str]() for name in rigs}
     kinds: Counter[str] = Counter()
     for number in range(count):

@@ -1,6 +1,6 @@
 """How fast, how exact and how large is tvsbayes beside its peers?
 
-    taskset -c 0 python -m experiments.speed.benchmarks run --parts strd posterior spots stereo     # the compared code
+    taskset -c 0 python -m experiments.speed.benchmarks run --parts posterior spots stereo     # the compared code
     python -m experiments.speed.benchmarks run --parts commands scaling                # as users start them
     python -m experiments.speed.benchmarks table > experiments/speed/benchmarks.md
 
@@ -141,14 +141,6 @@ PARTS = {
         "size; Laplace only. The first fit holds the compilation, which the shape of a campaign decides.",
         {"reading_s": ("read, s", ".3g"), "first_s": ("first fit, s", ".3g"), "warm_s": ("warm fit, s", ".3g"),
          "rss_mib": ("peak memory, MiB", ".0f")}, tuple(f"{n} spots" for n in SIZES), scaling, repeats=1),
-    "strd": Part("Certified least-squares problems (NIST StRD)", "44 fits: 22 problems from both starts. Digits agree "
-        "with the certified values (at most 11 are printed by NIST): of the worst parameter of a fit, and of the worst "
-        f"standard error. Ours is the descent of `stereo` and of the fit; scipy has tolerances {peers.TIGHT:g}, "
-        "`x_scale='jac'` and the same compiled residuals and Jacobian, each call of which costs it 0.1 ms or more from "
-        "Python; or, as most use it, NumPy and finite differences. Seconds are of all 44, without compilation.",
-        {"good": (f"fits with {peers.DIGITS:g} digits", ".0f"), "least": ("digits, least", ".1f"),
-         "median": ("median", ".1f"), "least_error": ("standard errors, least", ".1f"), "cpu_s": ("CPU s", ".3g"),
-         "missed": ("missed", "")}, (OURS, *peers.STRD, peers.USUAL), peers.certified, "cpu_s"),
     "posterior": Part("Sampling the posterior", "60 spots of the mounted rig, both axes moved between any two. Worst "
         "bulk effective draws of all free parameters over the process' CPU seconds, compilation apart. `tvsbayes` is "
         "`sample` from the fit until its own limits are met; tier 1 alone ends before the chain, its effective draws "

@@ -10,95 +10,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 
 from experiments.common.against_truth import rms
 from experiments.common.clock import timed
-from experiments.common.of_tests import module_of_tests
 from experiments.common.rigs import dense_plan, mounted_rig, pixels_of, small_plan
 
 Work = Callable[[int], Mapping[str, object]]
 OURS = "tvsbayes"
-
-
-TIGHT, DIGITS = 1e-15, 6.0
-STRD = {"scipy lm": "lm", "scipy trf": "trf"}
-USUAL = "scipy lm, NumPy and finite differences"
-
-
-def solved(problems: Mapping, solve: Callable[[str, np.ndarray], np.ndarray]) -> dict[tuple[str, int], np.ndarray]:
-    """Every problem from both starts, NaN where a solver gave up."""
-    found = {}
-    for name, start in ((name, start) for name in problems for start in (0, 1)):
-        try:
-            found[name, start] = solve(name, problems[name].starts[start])
-        except (ValueError, np.linalg.LinAlgError):
-            found[name, start] = np.full(problems[name].certified.size, np.nan)
-    return found
-
-
-def certified(_: Path) -> Mapping[str, Work]:
-    """NIST's problems of `tests/support/certified_problems.py`, from both starts, by our descent and by scipy."""
-    import jax
-    import jax.numpy as jnp
-    from scipy import optimize
-
-    from tvsbayes.statistics.least_squares import residuals_and_jacobian
-
-    jax.config.update("jax_enable_x64", True)
-    strd = module_of_tests("support.certified_problems")
-    if not strd.FOLDER.is_dir():
-        raise SystemExit(f"NIST's files are not at {strd.FOLDER}: choose --parts without strd")
-    problems = {name: strd.read_problem(name) for name in strd.MODELS}
-    data = {name: (jnp.asarray(p.x), jnp.asarray(p.y)) for name, p in problems.items()}
-    plain = {name: jax.jit(residual) for name, residual in strd.RESIDUALS.items()}
-    options = {"xtol": TIGHT, "ftol": TIGHT, "gtol": TIGHT, "x_scale": "jac", "max_nfev": 100_000}
-
-    def residuals(name: str, value: np.ndarray) -> np.ndarray:
-        return np.asarray(plain[name](jnp.asarray(value), data[name]))
-
-    def jacobian(name: str, value: np.ndarray) -> np.ndarray:
-        return np.asarray(residuals_and_jacobian(strd.RESIDUALS[name], jnp.asarray(value), data[name]).jacobian)
-
-    def ours(name: str, start: np.ndarray) -> np.ndarray:
-        return strd.descended(strd.RESIDUALS[name], start, data[name]).value
-
-    def peer(method: str, name: str, start: np.ndarray) -> np.ndarray:
-        both = {"fun": lambda b: residuals(name, b), "jac": lambda b: jacobian(name, b)}
-        return optimize.least_squares(x0=start, method=method, **both, **options).x
-
-    def usual(name: str, start: np.ndarray) -> np.ndarray:
-        with mock.patch.object(strd, "jnp", np):
-            about = (problems[name].x, problems[name].y)
-            return optimize.least_squares(strd.RESIDUALS[name], start, args=(about,), method="lm", **options).x
-
-    def digits(name: str, value: np.ndarray) -> tuple[float, float]:
-        """Of the worst parameter and of the worst standard error."""
-        problem, residual = problems[name], residuals(name, value)
-        try:
-            covariance = strd.least_squares_covariance(jacobian(name, value)) * (residual @ residual)
-            errors = strd.digits(np.sqrt(np.diag(covariance) / (problem.x.size - value.size)), problem.sd)
-        except (np.linalg.LinAlgError, ValueError):
-            errors = 0.0
-        return max(strd.digits(value, problem.certified), 0.0), max(errors, 0.0)
-
-    def work(solve: Callable, _: int) -> Mapping[str, object]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
-            found, cost = timed(lambda: solved(problems, solve))
-            of = {key: digits(key[0], value) for key, value in found.items()}
-        parameters, errors = np.array(list(of.values())).T
-        missed = ", ".join(f"{name} {start + 1}" for (name, start), d in of.items() if d[0] < DIGITS)
-        row = {**cost, "good": int(np.sum(parameters >= DIGITS)), "missed": missed, "least": float(parameters.min())}
-        return {**row, "median": float(np.median(parameters)), "least_error": float(errors.min())}
-
-    works = {OURS: partial(work, ours), USUAL: partial(work, usual)}
-    works |= {name: partial(work, partial(peer, method)) for name, method in STRD.items()}
-    for compiled in works.values():
-        compiled(0)
-    return works
 
 
 CHAINS, WARMUP, DRAWS, TRUSTED = 4, 250, 500, 400

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.robustness.mistakes import MISTAKES, cut, cuts_of, sound_campaign, turned
-from experiments.robustness.mistakes import _rigs as rigs
+from experiments.robustness.mistakes import MISTAKES, cut, cuts_of, sound_campaign, sound_rigs, turned
 from tvsbayes.estimators.counter_pattern import hidden_deg
 from tvsbayes.estimators.plausibility import implausible
 from tvsbayes.files.disk import shipped_data
@@ -33,7 +32,7 @@ def with_prior(campaign: Campaign, **changed: Prior) -> Campaign:
 
 def test_sound_campaigns_have_no_finding_whole_or_cut():
     """One of each rig, from every protocol and plan; 500 in experiments/robustness/mistakes.md."""
-    drawn = rigs()
+    drawn = sound_rigs()
     for number in range(len(drawn)):
         name, campaign = sound_campaign(number, drawn)
         for looks in cuts_of(campaign, np.random.default_rng(number))[::4]:

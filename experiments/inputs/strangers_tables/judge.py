@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from experiments.common.commands import quietly
 from experiments.inputs.strangers_tables.kinds import Drawn
-from experiments.inputs.strangers_tables.measured import DOMAIN, SCALE, Reading, Truth
+from experiments.inputs.strangers_tables.tables import DOMAIN, SCALE, Reading, Truth
 
 SPELLED = {
     "\u00b5m": "um",
@@ -86,134 +86,65 @@ def read_axis(folder: Path) -> Folder:
     return Folder(SPELLED.get(unit, unit), tuple(readings))
 
 
-def read_sightings(folder: Path) -> Folder:
-    """A folder of a head."""
-    moves, readings = rows_of(folder / "moves.csv"), []
-    for row in rows_of(folder / "sightings.csv"):
-        if row["status"] != "ok":
-            continue
-        move = moves[int(row["move"])]
-        pair = (int(move["pan_steps"]), int(move["tilt_steps"]), float(row["elevation_deg"]))
-        readings.append(Reading(0.0, float(row["azimuth_deg"]), u=float(row["u_deg"] or 0), pair=pair))
-    return Folder("deg", tuple(readings))
-
-
-def difference(truth: Truth, folder: Folder) -> str:
-    """The first thing that is not as the table says; empty where all is."""
-    if not folder.readings:
-        return "no reading"
+def folder_difference(out: Path, truth: Truth) -> str:
+    """The first thing of a folder that is not as the table says; empty where all is."""
+    try:
+        folder = read_axis(out)
+    except (OSError, KeyError, ValueError) as error:
+        return f"folder of another kind: {type(error).__name__}"
+    unit = truth.unit or truth.meant
     if truth.unit is not None and DOMAIN.get(folder.unit) != DOMAIN[truth.unit]:
         return f"unit {folder.unit} for {truth.unit}"
-    wrong = ""
-    for factor in factors(truth, folder):
-        found = compared(truth, folder, factor)
-        if not found:
-            return ""
-        wrong = wrong or found
-    if wrong.startswith("value") and truth.unit not in (None, folder.unit) and not compared(truth, folder, 1.0):
-        return f"unit {folder.unit} for {truth.unit}"
-    return wrong
-
-
-def factors(truth: Truth, folder: Folder) -> list[float]:
-    """Units of the table per unit of the folder that are right."""
-    if truth.unit is not None:
-        return [SCALE[folder.unit] / SCALE[truth.unit]]
-    if truth.meant and DOMAIN.get(folder.unit) == DOMAIN[truth.meant]:
-        return [1.0, SCALE[folder.unit] / SCALE[truth.meant]]
-    return [1.0]
-
-
-def compared(truth: Truth, folder: Folder, factor: float) -> str:
-    """The first difference, where a unit of the folder is `factor` units of the table."""
+    # Of a unit that nobody knows the numbers may be left as they are.
+    same = unit is not None and DOMAIN.get(folder.unit) == DOMAIN[unit]
+    right = [1.0] * (truth.unit is None) + ([SCALE[folder.unit] / SCALE[unit]] if same else [])
+    # Commands may have been turned into the unit of the readings.
     scales = [1.0]
     if truth.command_unit in SCALE and folder.unit in SCALE:
-        # Commands may have been turned into the unit of the readings.
         scales.append(SCALE[folder.unit] / SCALE[truth.command_unit])
-    wrongs = []
-    for scale in scales:
-        told = [r._replace(command=r.command * scale, value=r.value * factor, u=r.u * factor) for r in folder.readings]
-        wrongs.append(by_stops(truth, told) if truth.spread else in_order(truth, told))
-    return "" if "" in wrongs else wrongs[0]
+    wrongs = [compared(truth, folder, factor, scale) for factor in right for scale in scales]
+    if "" in wrongs:
+        return ""
+    if wrongs[0].startswith("value") and truth.unit not in (None, folder.unit) and not compared(truth, folder, 1, 1):
+        return f"unit {folder.unit} for {truth.unit}"
+    return wrongs[0]
 
 
-def in_order(truth: Truth, told: Sequence[Reading]) -> str:
-    """Every reading of the table once, in its order; `kept` of them where others may be left out."""
-    pairs: list[tuple[Reading, Reading]] = []
-    if truth.kept is None:
-        if len(told) != len(truth.readings):
-            return f"readings: {'fewer' if len(told) < len(truth.readings) else 'more'} than there are"
-        pairs = list(zip(truth.readings, told, strict=True))
-    else:
-        left = iter(truth.readings)
-        for reading in told:
-            # The same line twice is the same reading twice.
-            if pairs and not _one(truth, pairs[-1][0], reading):
-                continue
-            expected = next((r for r in left if not _one(truth, r, reading)), None)
-            if expected is None:
-                return "a reading that belongs to another command"
-            pairs.append((expected, reading))
-        if len(pairs) < truth.kept:
-            return "readings: fewer than are sound"
+def compared(truth: Truth, folder: Folder, factor: float, scale: float) -> str:
+    """The first difference, where units of the folder are so many of the table, of readings and of commands."""
+    told = [r._replace(command=r.command * scale, value=r.value * factor, u=r.u * factor) for r in folder.readings]
+    if len(told) != len(truth.readings):
+        return f"readings: {'fewer' if len(told) < len(truth.readings) else 'more'} than there are"
+    pairs = list(zip(truth.readings, told, strict=True))
     for expected, reading in pairs:
-        # A homing forgets the side.
-        forgotten = truth.segments == "any" and reading.side == 0
-        if wrong := _one(truth, expected._replace(side=0) if forgotten else expected, reading):
+        if wrong := one_difference(truth, expected, reading):
             return wrong
-    if truth.segments == "exact" and truth.kept is None:
-        changes = [[b.segment != a.segment for a, b in pairwise(r)] for r in (truth.readings, told)]
+    if not truth.cycles:
+        changes = [[b.segment != a.segment for a, b in pairwise(readings)] for readings in (truth.readings, told)]
         if changes[0] != changes[1]:
             return "homings"
     return times(truth, pairs)
 
 
-def _one(truth: Truth, expected: Reading, reading: Reading) -> str:
+def one_difference(truth: Truth, expected: Reading, reading: Reading) -> str:
     """The difference between two readings."""
-    tolerance = 0.6 * truth.digit + 1e-9 * abs(expected.value)
-    if expected.pair is not None:
-        turn = (reading.value - expected.value + 180) % 360 - 180
-        if reading.pair is None or reading.pair[:2] != expected.pair[:2]:
-            return "counters"
-        if abs(turn) > tolerance or abs(reading.pair[2] - expected.pair[2]) > tolerance:
-            return f"angles{_power(reading.value, expected.value)}"
-        # Without a column the importer states its default.
-        return "u" if expected.u and abs(reading.u - expected.u) > 0.03 * expected.u else ""
     if abs(reading.command - expected.command) > 1e-9 * max(1.0, abs(expected.command)):
-        return f"command{_power(reading.command, expected.command)}"
-    if abs(reading.value - expected.value) > tolerance:
-        return f"value{_power(reading.value, expected.value)}"
+        return f"command{power(reading.command, expected.command)}"
+    if abs(reading.value - expected.value) > 0.6 * truth.digit + 1e-9 * abs(expected.value):
+        return f"value{power(reading.value, expected.value)}"
     if abs(reading.u - expected.u) > 0.03 * expected.u:
-        return f"u{_power(reading.u, expected.u)}"
-    unknown = reading.side == 0 and truth.answer == "either"
+        return f"u{power(reading.u, expected.u)}"
+    # A homing forgets the side.
+    unknown = reading.side == 0 and (truth.answer == "either" or truth.cycles)
     return "side" if expected.side and reading.side != expected.side and not unknown else ""
 
 
-def _power(found: float, expected: float) -> str:
+def power(found: float, expected: float) -> str:
     """By how much it is off, if by a factor that names a unit."""
     if not found or not expected:
         return " for none" if found else " lost"
-    ratio = found / expected
     known = {1000: "x 1000", 100: "x 100", 10: "x 10", 0.001: "/ 1000", 2: "x 2", 3600: "x 3600", 25.4: "x 25.4"}
-    return next((f" {text}" for value, text in known.items() if abs(ratio / value - 1) < 0.03), "")
-
-
-def by_stops(truth: Truth, told: Sequence[Reading]) -> str:
-    """Of each stop at least one reading, none from outside of its spread."""
-    number, seen = -1, set()
-    for reading in told:
-        while True:
-            stop = truth.readings[number] if number >= 0 else None
-            same = stop is not None and abs(reading.command - stop.command) < 1e-6
-            if stop is not None and same and abs(reading.value - stop.value) <= truth.spread:
-                if reading.side != stop.side and stop.side:
-                    return "side"
-                seen.add(number)
-                break
-            if same or number + 1 == len(truth.readings):
-                return "a reading in motion"
-            number += 1
-    return "" if len(seen) == len(truth.readings) else "stops: fewer than there are"
+    return next((f" {text}" for value, text in known.items() if abs(found / expected / value - 1) < 0.03), "")
 
 
 def times(truth: Truth, pairs: Sequence[tuple[Reading, Reading]]) -> str:
@@ -268,17 +199,6 @@ def carried_out(line: Sequence[str], out: Path) -> tuple[str, dict[str, Any]]:
     return ("refused" if code in (2, 3) else "crash"), document
 
 
-def folder_difference(out: Path, truth: Truth) -> str:
-    """What is wrong with the folder."""
-    sighted = truth.readings[0].pair is not None
-    try:
-        folder = read_sightings(out) if sighted else read_axis(out)
-        wrongs = [difference(one, folder) for one in (truth, *truth.also)]
-        return "" if "" in wrongs else wrongs[0]
-    except (OSError, KeyError, ValueError) as error:
-        return f"folder of another kind: {type(error).__name__}"
-
-
 def answered(error: dict[str, Any], out: Path, truth: Truth, depth: int = 0) -> tuple[bool, bool]:
     """Is there an answer, and does one lead to the right folder?"""
     lines = answers(error)
@@ -295,7 +215,7 @@ def judge(drawn: Drawn, folder: Path) -> Verdict:
     """Import a drawn table without an option, and compare; answer what is asked."""
     path, out = folder / drawn.file.name, folder / "out"
     path.write_bytes(drawn.file.data)
-    line = ["import", str(path), *drawn.words, "--to", str(out), "--yes", "--json"]
+    line = ["import", str(path), "--axis", "--to", str(out), "--yes", "--json"]
     state, document = carried_out(line, out)
     if state == "crash":
         return Verdict("crash", document.get("error", {}).get("message", "")[:200])
