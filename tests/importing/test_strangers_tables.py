@@ -13,7 +13,7 @@ import pytest
 from experiments.inputs.strangers_tables.__main__ import drawn_table, judged
 from experiments.inputs.strangers_tables.judge import folder_difference
 from experiments.inputs.strangers_tables.kinds import DRAWS, Drawn
-from experiments.inputs.strangers_tables.tables import Reading, Truth
+from experiments.inputs.strangers_tables.measured import Reading, Truth
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from experiments.common.page import share, table
 from experiments.common.rows import ROOT
 from experiments.inputs.strangers_tables.judge import Verdict, judge
 from experiments.inputs.strangers_tables.kinds import DRAWS, Drawn
-from experiments.inputs.strangers_tables.tables import LANGUAGES, Stranger
+from experiments.inputs.strangers_tables.measured import LANGUAGES, Stranger
 
 OUTPUT = ROOT / "experiments" / "output" / "strangers_tables"
 WORDS = ("right", "guessed", "asked", "unanswered", "refused", "crash", "wrong")

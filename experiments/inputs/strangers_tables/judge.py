@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from experiments.common.commands import quietly
 from experiments.inputs.strangers_tables.kinds import Drawn
-from experiments.inputs.strangers_tables.tables import DOMAIN, SCALE, Reading, Truth
+from experiments.inputs.strangers_tables.measured import DOMAIN, SCALE, Reading, Truth
 
 SPELLED = {
     "\u00b5m": "um",

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.inputs.strangers_tables.tables import (
+from experiments.inputs.strangers_tables.measured import (
     DIGITS,
     DOMAIN,
     SCALE,
