@@ -138,7 +138,7 @@ TOML_PLACES = {
 @pytest.mark.parametrize("name", TOML_PLACES)
 def test_toml_messages_name_the_line_of_the_key_itself(name):
     text, path, line = TOML_PLACES[name]
-    keys = Keys({}, "t.toml", parse_toml(text.encode(), "t.toml").text, path[:-1])
+    keys = Keys({}, "t.toml", parse_toml(text.encode(), "t.toml").content, path[:-1])
     assert keys.refuse(path[-1], "code", "allowed", "remedy").line == line
 
 

@@ -54,7 +54,7 @@ def test_ten_times_the_uncertainty_of_the_reference_is_in_the_u_of_the_line():
     """By GUM the u of the scale, 4e-7, adds in quadrature; the readings' scatter is the same, and rescales nothing."""
     u = {}
     for scale in (1e-6, 1.0, 10.0):
-        summary = summary_of(screw(Reference(common=True), scale=scale))
+        summary = summary_of(screw(Reference(u_is="common"), scale=scale))
         line, classic = summary.effective_per_command["forward"].sd, summary.classic.u_per_command
         u[scale] = np.array([line, classic])
         assert "reading_scale" not in summary.parameters
@@ -121,7 +121,7 @@ def test_variance_by_cause_is_exactly_that_of_the_posterior(seed):
 
 
 def test_a_common_u_is_no_noise():
-    rows = rows_of(screw(Reference(common=True)))
+    rows = rows_of(screw(Reference(u_is="common")))
     assert not rows.variance.any() and rows.reference_causes == ("u of readings",)
     np.testing.assert_allclose(rows.reference[:, 0], 2e-4 + 4e-7 * rows.command, rtol=1e-12)
     left_out = rows.command > 100
@@ -142,7 +142,7 @@ def test_the_expansion_of_the_reference_corrects_and_has_a_u():
     assert classic_axis(after).per_command == pytest.approx(classic_axis(before).per_command * (1 + 4.8e-5), rel=1e-9)
 
 
-STATED = Reference(2e-4, 1e-6, StatedValue(8e-6, 1e-6), True, "K-17", datetime.date(2027, 1, 15))
+STATED = Reference(2e-4, 1e-6, StatedValue(8e-6, 1e-6), "common", "K-17", datetime.date(2027, 1, 15))
 
 
 def test_a_folder_states_the_reference(tmp_path):
@@ -152,7 +152,7 @@ def test_a_folder_states_the_reference(tmp_path):
     known = axis_hashes(campaign)
     for other, same in (
         (replace(STATED, u=1e-4), False),
-        (replace(STATED, common=False), False),
+        (replace(STATED, u_is="independent"), False),
         (replace(STATED, certificate="other", valid_until=None), True),
     ):
         assert (axis_hashes(replace(campaign, reference=other)) == known) is same

@@ -301,8 +301,8 @@ def _tables(text: str, path: Path) -> Mapping[str, Any]:
 def read_calibration_json(path: Path) -> Calibration:
     """Read what `calibration_json` made; errors as in `read_draws`."""
     keys = parse_json(read_bytes(path, RESULTS_BYTES_MAX), escaped(path.name))
-    known = keys.word("format", FORMATS)
-    convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
+    known = keys.word("format", *FORMATS)
+    convention = keys.word("aperture_convention", "in-plane", "azimuth")
     try:
         # Wrong types fail below or in `_shaped`.
         d: Mapping[str, Any] = keys.values

@@ -94,7 +94,7 @@ def accepted_calibration(campaign: Campaign, stored: FitFiles | Reason | None = 
             file="results/fit.json",
             remedy="run `tvsbayes fit`, aim by `tvsbayes steps-for` or the header, and look there",
         )
-    stored.keys.word("format", FIT_FORMATS)
+    stored.keys.word("format", *FIT_FORMATS)
     refuse_answer(answer_of(stored.keys), SURER)
     return calibration
 

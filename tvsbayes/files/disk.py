@@ -70,6 +70,14 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
     return data
 
 
+def require_campaign_folder(folder: Path, kind: str) -> None:
+    """Refuse a path that is no folder; `kind` is the kind of folder wanted, in words."""
+    if not folder.is_dir():
+        found = "no such folder" if not folder.exists() else "a file"
+        place, remedy = escaped(str(folder), 200), "give the folder that holds campaign.toml"
+        raise refusal("missing-file", file=place, found=found, allowed=kind, remedy=remedy)
+
+
 def _too_large(path: Path, found: str, allowed: str) -> InputError:
     remedy = "split the data or remove what is not needed"
     return refusal("size", file=escaped(Path(path).name), found=found, allowed=allowed, remedy=remedy)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import datetime
 import json
 import math
-import numbers
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import NamedTuple
+from numbers import Integral, Real
+from typing import Any, NamedTuple, TypeGuard
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, other_format, refusal, shown
 from tvsbayes.files.disk import decode
@@ -35,6 +35,11 @@ _TOML_STRING_OR_COMMENT = re.compile(
 )
 _TOKEN = re.compile(rf"{_TOML_STRING_OR_COMMENT.pattern}|[\[\]{{}}=:,.\n]|[^\s\[\]{{}}=:,.\"'#]++", re.DOTALL)
 """Tokens by which keys are located: strings and comments, marks, and the words between them."""
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether a value of TOML or JSON is a number; booleans are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 class StatedValue(NamedTuple):
@@ -121,9 +126,9 @@ def _unquoted(key: str) -> str:
 class Keys:
     """One table of a TOML or JSON file, read key by key; its errors state file, line and dotted key."""
 
-    def __init__(self, values: dict[str, object], file: str, text: str, path: tuple[str, ...] = ()):
-        """`values` as parsed from `text`; `path` is the path from the top of the file to this table."""
-        self.values, self.file, self.text, self.path = values, file, text, path
+    def __init__(self, values: dict[str, object], file: str, content: str, path: tuple[str, ...] = ()):
+        """`values` as parsed from `content`; `path` is the path from the top of the file to this table."""
+        self.values, self.file, self.content, self.path = values, file, content, path
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
@@ -138,7 +143,7 @@ class Keys:
 
     def _line(self, keys: tuple[str, ...]) -> int | None:
         """The line of the innermost of `keys` that occurs in the text."""
-        lines = _key_lines(self.text)
+        lines = _key_lines(self.content)
         paths = (".".join(keys[:count]) for count in range(len(keys), 0, -1))
         return next((lines[path] for path in paths if path in lines), None)
 
@@ -150,74 +155,97 @@ class Keys:
                 allowed = "only " + ", ".join(names)
                 raise self.refuse(key, "unknown-key", allowed, closest(key, names), found="an unknown key")
 
-    def _get(self, key: str, allowed: str) -> object:
+    def read(self, key: str, kind: Kind) -> Any:
+        """The value under `key`, which must be of a kind."""
+        method, *limits = kind if isinstance(kind, tuple) else (kind,)
+        return method(self, key, *limits)
+
+    def entries(self, kinds: Mapping[str, Kind], required: Iterable[str] = ()) -> dict[str, Any]:
+        """The values of a table with these keys and no others, in the order of the file; `required` must be there."""
+        self.only(kinds)
+        return {key: self.read(key, kinds[key]) for key in dict.fromkeys((*self.values, *required))}
+
+    def document(self, form: str, kinds: Mapping[str, Kind], required: Iterable[str] = ()) -> dict[str, Any]:
+        """The values of a file of the format `form`, as `entries`, without the key `format`."""
+        self.word("format", form)
+        entries = self.entries({"format": Keys.text, **kinds}, required)
+        return {key: value for key, value in entries.items() if key != "format"}
+
+    def value(self, key: str) -> Any:
+        """The value under `key` as it stands."""
+        return self.values[key]
+
+    def _held(
+        self, key: str, fits: Callable[[Any], object], code: str, allowed: str, remedy: str = "correct the value"
+    ) -> Any:
+        """The value under `key` as it stands, which must fit."""
         if key not in self.values:
             raise self.refuse(key, "missing-key", allowed, f"add {key}")
+        if not fits(self.values[key]):
+            raise self.refuse(key, code, allowed, remedy)
         return self.values[key]
+
+    def checked(self, key: str, kind: Kind, fits: Callable[[Any], object], code: str, allowed: str, remedy: str) -> Any:
+        """A value of a kind that fits besides."""
+        if not fits(value := self.read(key, kind)):
+            raise self.refuse(key, code, allowed, remedy)
+        return value
 
     def number(self, key: str, low: float, high: float) -> float:
         """A finite number in [low, high]; booleans are refused."""
         allowed = f"a finite number from {low:g} to {high:g}" if low < high else f"exactly {low:g}"
-        value = self._get(key, allowed)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise self.refuse(key, "number", allowed, "correct the value and check its unit")
-        return float(value)
+        remedy = "correct the value and check its unit"
+        return float(self._held(key, lambda v: is_number(v) and low <= v <= high, "number", allowed, remedy))
+
+    def numbers(self, key: str, low: float, high: float, most: int) -> tuple[float, ...]:
+        """One number in [low, high], or a list of 1 to `most` different numbers."""
+        stated: Any = self.values[key]
+        values = stated if isinstance(stated, list) else [stated]
+        inside = all(is_number(value) and low <= value <= high for value in values)
+        if not inside or not 0 < len({*values}) == len(values) <= most:
+            allowed = f"a number from {low:g} to {high:g}, or a list of up to {most} different ones"
+            raise self.refuse(key, "numbers", allowed, "correct the values and check their unit")
+        return tuple(map(float, values))
 
     def integer(self, key: str, low: int, high: int) -> int:
         """A whole number in [low, high]."""
         allowed = f"a whole number from {low} to {high}"
-        value = self._get(key, allowed)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.refuse(key, "integer", allowed, "correct the value")
-        return value
+        return self._held(key, lambda v: type(v) is int and low <= v <= high, "integer", allowed)
 
-    def text_value(self, key: str, chars_max: int = 200) -> str:
+    def text(self, key: str, chars_max: int = 200) -> str:
         """Printable text without line breaks; fields such as `notes` have a larger `chars_max` and may have breaks."""
-        allowed = f"printable text of at most {chars_max} characters"
-        value = self._get(key, allowed)
-        breaks = "\n\t" if chars_max > 200 else ""
-        if not isinstance(value, str) or len(value) > chars_max:
-            raise self.refuse(key, "text", allowed, "shorten it, or put it in quotes")
+        allowed, breaks = f"printable text of at most {chars_max} characters", "\n\t" * (chars_max > 200)
+        remedy = "shorten it, or put it in quotes"
+        value = self._held(key, lambda v: isinstance(v, str) and len(v) <= chars_max, "text", allowed, remedy)
         if not all(c.isprintable() or c in breaks for c in value):
             raise self.refuse(key, "text", allowed, "remove the control characters")
         return value
 
     def flag(self, key: str) -> bool:
         """The boolean under `key`."""
-        value = self._get(key, "true or false")
-        if not isinstance(value, bool):
-            raise self.refuse(key, "boolean", "true or false", "write true or false without quotes")
-        return value
+        remedy = "write true or false without quotes"
+        return self._held(key, lambda v: isinstance(v, bool), "boolean", "true or false", remedy)
 
-    def word(self, key: str, words: tuple[str, ...]) -> str:
+    def date(self, key: str) -> datetime.date:
+        """A date, or a time."""
+        allowed = "a date or time such as 2026-01-15T10:00:00Z"
+        return self._held(key, lambda v: isinstance(v, datetime.date), "date", allowed, "write it without quotes")
+
+    def word(self, key: str, *words: str) -> str:
         """One of a few words."""
-        allowed = " or ".join(shown(w) for w in words)
-        value = self._get(key, allowed)
-        if value not in words:
-            remedy = other_format(str(value), words) if key == "format" else None
-            raise self.refuse(key, "word", allowed, remedy or closest(str(value)[:100], words))
-        return str(value)
+        found = str(self.values.get(key))
+        remedy = other_format(found, words) if key == "format" else None
+        allowed = " or ".join(map(shown, words))
+        return self._held(key, lambda v: v in words, "word", allowed, remedy or closest(found[:100], words))
 
-    def some_words(self, key: str, words: tuple[str, ...]) -> tuple[str, ...]:
+    def some_words(self, key: str, *words: str) -> tuple[str, ...]:
         """A list of different words, in the order of `words`."""
-        allowed = f"a list of {' and '.join(shown(w) for w in words)}, or of one of them"
-        value = self._get(key, allowed)
-        entries: list[object] = value if isinstance(value, list) else []
-        if not entries or any(entry not in words for entry in entries) or len({*map(str, entries)}) != len(entries):
+        stated = self.values[key]
+        entries: list[object] = stated if isinstance(stated, list) else []
+        if not entries or any(entry not in words for entry in entries) or len({*entries}) != len(entries):
+            allowed = f"a list of {' and '.join(map(shown, words))}, or of one of them"
             raise self.refuse(key, "words", allowed, f"write {key} = [{shown(words[0])}], or leave it out")
         return tuple(word for word in words if word in entries)
-
-    def numbers(self, key: str, low: float, high: float, most: int) -> tuple[float, ...]:
-        """One number in [low, high], or a list of 1 to `most` different numbers."""
-        allowed = f"a number from {low:g} to {high:g}, or a list of up to {most} different ones"
-        value = self._get(key, allowed)
-        entries = value if isinstance(value, list) else [value]
-        values = [
-            float(e) for e in entries if isinstance(e, int | float) and not isinstance(e, bool) and low <= e <= high
-        ]
-        if len(values) != len(entries) or not 1 <= len(values) <= most or len(set(values)) != len(values):
-            raise self.refuse(key, "numbers", allowed, "correct the values and check their unit")
-        return tuple(values)
 
     def table(self, key: str) -> Keys:
         """The table under `key`; empty if it is absent."""
@@ -225,16 +253,22 @@ class Keys:
         if not isinstance(value, dict):
             path = escaped(".".join((*self.path, key)))
             raise self.refuse(key, "table", "a table", f"write it as [{path}] with keys below")
-        return Keys(value, self.file, self.text, (*self.path, key))
+        return Keys(value, self.file, self.content, (*self.path, key))
+
+    def nested(self, key: str, kinds: Mapping[str, Kind]) -> dict[str, Any]:
+        """The values of the table under `key`, as `entries`."""
+        return self.table(key).entries(kinds)
 
     def quantity(self, key: str, low: float, high: float, u_max: float) -> StatedValue:
         """`{ value, u }` with value in [low, high] and standard uncertainty u in [0, u_max]."""
         allowed = "{ value = number, u = standard uncertainty }, both and nothing else"
-        value = self._get(key, allowed)
-        if not isinstance(value, dict) or set(value) != {"value", "u"}:
-            raise self.refuse(key, "quantity", allowed, "u = 0 states that the value is exact")
-        entry = self.table(key)
-        return StatedValue(entry.number("value", low, high), entry.number("u", 0.0, u_max))
+        remedy = "u = 0 states that the value is exact"
+        self._held(key, lambda v: isinstance(v, dict) and v.keys() == {"value", "u"}, "quantity", allowed, remedy)
+        return StatedValue(**self.nested(key, {"value": (Keys.number, low, high), "u": (Keys.number, 0.0, u_max)}))
+
+
+type Kind = Callable[..., Any] | tuple[Any, ...]
+"""What reads the value under a key, a method of `Keys` or another function of keys and key, and its limits."""
 
 
 def parse_toml(data: bytes, file: str) -> Keys:
@@ -320,12 +354,14 @@ def toml_value(value: object) -> str:
         return str(value).lower()
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, numbers.Integral):
+    if isinstance(value, Integral):
         return str(int(value))
-    if isinstance(value, numbers.Real):
+    if isinstance(value, Real):
         return repr(float(value))
     if isinstance(value, datetime.datetime | datetime.date):
         return value.isoformat()
+    if isinstance(value, StatedValue):
+        value = value._asdict()
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(toml_value, value)) + "]"
     if isinstance(value, dict):
@@ -337,3 +373,13 @@ def toml_line(key: str, value: object) -> str:
     """Format `key = value`, the key quoted where TOML requires it."""
     bare = re.fullmatch(r"[A-Za-z0-9_-]+", key)
     return f"{key if bare else json.dumps(key, ensure_ascii=False)} = {toml_value(value)}"
+
+
+def toml_text(tables: Mapping[str, Mapping[str, object]]) -> str:
+    """Format tables by name, "" for the top of the file; entries that are None are left out."""
+    lines = []
+    for name, entries in tables.items():
+        lines += [f"[{name}]"] * bool(name) + [
+            toml_line(key, value) for key, value in entries.items() if value is not None
+        ]
+    return "\n".join(lines) + "\n"

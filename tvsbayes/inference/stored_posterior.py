@@ -81,7 +81,7 @@ def posterior_in(files: FitFiles, *, anyway: bool = False) -> StoredPosterior:
         InputError: they are damaged or of a version that cannot be read.
         NotConverged: the fit has no answer, or none that is accepted.
     """
-    keys, kind = files.keys, files.keys.text_value("format")
+    keys, kind = files.keys, files.keys.text("format")
     if not FORMAT.fullmatch(kind):
         remedy = "read it with the tvsbayes that wrote it, or fit again" if OLDER.fullmatch(kind) else AGAIN
         raise keys.refuse("format", "format", "a fit of version 1, such as tvsbayes-fit/1", remedy)
@@ -107,8 +107,8 @@ def answer_of(keys: Keys) -> AnswerKind:
         )
     if keys.values.get("answer") is None:
         # Up to 0.2.0 a converged sample was accepted.
-        return "accepted" if keys.word("estimator", ("posterior", "laplace")) == "posterior" else "laplace"
-    return ANSWERS[ANSWERS.index(keys.word("answer", ANSWERS))]
+        return "accepted" if keys.word("estimator", "posterior", "laplace") == "posterior" else "laplace"
+    return ANSWERS[ANSWERS.index(keys.word("answer", *ANSWERS))]
 
 
 def _draws(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -31,10 +31,10 @@ from tvsbayes.files.csv_kind import (
     unique,
 )
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
-from tvsbayes.files.disk import read_bytes, write_folder
-from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_toml, toml_line
+from tvsbayes.files.disk import read_bytes, require_campaign_folder, write_folder
+from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_toml, toml_text
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
-from tvsbayes.instrument.campaign_header import parse_header
+from tvsbayes.instrument.campaign_header import CAMPAIGN_FORMAT, parse_header
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.experiments import check_experiments
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
@@ -468,10 +468,7 @@ def read_campaign(folder: Path | str) -> Campaign:
         InputError: missing, malformed or contradictory entries, with file, line and column.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        place, found = escaped(str(folder), 200), "no such folder" if not folder.exists() else "a file"
-        allowed, remedy = "a campaign folder", "give the folder that holds campaign.toml"
-        raise refusal("missing-file", file=place, found=found, allowed=allowed, remedy=remedy)
+    require_campaign_folder(folder, "a campaign folder")
     if not os.path.lexists(folder / "campaign.toml"):
         raise _no_campaign(folder)
     sightings = os.path.lexists(folder / SIGHTINGS.file)
@@ -522,12 +519,9 @@ def looks_bytes(campaign: Campaign, ordered: bool = False) -> bytes:
 
 def campaign_toml(campaign: Campaign) -> bytes:
     """The content of `campaign.toml`: header and the complete `[rig]` table."""
-    lines = [toml_line("format", "tvsbayes-campaign/1")]
     tables = {name: value for name, value in campaign.header.items() if isinstance(value, dict)}
-    lines += [toml_line(key, value) for key, value in campaign.header.items() if key not in tables]
-    for name, table in tables.items():
-        lines += [f"[{name}]", *(toml_line(key, value) for key, value in table.items())]
-    return ("\n".join(lines) + "\n" + rig_table_toml(campaign.rig)).encode()
+    top = {name: value for name, value in campaign.header.items() if name not in tables}
+    return (toml_text({"": {"format": CAMPAIGN_FORMAT, **top}, **tables}) + rig_table_toml(campaign.rig)).encode()
 
 
 def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:

@@ -6,14 +6,16 @@ Units are those of the names: mm, degrees, radians, px, s; counters in steps. No
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path, PureWindowsPath
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 from tvsbayes.errors import InputError, closest, entry_refusal, escaped
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, Kind, StatedValue, parse_toml, toml_text
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, HOME_KEYS, LIMIT_KEYS, CounterLimits
 from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, WORDS, Mechanism, mechanism_named
@@ -127,9 +129,15 @@ class Rig(WithStereo):
 
 _PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in AXES}
 _PERIOD_MIN_DEG = 1e-6
+_PERIOD_OF = {name: (name.split(".")[1], 1) for name in HARMONIC_NAMES} | {
+    name: (name.split(".")[1], int(name.split(".")[2])) for name in AMPLITUDE_NAMES
+}
+"""Axis and number, from 1, of the period of every name in `PERIODIC_NAMES`."""
 _GROUPS = {
     name.rsplit(".", n)[0] for kind in MECHANISMS.values() for name in (*kind.names, *_PERIOD_NAMES) for n in (1, 2, 3)
 }
+_OWN_KEYS = ("aperture_convention", "mechanism", "absolute", "prior")
+"""Keys of `[rig]` without a value and a u."""
 
 
 def _names_at(place: Place, mechanism: Mechanism) -> tuple[str, ...]:
@@ -137,25 +145,15 @@ def _names_at(place: Place, mechanism: Mechanism) -> tuple[str, ...]:
     return tuple(p.name for p in mechanism.parameters.values() if p.place == place and p.name in mechanism.documented)
 
 
-def _period_number(name: str) -> int:
-    """Number of the period of a periodic parameter, from 1: the first, or the amplitude's own."""
-    return int(name.rpartition(".")[2]) if name in AMPLITUDE_NAMES else 1
-
-
 def _has_period(name: str, period_deg: Mapping[str, tuple[float, ...]]) -> bool:
     """Whether the axis of a periodic parameter states its period."""
-    return len(period_deg.get(name.split(".")[1], ())) >= _period_number(name)
-
-
-def _without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> str | None:
-    """The first periodic parameter that is not fixed at 0 and whose period is unstated."""
-    free = (name for name in PERIODIC_NAMES if name in priors and (priors[name].value != 0 or priors[name].u != 0))
-    return next((name for name in free if not _has_period(name, period_deg)), None)
+    axis, order = _PERIOD_OF[name]
+    return len(period_deg.get(axis, ())) >= order
 
 
 def _period_remedy(name: str) -> str:
-    axis, number = name.split(".")[1], _period_number(name)
-    value = "P" if number == 1 else "[" + ", ".join(f"P{n}" for n in range(1, number + 1)) + "]"
+    axis, order = _PERIOD_OF[name]
+    value = "P" if order == 1 else "[" + ", ".join(f"P{n}" for n in range(1, order + 1)) + "]"
     return (
         f'add "harmonic_period_deg.{axis}" = {{ value = {value}, u = 0.0 }} to [rig]: degrees of the output per turn '
         f"of the faulty member, {FULL_TURN_DEG:g} for the wheel, {FULL_TURN_DEG:g} x teeth of the pinion / teeth of "
@@ -163,16 +161,28 @@ def _period_remedy(name: str) -> str:
     )
 
 
-def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> None:
+def require_periods(
+    priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]], table: Keys | None = None
+) -> None:
     """Refuse harmonics and amplitudes without a stated period: their error would have no known angle.
+
+    Args:
+        priors: by name.
+        period_deg: stated periods by axis.
+        table: states the priors, for the place in a file.
 
     Raises:
         InputError: a value or u other than 0 on an axis without the period.
     """
-    name = _without_period(priors, period_deg)
-    if name is not None:
-        message = f"{name} has no period"
-        raise InputError("missing-period", message, column=name, remedy=_period_remedy(name))
+    for name in PERIODIC_NAMES:
+        fixed = name not in priors or priors[name].value == priors[name].u == 0
+        if fixed or _has_period(name, period_deg):
+            continue
+        code, remedy = "missing-period", _period_remedy(name)
+        if table is None:
+            raise InputError(code, f"{name} has no period", column=name, remedy=remedy)
+        allowed = "harmonics and amplitudes of an axis whose periods are stated"
+        raise table.refuse(name, code, allowed, remedy, f"{name.split('.')[0]} without a period")
 
 
 def _explanation(name: str, allowed: tuple[str, ...]) -> str:
@@ -195,23 +205,6 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     return closest(name, allowed)
 
 
-class _Place(NamedTuple):
-    """The table of an entry, and its key there."""
-
-    keys: Keys
-    key: str
-
-
-def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[str, _Place]]:
-    """Every entry by its full name, for quoted and dotted keys."""
-    for key, value in table.values.items():
-        name = prefix + key
-        if isinstance(value, dict) and value and name in _GROUPS and not {"value", "u"} & set(value):
-            yield from _entries(table.table(key), name + ".")
-        else:
-            yield name, _Place(table, key)
-
-
 def _in_blocks(names: Iterable[str]) -> str:
     """Short list of names: one word for those of a block, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
     blocks: dict[str, list[list[str]]] = {}
@@ -225,43 +218,44 @@ def _in_blocks(names: Iterable[str]) -> str:
     )
 
 
-def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, _Place]:
-    """Place of each parameter name in a table; `allowed` lists the permitted names."""
-    entries: dict[str, _Place] = {}
-    for name, place in _entries(table):
-        if name not in allowed:
-            # Keys of [rig] that are not priors were read before.
-            own_keys = () if "rig" not in table.path or "prior" in table.path else _OWN_KEYS
-            names = "only " + _in_blocks((*allowed, *own_keys))
-            found = f"the name {escaped(name)}"
-            raise place.keys.refuse(place.key, "unknown-key", names, _explanation(name, allowed), found)
-        if name in entries:
-            raise place.keys.refuse(place.key, "duplicate-key", "every name once", "remove one", f"{name} twice")
-        entries[name] = place
-    return entries
+def _flat(table: Keys, names: tuple[str, ...], besides: tuple[str, ...] = ()) -> Keys:
+    """The entries `names` of a table by their full names, for quoted and dotted keys; `besides` are other keys."""
+    flat = Keys({}, table.file, table.content, table.path)
+
+    def add(values: Mapping[str, Any], prefix: str = "") -> None:
+        for key, value in values.items():
+            name = prefix + key
+            if isinstance(value, dict) and value and name in _GROUPS and not {"value", "u"} & value.keys():
+                add(value, f"{name}.")
+            elif name not in (*names, *besides):
+                allowed = "only " + _in_blocks((*names, *besides))
+                raise flat.refuse(name, "unknown-key", allowed, _explanation(name, names), f"the name {escaped(name)}")
+            elif name in flat:
+                raise flat.refuse(name, "duplicate-key", "every name once", "remove one", f"{name} twice")
+            elif name in names:
+                flat.values[name] = value
+
+    add(table.values)
+    return flat
 
 
-def _parse_priors(entries: Mapping[str, _Place]) -> dict[str, Prior]:
-    """The stated priors, checked."""
-    priors: dict[str, Prior] = {}
-    for name, (keys, key) in entries.items():
-        parameter = parameter_of(name)
-        assert parameter is not None
-        stated = keys.values.get(key)
-        if parameter.prior.distribution == "half-normal" and isinstance(stated, dict) and stated.get("value", 0) != 0:
-            remedy = "write value = 0: it is the size of something that has no sign, a half-normal whose scale is u"
-            raise keys.table(key).refuse("value", "number", "exactly 0", remedy)
-        expected = keys.quantity(key, parameter.low, parameter.high, parameter.u_max)
-        priors[name] = Prior(expected.value, expected.u, parameter.prior.distribution)
-    return priors
+def _prior(keys: Keys, name: str) -> Prior:
+    """A stated prior, checked."""
+    parameter, stated = parameter_of(name), keys.values[name]
+    assert parameter is not None
+    distribution = parameter.prior.distribution
+    if distribution == "half-normal" and isinstance(stated, dict) and stated.get("value", 0) != 0:
+        remedy = "write value = 0: it is the size of something that has no sign, a half-normal whose scale is u"
+        raise keys.table(name).refuse("value", "number", "exactly 0", remedy)
+    return Prior(*keys.quantity(name, parameter.low, parameter.high, parameter.u_max), distribution)
 
 
-def _parse_periods(keys: Keys, key: str) -> tuple[float, ...]:
+def _periods(keys: Keys, key: str) -> tuple[float, ...]:
     """Periods in degrees of the output, bare or as { value, u }; exact, since tooth counts determine them."""
     value = keys.values[key]
     if isinstance(value, dict):
         allowed = "{ value = period or list of periods, u = 0.0 }, both and nothing else"
-        if set(value) != {"value", "u"}:
+        if value.keys() != {"value", "u"}:
             raise keys.refuse(key, "quantity", allowed, "u = 0 states that the value is exact")
         if keys.table(key).number("u", 0.0, FULL_TURN_DEG) != 0:
             remedy = "write u = 0.0: tooth counts give the period exactly (the wheel's is 360)"
@@ -270,22 +264,16 @@ def _parse_periods(keys: Keys, key: str) -> tuple[float, ...]:
     return keys.numbers(key, _PERIOD_MIN_DEG, FULL_TURN_DEG, PERIODS_MAX)
 
 
-def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> None:
-    """Check as `require_periods`, with the location in the file."""
-    name = _without_period(priors, period_deg)
-    if name is not None:
-        allowed = "harmonics and amplitudes of an axis whose periods are stated"
-        found = f"{name.split('.')[0]} without a period"
-        raise table.refuse(name, "missing-period", allowed, _period_remedy(name), found)
-
-
-_OWN_KEYS = ("aperture_convention", "mechanism", "absolute", "prior")
-"""Keys of `[rig]` without a value and a u."""
+def _priors(flat: Keys, period_deg: Mapping[str, tuple[float, ...]]) -> dict[str, Prior]:
+    """The priors in a table, by their full names."""
+    priors = flat.entries(dict.fromkeys(flat.values, _prior))
+    require_periods(priors, period_deg, flat)
+    return priors
 
 
 def _stated_mechanism(table: Keys, sightings: bool) -> Mechanism:
     """The mechanism by its key in `[rig]`."""
-    word = table.word("mechanism", WORDS) if "mechanism" in table else WORDS[0]
+    word = table.word("mechanism", *WORDS) if "mechanism" in table else WORDS[0]
     if (mechanism := mechanism_named(word, sightings)) is None:
         remedy = 'write mechanism = "pan-tilt" into [rig]; a scanner needs stereo.json and spots.csv instead'
         allowed = "a pan-tilt head where there are sightings and no stereo pair"
@@ -304,35 +292,30 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
         InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
             a half-normal with a value other than 0, harmonics or amplitudes without a period, a period with u > 0.
     """
-    mechanism = _stated_mechanism(table, sightings)
-    declared_names, prior_names = (_names_at(place, mechanism) for place in ("rig", "rig.prior"))
-    extra = {k: v for k, v in table.values.items() if k not in _OWN_KEYS}
-    own_keys = Keys(extra, table.file, table.text, table.path)
-    own_entries = _named_entries(own_keys, (*declared_names, *_PERIOD_NAMES))
+    mechanism, convention = _stated_mechanism(table, sightings), "aperture_convention"
+    names, prior_names = (_names_at(place, mechanism) for place in ("rig", "rig.prior"))
+    own = _flat(table, (*names, *_PERIOD_NAMES), _OWN_KEYS)
+    declared = own.entries(dict.fromkeys(names, _prior) | dict.fromkeys(_PERIOD_NAMES, _periods))
     period_deg: dict[str, tuple[float, ...]] = {
-        axis: _parse_periods(*own_entries.pop(n)) for n, axis in _PERIOD_NAMES.items() if n in own_entries
+        axis: declared.pop(name) for name, axis in _PERIOD_NAMES.items() if name in declared
     }
-    declared = _parse_priors(own_entries)
     # Any parameter may stand in [rig.prior], also one that belongs to [rig].
-    prior_entries = _named_entries(table.table("prior"), (*prior_names, *declared_names))
-    absolute = table.some_words("absolute", AXES) if "absolute" in table else ()
-    for name in (f"home_sd_deg.{axis}" for axis in absolute):
-        if name in prior_entries:
-            keys, key = prior_entries[name]
-            allowed = "no entry for an axis in `absolute`"
-            raise keys.refuse(key, "absolute", allowed, "leave one of them out: no homing sets an absolute zero")
-    prior = _parse_priors(prior_entries)
-    for name in declared:
-        if name in prior:
+    stated = _flat(table.table("prior"), (*prior_names, *names))
+    prior = _priors(stated, period_deg)
+    absolute = table.some_words("absolute", *AXES) if "absolute" in table else ()
+    for name in prior:
+        refuse = partial(stated.refuse, name)
+        if name in declared:
             found = f"{name} in [rig] and in [rig.prior]"
-            raise table.table("prior").refuse(name, "duplicate-key", "every name once", "remove one", found)
-    _check_periods(table.table("prior"), prior, period_deg)
-    key = "aperture_convention"
-    if key in table and "aperture_zero_deg" not in mechanism.documented:
-        raise table.refuse(key, "unknown-key", "no aperture", "leave it out: a head has no receiver", f"the name {key}")
-    azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
-    convention: Literal["in-plane", "azimuth"] = "azimuth" if azimuth else "in-plane"
-    return RigTable({**prior, **declared}, convention, period_deg, mechanism, absolute)
+            raise refuse("duplicate-key", "every name once", "remove one", found)
+        if name in (f"home_sd_deg.{axis}" for axis in absolute):
+            allowed = "no entry for an axis in `absolute`"
+            raise refuse("absolute", allowed, "leave one of them out: no homing sets an absolute zero")
+    if convention in table and "aperture_zero_deg" not in mechanism.documented:
+        remedy = "leave it out: a head has no receiver"
+        raise table.refuse(convention, "unknown-key", "no aperture", remedy, f"the name {convention}")
+    azimuth = convention in table and table.word(convention, "in-plane", "azimuth") == "azimuth"
+    return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg, mechanism, absolute)
 
 
 def rig_table_toml(table: RigTable) -> str:
@@ -342,59 +325,40 @@ def rig_table_toml(table: RigTable) -> str:
     shifts of the zeros appear only where they differ from the defaults: earlier campaigns keep their text and hash.
     """
 
-    def entry(name: str) -> str:
-        prior = table.priors[name]
-        return toml_line(name, {"value": float(prior.value), "u": float(prior.u)})
+    def entries(names: Iterable[str]) -> dict[str, object]:
+        return {name: StatedValue(float(table.priors[name].value), float(table.priors[name].u)) for name in names}
 
-    kind = table.mechanism
+    kind, stated = table.mechanism, table.harmonic_period_deg
+    periods: dict[str, object] = {
+        name: {"value": stated[axis][0] if len(stated[axis]) == 1 else stated[axis], "u": 0.0}
+        for name, axis in _PERIOD_NAMES.items()
+        if stated.get(axis)
+    }
     has_aperture = "aperture_zero_deg" in kind.documented
-    own = ("aperture_convention", table.aperture_convention) if has_aperture else ("mechanism", kind.word)
-    stated = {name: table.harmonic_period_deg.get(axis, ()) for name, axis in _PERIOD_NAMES.items()}
-    periods = [
-        toml_line(name, {"value": numbers[0] if len(numbers) == 1 else numbers, "u": 0.0})
-        for name, numbers in stated.items()
-        if numbers
-    ]
-    periodic = [entry(name) for name in PERIODIC_NAMES if _has_period(name, table.harmonic_period_deg)]
-    declared = map(entry, _names_at("rig", kind))
+    own = {"aperture_convention": table.aperture_convention} if has_aperture else {"mechanism": kind.word}
     omitted = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
-    omitted |= {f"home_sd_deg.{axis}" for axis in table.absolute}
-    priors = [entry(name) for name in _names_at("rig.prior", kind) if name not in {*PERIODIC_NAMES, *omitted}]
-    absolute = [toml_line("absolute", list(table.absolute))] if table.absolute else []
-    return (
-        "\n".join(["[rig]", *declared, *periods, toml_line(*own), *absolute, "[rig.prior]", *priors, *periodic]) + "\n"
-    )
+    omitted |= {*PERIODIC_NAMES, *(f"home_sd_deg.{axis}" for axis in table.absolute)}
+    names = [name for name in _names_at("rig.prior", kind) if name not in omitted]
+    names += [name for name in PERIODIC_NAMES if _has_period(name, stated)]
+    rig = {**entries(_names_at("rig", kind)), **periods, **own, "absolute": table.absolute or None}
+    return toml_text({"rig": rig, "rig.prior": entries(names)})
 
 
 COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
 """Default durations of a move, a look and the placement of a sheet."""
 
 
-_NUMBERS = {
-    "speed_steps_per_s": (1e-3, 1e7),
-    "acceleration_steps_per_s2": (10.0, 1e5),
-    "laser_watchdog_s": (0.1, 10.0),
-    "settle_s": (0.0, 3600.0),
-}
-"""Entries of `[positioner]` that are numbers, with their range."""
-
-
-def _parse_options(table: Keys) -> dict[str, Setting]:
+def _options(keys: Keys, key: str) -> dict[str, Setting]:
     """The table `options` of a driver, as entries `options.NAME`; the driver checks them."""
-    if "options" not in table:
-        return {}
-    options = table.table("options")
-    values: dict[str, Setting] = {}
-    for key, value in options.values.items():
-        if isinstance(value, str):
-            values[f"options.{key}"] = options.text_value(key)
-        elif isinstance(value, bool):
-            values[f"options.{key}"] = int(value)
-        elif isinstance(value, int):
-            values[f"options.{key}"] = options.integer(key, -(2**53), 2**53)
-        else:
-            values[f"options.{key}"] = options.number(key, -1e300, 1e300)
-    return values
+    kinds: dict[type, Kind] = {
+        **{str: Keys.text, bool: lambda table, name: int(table.values[name])},
+        **{int: (Keys.integer, -(2**53), 2**53), float: (Keys.number, -1e300, 1e300)},
+    }
+    options = keys.table(key)
+    return {
+        f"options.{name}": options.read(name, kinds.get(type(value), kinds[float]))
+        for name, value in options.values.items()
+    }
 
 
 def driver_options(table: Mapping[str, Setting], section: str, known: Iterable[str]) -> dict[str, Setting]:
@@ -410,59 +374,83 @@ def driver_options(table: Mapping[str, Setting], section: str, known: Iterable[s
     return options
 
 
-def _parse_positioner(table: Keys) -> dict[str, Setting]:
-    """`[positioner]`: driver, port, limits, counters at the home switches, speeds; `options` of other drivers."""
-    keys = [key for pair in LIMIT_KEYS.values() for key in pair] + list(HOME_KEYS.values())
-    table.only(("driver", "port", "baud", *keys, *_NUMBERS, "options"))
-    values: dict[str, Setting] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
-    # Serial libraries interpret addresses: one kind of address writes a file of that name.
-    if "://" in str(values.get("port", "")):
-        remedy = "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are"
-        raise table.refuse("port", "port", "the name of a serial port, no address", remedy)
-    if "baud" in table:
-        values["baud"] = table.integer("baud", 300, 10_000_000)
-    steps = {key: table.integer(key, -COUNTER_MAX, COUNTER_MAX) for key in keys if key in table}
+def _device(keys: Keys, key: str) -> Setting:
+    """A camera, by name or number."""
+    return keys.text(key) if isinstance(keys.values[key], str) else keys.integer(key, 0, 1000)
+
+
+# Serial libraries interpret addresses: one kind of address writes a file of that name.
+_PORT = (
+    *(Keys.checked, Keys.text, lambda port: "://" not in port, "port", "the name of a serial port, no address"),
+    "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are",
+)
+_POSITIONER: dict[str, Kind] = {
+    **{"driver": Keys.text, "port": _PORT, "baud": (Keys.integer, 300, 10_000_000)},
+    **dict.fromkeys((*chain(*LIMIT_KEYS.values()), *HOME_KEYS.values()), (Keys.integer, -COUNTER_MAX, COUNTER_MAX)),
+    **{"speed_steps_per_s": (Keys.number, 1e-3, 1e7), "acceleration_steps_per_s2": (Keys.number, 10.0, 1e5)},
+    **{"laser_watchdog_s": (Keys.number, 0.1, 10.0), "settle_s": (Keys.number, 0.0, 3600.0), "options": _options},
+}
+_CAMERAS: dict[str, Kind] = {
+    **{"driver": Keys.text, **dict.fromkeys(("source", "left", "right"), _device)},
+    **dict.fromkeys(("width", "height"), (Keys.integer, 1, 65_535)),
+    **{
+        "exposure": (Keys.number, -100.0, 1e9),
+        "spot_sd_px": (Keys.number, 1e-4, 100.0),
+        "sighting_sd_deg": (Keys.number, 1e-7, 30.0),
+    },
+    "options": _options,
+}
+
+
+def _sheets(keys: Keys, key: str) -> dict[str, float]:
+    """Depths of the sheets by name."""
+    sheets = keys.table(key)
+    for name in sheets.values:
+        if not (name.isprintable() and 0 < len(name) <= 100):
+            raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
+    return sheets.entries(dict.fromkeys(sheets.values, (Keys.number, 50.0, 100_000.0)))
+
+
+def _lies_beside(name: str) -> bool:
+    """Whether a file's name stays in the folder of the file that states it, or below, on every system."""
+    windows = PureWindowsPath(name)
+    leaves = Path(name).is_absolute() or windows.drive or windows.root or ".." in windows.parts
+    return bool(name) and not leaves
+
+
+_RIG: dict[str, Kind] = {
+    **{"name": Keys.text, "notes": (Keys.text, 2000)},
+    "stereo": (
+        *(Keys.checked, Keys.text, _lies_beside, "path", "a file name relative to the rig file, inside its folder"),
+        "put the file beside the rig file and give its name",
+    ),
+    **{"rig": Keys.table, "truth": Keys.table, "sheets": _sheets, "positioner": (Keys.nested, _POSITIONER)},
+    **{"cameras": (Keys.nested, _CAMERAS), "costs": (Keys.nested, dict.fromkeys(COSTS_S, (Keys.number, 0.0, 1e6)))},
+}
+"""Keys of a rig file."""
+
+
+def _check_limits(table: Keys, positioner: Mapping[str, Any]) -> None:
     for lowest, highest in LIMIT_KEYS.values():
-        if lowest in steps and highest in steps and steps[lowest] > steps[highest]:
-            raise table.refuse(highest, "limits", f"at least {lowest} = {steps[lowest]}", "swap the two limits")
-    values |= {key: table.number(key, *limits) for key, limits in _NUMBERS.items() if key in table}
-    return {**values, **steps, **_parse_options(table)}
+        if lowest in positioner and positioner[lowest] > positioner.get(highest, math.inf):
+            raise table.refuse(highest, "limits", f"at least {lowest} = {positioner[lowest]}", "swap the two limits")
 
 
-def _parse_cameras(table: Keys, stereo: Stereo | None) -> dict[str, Setting]:
-    """`[cameras]`: driver, devices, size (that of the calibration), exposure, spot uncertainty, `options`."""
-    numbers = {"exposure": (-100.0, 1e9), "spot_sd_px": (1e-4, 100.0), "sighting_sd_deg": (1e-7, 30.0)}
-    table.only(("driver", "source", "left", "right", "width", "height", *numbers, "options"))
-    values: dict[str, Setting] = {"spot_sd_px": SPOT_SD_PX, **_parse_options(table)}
-    if "driver" in table:
-        values["driver"] = table.text_value("driver")
-    for key in ("source", "left", "right"):
-        if key in table:
-            is_name = isinstance(table.values[key], str)
-            values[key] = table.text_value(key) if is_name else table.integer(key, 0, 1000)
-    if stereo is not None and stereo.right_image_size is not None:
+def _check_pictures(table: Keys, cameras: Mapping[str, Any], stereo: Stereo) -> None:
+    """Require that the cameras take pictures of the size at which they are calibrated."""
+    if stereo.right_image_size is not None:
         remedy = "record with the cameras' own program, then `tvsbayes new --pictures FOLDER`"
         found = "a stereo file of two picture sizes"
         raise table.refuse("stereo", "image-size", "cameras of one picture size", remedy, found)
-    calibrated = {} if stereo is None else {"width": stereo.image_width, "height": stereo.image_height}
-    for key in ("width", "height"):
-        if key in table:
-            size = values[key] = table.integer(key, 1, 65_535)
-            if size != calibrated.get(key, size):
-                remedy = "calibrate and observe at one image size"
-                raise table.refuse(key, "image-size", f"{calibrated[key]} px, as in the stereo file", remedy)
-    values |= {key: table.number(key, *limits) for key, limits in numbers.items() if key in table}
-    return values
+    for key, size in (("width", stereo.image_width), ("height", stereo.image_height)):
+        if cameras.get(key, size) != size:
+            remedy = "calibrate and observe at one image size"
+            raise table.refuse(key, "image-size", f"{size} px, as in the stereo file", remedy)
 
 
-def _file_beside(keys: Keys, key: str, folder: Path) -> Path:
-    """The file that `key` names, which must lie in the folder of the rig file or below."""
-    name = keys.text_value(key)
-    windows = PureWindowsPath(name)
-    if not name or Path(name).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
-        allowed = "a file name relative to the rig file, inside its folder"
-        raise keys.refuse(key, "path", allowed, "put the file beside the rig file and give its name")
-    return folder / name
+def _settings(entries: Mapping[str, Any]) -> dict[str, Setting]:
+    """A table of settings with the options of its driver beside the others."""
+    return {key: value for key, value in entries.items() if key != "options"} | entries.get("options", {})
 
 
 def read_rig(path: Path) -> Rig:
@@ -474,30 +462,24 @@ def read_rig(path: Path) -> Rig:
     """
     path = Path(path)
     keys = parse_toml(read_bytes(path, TOML_BYTES_MAX), escaped(path.name))
-    keys.word("format", ("tvsbayes-rig/1",))
-    tables = ("rig", "truth", "sheets", "positioner", "cameras", "costs")
-    keys.only(("format", "name", "notes", "stereo", *tables))
-    header = {key: keys.text_value(key, length) for key, length in (("name", 200), ("notes", 2000)) if key in keys}
-    sightings = "stereo" not in keys and mechanism_named(keys.table("rig").values.get("mechanism"), True) is not None
-    table = parse_rig_table(keys.table("rig"), sightings)
-    stereo = None if sightings else read_stereo(_file_beside(keys, "stereo", path.parent), folder=path.parent)
-    sheets = keys.table("sheets")
-    for name in sheets.values:
-        if not (name.isprintable() and 0 < len(name) <= 100):
-            raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
-    costs = keys.table("costs")
-    costs.only(COSTS_S)
+    stated = keys.values.get("rig")
+    sightings = "stereo" not in keys and isinstance(stated, dict) and mechanism_named(stated.get("mechanism"), True)
+    entries = keys.document("tvsbayes-rig/1", _RIG, () if sightings else ("stereo",))
+    table = parse_rig_table(keys.table("rig"), bool(sightings))
+    stereo = None if sightings else read_stereo(path.parent / entries["stereo"], folder=path.parent)
+    positioner, cameras = (_settings(entries.get(name, {})) for name in ("positioner", "cameras"))
+    _check_limits(keys.table("positioner"), positioner)
+    if stereo is not None:
+        _check_pictures(keys.table("cameras"), cameras, stereo)
     names = tuple(name for name in table.mechanism.rig_names if name in table.mechanism.documented)
-    truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), names))}
-    _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(
         table=table,
         stereo=stereo,
-        truth=truth,
-        sheets_mm={name: sheets.number(name, 50.0, 100_000.0) for name in sheets.values},
-        positioner=_parse_positioner(keys.table("positioner")),
-        cameras=_parse_cameras(keys.table("cameras"), stereo),
-        costs_s={k: costs.number(k, 0.0, 1e6) if k in costs else v for k, v in COSTS_S.items()},
+        truth=table.priors | _priors(_flat(keys.table("truth"), names), table.harmonic_period_deg),
+        sheets_mm=entries.get("sheets", {}),
+        positioner=positioner,
+        cameras={"spot_sd_px": SPOT_SD_PX, **cameras},
+        costs_s=COSTS_S | entries.get("costs", {}),
         path=path,
-        header=header,
+        header={key: entries[key] for key in ("name", "notes") if key in entries},
     )

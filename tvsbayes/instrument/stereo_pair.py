@@ -10,15 +10,18 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.disk import read_bytes, write_atomically
-from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
+from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, Kind, is_number, parse_json
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 
+STEREO_FORMAT = "tvsbayes-stereo/1"
 UNDISTORT_ITERATIONS = 200
 UNDISTORT_TOLERANCE_PX = 1e-9
 """Largest error of distorting an undistorted pixel again: 10^4 times the rounding of 1000 px in float64."""
@@ -239,11 +242,6 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
     return 2.0 * q[1:] if length < 1e-12 else q[1:] * (2.0 * math.atan2(length, q[0]) / length)
 
 
-_STEREO_KEYS = (
-    *("format", "image_width", "image_height", "M1", "D1", "M2", "D2", "R", "T"),
-    *("parameter_covariance", "rms_px", "assumed", "assumed_from", "right_image_size"),
-)
-_ORIGIN_CHARS_MAX = 400
 ASSUMED_REMEDY = (
     "calibrate from pictures (`tvsbayes stereo FOLDER`), or import again with --rms-px, --views, --board, --pitch-mm, "
     "--joint or --fixed-intrinsics, or with --u-focal-percent, --u-principal-px, --u-rotation-mrad, --u-baseline-mm"
@@ -286,44 +284,61 @@ def scaled_px(pixels: np.ndarray, size: tuple[int, int], to: tuple[int, int]) ->
     return (pixels + 0.5) * (to[0] / size[0]) - 0.5
 
 
-def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
+def _matrix(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
     """The finite numbers under `key`, in one of `shapes`, returned in the first of them."""
-    shapes_text = " or ".join("x".join(map(str, shape)) for shape in shapes)
-    allowed = f"finite numbers in a list of {shapes_text}"
+    allowed = f"finite numbers in a list of {' or '.join('x'.join(map(str, shape)) for shape in shapes)}"
     value = keys.values.get(key)
-    rows = value if isinstance(value, list) else [None]
-    lists = [row for row in rows if isinstance(row, list)]
-    nested = bool(rows) and len(lists) == len(rows)
-    entries = [entry for row in lists for entry in row] if nested else rows
+    rows: list[Any] = value if isinstance(value, list) else [None]
+    nested = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = list(chain(*rows)) if nested else rows
     for entry in entries:
-        if isinstance(entry, bool) or not isinstance(entry, int | float) or not abs(entry) <= _ENTRY_MAX:
+        if not (is_number(entry) and abs(entry) <= _ENTRY_MAX):
             found = shown(entry) if isinstance(value, list) else None
             raise keys.refuse(key, "matrix", allowed, "one list per row, every entry a number", found)
-    lengths = {len(row) for row in lists} if nested else {0}
+    lengths = {len(row) for row in rows} if nested else {0}
     shape = (len(rows), *lengths) if nested else (len(rows),)
-    if len(lengths) != 1 or shape not in shapes:
+    if shape not in shapes:
         found = "rows of different lengths" if len(lengths) != 1 else "x".join(map(str, shape))
         raise keys.refuse(key, "shape", allowed, "write OpenCV's matrix, one list per row", found)
     return np.array(entries, dtype=float).reshape(shapes[0])
 
 
 def _camera_matrix(keys: Keys, key: str) -> np.ndarray:
-    matrix = _array(keys, key, (3, 3))
+    matrix = _matrix(keys, key, (3, 3))
     pattern_holds = np.array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
     if not (pattern_holds and matrix[0, 0] > 0 and matrix[1, 1] > 0):
-        allowed = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, px"
-        found = escaped(json.dumps(matrix.tolist()), 120)
-        raise keys.refuse(key, "camera-matrix", allowed, "give OpenCV's camera matrix without skew", found)
+        allowed, found = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, px", json.dumps(matrix.tolist())
+        remedy = "give OpenCV's camera matrix without skew"
+        raise keys.refuse(key, "camera-matrix", allowed, remedy, escaped(found, 120))
     return matrix
 
 
-def _check_covariance(keys: Keys, key: str, covariance: np.ndarray) -> None:
-    """Require a symmetric, positive semi-definite matrix after scaling each row by its standard deviation."""
-    allowed = "a symmetric positive semi-definite 24x24 matrix; a zero row fixes a parameter"
+def _rotation(keys: Keys, key: str) -> np.ndarray:
+    rotation = _matrix(keys, key, (3, 3))
+    deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), abs(np.linalg.det(rotation) - 1.0))
+    if deviation > _ROTATION_TOLERANCE:
+        allowed = f"R R^T = 1 and det R = +1 to {_ROTATION_TOLERANCE:g}"
+        found = f"a matrix that misses it by {deviation:.3g}"
+        raise keys.refuse(key, "rotation", allowed, "give R of x_right = R x_left + T, all digits", found)
+    return rotation
+
+
+def _translation(keys: Keys, key: str) -> np.ndarray:
+    translation = _matrix(keys, key, (3,), (3, 1))
+    if not 0 < np.linalg.norm(translation) <= 1e5:
+        allowed = "a translation longer than 0 and at most 100000 mm"
+        raise keys.refuse(key, "translation", allowed, "give T in mm", escaped(str(translation.tolist())))
+    return translation
+
+
+def _covariance(keys: Keys, key: str) -> np.ndarray:
+    """A matrix that is symmetric and positive semi-definite once each row is scaled by its standard deviation."""
 
     def refusal(found: str) -> InputError:
+        allowed = "a symmetric positive semi-definite 24x24 matrix; a zero row fixes a parameter"
         return keys.refuse(key, "covariance", allowed, "take it from the calibration of M, D, R, T", found)
 
+    covariance = _matrix(keys, key, (24, 24))
     variances = np.diag(covariance)
     if (variances < 0).any():
         name = STEREO_PARAMETER_NAMES[int(np.argmin(variances))]
@@ -341,48 +356,31 @@ def _check_covariance(keys: Keys, key: str, covariance: np.ndarray) -> None:
     smallest = float(np.linalg.eigvalsh(correlation).min()) if free.any() else 0.0
     if smallest < -_EIGENVALUE_TOLERANCE:
         raise refusal(f"a smallest eigenvalue of {smallest:.3g} of the correlation matrix")
+    return covariance
+
+
+_DISTORTION = _matrix, (5,), (1, 5), (5, 1)
+_KEYS: dict[str, Kind] = {
+    **dict.fromkeys(("image_width", "image_height"), (Keys.integer, 1, 65_535)),
+    **{"M1": _camera_matrix, "D1": _DISTORTION, "M2": _camera_matrix, "D2": _DISTORTION},
+    **{"R": _rotation, "T": _translation, "parameter_covariance": _covariance, "rms_px": (Keys.number, 0.0, 1e4)},
+    **{"assumed": Keys.flag, "assumed_from": (Keys.text, 400), "right_image_size": (_matrix, (2,))},
+}
+"""Keys of `stereo.json`, the fields of `Stereo`."""
+_OPTIONAL = ("assumed", "assumed_from", "right_image_size")
 
 
 def parse_stereo(data: bytes, file: str) -> Stereo:
     """A checked stereo calibration from the bytes of `stereo.json`; see `read_stereo`."""
     keys = parse_json(data, file)
-    keys.word("format", ("tvsbayes-stereo/1",))
-    keys.only(_STEREO_KEYS)
-    width, height = keys.integer("image_width", 1, 65_535), keys.integer("image_height", 1, 65_535)
-    rotation = _array(keys, "R", (3, 3))
-    deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), abs(np.linalg.det(rotation) - 1.0))
-    if deviation > _ROTATION_TOLERANCE:
-        allowed = f"R R^T = 1 and det R = +1 to {_ROTATION_TOLERANCE:g}"
-        found = f"a matrix that misses it by {deviation:.3g}"
-        raise keys.refuse("R", "rotation", allowed, "give R of x_right = R x_left + T, all digits", found)
-    translation = _array(keys, "T", (3,), (3, 1))
-    if not 0 < np.linalg.norm(translation) <= 1e5:
-        allowed = "a translation longer than 0 and at most 100000 mm"
-        raise keys.refuse("T", "translation", allowed, "give T in mm", escaped(str(translation.tolist())))
-    right_size = None
-    if "right_image_size" in keys:
-        width_right, height_right = _array(keys, "right_image_size", (2,)).astype(int).tolist()
-        right_size = width_right, height_right
-        if not same_shape((width, height), right_size):
-            allowed = f"width and height in the proportion of {width} to {height} px"
+    entries = keys.document(STEREO_FORMAT, _KEYS, (key for key in _KEYS if key not in _OPTIONAL))
+    size = entries["image_width"], entries["image_height"]
+    if "right_image_size" in entries:
+        entries["right_image_size"] = right_size = tuple(entries["right_image_size"].astype(int).tolist())
+        if not same_shape(size, right_size):
+            allowed = f"width and height in the proportion of {size[0]} to {size[1]} px"
             raise keys.refuse("right_image_size", "image-size", allowed, "calibrate at sizes of one proportion")
-    covariance = _array(keys, "parameter_covariance", (24, 24))
-    _check_covariance(keys, "parameter_covariance", covariance)
-    return Stereo(
-        image_width=width,
-        image_height=height,
-        M1=_camera_matrix(keys, "M1"),
-        D1=_array(keys, "D1", (5,), (1, 5), (5, 1)),
-        M2=_camera_matrix(keys, "M2"),
-        D2=_array(keys, "D2", (5,), (1, 5), (5, 1)),
-        R=rotation,
-        T=translation,
-        parameter_covariance=covariance,
-        rms_px=keys.number("rms_px", 0.0, 1e4),
-        assumed="assumed" in keys and keys.flag("assumed"),
-        assumed_from=keys.text_value("assumed_from", _ORIGIN_CHARS_MAX) if "assumed_from" in keys else "",
-        right_image_size=right_size,
-    )
+    return Stereo(**entries)
 
 
 def read_stereo(path: Path, folder: Path | None = None) -> Stereo:
@@ -404,17 +402,14 @@ def stereo_bytes(stereo: Stereo) -> bytes:
     Raises:
         InputError: `read_stereo` would refuse the pair.
     """
-    lines = []
-    for key in _STEREO_KEYS:
-        value = "tvsbayes-stereo/1" if key == "format" else getattr(stereo, key)
+    lines = [f' "format": {json.dumps(STEREO_FORMAT)}']
+    for key in _KEYS:
+        value = getattr(stereo, key)
         if key in ("assumed_from", "right_image_size") and not value:
             continue
-        if isinstance(value, np.ndarray) and value.ndim == 2:
-            rows = ",\n  ".join(json.dumps(row) for row in value.tolist())
-            lines.append(f' "{key}": [\n  {rows}]')
-        else:
-            plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-            lines.append(f' "{key}": {json.dumps(plain)}')
+        plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        rows = ",\n  ".join(map(json.dumps, plain)) if np.ndim(value) == 2 else ""
+        lines.append(f' "{key}": ' + (f"[\n  {rows}]" if rows else json.dumps(plain)))
     data = ("{\n" + ",\n".join(lines) + "\n}\n").encode()
     parse_stereo(data, "stereo.json")
     return data
@@ -449,32 +444,38 @@ def fold_radius(distortion: np.ndarray) -> float:
 
 
 def _lens_doubts(
-    matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[int, int], matrix_place: str, distortion_place: str
+    matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[int, int], side: str, matrix_place: str, place: str
 ) -> list[str]:
-    """Doubts about a camera whose numbers do not fit any usual lens."""
-    doubts = []
-    view_deg = 2 * math.degrees(math.atan(size_px[0] / 2 / matrix[0, 0]))
-    if view_deg > VIEW_DEG_MAX:
-        doubts.append(
-            f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {view_deg:.0f} deg, which no such lens has"
-        )
-    if view_deg < VIEW_DEG_MIN:
-        doubts.append(f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {view_deg:.2g} deg: is it in px?")
-    corners = np.array([[x, y] for x in (0, size_px[0] - 1) for y in (0, size_px[1] - 1)], float)
-    corner = float(np.linalg.norm((corners - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], axis=1).max())
-    fold = fold_radius(distortion)
+    """Doubts about a camera whose numbers do not fit any usual lens; `place` is that of the distortion."""
+    (fx, fy), centre_px = matrix[[0, 1], [0, 1]], matrix[:2, 2]
     k1, k2, p1, p2, k3 = np.asarray(distortion, float).ravel()
-    if fold < math.inf and fold * (1 + k1 * fold**2 + k2 * fold**4 + k3 * fold**6) < corner:
-        doubts.append(
-            f"{distortion_place} (k1 {k1:.3g}, k2 {k2:.3g}, k3 {k3:.3g}) folds inside the picture, at r = "
-            f"{fold:.2f} ({math.degrees(math.atan(fold)):.0f} deg off the axis; the corner is at r = {corner:.2f}): "
-            "pixels beyond belong to no ray or to two; calibrate again with boards up to the corners, or with --fix-k3"
-        )
-    if max(abs(p1), abs(p2)) > TANGENTIAL_MAX:
-        doubts.append(
-            f"{distortion_place} has p1 {p1:.3g}, p2 {p2:.3g}: is it a fisheye (equidistant) model under another name?"
-        )
-    return doubts
+    off_px, size = np.abs(centre_px - (np.array(size_px) - 1) / 2), f"{size_px[0]} x {size_px[1]} px"
+    # Integer = centre of a pixel: the image extends from -0.5 to its size - 0.5.
+    is_outside, is_far = (bool((off_px > share * np.array(size_px)).any()) for share in (0.5, PRINCIPAL_SHARE_MAX))
+    point = f"the {side} principal point ({centre_px[0]:.0f}, {centre_px[1]:.0f}) px"
+    view_deg = 2 * math.degrees(math.atan(size_px[0] / 2 / fx))
+    corners = np.array([[x, y] for x in (0, size_px[0] - 1) for y in (0, size_px[1] - 1)], float)
+    corner = float(np.linalg.norm((corners - centre_px) / (fx, fy), axis=1).max())
+    fold = fold_radius(distortion)
+    folds = fold < math.inf and fold * (1 + k1 * fold**2 + k2 * fold**4 + k3 * fold**6) < corner
+    doubts = {
+        f"{point} lies outside the image of {size}: is that its size?": is_outside,
+        f"{point} is far from the middle of the image of {size}: is that its size?": is_far and not is_outside,
+        f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are nearly square": (
+            abs(fx / fy - 1) > ASPECT_SHARE_MAX
+        ),
+        f"fx in {matrix_place} is {fx:.4g} px: a view of {view_deg:.0f} deg, which no such lens has": (
+            view_deg > VIEW_DEG_MAX
+        ),
+        f"fx in {matrix_place} is {fx:.4g} px: a view of {view_deg:.2g} deg: is it in px?": view_deg < VIEW_DEG_MIN,
+        f"{place} (k1 {k1:.3g}, k2 {k2:.3g}, k3 {k3:.3g}) folds inside the picture, at r = {fold:.2f} "
+        f"({math.degrees(math.atan(fold)):.0f} deg off the axis; the corner is at r = {corner:.2f}): pixels beyond "
+        "belong to no ray or to two; calibrate again with boards up to the corners, or with --fix-k3": folds,
+        f"{place} has p1 {p1:.3g}, p2 {p2:.3g}: is it a fisheye (equidistant) model under another name?": (
+            max(abs(p1), abs(p2)) > TANGENTIAL_MAX
+        ),
+    }
+    return [sentence for sentence, holds in doubts.items() if holds]
 
 
 def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tuple[str, ...]:
@@ -488,44 +489,23 @@ def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tupl
         places: file and key of M1, D1, M2, D2, R, T, in words; where absent, those of `stereo.json`.
     """
     place = {name: f"{name} of stereo.json" for name in ("M1", "D1", "M2", "D2", "R", "T")} | dict(places or {})
-    doubts = [text] if (text := baseline_doubt(stereo, place["T"])) is not None else []
     turn_deg = math.degrees(float(np.linalg.norm(rotation_vector(stereo.R))))
-    if turn_deg > TURN_DEG_MAX:
-        doubts.append(f"{place['R']} turns by {turn_deg:.0f} deg: do both cameras look at one scene?")
     # Position of the second camera in axes of the first: x to the right, as picture columns increase.
-    right_mm = -float(stereo.R[:, 0] @ stereo.T)
-    if right_mm < 0:
-        doubts.append(
-            f"the second camera stands {-right_mm:.4g} mm to the left of the first (x_right = R x_left + T with T_x = "
-            f"{stereo.T[0]:+.4g} mm): are left and right swapped?"
-        )
-    baseline_mm = float(np.linalg.norm(stereo.T))
-    if abs(right_mm) < BESIDE_SHARE * baseline_mm:
-        below_mm, before_mm = (-float(stereo.R[:, k] @ stereo.T) for k in (1, 2))
-        doubts.append(
-            f"{place['T']} puts the second camera {below_mm:+.4g} mm below and {before_mm:+.4g} mm before the first, "
-            f"and only {right_mm:+.4g} mm to the right: is it in axes of another frame, or the inverse of a pose?"
-        )
-    focal_px = sorted((float(stereo.M1[0, 0]), float(stereo.M2[0, 0])))
-    if focal_px[1] > FOCAL_TIMES_MAX * focal_px[0]:
-        doubts.append(
-            f"fx of the two cameras are {focal_px[0]:.4g} and {focal_px[1]:.4g} px ({place['M1']}, {place['M2']}): are "
-            "they of pictures of two sizes?"
-        )
+    right_mm, below_mm, before_mm = (-stereo.R.T @ stereo.T).tolist()
+    short_px, long_px = sorted((float(stereo.M1[0, 0]), float(stereo.M2[0, 0])))
+    doubts = {
+        f"{place['R']} turns by {turn_deg:.0f} deg: do both cameras look at one scene?": turn_deg > TURN_DEG_MAX,
+        f"the second camera stands {-right_mm:.4g} mm to the left of the first (x_right = R x_left + T with T_x = "
+        f"{stereo.T[0]:+.4g} mm): are left and right swapped?": right_mm < 0,
+        f"{place['T']} puts the second camera {below_mm:+.4g} mm below and {before_mm:+.4g} mm before the first, and "
+        f"only {right_mm:+.4g} mm to the right: is it in axes of another frame, or the inverse of a pose?": (
+            abs(right_mm) < BESIDE_SHARE * float(np.linalg.norm(stereo.T))
+        ),
+        f"fx of the two cameras are {short_px:.4g} and {long_px:.4g} px ({place['M1']}, {place['M2']}): are they of "
+        "pictures of two sizes?": long_px > FOCAL_TIMES_MAX * short_px,
+    }
+    pair = (sentence for sentence, holds in doubts.items() if holds)
     size_px = stereo.image_width, stereo.image_height
-    for side, matrix in (("left", stereo.M1), ("right", stereo.M2)):
-        centre_px = float(matrix[0, 2]), float(matrix[1, 2])
-        point = f"the {side} principal point ({centre_px[0]:.0f}, {centre_px[1]:.0f}) px"
-        # Integer = centre of a pixel: the image extends from -0.5 to its size - 0.5.
-        if not all(-0.5 <= c <= n - 0.5 for c, n in zip(centre_px, size_px, strict=True)):
-            doubts.append(f"{point} lies outside the image of {size_px[0]} x {size_px[1]} px: is that its size?")
-        elif any(abs(c - (n - 1) / 2) > PRINCIPAL_SHARE_MAX * n for c, n in zip(centre_px, size_px, strict=True)):
-            doubts.append(
-                f"{point} is far from the middle of the image of {size_px[0]} x {size_px[1]} px: is that its size?"
-            )
-        fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
-        if abs(fx / fy - 1) > ASPECT_SHARE_MAX:
-            doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are nearly square")
-        number, distortion = ("1", stereo.D1) if side == "left" else ("2", stereo.D2)
-        doubts += _lens_doubts(matrix, distortion, size_px, place[f"M{number}"], place[f"D{number}"])
-    return tuple(doubts)
+    left = _lens_doubts(stereo.M1, stereo.D1, size_px, "left", place["M1"], place["D1"])
+    right = _lens_doubts(stereo.M2, stereo.D2, size_px, "right", place["M2"], place["D2"])
+    return (*filter(None, [baseline_doubt(stereo, place["T"])]), *pair, *left, *right)

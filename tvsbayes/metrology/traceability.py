@@ -75,7 +75,7 @@ def stated_in(header: Mapping[str, object], name: str, key: str) -> StatedValue 
     """Return a quantity of such a table of a header."""
     table = header.get(name)
     entry = table.get(key) if isinstance(table, dict) else None
-    return StatedValue(entry["value"], entry["u"]) if isinstance(entry, dict) else None
+    return entry if isinstance(entry, StatedValue) else None
 
 
 def stated_value(campaign: Measured, name: str, key: str) -> StatedValue | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -146,6 +146,20 @@ def extreme(of: dict[str, float], chosen: Callable[..., str]) -> NamedValue:
     return NamedValue(name, of[name])
 
 
+def _sampling(diagnosis: Reweighted | Convergence, **run: Any) -> Sampling:
+    """Summary of a diagnosis; `run` are the fields that describe walkers."""
+    return Sampling(
+        converged=diagnosis.converged,
+        missing=diagnosis.missing,
+        least_ess_bulk=extreme(diagnosis.ess_bulk, min),
+        least_ess_tail=extreme(diagnosis.ess_tail, min),
+        proposal_pareto_k=diagnosis.importance.pareto_k,
+        importance=diagnosis.importance,
+        agreement=diagnosis.agreement,
+        **run,
+    )
+
+
 @dataclass(frozen=True)
 class Reweighted:
     """Diagnosis of weighted draws without a chain.
@@ -187,25 +201,9 @@ class Reweighted:
     @property
     def sampling(self) -> Sampling:
         """Summary of the draws' diagnosis."""
-        return Sampling(
-            converged=self.converged,
-            missing=self.missing,
-            walkers=None,
-            steps=None,
-            discarded=None,
-            thin=None,
-            tau_steps=None,
-            worst_rhat=None,
-            least_ess_bulk=extreme(self.ess_bulk, min),
-            least_ess_tail=extreme(self.ess_tail, min),
-            acceptance=None,
-            least_acceptance=None,
-            stuck_walkers=(),
-            invalid_evaluations=self.importance.invalid_evaluations,
-            proposal_pareto_k=self.importance.pareto_k,
-            importance=self.importance,
-            agreement=self.agreement,
-        )
+        walked = ("walkers", "steps", "discarded", "thin", "tau_steps", "worst_rhat", "acceptance", "least_acceptance")
+        invalid = self.importance.invalid_evaluations
+        return _sampling(self, **dict.fromkeys(walked), stuck_walkers=(), invalid_evaluations=invalid)
 
 
 @dataclass(frozen=True)
@@ -258,22 +256,12 @@ class Convergence:
     @property
     def sampling(self) -> Sampling:
         """Summary of the chain's diagnosis."""
-        return Sampling(
-            converged=self.converged,
-            missing=self.missing,
+        return _sampling(
+            self,
+            **{name: getattr(self, name) for name in ("steps", "discarded", "thin", "tau_steps", "stuck_walkers")},
             walkers=len(self.acceptance),
-            steps=self.steps,
-            discarded=self.discarded,
-            thin=self.thin,
-            tau_steps=self.tau_steps,
             worst_rhat=extreme(self.rhat, max),
-            least_ess_bulk=extreme(self.ess_bulk, min),
-            least_ess_tail=extreme(self.ess_tail, min),
             acceptance=float(self.acceptance.mean()),
             least_acceptance=float(self.acceptance.min()),
-            stuck_walkers=self.stuck_walkers,
             invalid_evaluations=self.invalid,
-            proposal_pareto_k=self.importance.pareto_k,
-            importance=self.importance,
-            agreement=self.agreement,
         )

@@ -194,7 +194,7 @@ def read_fit(path: Path | str) -> FitRecord:
 
 def fit_of(keys: Keys) -> FitRecord:
     """The record of a document; errors as of `read_fit`."""
-    keys.word("format", FIT_FORMATS)
+    keys.word("format", *FIT_FORMATS)
     hold_to_schema(keys, fit_schema(), AGAIN)
     _check_agreement(keys)
     # Documents of the first tvsbayes have no evidence; an incomplete one counts as none.

@@ -267,7 +267,7 @@ def hold_to_schema(keys: Keys, schema: Mapping[str, Any], remedy: str) -> None:
         else:
             value = value.get(str(part), "nothing") if isinstance(value, dict) else "nothing"
     *path, key = (part for part in place if isinstance(part, str))
-    raise Keys({}, keys.file, keys.text, (*keys.path, *path)).refuse(key, "schema", allowed, remedy, shown(value))
+    raise Keys({}, keys.file, keys.content, (*keys.path, *path)).refuse(key, "schema", allowed, remedy, shown(value))
 
 
 def read_record[T: Record](kind: type[T], keys: Keys, remedy: str, *, held: bool = False) -> T:
@@ -293,7 +293,8 @@ def read_record[T: Record](kind: type[T], keys: Keys, remedy: str, *, held: bool
         # JSON schema does not detect 3.0 for a whole number, or array rows of different lengths.
         message, _, place = str(error).partition(" - at ")
         *path, key = re.findall(r"\.(\w+)", place) or [""]
-        raise Keys({}, keys.file, keys.text, (*keys.path, *path)).refuse(key, "schema", message, remedy, "") from error
+        at = Keys({}, keys.file, keys.content, (*keys.path, *path))
+        raise at.refuse(key, "schema", message, remedy, "") from error
 
 
 def stored_document(campaign: HasFolder, name: str, formats: tuple[str, ...], inputs: Mapping[str, str]) -> Keys | None:
@@ -308,5 +309,5 @@ def stored_document(campaign: HasFolder, name: str, formats: tuple[str, ...], in
     keys = parse_json(read_bytes(path, JSON_BYTES_MAX), f"results/{name}")
     if keys.values.get("inputs") != inputs:
         return None
-    keys.word("format", formats)
+    keys.word("format", *formats)
     return keys

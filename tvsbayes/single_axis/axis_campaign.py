@@ -9,14 +9,14 @@ from __future__ import annotations
 import datetime
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_kind import (
     Column,
     CsvKind,
@@ -28,11 +28,11 @@ from tvsbayes.files.csv_kind import (
     unique,
 )
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
-from tvsbayes.files.disk import read_bytes, write_folder
-from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, StatedValue, parse_toml, toml_line
+from tvsbayes.files.disk import read_bytes, require_campaign_folder, write_folder
+from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, Kind, StatedValue, is_number, parse_toml, toml_text
 from tvsbayes.instrument.campaign import MOVES, SPOTS, TEMPERATURES_DEGC
-from tvsbayes.instrument.campaign_header import ENVIRONMENT, header_tables, header_value, header_values
-from tvsbayes.instrument.conditions import check_power, powered_on_s
+from tvsbayes.instrument.campaign_header import ENVIRONMENT, ORIGIN, PEOPLE, TIMES, header_of, header_values
+from tvsbayes.instrument.conditions import powered_on_s
 from tvsbayes.instrument.copies import refuse_copied
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
 from tvsbayes.single_axis.waves import WavePeriods
@@ -54,18 +54,8 @@ REFERENCE, COMMON = "reference", "common"
 """Table of what reads the axis; its word for a u of readings.csv that is one error of all readings."""
 NO_EXPANSION, EXPANSION_MAX = StatedValue(0.0, 0.0), 1e-2
 """Largest relative expansion, 1/K."""
-CERTIFICATE_CHARS_MAX = 200
 _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
 """Log-normal parameters by which the model divides: the density is undefined where they are fixed at 0."""
-HEADER_TABLES = {
-    "environment": ENVIRONMENT,
-    "traceability": ("reference_certificate", "reference_calibrated"),
-}
-"""Keys of the tables of the header."""
-PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
-"""Keys of `[axis]` that define waves."""
-LIMITS, COMMAND_UNIT = "limits", "command_unit"
-"""Keys of `[axis]`: the commands that a plan may give; their unit."""
 PERIODS_MAX, RANGES_MAX = 8, 4
 """Largest numbers of stated and of unknown periods; each period adds two sampled coordinates."""
 
@@ -152,6 +142,10 @@ AXIS_MOVES = CsvKind(
 READINGS = CsvKind(Reading, "readings.csv", "a row for every reading")
 
 
+CERTIFIED = ("certificate", "valid_until")
+"""Entries of `[reference]` on which no estimate depends."""
+
+
 @dataclass(frozen=True)
 class Reference:
     """What `[reference]` states of what reads the axis: uncertainties common to all its readings.
@@ -164,7 +158,7 @@ class Reference:
         u: standard uncertainty of an offset of all readings, unit.
         u_per_unit: standard uncertainty of the scale, relative.
         expansion_per_K: relative expansion of the reference: a reading r at T means r (1 + expansion (T - 20 degC)).
-        common: whether the u of readings.csv is one error of all readings, not noise of each.
+        u_is: whether the u of readings.csv is one error of all readings, `COMMON`, or noise of each.
         certificate: name of its certificate, "" where not stated.
         valid_until: last day of its validity.
     """
@@ -172,7 +166,7 @@ class Reference:
     u: float = 0.0
     u_per_unit: float = 0.0
     expansion_per_K: StatedValue = NO_EXPANSION
-    common: bool = False
+    u_is: str = "independent"
     certificate: str = ""
     valid_until: datetime.date | None = None
 
@@ -181,14 +175,15 @@ class Reference:
         """Whether its readings depend on the temperature."""
         return self.expansion_per_K != NO_EXPANSION
 
-    def lines(self, *, estimate: bool = False) -> list[str]:
-        """The entries of `[reference]`; with `estimate` those on which an estimate depends."""
-        entries: dict[str, object] = {"u": self.u or None, "u_per_unit": self.u_per_unit or None}
-        entries["expansion_per_K"] = self.expansion_per_K._asdict() if self.expands else None
-        entries["u_is"] = COMMON if self.common else None
-        if not estimate:
-            entries |= {"certificate": self.certificate or None, "valid_until": self.valid_until}
-        return [toml_line(name, value) for name, value in entries.items() if value is not None]
+    @property
+    def common(self) -> bool:
+        """Whether the u of readings.csv is one error of all readings."""
+        return self.u_is == COMMON
+
+    @property
+    def entries(self) -> dict[str, object]:
+        """The entries of `[reference]`."""
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
 
 
 @dataclass(frozen=True, repr=False)
@@ -259,10 +254,6 @@ class AxisCampaign(Shown):
         )
 
 
-_HEADER = (
-    *("format", "unit", "name", "operator", "instrument", "serial", "method", "notes", "created", "powered_on"),
-    *("rate", "synthetic", "seed", "axis", REFERENCE, *HEADER_TABLES),
-)
 _FILES = {"moves.csv": CSV_BYTES_MAX, "readings.csv": CSV_BYTES_MAX, "campaign.toml": TOML_BYTES_MAX}
 """campaign.toml is written last: a folder without it is incomplete."""
 
@@ -309,127 +300,114 @@ def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[
     return check
 
 
-def _parse_header(keys: Keys) -> dict[str, object]:
-    keys.only(_HEADER)
-    header: dict[str, object] = {}
-    for key in keys.values:
-        if key == "rate":
-            header[key] = keys.number(key, -COMMAND_MAX, COMMAND_MAX)
-            if not header[key]:
-                raise keys.refuse(key, "zero", "commands per second, not 0", "leave it out of an axis that stops")
-        elif key not in ("format", "unit", "axis", REFERENCE, *HEADER_TABLES):
-            header[key] = header_value(keys, key)
-    check_power(keys, header)
-    return header | header_tables(keys, HEADER_TABLES)
+def _prior(keys: Keys, key: str) -> AxisPrior:
+    """A prior of `[axis]`; a half-normal has value 0, or u = 0 and its fixed value."""
+    kind = AXIS_KEYS[key].kind
+    value, u = keys.quantity(key, -COMMAND_MAX if kind == "normal" else 0.0, COMMAND_MAX, COMMAND_MAX)
+    refuse = partial(keys.table(key).refuse, "value")
+    if kind == "half-normal" and value and u:
+        raise refuse("half-normal", "0 where u is not 0", "give the scale as u, or fix it by u = 0")
+    if kind == "log-normal" and not value and (u or key in _NEVER_ZERO):
+        raise refuse("log-normal", "a positive median", "u is the sd of the logarithm")
+    if key == "per_command" and not value:
+        raise refuse("zero", "a number other than 0", "state what one command does, or leave it out")
+    return AxisPrior(value, u)
 
 
-def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
-    """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and its fixed value."""
-    others = ("absolute", LIMITS, COMMAND_UNIT, *PERIODS)
-    keys.only((*AXIS_KEYS, *others))
-    stated: dict[str, AxisPrior] = {}
-    for name in keys.values:
-        if name in others:
-            continue
-        kind = AXIS_KEYS[name].kind
-        low = -COMMAND_MAX if kind == "normal" else 0.0
-        value, u = keys.quantity(name, low, COMMAND_MAX, COMMAND_MAX)
-        entry = keys.table(name)
-        if kind == "half-normal" and value and u:
-            raise entry.refuse("value", "half-normal", "0 where u is not 0", "give the scale as u, or fix it by u = 0")
-        if kind == "log-normal" and not value and (u or name in _NEVER_ZERO):
-            raise entry.refuse("value", "log-normal", "a positive median", "u is the sd of the logarithm")
-        if name == "per_command" and not value:
-            raise entry.refuse("value", "zero", "a number other than 0", "state what one command does, or leave it out")
-        stated[name] = AxisPrior(value, u)
-    return stated
-
-
-def _parse_periods(keys: Keys) -> WavePeriods:
-    """Waves that `[axis]` defines."""
-    minimum = 1.0 / COMMAND_MAX
-    periods = keys.numbers("periods", minimum, COMMAND_MAX, PERIODS_MAX) if "periods" in keys else ()
-    encoder = keys.number("encoder_period", minimum, COMMAND_MAX) if "encoder_period" in keys else None
-    in_seconds = "periods_in" in keys and keys.word("periods_in", ("unit", "seconds")) == "seconds"
-    between = _parse_ranges(keys) if "period_between" in keys else ()
-    return WavePeriods(periods, between, in_seconds, encoder)
-
-
-def _parse_limits(keys: Keys) -> tuple[float, float] | None:
-    """`limits`: [lowest, highest] command."""
-    if LIMITS not in keys:
-        return None
-    ends = keys.numbers(LIMITS, -COMMAND_MAX, COMMAND_MAX, 2)
-    if len(ends) != 2 or not ends[0] < ends[1]:
-        allowed = "[lowest, highest] command, the lower one first"
-        raise keys.refuse(LIMITS, "range", allowed, "give both ends that the machine allows, in commands")
-    return ends[0], ends[1]
-
-
-def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
-    """`period_between`: [low, high], or a list of such pairs, one for every unknown period."""
+def _ranges(keys: Keys, key: str) -> tuple[tuple[float, float], ...]:
+    """[low, high], or a list of such pairs, one for every unknown period."""
+    refuse = partial(keys.refuse, key, "range")
     allowed = f"[low, high] with 0 < low < high, or a list of up to {RANGES_MAX} such pairs"
-    refuse = partial(keys.refuse, "period_between", "range")
-    value = keys.values["period_between"]
-    entries: list[Any] = value if isinstance(value, list) else [value]
-    ranges: list[tuple[float, float]] = []
-    for pair in entries if entries and all(isinstance(entry, list) for entry in entries) else [entries]:
-        numbers = [float(end) for end in pair if isinstance(end, int | float) and not isinstance(end, bool)]
-        if not len(pair) == len(numbers) == 2:
+    stated: Any = keys.values[key]
+    entries = stated if isinstance(stated, list) else [stated]
+    pairs = entries if entries and all(isinstance(entry, list) for entry in entries) else [entries]
+    for pair in pairs:
+        if len(pair) != 2 or not all(map(is_number, pair)):
             raise refuse(allowed, "give both ends of every range, in their unit")
-        low, high = numbers
-        if not 0 < low < high <= COMMAND_MAX:
+        if not 0 < pair[0] < pair[1] <= COMMAND_MAX:
             raise refuse(allowed, "order the ends; a known period goes into `periods`")
-        ranges.append((low, high))
-    for k, (low, high) in enumerate(ranges):
-        if any((low, high) != other and low < other[1] and other[0] < high for other in ranges[:k]):
+    for (low, high), other in combinations(pairs, 2):
+        if [low, high] != other and low < other[1] and other[0] < high:
             rule = "ranges that are the same or do not overlap"
             raise refuse(rule, "write one range twice where both periods may be there")
-    if len(ranges) > RANGES_MAX:
+    if len(pairs) > RANGES_MAX:
         raise refuse(allowed, "ask for fewer unknown periods at once")
-    return tuple(ranges)
+    return tuple((float(low), float(high)) for low, high in pairs)
 
 
-def _parse_reference(keys: Keys, moves: Sequence[AxisMove]) -> Reference:
-    """Check `[reference]` of a folder with these moves."""
-    keys.only(("u", "u_per_unit", "expansion_per_K", "u_is", "certificate", "valid_until"))
-    numbers = {name: keys.number(name, 0.0, COMMAND_MAX) for name in ("u", "u_per_unit") if name in keys}
-    expansion = NO_EXPANSION
-    if "expansion_per_K" in keys:
-        ends = -EXPANSION_MAX, EXPANSION_MAX
-        if isinstance(keys.values["expansion_per_K"], int | float):
-            expansion = StatedValue(keys.number("expansion_per_K", *ends), 0.0)
-        else:
-            expansion = keys.quantity("expansion_per_K", *ends, EXPANSION_MAX)
-        if not any(move.temperature_degC is not None for move in moves):
-            remedy = "add the column temperature_degC to moves.csv, or leave the expansion out"
-            raise keys.refuse("expansion_per_K", "temperature", "an expansion where temperatures are recorded", remedy)
-    certificate = keys.text_value("certificate", CERTIFICATE_CHARS_MAX) if "certificate" in keys else ""
-    common = "u_is" in keys and keys.word("u_is", (COMMON, "independent")) == COMMON
-    until = keys.values.get("valid_until")
-    if until is not None and (not isinstance(until, datetime.date) or isinstance(until, datetime.datetime)):
-        raise keys.refuse("valid_until", "date", "a date such as 2027-01-15", "write it without quotes")
-    return Reference(**numbers, expansion_per_K=expansion, common=common, certificate=certificate, valid_until=until)
+def _expansion(keys: Keys, key: str) -> StatedValue:
+    if isinstance(keys.values[key], int | float):
+        return StatedValue(keys.number(key, -EXPANSION_MAX, EXPANSION_MAX), 0.0)
+    return keys.quantity(key, -EXPANSION_MAX, EXPANSION_MAX, EXPANSION_MAX)
+
+
+_COMMAND, _PERIOD = (-COMMAND_MAX, COMMAND_MAX), (1.0 / COMMAND_MAX, COMMAND_MAX)
+_AXIS: dict[str, Kind] = {
+    **dict.fromkeys(AXIS_KEYS, _prior),
+    "absolute": Keys.flag,
+    "limits": (
+        *(Keys.checked, (Keys.numbers, *_COMMAND, 2), lambda ends: len(ends) == 2 and ends[0] < ends[1], "range"),
+        *("[lowest, highest] command, the lower one first", "give both ends that the machine allows, in commands"),
+    ),
+    "command_unit": (Keys.text, UNIT_CHARS_MAX),
+    "periods": (Keys.numbers, *_PERIOD, PERIODS_MAX),
+    "periods_in": (Keys.word, "unit", "seconds"),
+    "period_between": _ranges,
+    "encoder_period": (Keys.number, *_PERIOD),
+}
+"""Keys of `[axis]`; then those of `[reference]` and of the whole file."""
+_REFERENCE: dict[str, Kind] = {
+    **dict.fromkeys(("u", "u_per_unit"), (Keys.number, 0.0, COMMAND_MAX)),
+    "expansion_per_K": _expansion,
+    "u_is": (Keys.word, COMMON, "independent"),
+    "certificate": Keys.text,
+    "valid_until": (
+        *(Keys.checked, Keys.value, lambda day: type(day) is datetime.date, "date"),
+        *("a date such as 2027-01-15", "write it without quotes"),
+    ),
+}
+_UNIT = (
+    *(Keys.checked, (Keys.text, UNIT_CHARS_MAX), str.strip, "text"),
+    *('the unit of readings, such as "deg" or "mm"', "name it"),
+)
+_RATE = (
+    *(Keys.checked, (Keys.number, *_COMMAND), bool, "zero"),
+    *("commands per second, not 0", "leave it out of an axis that stops"),
+)
+_CAMPAIGN: dict[str, Kind] = {
+    **{"unit": _UNIT, "name": Keys.text, **PEOPLE, **TIMES, "rate": _RATE, **ORIGIN},
+    **{"axis": (Keys.nested, _AXIS), REFERENCE: (Keys.nested, _REFERENCE), "environment": (Keys.nested, ENVIRONMENT)},
+    "traceability": (Keys.nested, {"reference_certificate": Keys.text, "reference_calibrated": Keys.date}),
+}
 
 
 def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     keys = parse_toml(files["campaign.toml"], "campaign.toml")
-    keys.word("format", (FORMAT,))
-    header, unit = _parse_header(keys), keys.text_value("unit", UNIT_CHARS_MAX)
-    if not unit.strip():
-        raise keys.refuse("unit", "text", 'the unit of readings, such as "deg" or "mm"', "name it")
-    axis = keys.table("axis")
-    stated, periods = _parse_axis_table(axis), _parse_periods(axis)
-    absolute = "absolute" in axis and axis.flag("absolute")
-    if absolute and "home_sd" in stated:
-        allowed = "no home_sd beside absolute = true"
-        raise axis.refuse("home_sd", "absolute", allowed, "leave one of them out: no homing sets an absolute zero")
-    moves = parse_axis_moves(files["moves.csv"])
+    entries = keys.document(FORMAT, _CAMPAIGN, required=("unit",))
+    unit, stated, reference = entries.pop("unit"), entries.pop("axis", {}), entries.pop(REFERENCE, {})
+    if stated.get("absolute") and "home_sd" in stated:
+        allowed, remedy = "no home_sd beside absolute = true", "leave one of them out: no homing sets an absolute zero"
+        raise keys.table("axis").refuse("home_sd", "absolute", allowed, remedy)
+    header, moves = header_of(keys, entries), parse_axis_moves(files["moves.csv"])
     readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
-    command_unit = axis.text_value(COMMAND_UNIT, UNIT_CHARS_MAX) if COMMAND_UNIT in axis else None
-    limits, reference = _parse_limits(axis), _parse_reference(keys.table(REFERENCE), moves)
+    if "expansion_per_K" in reference and all(move.temperature_degC is None for move in moves):
+        allowed = "an expansion where temperatures are recorded"
+        remedy = "add the column temperature_degC to moves.csv, or leave the expansion out"
+        raise keys.table(REFERENCE).refuse("expansion_per_K", "temperature", allowed, remedy)
     return AxisCampaign(
-        *(unit, moves, readings, stated, header, periods, path, absolute, limits, command_unit, reference)
+        *(unit, moves, readings),
+        stated={name: prior for name, prior in stated.items() if name in AXIS_KEYS},
+        header=header,
+        periods=WavePeriods(
+            *(stated.get("periods", ()), stated.get("period_between", ())),
+            in_seconds=stated.get("periods_in") == "seconds",
+            encoder=stated.get("encoder_period"),
+        ),
+        path=path,
+        absolute=stated.get("absolute", False),
+        limits=stated.get("limits"),
+        command_unit=stated.get("command_unit"),
+        reference=Reference(**reference),
     )
 
 
@@ -446,10 +424,7 @@ def read_axis(folder: Path | str) -> AxisCampaign:
         InputError: missing, malformed or contradictory entries, with file, line and column.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        place, found = escaped(str(folder), 200), "no such folder" if not folder.exists() else "a file"
-        allowed, remedy = "an axis folder", "give the folder that holds campaign.toml"
-        raise refusal("missing-file", file=place, found=found, allowed=allowed, remedy=remedy)
+    require_campaign_folder(folder, "an axis folder")
     return _parse_files({name: read_bytes(folder / name, limit, folder) for name, limit in _FILES.items()}, folder)
 
 
@@ -458,23 +433,22 @@ def axis_templates() -> dict[str, bytes]:
     return templates("axis_templates", AXIS_MOVES, READINGS)
 
 
-def _axis_table_lines(campaign: AxisCampaign) -> list[str]:
-    priors = [toml_line(name, {"value": p.value, "u": p.u}) for name, p in sorted(campaign.stated.items())]
+def _axis_entries(campaign: AxisCampaign) -> dict[str, object]:
+    """The entries of `[axis]` on which an estimate depends."""
+    priors = {name: StatedValue(prior.value, prior.u) for name, prior in sorted(campaign.stated.items())}
     entries = {**campaign.periods.entries(), "absolute": campaign.absolute}
-    return [*priors, *(toml_line(name, value) for name, value in entries.items() if value)]
+    return priors | {name: value for name, value in entries.items() if value}
 
 
 def axis_toml(campaign: AxisCampaign) -> bytes:
     """The content of `campaign.toml`."""
-    lines = [toml_line("format", FORMAT), toml_line("unit", campaign.unit)]
-    lines += [toml_line(key, value) for key, value in campaign.header.items()]
-    # No estimate depends on them: they are no part of the hash of the inputs.
-    limits = None if campaign.limits is None else list(campaign.limits)
-    besides = {LIMITS: limits, COMMAND_UNIT: campaign.command_unit}
-    lines += ["[axis]", *(toml_line(key, value) for key, value in besides.items() if value is not None)]
-    reference = campaign.reference.lines()
-    lines += [*_axis_table_lines(campaign), *([f"[{REFERENCE}]", *reference] if reference else [])]
-    return ("\n".join(lines) + "\n").encode()
+    besides = {"limits": campaign.limits, "command_unit": campaign.command_unit}
+    tables = {
+        "": {"format": FORMAT, "unit": campaign.unit, **campaign.header},
+        "axis": besides | _axis_entries(campaign),
+    }
+    reference = campaign.reference.entries
+    return toml_text(tables | ({REFERENCE: reference} if reference else {})).encode()
 
 
 def axis_bytes(campaign: AxisCampaign) -> dict[str, bytes]:
@@ -501,9 +475,9 @@ def write_axis(campaign: AxisCampaign, folder: Path) -> None:
 def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
     """SHA-256 of the inputs of an estimate, by "moves", "readings" and "axis", over values in canonical text."""
     readings = sorted(campaign.readings, key=lambda reading: reading.reading)
-    timing = [toml_line(key, campaign.header[key]) for key in ("rate", "powered_on") if key in campaign.header]
-    reference = campaign.reference.lines(estimate=True)
-    axis = "\n".join([campaign.unit, *timing, *_axis_table_lines(campaign), *reference])
+    timing = {key: campaign.header[key] for key in ("rate", "powered_on") if key in campaign.header}
+    reference = {name: value for name, value in campaign.reference.entries.items() if name not in CERTIFIED}
+    axis = f"{campaign.unit}\n{toml_text({'': timing | _axis_entries(campaign) | reference})}".rstrip("\n")
     contents = AXIS_MOVES.content(campaign.moves), READINGS.content(readings), axis.encode()
     names = ("moves", "readings", "axis")
     return {name: hashlib.sha256(data).hexdigest() for name, data in zip(names, contents, strict=True)}

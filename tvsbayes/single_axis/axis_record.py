@@ -296,7 +296,7 @@ def results_for(
     why = stored.reason if isinstance(stored, Reason) else "results/ are of a fit that did not converge"
     if isinstance(stored, FitFiles) and stored.keys.values.get("converged") is True:
         document = stored.keys
-        document.word("format", (AXIS_FIT_FORMAT,))
+        document.word("format", AXIS_FIT_FORMAT)
         hold_to_schema(document, axis_fit_schema(), AGAIN)
         summary = read_record(AxisSummary, document, AGAIN, held=True)
         if "answer" not in document.values and summary.estimator == "posterior":

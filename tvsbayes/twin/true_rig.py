@@ -180,7 +180,7 @@ def read_truth(path: str | Path, stated: Stereo | None) -> Truth:
     """
     path = Path(path)
     keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
-    keys.word("format", (TRUTH_FORMAT,))
+    keys.word("format", TRUTH_FORMAT)
     try:
         return Truth.from_json(keys.values, stated)
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
