@@ -189,7 +189,7 @@ FAULTS = (
     # Files and their refusals.
     Fault("a cell that is no number is accepted", "Table.numbers", Never("isfinite"),
           "test_message_tells_place_found_allowed_and_remedy"),
-    Fault("a mirrored rotation of the cameras is accepted", "parse_stereo", Call("det", "1.0"),
+    Fault("a mirrored rotation of the cameras is accepted", "stereo_pair._rotation", Call("det", "1.0"),
           "test_stereo_refusals_name_line_and_key"),
     Fault("pixels counted from 1 are moved the wrong way", "importing.looks._looks",
           Reads("cells.wishes.pixels_from", "-value"), "test_notations_of_others"),
