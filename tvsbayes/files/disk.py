@@ -24,7 +24,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from tvsbayes.errors import CONTROL, InputError, escaped, refusal, shown
 
@@ -160,25 +160,12 @@ def decode(data: bytes, file: str, skipped: int = 0) -> str:
     return text
 
 
-class Flushing(Protocol):
-    """The calls that `flush_folder` makes; the module `os` has them."""
-
-    def open(self, path: Path, flags: int, /) -> int:
-        """A descriptor of the folder."""
-
-    def fsync(self, descriptor: int, /) -> None:
-        """Make its content durable."""
-
-    def close(self, descriptor: int, /) -> None:
-        """Close it."""
-
-
-def flush_folder(folder: Path, disk: Flushing = os) -> None:
+def flush_folder(folder: Path, disk: Any = os) -> None:
     """Make the names in a folder durable, where the system allows it: only POSIX flushes folders.
 
     Args:
         folder: the folder.
-        disk: calls of the operating system.
+        disk: has `open`, `fsync` and `close` of the operating system.
 
     Raises:
         OSError: the disk failed.

@@ -171,23 +171,20 @@ class Keys:
         entries = self.entries({"format": Keys.text, **kinds}, required)
         return {key: value for key, value in entries.items() if key != "format"}
 
-    def value(self, key: str) -> Any:
-        """The value under `key` as it stands."""
-        return self.values[key]
-
-    def _held(
-        self, key: str, fits: Callable[[Any], object], code: str, allowed: str, remedy: str = "correct the value"
+    def held(
+        self,
+        key: str,
+        fits: Callable[[Any], object],
+        code: str,
+        allowed: str,
+        remedy: str = "correct the value",
+        kind: Kind | None = None,
     ) -> Any:
-        """The value under `key` as it stands, which must fit."""
-        if key not in self.values:
+        """The value under `key`, as it stands or of a kind, which must fit."""
+        if kind is None and key not in self.values:
             raise self.refuse(key, "missing-key", allowed, f"add {key}")
-        if not fits(self.values[key]):
-            raise self.refuse(key, code, allowed, remedy)
-        return self.values[key]
-
-    def checked(self, key: str, kind: Kind, fits: Callable[[Any], object], code: str, allowed: str, remedy: str) -> Any:
-        """A value of a kind that fits besides."""
-        if not fits(value := self.read(key, kind)):
+        value = self.values[key] if kind is None else self.read(key, kind)
+        if not fits(value):
             raise self.refuse(key, code, allowed, remedy)
         return value
 
@@ -195,7 +192,7 @@ class Keys:
         """A finite number in [low, high]; booleans are refused."""
         allowed = f"a finite number from {low:g} to {high:g}" if low < high else f"exactly {low:g}"
         remedy = "correct the value and check its unit"
-        return float(self._held(key, lambda v: is_number(v) and low <= v <= high, "number", allowed, remedy))
+        return float(self.held(key, lambda v: is_number(v) and low <= v <= high, "number", allowed, remedy))
 
     def numbers(self, key: str, low: float, high: float, most: int) -> tuple[float, ...]:
         """One number in [low, high], or a list of 1 to `most` different numbers."""
@@ -210,13 +207,13 @@ class Keys:
     def integer(self, key: str, low: int, high: int) -> int:
         """A whole number in [low, high]."""
         allowed = f"a whole number from {low} to {high}"
-        return self._held(key, lambda v: type(v) is int and low <= v <= high, "integer", allowed)
+        return self.held(key, lambda v: type(v) is int and low <= v <= high, "integer", allowed)
 
     def text(self, key: str, chars_max: int = 200) -> str:
         """Printable text without line breaks; fields such as `notes` have a larger `chars_max` and may have breaks."""
         allowed, breaks = f"printable text of at most {chars_max} characters", "\n\t" * (chars_max > 200)
         remedy = "shorten it, or put it in quotes"
-        value = self._held(key, lambda v: isinstance(v, str) and len(v) <= chars_max, "text", allowed, remedy)
+        value = self.held(key, lambda v: isinstance(v, str) and len(v) <= chars_max, "text", allowed, remedy)
         if not all(c.isprintable() or c in breaks for c in value):
             raise self.refuse(key, "text", allowed, "remove the control characters")
         return value
@@ -224,19 +221,19 @@ class Keys:
     def flag(self, key: str) -> bool:
         """The boolean under `key`."""
         remedy = "write true or false without quotes"
-        return self._held(key, lambda v: isinstance(v, bool), "boolean", "true or false", remedy)
+        return self.held(key, lambda v: isinstance(v, bool), "boolean", "true or false", remedy)
 
     def date(self, key: str) -> datetime.date:
         """A date, or a time."""
         allowed = "a date or time such as 2026-01-15T10:00:00Z"
-        return self._held(key, lambda v: isinstance(v, datetime.date), "date", allowed, "write it without quotes")
+        return self.held(key, lambda v: isinstance(v, datetime.date), "date", allowed, "write it without quotes")
 
     def word(self, key: str, *words: str) -> str:
         """One of a few words."""
         found = str(self.values.get(key))
         remedy = other_format(found, words) if key == "format" else None
         allowed = " or ".join(map(shown, words))
-        return self._held(key, lambda v: v in words, "word", allowed, remedy or closest(found[:100], words))
+        return self.held(key, lambda v: v in words, "word", allowed, remedy or closest(found[:100], words))
 
     def some_words(self, key: str, *words: str) -> tuple[str, ...]:
         """A list of different words, in the order of `words`."""
@@ -263,7 +260,7 @@ class Keys:
         """`{ value, u }` with value in [low, high] and standard uncertainty u in [0, u_max]."""
         allowed = "{ value = number, u = standard uncertainty }, both and nothing else"
         remedy = "u = 0 states that the value is exact"
-        self._held(key, lambda v: isinstance(v, dict) and v.keys() == {"value", "u"}, "quantity", allowed, remedy)
+        self.held(key, lambda v: isinstance(v, dict) and v.keys() == {"value", "u"}, "quantity", allowed, remedy)
         return StatedValue(**self.nested(key, {"value": (Keys.number, low, high), "u": (Keys.number, 0.0, u_max)}))
 
 

@@ -381,8 +381,9 @@ def _device(keys: Keys, key: str) -> Setting:
 
 # Serial libraries interpret addresses: one kind of address writes a file of that name.
 _PORT = (
-    *(Keys.checked, Keys.text, lambda port: "://" not in port, "port", "the name of a serial port, no address"),
+    *(Keys.held, lambda port: "://" not in port, "port", "the name of a serial port, no address"),
     "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are",
+    Keys.text,
 )
 _POSITIONER: dict[str, Kind] = {
     **{"driver": Keys.text, "port": _PORT, "baud": (Keys.integer, 300, 10_000_000)},
@@ -421,8 +422,9 @@ def _lies_beside(name: str) -> bool:
 _RIG: dict[str, Kind] = {
     **{"name": Keys.text, "notes": (Keys.text, 2000)},
     "stereo": (
-        *(Keys.checked, Keys.text, _lies_beside, "path", "a file name relative to the rig file, inside its folder"),
+        *(Keys.held, _lies_beside, "path", "a file name relative to the rig file, inside its folder"),
         "put the file beside the rig file and give its name",
+        Keys.text,
     ),
     **{"rig": Keys.table, "truth": Keys.table, "sheets": _sheets, "positioner": (Keys.nested, _POSITIONER)},
     **{"cameras": (Keys.nested, _CAMERAS), "costs": (Keys.nested, dict.fromkeys(COSTS_S, (Keys.number, 0.0, 1e6)))},

@@ -346,8 +346,9 @@ _AXIS: dict[str, Kind] = {
     **dict.fromkeys(AXIS_KEYS, _prior),
     "absolute": Keys.flag,
     "limits": (
-        *(Keys.checked, (Keys.numbers, *_COMMAND, 2), lambda ends: len(ends) == 2 and ends[0] < ends[1], "range"),
+        *(Keys.held, lambda ends: len(ends) == 2 and ends[0] < ends[1], "range"),
         *("[lowest, highest] command, the lower one first", "give both ends that the machine allows, in commands"),
+        (Keys.numbers, *_COMMAND, 2),
     ),
     "command_unit": (Keys.text, UNIT_CHARS_MAX),
     "periods": (Keys.numbers, *_PERIOD, PERIODS_MAX),
@@ -362,17 +363,17 @@ _REFERENCE: dict[str, Kind] = {
     "u_is": (Keys.word, COMMON, "independent"),
     "certificate": Keys.text,
     "valid_until": (
-        *(Keys.checked, Keys.value, lambda day: type(day) is datetime.date, "date"),
+        *(Keys.held, lambda day: type(day) is datetime.date, "date"),
         *("a date such as 2027-01-15", "write it without quotes"),
     ),
 }
 _UNIT = (
-    *(Keys.checked, (Keys.text, UNIT_CHARS_MAX), str.strip, "text"),
-    *('the unit of readings, such as "deg" or "mm"', "name it"),
+    *(Keys.held, str.strip, "text", 'the unit of readings, such as "deg" or "mm"', "name it"),
+    (Keys.text, UNIT_CHARS_MAX),
 )
 _RATE = (
-    *(Keys.checked, (Keys.number, *_COMMAND), bool, "zero"),
-    *("commands per second, not 0", "leave it out of an axis that stops"),
+    *(Keys.held, bool, "zero", "commands per second, not 0", "leave it out of an axis that stops"),
+    (Keys.number, *_COMMAND),
 )
 _CAMPAIGN: dict[str, Kind] = {
     **{"unit": _UNIT, "name": Keys.text, **PEOPLE, **TIMES, "rate": _RATE, **ORIGIN},
