@@ -284,6 +284,26 @@ OTHERS: dict[str, Callable[[], Sample]] = {
     "sheets with two tables": lambda: Sample("book.xlsx", two_sheets()),
     "a table as a guide log": lambda: Sample("table.csv", TABLE, ("--axis", "--format", "phd2")),
     "a guide log without --axis": lambda: Sample("guide.txt", guide_log(99), ()),
+    "camonitor without --axis": lambda: Sample("log.txt", CAMONITOR, ()),
+    "an unknown format": lambda: Sample("table.csv", TABLE, ("--axis", "--format", "phd")),
+    "a run of a table": lambda: Sample("table.csv", TABLE, ("--axis", "--run", "1")),
+    **{
+        f"a guide log with {' '.join(words)}": lambda words=words: Sample(
+            "guide.txt", guide_log(99), ("--axis", *words)
+        )
+        for words in (("--column", "u=dx"), ("--run", "3"), ("--assume", "dec=3"), ("--assume", "declination_deg=x"))
+    },
+    "an angle sensor alone": lambda: Sample("log.txt", '{"q": "angle:a", "params": {"data": [[1, 2]]}}\x03'),
+    "minutes beyond 60": lambda: Sample("log.txt", "steps;angle\n0;1\u00b061'00\"\n1;2\u00b000'00\"\n"),
+    "two notations in a column": lambda: Sample("log.txt", "steps;angle\n0;1 mm\n1;2 deg\n"),
+    "Greek letters in UTF-16": lambda: Sample(
+        "dial.csv",
+        # Their high byte is the end marker of a message of Klipper's logger.
+        ("Position (mm);\u03bb laser (mm)\n" + "".join(f"{10 * k};{10.01 * k:.3f}\n" for k in range(9))).encode(
+            "utf-16"
+        ),
+        ("--axis", "--column", "value=\u03bb laser (mm)"),
+    ),
     "a serial log": lambda: Sample("serial.txt", serial_log()),
     "a serial log with a lost line": lambda: Sample("serial.txt", serial_log(lost=(30, 75))),
     "summer time": lambda: Sample("epics.txt", clock_log(step_back=False)),
