@@ -185,7 +185,7 @@ FAULTS = (
     Fault("what must not be used ends with exit code 0", "app.finish", Call("Ended", "function(0)"),
           "test_a_fit_that_did_not_converge_is_exit_4"),
     Fault("numbers of an axis that must not be used are offered to firmware", "axis_fit_text",
-          Reads("summary.explained", "True"), "test_numbers_that_must_not_be_used_are_not_offered_to_firmware"),
+          Reads("summary.explained", "True"), "test_what_the_text_of_an_axis_adds"),
     # Files and their refusals.
     Fault("a cell that is no number is accepted", "Table.numbers", Never("isfinite"),
           "test_message_tells_place_found_allowed_and_remedy"),
