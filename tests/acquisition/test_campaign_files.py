@@ -12,7 +12,7 @@ from support.bench_runs import HEADER, Run, ctrl_c, small_plan
 
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG
 from tvsbayes.acquisition.journal_check import behind_journal
-from tvsbayes.acquisition.session import acquire, begin
+from tvsbayes.acquisition.session import begin
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
@@ -31,19 +31,6 @@ def eight_looks(mounted_rig, tmp_path_factory) -> Path:
 def finished(eight_looks, tmp_path) -> Path:
     """A folder of its own of a run of eight looks that is done."""
     return Path(shutil.copytree(eight_looks, tmp_path / "c"))
-
-
-def test_campaign_is_readable_after_every_look(mounted_rig, tmp_path):
-    counts = []
-
-    def show(progress):
-        if (tmp_path / "c" / "campaign.toml").exists():
-            counts.append(len(read_campaign(tmp_path / "c").spots))
-            assert counts[-1] == progress.looks and progress.looks_total == 8
-            assert progress.seconds_left >= 0
-
-    Run(mounted_rig, tmp_path / "c", show=show).engine.run()
-    assert counts[-1] == 7 and len(counts) > 10
 
 
 @pytest.mark.parametrize("refusals", [3, 10_000])
@@ -119,29 +106,6 @@ def test_tables_that_lack_a_look_of_the_journal_say_which(finished, capsys):
     assert "warning: spots.csv lacks look 7, which log.jsonl holds" in " ".join(capsys.readouterr().err.split())
     (folder / LOG).write_bytes(b"damaged\n")
     assert behind_journal(folder, read_campaign(folder)) == "", "what is wrong with a journal is reported by check"
-
-
-def test_a_deleted_journal_has_a_remedy_that_leads_somewhere(mounted_rig, finished, tmp_path):
-    (finished / LOG).unlink()
-    with pytest.raises(InputError) as refused:
-        acquire(mounted_rig, small_plan(2), finished, simulate=True, resume=True)
-    assert "backup" in refused.value.remedy and "another folder" in refused.value.remedy
-    with pytest.raises(InputError) as refused:
-        acquire(mounted_rig, small_plan(2), tmp_path / "new", simulate=True, resume=True)
-    assert refused.value.remedy.startswith("leave --resume out")
-
-
-def test_a_repair_counts_what_follows_a_lost_event(finished, tmp_path, capsys):
-    """A motion of the first look is lost: until the next homing the mirror angles are unknown."""
-    folder = finished
-    lines = (folder / LOG).read_bytes().splitlines(keepends=True)
-    lost = next(number for number, line in enumerate(lines) if b'"moved"' in line)
-    later = [sum(f'"{event}"'.encode() in line for line in lines[lost + 1 :]) for event in ("moved", "looked")]
-    (folder / LOG).write_bytes(b"".join(lines[:lost] + lines[lost + 1 :]))
-    assert run(["check", str(folder), "--repair-to", str(tmp_path / "new"), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert [document["moves_not_counted"], document["looks_not_counted"]] == later and later[1] > 0
-    assert document["looks"] + document["looks_not_counted"] == 8
 
 
 def test_what_a_killed_run_left_unfinished_is_removed_at_its_resume(mounted_rig, tmp_path):

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -122,14 +119,6 @@ def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):
     assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}, checks
 
 
-def test_a_dark_picture_is_judged_by_the_bits_that_its_driver_states(tmp_path):
-    """Mean 20 of 4095 is a cap on the lens; as 8 bits it would pass."""
-    device, camera = bench(level=20.0, texture=10.0)
-    in_bits_of_twelve(camera, 1, 4095)
-    check = checks_of(device, camera, tmp_path)["exposure left"]
-    assert check.status == "warning" and check.found.startswith("mean 1 of 255") and "cap" in check.remedy
-
-
 @pytest.mark.parametrize(
     ("camera", "name", "word"),
     [
@@ -216,29 +205,6 @@ def test_rig_without_hardware_says_what_is_missing(tmp_path):
     checks = {check.name: check for check in examine(RIG, tmp_path)}
     assert "[positioner]" in checks["port"].remedy and checks["cameras"].status == "fault"
     assert checks["disk flush"].status in ("ok", "warning") and list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.thorough
-def test_missing_hardware_is_reported_once_and_by_us_alone(tmp_path):
-    """In a process of its own: OpenCV and FFmpeg write past Python, FFmpeg at the log level of its first caller."""
-    folder = RIG_FILE.parent
-    tables = '[positioner]\nport = "/nowhere/port"\n[cameras]\n'
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV_")}
-    for cameras in ('left = "/nowhere/left"\nright = "/nowhere/right"\n', 'source = "http://127.0.0.1:9/x.mjpg"\n'):
-        text = (folder / "rig.toml").read_text(encoding="utf-8")
-        (tmp_path / "rig.toml").write_text(f"{text}\n{tables}{cameras}", encoding="utf-8")
-        (tmp_path / "stereo.json").write_bytes((folder / "stereo.json").read_bytes())
-        command = [sys.executable, "-c", "import sys; from tvsbayes.cli.main import run; sys.exit(run(sys.argv[1:]))"]
-        done = subprocess.run(
-            [*command, "doctor", "rig.toml"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 5
-        assert [line.split(":")[0] for line in done.stderr.splitlines()] == ["error", "what to do"], done.stderr
-        faults = {line.split()[1]: line for line in done.stdout.splitlines() if line.startswith("fault")}
-        assert set(faults) == {"port:", "firmware:", "cameras:"}
-        for name, remedy in (("cameras:", "check [cameras]"), ("firmware:", "check [positioner] port")):
-            assert faults[name].count(remedy) == 1, faults[name]
-        assert "tvsbayes doctor" not in done.stdout + done.stderr
 
 
 def test_contract_of_drivers_that_keep_it_and_of_one_that_does_not(small_rig):

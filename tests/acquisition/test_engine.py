@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import datetime
 import signal
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from support.bench_runs import HEADER, Run, ctrl_c, events, raise_error, small_plan
 
-from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK, _approach
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import check_journal, repair_campaign, verify
 from tvsbayes.acquisition.observation import DetectedSpot, Observation
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import LOST_STEPS, recorded
 from tvsbayes.acquisition.session import acquire, begin
-from tvsbayes.acquisition.simulated_bench import SIMULATED_START, SimulatedOperator, TwinObserver
+from tvsbayes.acquisition.simulated_bench import SimulatedOperator
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.campaign import UNDETECTED, read_campaign
 from tvsbayes.positioner.protocol import request
@@ -176,18 +173,6 @@ def test_resumed_after_any_look_every_look_is_there_once(mounted_rig, tmp_path, 
     assert shifts and max(shifts) < 15
 
 
-def test_run_that_was_interrupted_while_it_resumed_goes_on_where_the_plan_stood(mounted_rig, tmp_path):
-    """The journal's last motion is then one to a reference look, not the plan's."""
-    folder, plan = tmp_path / "c", small_plan()
-    Run(mounted_rig, folder, plan, at=3, then=ctrl_c).engine.run()
-    second = Run(mounted_rig, folder, plan, resume=True, start=1, at=2, then=EXITS["camera fault"][0])
-    with pytest.raises(DeviceFault):
-        second.engine.run()
-    assert read_campaign(folder).moves[-1].pan_steps == 0, "of the second reference look; the plan stood at 100"
-    assert Run(mounted_rig, folder, plan, resume=True, start=2).engine.run().reason == "done"
-    assert_looks_as_planned(read_campaign(folder), plan)
-
-
 @pytest.mark.parametrize(
     ("event", "number", "left", "last_step"),
     [
@@ -237,17 +222,6 @@ def test_plan_begins_again_where_a_repair_lost_its_only_homing(mounted_rig, tmp_
     assert_looks_as_planned(read_campaign(tmp_path / "new"), plan)
 
 
-def test_resuming_what_is_done_asks_for_nothing(mounted_rig, tmp_path):
-    Run(mounted_rig, tmp_path / "c").engine.run()
-
-    class Bothered(SimulatedOperator):
-        def place(self, *arguments):
-            raise AssertionError("there is nothing left to look at")
-
-    again = Run(mounted_rig, tmp_path / "c", resume=True, start=1, operator=lambda r: Bothered(r.instrument))
-    assert (again.engine.run().reason, len(read_campaign(tmp_path / "c").spots)) == ("done", 8)
-
-
 def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(mounted_rig, tmp_path):
     """The device stayed on: its counters pass the history to the resumed run's homing."""
     folder, plan = tmp_path / "c", small_plan()
@@ -260,19 +234,6 @@ def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(mounted_rig, tmp
     assert {s.status for s in read_campaign(folder).spots[:4]} == {LOST_STEPS}
 
 
-def test_segment_that_an_alarm_ended_is_not_taken_for_verified(mounted_rig, tmp_path):
-    """In alarm the counters are lost; the homing that follows reports no deviation, but there is none to report."""
-    folder, plan = tmp_path / "c", small_plan()
-    first = Run(mounted_rig, folder, plan, at=4, then=EXITS["device aborted"][0])
-    with pytest.raises(DeviceFault):
-        first.engine.run()
-    first.instrument.mechanics.true_steps[0] -= 6
-    second = Run(mounted_rig, folder, plan, resume=True, start=1)
-    second.engine.bench = replace(second.engine.bench, positioner=first.instrument.positioner())
-    assert second.engine.run().lost_segments == ()
-    assert recorded(read_journal(folder).records).unverified == (0,)
-
-
 def test_frames_of_an_interrupted_look_are_never_overwritten(mounted_rig, tmp_path):
     folder = tmp_path / "c"
     Run(mounted_rig, folder, at=2, then=ctrl_c).engine.run()
@@ -282,15 +243,6 @@ def test_frames_of_an_interrupted_look_are_never_overwritten(mounted_rig, tmp_pa
     Run(mounted_rig, folder, resume=True, start=1).engine.run()
     assert [s.spot for s in read_campaign(folder).spots][:4] == [0, 1, 3, 4]
     assert verify(folder).orphans == ("frames/000002_left.png", "frames/screenshot.png")
-
-
-def test_clock_that_goes_back_leaves_the_times_in_order(mounted_rig, tmp_path):
-    run_ = Run(mounted_rig, tmp_path / "c")
-    times = iter([50.0, 40.0, 60.0, 10.0] + [70.0 + k for k in range(200)])
-    run_.engine._log._utc = lambda: SIMULATED_START + datetime.timedelta(seconds=next(times))
-    run_.engine.run()
-    moves = read_campaign(tmp_path / "c").moves
-    assert all(a.time_s <= b.time_s for a, b in pairwise(moves))
 
 
 def test_lost_steps_void_their_segment_and_no_other(mounted_rig, tmp_path):
@@ -329,26 +281,6 @@ def test_pictures_of_a_segment_with_lost_steps_no_longer_wait_for_detection(moun
     assert [spot.status for spot in read_campaign(tmp_path / "c").spots] == [UNDETECTED] * 4 + [LOST_STEPS] * 4
 
 
-def test_forgotten_sheet_is_noticed_by_its_spot(mounted_rig, tmp_path):
-    requests = []
-
-    class Forgetful(SimulatedOperator):
-        def place(self, target, x_mm, placement, remark):
-            requests.append((target, remark))
-            if target == "d2" and not remark and sum(t == "d2" for t, _ in requests) == 1:
-                return True
-            return super().place(target, x_mm, placement, remark)
-
-    run_ = Run(mounted_rig, tmp_path / "c", operator=lambda r: Forgetful(r.instrument))
-    assert run_.engine.run().ok == 8
-    assert [t for t, remark in requests if remark] == ["d2"]
-    assert "spot lies at X = 17" in next(remark for _, remark in requests if remark)
-    campaign = read_campaign(tmp_path / "c")
-    plain = Run(mounted_rig, tmp_path / "plain")
-    plain.engine.run()
-    assert [s.target for s in campaign.spots] == [s.target for s in read_campaign(tmp_path / "plain").spots]
-
-
 def test_sheet_that_never_comes_ends_the_run(mounted_rig, tmp_path):
     class Absent(SimulatedOperator):
         def place(self, target, x_mm, placement, remark):
@@ -358,33 +290,3 @@ def test_sheet_that_never_comes_ends_the_run(mounted_rig, tmp_path):
     with pytest.raises(DeviceFault) as caught:
         run_.engine.run()
     assert caught.value.code == "placement" and run_.dark()
-
-
-def test_looks_without_a_spot_are_repeated_and_then_refused(mounted_rig, tmp_path):
-    class Blind:
-        def __init__(self, instrument):
-            self.inner, self.calls = TwinObserver(instrument, 0.08), 0
-
-        def observe(self, positioner, spot):
-            self.calls += 1
-            observation = self.inner.observe(positioner, spot)
-            blind = spot == 2 or (spot == 4 and self.calls % 2 == 0)
-            return replace(observation, spot=DetectedSpot("no-spot")) if blind else observation
-
-    run_ = Run(mounted_rig, tmp_path / "c", observer=Blind)
-    outcome = run_.engine.run()
-    assert (outcome.ok, outcome.refused) == (7, 1) and outcome.retries >= ATTEMPTS_PER_LOOK - 1
-    spot = read_campaign(tmp_path / "c").spots[2]
-    assert spot.status == "no-spot" and spot.u_left_px is None
-
-
-@pytest.mark.parametrize(
-    ("steps", "ours", "other"),
-    [
-        *((1200, "left", "left"), (20, "left", "left"), (19, "unknown", "unknown")),
-        *((0, "right", "unknown"), (-3, "right", "unknown"), (-20, "right", "right"), (-500, "right", "right")),
-    ],
-)
-def test_approach_after_homing(steps, ours, other):
-    """Our firmware comes to rest in the negative sense; a board that pulls off its switches the other way does not."""
-    assert [_approach("pan", steps, ends_negative) for ends_negative in (True, False)] == [ours, other]

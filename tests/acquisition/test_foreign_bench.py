@@ -19,7 +19,6 @@ from tvsbayes.acquisition.session import begin
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.counter_limits import CounterLimits
-from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
 
@@ -87,11 +86,3 @@ def test_a_run_on_a_grbl_board_that_is_reset_and_resumed(mounted_rig, tmp_path):
     assert {move.segment for move in campaign.moves} == {0, 1} and record.unverified == (0, 1) and not record.lost
     start = events(tmp_path / "c", "start")[0]
     assert start["device"]["fw"] == "Grbl 1.1h" and start["setup"]["positioner.port"] == "/dev/ttyUSB0"
-
-
-def test_a_stop_where_a_board_was_homed_has_no_known_side(mounted_rig, tmp_path):
-    """$23 sets the sense in which GRBL pulls off its switches; it was not read."""
-    rig, board = replace(mounted_rig, positioner={"driver": "grbl", "port": "/dev/ttyUSB0"}), GrblBoard()
-    engine(rig, tmp_path / "c", board, plan=[PlanStep(0, "home", -80, -70)]).run()
-    move = recorded(read_journal(tmp_path / "c").records).moves[0]
-    assert (move.pan_approach, move.tilt_approach) == ("unknown", "unknown")

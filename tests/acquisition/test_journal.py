@@ -6,7 +6,6 @@ import errno
 import itertools
 import os
 import random
-import stat
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -18,15 +17,6 @@ from support.journals import continue_looks, write_looks
 from tvsbayes.acquisition.journal import LOG, Disk, Journal, encode, read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.errors import DeviceFault, InputError
-
-
-def test_what_is_written_is_read_back(folder):
-    reading = read_journal(folder)
-    assert [r.event for r in reading.records] == ["created", *["intent", "looked"] * 3, "stop"]
-    assert reading.records[2].data["frames"][1]["name"] == "frames/000000_right.png" and not reading.torn
-    check = verify(folder)
-    assert (check.records, check.frames, check.orphans, check.torn_bytes, check.stopped) == (8, 6, (), 0, "done")
-    assert check.warnings == []
 
 
 def test_line_format_is_the_documented_one():
@@ -69,14 +59,6 @@ def test_every_byte_flipped_is_found(folder):
 
     tried, missed = flips_found(folder, values)
     assert tried == size - 2 + 2 * 255 and missed == []
-
-
-@pytest.mark.slow
-def test_every_single_byte_change_is_found(tmp_path):
-    """All 255 other values of every byte."""
-    write_looks(tmp_path / "run", 3)
-    tried, missed = flips_found(tmp_path / "run", lambda place, byte: [v for v in range(256) if v != byte])
-    assert tried == 255 * (tmp_path / "run" / LOG).stat().st_size and missed == []
 
 
 def test_lost_doubled_swapped_and_foreign_lines_are_found(folder, tmp_path):
@@ -150,22 +132,6 @@ def test_a_disk_without_locks_is_not_called_another_writer(folder, monkeypatch):
     monkeypatch.undo()
     # Nothing stays that would call the folder occupied once it is on a disk with locks.
     Journal.create(folder.with_name("new")).close()
-
-
-@pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
-def test_a_file_system_that_flushes_no_folders_will_do(tmp_path, monkeypatch):
-    flush = os.fsync
-
-    def files_only(descriptor):
-        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, "Invalid argument")
-        flush(descriptor)
-
-    monkeypatch.setattr(os, "fsync", files_only)
-    journal = Journal.create(tmp_path / "c")
-    journal.append("begun")
-    journal.close()
-    assert [record.event for record in read_journal(tmp_path / "c").records] == ["created", "begun"]
 
 
 def test_two_writers_are_refused(folder):
@@ -243,25 +209,6 @@ def test_disk_error_at_every_call_stops_cleanly_and_loses_nothing(tmp_path, numb
         journal.close()
         verify(folder)
     assert at > 30, "the whole sequence was walked through"
-
-
-def test_after_a_disk_error_nothing_more_is_written(tmp_path):
-    journal = Journal.create(tmp_path)
-    journal._disk = FailingDisk(2, errno.EIO)
-    with pytest.raises(DeviceFault):
-        journal.append("intent")
-    journal._disk = Disk()
-    with pytest.raises(DeviceFault, match="closed after a disk error"):
-        journal.append("intent")
-
-
-def test_short_writes_are_completed(tmp_path):
-    class Dribble(Disk):
-        def write(self, descriptor, data):
-            return super().write(descriptor, data[:7])
-
-    write_looks(tmp_path, 1, Dribble())
-    assert verify(tmp_path).records == 4
 
 
 @pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
@@ -485,16 +432,6 @@ def killed_writers(folder: Path, kills: int, seed: int) -> tuple[int, int]:
 def test_killed_writers_lose_nothing(tmp_path):
     total, _ = killed_writers(tmp_path / "run", 6, seed=1)
     assert total > 6
-
-
-@pytest.mark.slow
-def test_300_killed_writers_lose_nothing(tmp_path, capsys):
-    """Ten journals of thirty kills each: reading the whole journal after every kill grows with its length."""
-    events = [killed_writers(tmp_path / f"run{k}", 30, seed=k) for k in range(10)]
-    # Every run acknowledged more than one event a kill; that none is lost is asserted after each kill.
-    assert all(total > 30 for total, _ in events)
-    with capsys.disabled():
-        print(f"\n300 kills, {sum(e for e, _ in events)} events acknowledged, {sum(t for _, t in events)} torn ends")
 
 
 def test_a_full_journal_is_reported_and_stays_readable(tmp_path, monkeypatch):

@@ -9,12 +9,9 @@ from tvsbayes.acquisition.journal import (
     LOG,
     LOG_ENTRIES_MAX,
     LOG_EVENTS_MAX,
-    Journal,
-    Record,
     read_journal,
 )
 from tvsbayes.acquisition.journal_check import repair, verify
-from tvsbayes.acquisition.recorder import Stop, event_of, recorded
 from tvsbayes.errors import InputError
 
 
@@ -69,56 +66,6 @@ def test_repair_keeps_what_is_whole_and_marks_the_gap(folder, tmp_path):
         repair(folder, tmp_path / "new")
 
 
-def test_repair_of_a_journal_without_its_first_line(folder, tmp_path):
-    (folder / LOG).write_bytes(b"x" + (folder / LOG).read_bytes())
-    done = repair(folder, tmp_path / "new")
-    assert done.lost_lines == [1]
-    assert [r.event for r in read_journal(tmp_path / "new").records][:3] == ["created", "gap", "intent"]
-
-
-LOOK = {"experiment": None, "point": None, "target": "d1", "status": "undetected", "pixels_px": None, "sds_px": None}
-
-
-def moved_and_looked(place):
-    """A homing, then four moves with a look each; returns the lines of its log."""
-    journal = Journal.create(place, id="0123", plan_sha256="ab" * 32)
-    at = {"step": 0, "time_s": 0.0, "pan_steps": 0, "tilt_steps": 0}
-    journal.append("intent", step=0, action="home")
-    journal.append("homed", **at, boot=1, approach=["left", "up"])
-    for k in range(1, 5):
-        journal.append("intent", step=2 * k - 1, action="move", pan_steps=k, tilt_steps=0)
-        journal.append("moved", **{**at, "step": 2 * k - 1, "time_s": float(k), "pan_steps": k})
-        journal.append("looked", step=2 * k, spot=k - 1, **LOOK)
-    journal.append("stop", reason="done", exit_code=0)
-    journal.close()
-    return (place / LOG).read_bytes().splitlines(keepends=True)
-
-
-@pytest.mark.parametrize(
-    ("lost", "spots", "moves"),
-    [("looked", [0, 2, 3], 5), ("moved", [0], 2), ("intent", [0], 2)],
-)
-def test_what_follows_a_lost_look_counts_and_what_follows_a_lost_motion_does_not(tmp_path, lost, spots, moves):
-    """A motion has two lines: a single one that is missing between whole motions was none."""
-    lines = moved_and_looked(tmp_path / "run")
-    del lines[{"intent": 6, "moved": 7, "looked": 8}[lost]]
-    (tmp_path / "run" / LOG).write_bytes(b"".join(lines))
-    repair(tmp_path / "run", tmp_path / "new")
-    history = recorded(read_journal(tmp_path / "new").records)
-    assert [spot.spot for spot in history.spots] == spots and len(history.moves) == moves
-
-
-def test_lines_that_changed_places_are_put_back(tmp_path):
-    lines = moved_and_looked(tmp_path / "run")
-    lines[7], lines[8] = lines[8], lines[7]
-    (tmp_path / "run" / LOG).write_bytes(b"".join(lines))
-    done = repair(tmp_path / "run", tmp_path / "new")
-    assert done.lost_lines == [] and done.kept == len(lines)
-    history = recorded(read_journal(tmp_path / "new").records)
-    assert (len(history.spots), len(history.moves), history.ignored_lines) == (4, 5, [])
-    assert "gap" not in [record.event for record in read_journal(tmp_path / "new").records]
-
-
 def test_a_log_is_capped_in_events_and_entries(folder, tmp_path):
     for data, what in ((b"\n" * (LOG_EVENTS_MAX + 1), "events"), (b"[" * (LOG_ENTRIES_MAX + 1), "entries")):
         (folder / LOG).write_bytes(data)
@@ -135,13 +82,3 @@ def test_a_frame_named_twice_is_read_once(folder, tmp_path):
     with pytest.raises(InputError, match="a frame that an event before it names"):
         verify(folder)
     assert repair(folder, tmp_path / "repaired").lost_frames == ["frames/000000_left.png"]
-
-
-def test_a_key_that_is_half_a_surrogate_pair_is_refused(folder):
-    """JSON may hold it; UTF-8 cannot encode it."""
-    (folder / LOG).write_bytes(sealed((folder / LOG).read_bytes().replace(b'"sha256"', b'"\\ud800"')))
-    with pytest.raises(InputError, match="frames as"):
-        verify(folder)
-    with pytest.raises(InputError) as caught:
-        event_of(Record(7, "stop", {"\ud800": 1}, 8), Stop)
-    assert caught.value.line == 8 and caught.value.message.isprintable()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.bench_runs import Run, raise_error
 
-from tvsbayes.acquisition.live_run import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, LiveRun, SeenLook, temperature
+from tvsbayes.acquisition.live_run import LiveRun, SeenLook, temperature
 from tvsbayes.acquisition.observation import DetectedSpot, Observation
 from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.acquisition.simulated_bench import TwinObserver
@@ -68,32 +67,6 @@ def test_faults_and_repeated_looks_are_reported_in_words(mounted_rig, tmp_path):
     assert doc["fault"] == {"code": "no-frame", "message": "the left camera delivers nothing", "remedy": "plug it in"}
     assert doc["remarks"] == tuple(f"look {spot}: no-spot; taken again" for spot in (0, 0, 1, 1))
     assert doc["look"]["status"] == "no-spot" and doc["trail"] == []
-
-
-def test_an_error_of_the_program_is_reported_too(mounted_rig, tmp_path):
-    live = LiveRun()
-    bug = Run(mounted_rig, tmp_path / "c", at=2, then=lambda i: raise_error(ZeroDivisionError()), live=live)
-    with pytest.raises(ZeroDivisionError):
-        bug.engine.run()
-    assert (live.latest.reason, live.latest.fault["code"]) == ("crashed", "ZeroDivisionError") and bug.dark()
-
-
-def test_unread_data_cost_no_memory():
-    """A long run keeps the last look, and bounded tails of the rest."""
-    live = LiveRun()
-    estimate = {"left": 0.06}
-    tracemalloc.start()
-    for spot in range(400):
-        live.looked(looked(spot, side=256))
-        live.remarked(f"look {spot}")
-        live.estimated(Estimate(spot, estimate, estimate))
-    kept, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    now = live.latest
-    assert (len(now.trail), len(now.remarks), len(now.estimates)) == (TRAIL_MAX, REMARKS_MAX, ESTIMATES_MAX)
-    assert now.look.spot == 399 and now.remarks[-1] == "look 399"
-    # Far more than the bounded tails, far less than 400 looks with their pictures.
-    assert kept < 300_000
 
 
 def test_only_the_last_look_has_pictures():

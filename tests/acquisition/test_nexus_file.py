@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import replace
 
@@ -66,29 +65,6 @@ def test_the_default_plot_is_found_by_the_rules_of_nexus(exported):
         groups = [node for node in every(file) if isinstance(node, h5py.Group)]
         classes = [group.attrs["NX_class"] for group in groups]
         assert set(classes) <= CLASSES, "every group says what it is"
-
-
-def test_the_files_come_back_byte_for_byte(exported):
-    folder, path = exported
-    with h5py.File(path) as file:
-        notes = file["entry/files"]
-        assert len(notes) == 5
-        for note in notes.values():
-            data = note["data"][()].tobytes()
-            assert data == (folder / text(note["file_name"])).read_bytes()
-            assert text(note["sha256"]) == hashlib.sha256(data).hexdigest()
-
-
-def test_nexus_own_package_reads_it(exported):
-    nexus = pytest.importorskip("nexusformat.nexus", reason="nexusformat is not installed")
-    folder, path = exported
-    root = nexus.nxload(str(path))
-    plotted = root.get_default()
-    assert plotted.nxname == "looks" and isinstance(plotted, nexus.NXdata)
-    assert plotted.nxsignal.nxname == "u_left" and plotted.nxerrors.shape == (8,)
-    assert [axis.nxname for axis in plotted.nxaxes] == ["spot"]
-    assert isinstance(root.entry.instrument.pan, nexus.NXpositioner)
-    assert list(root.entry.instrument.pan.value.nxdata) == [move.pan_steps for move in read_campaign(folder).moves]
 
 
 def test_looks_without_a_spot_and_campaigns_without_a_journal(tmp_path):

@@ -18,8 +18,7 @@ from support.firmware_sessions import NO_EMULATOR
 from tvsbayes.acquisition import place_command
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator
-from tvsbayes.acquisition.place_command import OUTPUT_BYTES_MAX, WORDS_MAX, PlaceCommand, require_placed
-from tvsbayes.cli.main import run
+from tvsbayes.acquisition.place_command import OUTPUT_BYTES_MAX, PlaceCommand
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.campaign import read_campaign
 
@@ -181,13 +180,6 @@ def test_what_a_program_leaves_running_is_ended_and_said(tmp_path, monkeypatch):
     os.close(mover.pipe)
 
 
-def test_the_end_of_long_output_is_kept_and_the_rest_is_said_to_be_discarded():
-    done = program("print('x' * 3 * 10**6 + 'end'); raise SystemExit(3)").run("d1", 175.0, 0, lambda: True)
-    assert len(done.words) == WORDS_MAX and done.words.strip().endswith("end") and done.output_bytes == 3_000_004
-    with pytest.raises(DeviceFault, match="the end of 3000004 bytes; the rest is discarded"):
-        require_placed(done)
-
-
 def test_a_flood_is_read_and_never_more_than_64_kb_of_it_held(monkeypatch):
     """A program that waits for its reader writes 4 MB, none of which meets a disk."""
     held, ordinary = [], place_command.os.read
@@ -215,8 +207,3 @@ def test_the_sheet_needs_no_question():
         raise AssertionError(question)
 
     assert TerminalOperator(StopKey(), Terminal(ask=ask), "2", places=False).place("d1", 175.0, 0, "")
-
-
-def test_options_of_the_command(tmp_path, capsys):
-    assert run(["acquire", "rig.toml", "plan.csv", str(tmp_path / "c"), "--simulate", "--place-seconds", "3"]) == 2
-    assert "--place-command" in capsys.readouterr().err

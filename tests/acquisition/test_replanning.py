@@ -12,7 +12,6 @@ from support.fits_beside import given_rig, proposing, two_directions
 
 from tvsbayes.acquisition.journal import Journal, Record, read_journal
 from tvsbayes.acquisition.operator import Terminal
-from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.replanning import (
     AdaptOptions,
     Proposal,
@@ -124,18 +123,6 @@ def test_a_proposal_that_the_rig_cannot_run_is_not_followed(mounted_rig, tmp_pat
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate).engine.run()
     assert (outcome.reason, outcome.looks) == ("done", 16) and not events(tmp_path / "c", "adapted")
     assert "proposed looks were not followed" in outcome.warnings[0]
-
-
-def test_the_time_ends_a_run_before_it_is_over(mounted_rig, tmp_path):
-    """Also one that goes on beyond the end of its plan."""
-    plan = small_plan(3)
-    minutes = plan_minutes(mounted_rig, plan) + 2
-    with Replanning(tmp_path / "c", ahead(), 1e-9, minutes, wait=True) as estimate:
-        run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate)
-        assert run_.engine.run().reason == "time over"
-    record = recorded(read_journal(tmp_path / "c").records)
-    done = plan_minutes(mounted_rig, run_.engine.plan[: record.next_step])
-    assert len(record.spots) > 12 and minutes - 0.1 < done <= minutes and record.unverified == ()
 
 
 def test_a_resumed_run_has_the_plan_of_the_interrupted_one(mounted_rig, tmp_path):

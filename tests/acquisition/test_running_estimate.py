@@ -9,7 +9,7 @@ import os
 import pytest
 from msgspec import structs
 from support.bench_runs import Run, small_plan
-from support.fits_beside import endless, killed, two_directions, waiting
+from support.fits_beside import killed, two_directions, waiting
 from support.small_results import small_summary
 
 from tvsbayes.acquisition import running_estimate
@@ -51,14 +51,6 @@ def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, enabled, show
     )
     assert (outcome.reason, outcome.looks) == ("done", 16)
     assert texts[-1] == ("left 0.0600(10), right 0.0600(10)" if shown else "")
-
-
-def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(mounted_rig, tmp_path):
-    with RunningEstimate(tmp_path / "c", endless, 1.0, {"left"}) as estimate:
-        assert Run(mounted_rig, tmp_path / "c", small_plan(5), estimate=estimate).engine.run().reason == "done"
-        (child,) = multiprocessing.active_children()
-        assert child.is_alive() and estimate.latest is None
-    assert child.exitcode is not None
 
 
 def test_fits_share_a_process_and_another_takes_over_from_one_that_was_killed(tmp_path):

@@ -107,19 +107,3 @@ def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
     positioner.move_to(0, 0)
     # What is left is the home offset.
     assert abs(instrument.state_deg().mirror_angles_deg[0]) < 5 * p["home_sd_deg.pan"]
-
-
-def test_camera_that_looks_on_does_not_change_the_motion(mounted_rig):
-    """The way from the home switch follows the mean ratio, whatever a camera's thread requests meanwhile."""
-    ends = []
-    for watched in (False, True):
-        instrument = Instrument(mounted_rig, 5)
-        positioner = instrument.positioner()
-        positioner.home()
-        if watched:
-            instrument.light()
-        positioner.move_to(0, 0)
-        ends.append(instrument.state_deg())
-    assert ends[0] == ends[1]
-    p = instrument.truth.parameters
-    assert abs(p["degrees_per_step.left"] - p["degrees_per_step.pan"]) > 1e-6, "else nothing is shown"

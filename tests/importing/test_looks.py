@@ -21,7 +21,8 @@ from tvsbayes.instrument.campaign import MOVES, PIXEL_SDS, PIXELS, SPOTS, Move, 
 NAMES = {
     ("pan_steps", "tilt_steps"): (
         "Horizontal|Vertikal, Schritte Schwenk|Schritte Neigung, Azimut|H\u00f6he, "
-        "Schwenken [Schritte]|Neigen [Schritte], pasos horizontal|pasos vertical, acimut|elevaci\u00f3n, giro|inclinaci\u00f3n, pas horizontale|pas verticale, "
+        "Schwenken [Schritte]|Neigen [Schritte], pasos horizontal|pasos vertical, "
+        "acimut|elevaci\u00f3n, giro|inclinaci\u00f3n, pas horizontale|pas verticale, "
         "azimut|inclinaison, steps pan|TiltCount"
     ),
     tuple(PIXELS): (
