@@ -6,7 +6,7 @@ import pytest
 
 from tvsbayes.errors import InputError, Question
 from tvsbayes.importing.cells import FieldCells
-from tvsbayes.importing.clock import date_time, forward, over_midnight, seconds_of, stamp_of, time_of_day
+from tvsbayes.importing.clock import date_time, seconds_of, stamp_of, time_of_day
 from tvsbayes.importing.table import table_of
 
 
@@ -64,11 +64,6 @@ def test_seconds_of_a_column(texts, expected, said):
     assert found == pytest.approx(expected, abs=1e-9) and said in text and bool(said) == bool(text)
 
 
-def test_units_of_time_are_those_of_the_name():
-    assert seconds("60310.5", "60311.5", name="MJD")[0] == pytest.approx([0.0, 86400.0])
-    assert seconds("3", "4", name="t (ms)")[0] == pytest.approx([0.003, 0.004])
-
-
 def test_the_end_of_summer_time_is_an_hour_less_the_usual_step():
     local = tuple(f"2026-10-25T02:{clock}" for clock in ("56:30", "58:00", "59:00", "00:00", "01:00"))
     found, said = seconds(*local)
@@ -83,15 +78,6 @@ def test_the_end_of_summer_time_is_an_hour_less_the_usual_step():
     ):
         with pytest.raises(Question, match="step back by"):
             seconds(*others)
-
-
-def test_one_clock_of_several_series_goes_on_by_what_it_lost():
-    """A series that is logged seldom does not hide the step of another; equal times are none."""
-    times = [0.0, 1.0, 1.0, 10.0, 11.0, 11.0, 5.0, 6.0, 6.0]
-    found, (back,) = forward(times, "abc" * 3)
-    assert found == [0.0, 1.0, 1.0, 10.0, 11.0, 11.0, 20.0, 21.0, 21.0]
-    assert (back.row, back.back_s, back.added_s) == (6, 5.0, 15.0)
-    assert over_midnight([86399.0, 1.0, 0.0, 2.0]) == [86399.0, 86401.0, 86400.0, 86402.0] and over_midnight([]) == []
 
 
 @pytest.mark.parametrize("cell", ["tomorrow", "9" * 400, "nan"])

@@ -29,12 +29,6 @@ def test_absolute_encoders_of_a_head(ask, say, tmp_path, night, kind, absolute, 
     assert say("check", tmp_path / "head")[0] == 0
 
 
-def test_encoders_are_incremental_unless_stated_and_that_is_said(ask, tmp_path, night):
-    code, document = ask("import", night, "--sightings", "--to", tmp_path / "head", "--yes")
-    assert code == 0 and any("--encoders output" in text for text in document["assumed"])
-    assert tuple(read_campaign(tmp_path / "head").rig.absolute) == ()
-
-
 def test_counters_have_no_encoders(ask, tmp_path):
     rows = "".join(f"{round(100 * a)},{round(100 * e)},{a},{e}\n" for a, e in ANGLES)
     (tmp_path / "log.csv").write_text(f"pan steps,tilt steps,az (deg),el (deg)\n{rows}")

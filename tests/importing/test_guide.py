@@ -11,11 +11,9 @@ from importing.samples import MAXIM_PX_PER_ARCSEC, MAXIM_PX_PER_S, maxim_log, ma
 from tvsbayes.errors import InputError, Question
 from tvsbayes.importing.guide import (
     SIDEREAL_ARCSEC_PER_S,
-    is_guide_log,
     periodic_error_rows,
     read_runs,
     rows_of_run,
-    run_rows,
 )
 from tvsbayes.importing.table import table_of
 
@@ -83,25 +81,6 @@ def test_the_uncorrected_motion_is_that_of_the_mount(ends):
     assert any("1 frame with a saturated star" in text for text in series.notes)
 
 
-def test_a_rate_at_the_declination_of_the_run_is_recognised():
-    """Later versions of the guider scale it, and state the rate at the equator beside it."""
-    scaled = RATE_PX * PIXEL / COSINE
-    norm = f'Norm rates RA = {scaled:.1f}"/s @ dec 0, Dec = 7.3"/s; ortho.err. = 8.7 deg\n'
-    (run,) = read_runs(night(pulse_rate=scaled, norm=norm), "log.txt")
-    series = rows_of_run(run, [], "log.txt", {})
-    times, motion = motions(series)
-    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
-    assert any("at the run's declination" in text and "guide speed: 6.1, -22 %" in text for text in series.assumed)
-
-
-def test_stated_values_replace_those_of_the_log():
-    (run,) = read_runs(night(pulse_rate=9.0), "log.txt")
-    times, motion = motions(rows_of_run(run, [], "log.txt", {"pulse_arcsec_per_s": 9.0}))
-    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
-    wrong = motions(rows_of_run(run, [], "log.txt", {"pulse_arcsec_per_s": 9.0, "declination_deg": 0.0}))[1]
-    assert np.abs(wrong - motion).max() > 0.1
-
-
 SETTLING = "INFO: SETTLING STATE CHANGE, Settling {}"
 EVENTS = {
     0: [SETTLING.format("started")],
@@ -135,19 +114,6 @@ def test_dithers_settling_drops_and_pauses_are_left_out_and_split_the_series():
     assert all(begins[r["move"]] <= r["time_s"] for r in series.readings)
 
 
-def test_several_runs_calibrations_and_empty_logs():
-    """Headers repeat, runs without frames are skipped, calibration steps are no frames."""
-    empty = HEADER.format(norm="") + "Guiding Ends at 2026-01-02 20:00:00\n"
-    calibration = "Calibration Begins at 2026-01-02 20:30:00\nDirection,Step,dx,dy,x,y,Dist\nWest,0,0,0,1,2,0\n"
-    log = "PHD2 version 2.6.14 [Windows], Log version 2.5.\n" + empty + calibration + night(50) + "\n" + night(20)[:-80]
-    assert is_guide_log(log)
-    runs = read_runs(log, "log.txt")
-    assert [(row["run"], row["frames"], row["pier"]) for row in run_rows(runs)] == [(1, 50, "West"), (2, 19, "West")]
-    series = [rows_of_run(run, [], "log.txt", {}) for run in runs]
-    assert "1 calibration step" in series[0].notes[0] and "period_between" not in series[0].axis
-    assert any("may be cut off" in text for text in series[1].notes)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message", "remedy"),
     [
@@ -165,22 +131,6 @@ def test_values_missing_in_the_log_are_asked_for(old, new, message, remedy):
         rows_of_run(run, [], "log.txt", {})
     said = refused.value
     assert remedy in (said.asked_by(()) if isinstance(said, Question) else said).remedy
-
-
-def test_a_run_without_pulses_needs_no_rate():
-    """The guiding assistant watches a mount that nobody corrects; it may not even be calibrated."""
-    log = "\n".join(
-        [
-            *HEADER.format(norm="").replace(f"xAngle = 1.0, xRate = {RATE_PX}", "not calibrated").splitlines(),
-            *(
-                f'{k},{3 * k},"Mount",0,0,{motion_of(3 * k) * COSINE / PIXEL:.4f},0,0,0,0,,0,,,,900,30,0'
-                for k in range(1, 99)
-            ),
-        ]
-    )
-    (run,) = read_runs(log, "log.txt")
-    times, motion = motions(rows_of_run(run, [], "log.txt", {}))
-    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
 
 
 def test_adaptive_optics_have_a_rate_of_their_own_and_hide_the_axis():
@@ -201,14 +151,6 @@ def test_a_periodic_error_in_no_angle_is_refused(head, words):
     table = table_of("pe.csv", "CSV", rows, range(1, 10))
     with pytest.raises(InputError, match=rf"in column {words}"):
         periodic_error_rows(table, "", {})
-
-
-def test_days_of_the_julian_calendar_are_days():
-    rows = {"MJD": [f"{60310 + k / 86400:.9f}" for k in range(9)], "PE": [f"{k % 4}.5" for k in range(9)]}
-    table = table_of("pe.csv", "CSV", rows, range(1, 10))
-    times = [reading["time_s"] for reading in periodic_error_rows(table, "", {}).readings]
-    # Days are written to 1e-9, 0.1 ms.
-    assert np.diff(times) == pytest.approx(np.ones(8), abs=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -93,12 +93,6 @@ def workbook(sheet: str) -> bytes:
     return output.getvalue()
 
 
-def test_a_stated_size_of_a_sheet_is_not_trusted(tmp_path):
-    cell = '<sheetData><row r="1"><c r="A1"><v>1</v></c></row></sheetData>'
-    table = written(tmp_path / "t.xlsx", workbook(f'<dimension ref="A1:XFD1048576"/>{cell}'))
-    assert table.columns == {"column 1": ("1",)}
-
-
 LAST = '<sheetData><row r="1048576"><c r="A1048576"><v>1</v></c></row></sheetData>'
 """One cell in the last row that there can be."""
 

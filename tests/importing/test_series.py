@@ -91,15 +91,6 @@ def test_a_log_of_klipper(packed):
     assert angles == pytest.approx([step * 360 / 3200 for step in steps], abs=1e-6)
 
 
-def test_what_angle_calibrate_saves():
-    text = b"[stepper_x]\nmicrosteps: 16\n#*# [angle my_sensor]\n#*# calibrate = \n"
-    text += b"#*# \t100.5,427.5,755.0,\n#*# \t1083.0\n"
-    assert is_klipper(text)
-    table = klipper_table(text, "printer.cfg")
-    assert table.columns["full steps"] == ("0", "1", "2", "3") and "holds no play" in table.kind
-    assert float(table.columns["angle (deg)"][1]) == pytest.approx(427.5 * 360 / 65536, rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("data", "message"),
     [
@@ -122,19 +113,6 @@ def test_what_angle_calibrate_saves():
 def test_broken_logs_of_klipper_are_refused(data, message):
     with pytest.raises(InputError, match=message):
         klipper_table(data, "log")
-
-
-@pytest.mark.parametrize("dwell_s", [1.5, 10.0])
-def test_a_command_logged_once_a_move_is_held_until_the_next(dwell_s):
-    """The axis is read in the middle of its dwell, where interpolation would put the command halfway to the next."""
-    rows = [(k, command) for k, command in enumerate([0.0, 10.0, 20.0, 10.0, 0.0, 10.0, 20.0])]
-    lines = [f"m:VAL 2026-03-01 10:00:{dwell_s * k % 60:09.6f} {c}" for k, c in rows if dwell_s * k < 59]
-    reads = [f"m:encoder 2026-03-01 10:00:{dwell_s * (k + 0.6) % 60:09.6f} {0.5 * c + 3}" for k, c in rows]
-    reads = reads[: len(lines) - 1]
-    table = epics_table("\n".join(lines + reads), "log", {})
-    steps, values = ([float(cell) for cell in table.columns[name]] for name in ("m:VAL", "m:encoder"))
-    assert len(steps) == len(reads) and values == pytest.approx([0.5 * step + 3 for step in steps], abs=1e-12)
-    assert "0 commands interpolated" in table.kind
 
 
 @pytest.mark.parametrize(("back_s", "added_s"), [(3580.0, 3600.0), (1.0, 21.0)])
@@ -165,17 +143,6 @@ def test_a_value_on_the_way_is_no_reading_at_the_command():
     assert len(table) == 9 and "9 readings under way left out" in table.kind
 
 
-def test_a_series_in_two_entries_of_an_archive_is_one():
-    def entry(name: str, first: int) -> dict:
-        data = [
-            {"secs": 1_700_000_000 + 5 * k, "val": float(k), "nanos": 0, "severity": 0} for k in range(first, first + 9)
-        ]
-        return {"meta": {"name": name}, "data": data}
-
-    text = json.dumps([entry(name, first) for first in (0, 9) for name in ("m1.VAL", "m1.RBV")])
-    assert len(epics_table(text, "log", {})) == 18
-
-
 def test_all_parts_of_a_packed_log_are_read():
     """Files of gzip that are joined are one; one that unpacks to more than the limit is refused, not cut."""
     messages = [json.dumps(message).encode() + b"\x03" for message in klipper()]
@@ -193,18 +160,3 @@ def test_messages_that_would_expand_are_small():
     messages.append({"q": "angle:a", "params": {"data": [[10.0, 5], [20.0, 7]]}})
     table = klipper_table(b"\x03".join(json.dumps(message).encode() for message in messages), "log")
     assert [float(cell) for cell in table.columns["steps"]] == pytest.approx([10_000_000, 19_999_999], abs=2)
-
-
-def test_values_on_the_way_are_no_readings_of_a_stop():
-    """A monitor posts each change; the last value before the next command is that of the stop."""
-    rows = [line("m.VAL", 0, 0.0), line("m.enc", 1, 0.01)]
-    for move in range(1, 6):
-        rows.append(line("m.VAL", 20 * move, 5.0 * move))
-        way = [5.0 * (move - 1) + part for part in range(1, 6)]
-        rows += [line("m.enc", 20 * move + 0.5 * k, at + 0.01) for k, at in enumerate(way, start=1)]
-    table = epics_table("\n".join(rows), "log.txt", {})
-    assert [float(cell) for cell in table.columns["m.enc"]] == pytest.approx(
-        [5.0 * k + 0.01 for k in range(6)], abs=1e-9
-    )
-    cut = epics_table("\n".join(rows[:-2]), "log.txt", {})
-    assert float(cut.columns["m.enc"][-1]) == pytest.approx(20.01, abs=1e-9)

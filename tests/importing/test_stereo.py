@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from tvsbayes.cameras.calibration_export import exported
 from tvsbayes.cameras.imported_calibration import read_calibration
 from tvsbayes.errors import InputError
 from tvsbayes.importing.stereo_trees import read_trees
-from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, stereo_bytes
+from tvsbayes.instrument.stereo_pair import Stereo, stereo_bytes
 
 
 def close(pair: Stereo, stereo: Stereo, rotation_atol: float = 1e-12) -> None:
@@ -37,17 +35,6 @@ def test_exported_files_are_imported_again(mounted, tmp_path, form, backwards):
     assert result.stereo.assumed_from == with_assumed_covariance(result.stereo, Provenance(), way).assumed_from
     assert any(result.stereo.assumed_from in note for note in result.notes)
     assert result.stereo.assumed and b'"assumed": true' in stereo_bytes(result.stereo)
-
-
-def test_ros_export_is_in_metres(mounted):
-    """P[0][3] of the right camera is -fx x baseline in metres, 0 in the left one."""
-    files = exported(mounted, "ros")
-    left, right = (
-        np.array(read_trees(files[name], name)[0].table("projection_matrix").values["data"]).reshape(3, 4)
-        for name in ("left.yaml", "right.yaml")
-    )
-    assert left[0, 3] == 0
-    assert abs(-right[0, 3] / right[0, 0] - np.linalg.norm(mounted.T) / 1000) < 1e-12
 
 
 def test_opencv_reads_exported_files(mounted, tmp_path):
@@ -77,49 +64,6 @@ def test_files_written_by_opencv_are_read(mounted, tmp_path, header):
     with pytest.raises(InputError, match="--image-size"):
         read_calibration([path])
     close(read_calibration([path], (1280, 720)).stereo, mounted)
-
-
-def test_millimetres_taken_for_metres_are_doubted(mounted, tmp_path):
-    """85 mm would be 85 m: no board determines such a pair, and the refusal says why."""
-    paths = written(tmp_path, exported(mounted, "opencv"))
-    with pytest.raises(InputError, match="was it in mm before it was taken for metres"):
-        read_calibration(paths, unit_mm=1000.0)
-    (warning,) = read_calibration(paths, unit_mm=150.0).warnings
-    assert "is 12.8 m long" in warning
-
-
-def test_cameras_on_the_wrong_sides_are_named(mounted, tmp_path):
-    """In every format: the pair is valid, but every depth would be negative."""
-    swapped = replace(mounted, R=mounted.R.T, T=-mounted.R.T @ mounted.T)
-    folders = {
-        "opencv": exported(swapped, "opencv"),
-        "tvsbayes": {"stereo.json": stereo_bytes(swapped)},
-    }
-    for source, files in folders.items():
-        result = read_calibration(written(tmp_path, files))
-        assert result.source == source and result.stereo.T[0] > 0
-        assert ["swapped" in warning for warning in result.warnings] == [True], source
-
-
-def test_an_image_size_of_other_pictures_is_named(mounted, tmp_path):
-    """OpenCV's files state no size; the shipped pair has 1280 x 720 px and its principal points near the middle."""
-    files = {name: data.replace(b"image_", b"other_") for name, data in exported(mounted, "opencv").items()}
-    paths = written(tmp_path, files)
-    assert read_calibration(paths, (1280, 720)).warnings == ()
-    for size, word in (((720, 1280), "far from the middle"), ((640, 360), "outside the image")):
-        warnings = read_calibration(paths, size).warnings
-        assert len(warnings) == 2 and all(word in w and "is that its size?" in w for w in warnings), warnings
-        assert ["left" in w for w in warnings] == [True, False]
-
-
-def test_the_bounds_of_a_plausible_principal_point(mounted):
-    """At most a quarter of the width from the middle, (1280 - 1) / 2 px; 5 % for fx / fy."""
-    for shift_px, doubts in ((319.0, 0), (321.0, 1), (-319.0, 0), (-321.0, 1)):
-        matrix = np.array([[800.0, 0, 639.5 + shift_px], [0, 800.0, 359.5], [0, 0, 1]])
-        assert len(pair_doubts(replace(mounted, M2=matrix))) == doubts, shift_px
-    for ratio, doubts in ((1.04, 0), (1.06, 1)):
-        matrix = np.array([[800.0 * ratio, 0, 639.5], [0, 800.0, 359.5], [0, 0, 1]])
-        assert len(pair_doubts(replace(mounted, M1=matrix))) == doubts, ratio
 
 
 def test_native_calibration_keeps_its_covariance(mounted, tmp_path):

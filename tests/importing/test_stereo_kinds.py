@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import scipy.io
-import yaml
-from support.calibration_files import FOREIGN, listed, plain, read_json, written
+from support.calibration_files import listed, plain, read_json, written
 
 from tvsbayes.cameras.calibration_export import exported
 from tvsbayes.cameras.imported_calibration import read_calibration
@@ -23,7 +22,6 @@ from tvsbayes.importing.stereo_trees import read_trees
 from tvsbayes.instrument.stereo_pair import (
     Stereo,
     project_pair,
-    rotation_vector,
     triangulate,
 )
 
@@ -32,26 +30,6 @@ def same(pair: Stereo, stereo: Stereo) -> None:
     np.testing.assert_allclose(pair.vector, stereo.vector, rtol=1e-9, atol=1e-9)
     assert (pair.image_width, pair.image_height) == (stereo.image_width, stereo.image_height)
     assert pair.assumed and pair.assumed_from
-
-
-def test_a_fisheye_is_fitted_or_refused_and_its_renaming_is_reported():
-    result = read_calibration([FOREIGN / "fisheye_advice" / "fisheye.yaml"])
-    (note,) = (n for n in result.notes if "cam0.distortion_coeffs of fisheye.yaml" in n)
-    assert "a fisheye lens, fitted to five coefficients within" in note
-    followed = read_calibration([FOREIGN / "fisheye_advice" / "followed.yaml"])
-    assert sum("fisheye (equidistant) model under another name" in w for w in followed.warnings) == 2
-    # OpenCV's own projections agree within the stated error, plus the grid's coarseness.
-    stereo, coefficients = result.stereo, np.array([0.03, -0.02, 0.03, -0.01])
-    assert result.source == "kalibr"
-    np.testing.assert_allclose(stereo.T, [-118.6, 0.4, 1.9], atol=1e-9)
-    rays = np.random.default_rng(1).uniform(-0.35, 0.35, (50, 2))
-    points = np.column_stack([rays, np.ones(50)]).reshape(-1, 1, 3)
-    still = np.zeros(3)
-    theirs = cv2.fisheye.projectPoints(points, still, still, stereo.M1, coefficients)[0].reshape(-1, 2)
-    ours = cv2.projectPoints(points, still, still, stereo.M1, stereo.D1)[0].reshape(-1, 2)
-    assert np.abs(theirs - ours).max() < 0.01
-    wide = np.array([[240.0, 0, 320], [0, 240, 240], [0, 0, 1]])
-    assert fitted_to_five(wide, coefficients, (640, 480), "fisheye").error_px > 0.1
 
 
 @pytest.mark.parametrize(
@@ -93,100 +71,6 @@ def test_every_container(mounted, tmp_path):
         same(read_calibration([tmp_path / file]).stereo, mounted)
 
 
-def test_tables_of_cameras(mounted, tmp_path):
-    """R and T in a table of their own, or as vectors at the top."""
-    size, turn = [mounted.image_width, mounted.image_height], rotation_vector(mounted.R).tolist()
-    left, right = (
-        {"camera_matrix": matrix.tolist(), "dist_coeffs": distortion.tolist(), "resolution": size}
-        for matrix, distortion in ((mounted.M1, mounted.D1), (mounted.M2, mounted.D2))
-    )
-    between = {"R": mounted.R.tolist(), "T": mounted.T.tolist()}
-    same(read_json(tmp_path, {"left": left, "right": right, "extrinsics": between}).stereo, mounted)
-    columns = {"rvec": turn, "tvec": mounted.T[:, None].tolist()}
-    same(read_json(tmp_path, {"cam1": left, "cam2": right, **columns}).stereo, mounted)
-
-
-ROS2 = """header:
-  stamp:
-    sec: 1
-    nanosec: 5
-  frame_id: {side}
-height: {height}
-width: {width}
-distortion_model: {model}
-d:
-{d}
-k:
-{k}
-r:
-{r}
-p:
-{p}
-binning_x: 0
-roi:
-  x_offset: 0
-  height: 0
-  width: 0
-  do_rectify: false
----
-"""
-
-
-def test_messages_of_ros_2_and_old_orb_slam_settings(mounted, tmp_path):
-    """`ros2 topic echo`: small letters, lists in lines, a separator at the end; LEFT.K ... with P in metres."""
-    size = mounted.image_width, mounted.image_height
-    pair = mounted.M1, mounted.D1, mounted.M2, mounted.D2
-    r1, r2, p1, p2, *_ = map(
-        np.array, cv2.stereoRectify(*pair, size, mounted.R, mounted.T[:, None] / 1000, alpha=0)[:4]
-    )
-    paths, slam = [], ["%YAML:1.0"]
-    for side, (k, d, r, p) in {"left": (*pair[:2], r1, p1), "right": (*pair[2:], r2, p2)}.items():
-        # As drivers of five coefficients publish it: the rational model's name, a tail of zeros.
-        lines = {
-            name: "\n".join(f"- {value!r}" for value in map(float, a.ravel()))
-            for name, a in {"d": np.append(d, [0, 0, 0]), "k": k, "r": r, "p": p}.items()
-        }
-        text = ROS2.format(side=side, width=size[0], height=size[1], model="rational_polynomial", **lines)
-        (tmp_path / f"{side}.yaml").write_text(text)
-        paths.append(tmp_path / f"{side}.yaml")
-        slam += [f"{side.upper()}.width: {size[0]}", f"{side.upper()}.height: {size[1]}"]
-        for name, value in {"K": k, "D": d[None], "R": r, "P": p}.items():
-            data = ", ".join(map(repr, map(float, value.ravel())))
-            slam += [
-                f"{side.upper()}.{name}: !!opencv-matrix",
-                f"   rows: {len(value)}",
-                f"   cols: {value.shape[1]}",
-                "   dt: d",
-                f"   data: [{data}]",
-            ]
-    result = read_calibration(paths)
-    same(result.stereo, mounted)
-    assert result.source == "ros" and "each camera by itself" in result.stereo.assumed_from
-    (tmp_path / "EuRoC.yaml").write_text("\n".join([*slam, "Camera.fx: 435.2", "Camera.bf: 47.9"]))
-    with pytest.raises(InputError, match="--import-unit m "):
-        read_calibration([tmp_path / "EuRoC.yaml"])
-    same(read_calibration([tmp_path / "EuRoC.yaml"], unit_mm=1000.0).stereo, mounted)
-
-
-def test_matlab_structures(mounted, tmp_path):
-    """Transposed intrinsics and rotation, rows before columns in the image size, pixels counted from 1."""
-    cameras = [
-        {
-            "IntrinsicMatrix": (m + np.outer([1, 1, 0], [0, 0, 1])).T,
-            "RadialDistortion": d[[0, 1, 4]],
-            "TangentialDistortion": d[2:4],
-            "ImageSize": [mounted.image_height, mounted.image_width],
-        }
-        for m, d in ((mounted.M1, mounted.D1), (mounted.M2, mounted.D2))
-    ]
-    document = {"CameraParameters1": cameras[0], "CameraParameters2": cameras[1], "RotationOfCamera2": mounted.R.T}
-    scipy.io.savemat(tmp_path / "s.mat", {"stereoParams": {**document, "TranslationOfCamera2": mounted.T}})
-    result = read_calibration([tmp_path / "s.mat"])
-    same(result.stereo, mounted)
-    assert result.source == "matlab" and any("rows, columns" in note for note in result.notes)
-    assert any("MATLAB counts pixels from 1" in note for note in result.notes)
-
-
 def test_one_file_per_camera_and_a_common_one(mounted, tmp_path):
     """In any order: file names give the cameras; R and T are in the third file or in the right camera's."""
     size = {"image_width": mounted.image_width, "image_height": mounted.image_height}
@@ -224,32 +108,6 @@ def test_a_rectified_pair_alone(mounted, tmp_path):
     files["extrinsics.yml"] = files["extrinsics.yml"].replace(b"\nR:", b"\nx:").replace(b"\nT:", b"\ny:")
     stereo = read_calibration(written(tmp_path, files)).stereo
     np.testing.assert_allclose(triangulate(stereo, project_pair(mounted, points)), points, atol=1e-6)
-
-
-def test_rational_models(mounted, tmp_path):
-    """A zero tail is plumb bob; a small one is fitted and reported; a large one is refused by its error."""
-    document = listed(mounted) | {"distortion_model": "rational_polynomial"}
-
-    def with_tail(*tail: float):
-        return read_json(tmp_path, {**document, "D1": [*mounted.D1.tolist(), *tail]})
-
-    def fitted(result) -> bool:
-        return any("fitted to five coefficients within" in note for note in result.notes)
-
-    plumb_bob = with_tail(0.0, 0.0, 0.0)
-    same(plumb_bob.stereo, mounted)
-    assert not fitted(plumb_bob) and fitted(with_tail(1e-4, 0.0, 0.0))
-    with pytest.raises(InputError, match=r"D1: found a lens of 8 coefficients, which five coefficients miss by"):
-        with_tail(0.5, 0.3, 0.2)
-
-
-def test_messages_of_both_cameras_in_one_paste(mounted, tmp_path):
-    """Messages that differ in the header alone count once; a line of dashes at the end is none."""
-    texts = [exported(mounted, "ros")[f"{side}.yaml"].decode() for side in ("left", "right")]
-    path = tmp_path / "pasted.txt"
-    path.write_text("".join(f"header: {{seq: {k}}}\n{text}---\n" for k, text in enumerate(2 * texts)))
-    result = read_calibration([path])
-    assert result.source == "ros" and np.abs(result.stereo.vector - mounted.vector).max() < 1e-9
 
 
 def test_a_fisheye_of_orb_slam_and_a_rectified_pair_by_its_baseline(tmp_path):
@@ -290,27 +148,6 @@ def test_two_picture_sizes_of_one_proportion(mounted, tmp_path):
     document["right"]["size"] = [1920, 1200]
     with pytest.raises(InputError, match="two sizes: 1280 x 720 and 1920 x 1200"):
         read_json(tmp_path, document)
-
-
-def test_yaml_dumps_of_python_are_read(mounted, tmp_path):
-    """A list shared by two tables is an alias, a tuple has a tag; arrays of NumPy are refused with a remedy."""
-    good = listed(mounted)
-    document = {"left": {"K": good["M1"], "D": good["D1"], "size": good["image_size"]}, "R": good["R"], "T": good["T"]}
-    document["right"] = {"K": good["M2"], "D": tuple(good["D2"]), "size": good["image_size"]}
-    path = tmp_path / "dump.yaml"
-    path.write_text(yaml.dump(document))
-    assert "&id001" in path.read_text() and "!!python/tuple" in path.read_text()
-    same(read_calibration([path]).stereo, mounted)
-    path.write_text(yaml.dump({"M1": mounted.M1}))
-    with pytest.raises(InputError, match="save lists"):
-        read_calibration([path])
-
-
-@pytest.mark.parametrize("key", ("ret", "retStereo", "mean_reprojection_error", "metadata.error"))
-def test_an_rms_is_read_under_its_common_names(mounted, tmp_path, key):
-    *table, name = key.split(".")
-    document = listed(mounted) | ({table[0]: {name: 0.77}} if table else {name: 0.77})
-    assert "RMS 0.77 px (of the file)" in read_json(tmp_path, document).stereo.assumed_from
 
 
 def test_missing_names_are_given_by_the_user(mounted, tmp_path):

@@ -180,16 +180,6 @@ def test_the_same_pair_in_the_files_of_every_program(names):
     assert {"M1", "M2", "R", "T"} <= set(pair.places)
 
 
-@pytest.mark.parametrize("name", ("kalibr_results/results-cam.txt", "ost_ini/ost.txt"))
-def test_texts_of_few_digits(name):
-    """Both print six to eight decimals: R to 1e-6, T to 1e-3 mm."""
-    pair = foreign_pair(read_files([FOREIGN / name]), SMALL, None, {})
-    good = foreign_pair(read_files([FOREIGN / "kalibr_chain" / "camchain.yaml"]), None, None, {})
-    for field, tolerance in {"M1": 1e-9, "D1": 1e-9, "M2": 1e-9, "D2": 1e-9, "R": 1e-6, "T": 1e-3}.items():
-        np.testing.assert_allclose(pair.values[field], good.values[field], atol=tolerance)
-    assert pair.made["fixed_intrinsics"] is ("ost" in name)
-
-
 NEW = {
     "a camera of Metashape without a pose": ("metashape/cameras.xml", "transform>", "reference>", "two cameras"),
     "skew of Metashape": ("metashape/cameras.xml", "<b1>", "<b2>1</b2><b1>", "b2, k4"),
@@ -214,13 +204,3 @@ def test_broken_files_of_other_programs_name_what_is_wrong(tmp_path, kind):
     size = SMALL if "kalibr" in name else None
     with pytest.raises(InputError, match=word):
         foreign_pair(read_files(files), size, 1000.0, {})
-
-
-def test_a_scale_of_metashape_is_metres(tmp_path):
-    text = (FOREIGN / "metashape" / "cameras.xml").read_text()
-    path = tmp_path / "c.xml"
-    path.write_text(text.replace('<scale locked="true">1</scale>', "<scale>0.5</scale>"))
-    assert foreign_pair(read_files([path]), None, None, {}).values["T"][0] == pytest.approx(-59.3)
-    path.write_text(text)
-    with pytest.raises(InputError, match="in a unit of the project"):
-        foreign_pair(read_files([path]), None, None, {})
