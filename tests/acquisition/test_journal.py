@@ -211,6 +211,15 @@ def test_disk_error_at_every_call_stops_cleanly_and_loses_nothing(tmp_path, numb
     assert at > 30, "the whole sequence was walked through"
 
 
+def test_short_writes_are_completed(tmp_path):
+    class Dribble(Disk):
+        def write(self, descriptor, data):
+            return super().write(descriptor, data[:7])
+
+    write_looks(tmp_path, 1, Dribble())
+    assert verify(tmp_path).records == 4
+
+
 @pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
 def test_the_folder_of_the_first_frame_is_durable_before_an_event_names_it(tmp_path):
     """It is made with that frame: its own name has to be flushed too, behind the frame's and before the line."""

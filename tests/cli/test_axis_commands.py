@@ -53,16 +53,6 @@ def test_fit_and_commands_that_use_it(ask, say, folder, tmp_path):
     assert "Calibration of an axis" in page and "data:image/svg+xml" in page
 
 
-@pytest.mark.thorough
-def test_held_out_positions(ask, folder):
-    code, document = ask("compare", folder, "--by", "positions")
-    held = document["hold_out"]
-    assert code == 0 and held["by"] == "positions" and held["rms_z"] > 0
-    assert {"position", "direction", "n", "mean", "predicted", "u"} <= set(held["positions"][0])
-    inner = [p for p in held["positions"] if abs(p["position"]) < 2300]
-    assert len(inner) == 14 and all(p["n"] == 2 for p in inner)
-
-
 def test_simulate_and_new(ask, folder, tmp_path):
     code, document = ask("simulate", folder, tmp_path / "again", "--seed", "3")
     assert code == 0 and document["readings"] == 33 and (tmp_path / "again" / "truth.json").exists()

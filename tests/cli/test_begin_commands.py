@@ -83,34 +83,6 @@ def test_moves_beside_the_pictures_are_copied(ask, two_looks, tmp_path):
     assert (tmp_path / "mine" / "moves.csv").read_bytes() == moves_bytes(campaign.moves)
 
 
-def test_without_moves_their_counters_are_asked_for(ask, say, tmp_path):
-    drawn(tmp_path / "pictures", *pairs("1", "2", "3"), "left4.png")
-    out = tmp_path / "mine"
-    code, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
-    assert code == 0 and "fill in moves.csv: pan_steps and tilt_steps of all 4 rows" in text
-    assert (
-        "spot 0, seen after move 1\n" in text
-        and "moves, which count from 0: where yours count from 1" in text
-        and "not paired: moves 0: no pictures" in text
-    )
-    assert "not paired: left4.png: without the picture of the other camera" in text
-    shutil.copy(MOUNTED / "stereo.json", out)
-    code, document = ask("check", out)
-    error = assert_error(document, "integer")
-    assert (code, error["file"], error["line"], error["column"]) == (2, "moves.csv", 2, "pan_steps")
-    code, document = ask("new", tmp_path / "other", "--pictures", tmp_path / "pictures", "--pair", "name")
-    assert code == 2 and "number, order" in assert_error(document, "usage")["message"]
-
-
-def test_printed_commands_can_be_run_unchanged(say, tmp_path):
-    """The folder's name with blank, quote and dollar is one word of the shell."""
-    drawn(tmp_path / "pictures", *pairs("0"))
-    out = tmp_path / "Anna's $laser 2"
-    _, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
-    commands = re.findall(r"`(tvsbayes (?:detect|check) .*?)`", text)
-    assert [shlex.split(each) for each in commands] == [["tvsbayes", each, str(out)] for each in ("detect", "check")]
-
-
 def test_a_question_has_the_commands_that_answer_it(ask, say, tmp_path):
     """Two folders without a word of a camera: the command of each answer runs as it is printed."""
     for name in ("A", "B"):
@@ -133,13 +105,3 @@ def test_renumbered_moves_are_reported(say, tmp_path):
     drawn(tmp_path / "pictures", *pairs("0930", "1015"))
     code, text, _ = say("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")
     assert code == 0 and "930 to 1015, are too sparse for moves: these are renumbered in order" in text
-
-
-def test_pictures_need_a_calibration_of_their_size(ask, tmp_path):
-    drawn(tmp_path / "pictures", *pairs("0"))
-    assert ask("new", tmp_path / "mine")[0] == 0
-    shutil.copy(MOUNTED / "stereo.json", tmp_path / "mine")
-    code, document = ask("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")
-    assert code == 2 and "8 x 6 px" in assert_error(document, "image-size")["message"]
-    assert not (tmp_path / "mine" / "frames").exists()
-    assert ask("new", tmp_path / "mine", "--swap")[0] == 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -43,31 +42,6 @@ def test_check_names_a_file_given_in_place_of_a_rig(ask, say, tmp_path):
         assert code == 2 and words in printed and remedy in printed, printed
 
 
-def test_check_reads_campaign_rig_and_plan(ask, say):
-    code, document = ask("check", PAPER_TWIN)
-    assert code == 0
-    assert document == {
-        "kind": "campaign",
-        "moves": 244,
-        "segments": 1,
-        "spots": 384,
-        "ok_spots": 384,
-        "refused": {},
-        "aperture_readings": 0,
-        "experiments": 96,
-        "findings": [],
-        "warnings": [],
-    }
-    code, document = ask("check", MOUNTED / "rig.toml")
-    assert (code, document["kind"], document["sheets_mm"]["d1"]) == (0, "rig", 175.0)
-    code, document = ask("check", MOUNTED / "paper.csv")
-    assert (code, document["kind"], document["look"], document["home"]) == (0, "plan", 384, 1)
-    code, out, _ = say("check", PAPER_TWIN)
-    assert code == 0
-    assert "\nusable spots                  384\n" in out and "{" not in out
-    assert out.endswith(", 0 warnings\n")
-
-
 def test_upper_case_endings_are_recognised(ask, tmp_path):
     for name, copied in (("rig.toml", "RIG.TOML"), ("stereo.json", "stereo.json"), ("paper.csv", "PAPER.CSV")):
         (tmp_path / copied).write_bytes((MOUNTED / name).read_bytes())
@@ -84,12 +58,6 @@ def test_check_warns_without_failing(ask, say, grid_campaign, tmp_path):
     assert len(document["warnings"]) == 1
     assert "covariance is zero" in document["warnings"][0]
     assert "warning: the stereo covariance is zero" in say("check", tmp_path / "exact")[1]
-
-
-def test_check_distinguishes_folder_and_file(ask, grid_folder, tmp_path):
-    shutil.copytree(grid_folder, tmp_path / "camp.csv")
-    code, document = ask("check", tmp_path / "camp.csv")
-    assert code == 0 and document["spots"] > 0
 
 
 def test_simulate_writes_a_campaign_reproducibly(ask, tmp_path):
@@ -158,26 +126,6 @@ def test_demo_shows_classic_and_joint_beside_the_truth(demonstrated):
         predicted = fit["classic_predicted_deg_per_step"][direction]
         sd = np.hypot(predicted["sd"], result["u_type_a_deg_per_step"])
         assert abs(predicted["value"] - result["mean_deg_per_step"]) < 5 * sd
-
-
-@pytest.mark.thorough
-def test_demo_keeps_campaign_and_results_in_the_given_folder(ask, demonstrated, tmp_path, monkeypatch):
-    out, kept = tmp_path / "kept", []
-
-    def calibrate(campaign, place, *, tier, progress):
-        kept.append((len(campaign.spots), place, tier))
-        return SimpleNamespace(record=demonstrated)
-
-    # A checkout whose twin has results.
-    shipped = tmp_path / "data"
-    shutil.copytree(PAPER_TWIN, shipped / "twins" / "paper_twin")
-    (shipped / "twins" / "paper_twin" / "results").mkdir(exist_ok=True)
-    monkeypatch.setattr(campaign_commands, "shipped_data", lambda: shipped)
-    monkeypatch.setattr(campaign_commands, "calibrate", calibrate)
-    assert ask("demo", out) == (0, demonstrated.document)
-    assert kept == [(384, out / "results", "importance")]
-    assert read_campaign(out).spots == read_campaign(PAPER_TWIN).spots and (out / "truth.json").is_file()
-    assert ask("demo", out)[0] == 2
 
 
 @pytest.mark.thorough

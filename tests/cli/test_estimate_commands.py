@@ -62,12 +62,6 @@ def test_classic_gives_null_for_a_direction_without_experiments(ask, say, tmp_pa
     assert "no experiment" in say("classic", tmp_path / "left")[1]
 
 
-def test_classic_without_a_complete_experiment_has_nothing_to_estimate(ask, grid_folder):
-    code, document = ask("classic", grid_folder)
-    assert code == 3
-    assert set(document) == {"error"}
-
-
 def test_fit_document_has_the_documented_keys_and_files(ask, grid_folder):
     code, document = ask("fit", grid_folder, "--no-sample")
     assert code == 0
@@ -161,16 +155,6 @@ def test_unreliable_weights_fall_back_to_laplace_with_a_warning(ask, say, grid_f
     code, text, _ = say("fit", grid_folder, "--quick")
     assert code == 0 and "not sampled: the weights of importance sampling have Pareto k" in text
     assert "\nverdict: usable with care: the posterior could not be sampled" in text
-
-
-@pytest.mark.thorough
-def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, grid_folder):
-    code, document = ask("fit", grid_folder, "--no-sample", "--per-axis")
-    assert code == 0
-    parameters = document["parameters"]
-    assert parameters["degrees_per_step.left"]["value"] == parameters["degrees_per_step.right"]["value"]
-    contrast = parameters["ratio_contrast_deg_per_step.tilt"]
-    assert (contrast["value"], contrast["sd"], contrast["prior_sd"], contrast["contraction"]) == (0.0, 0.0, 0.0, None)
 
 
 @pytest.mark.thorough
@@ -279,17 +263,6 @@ def test_a_spot_outside_the_lens_model_and_a_duplicate_are_left_out(ask, mounted
     assert document["classic_predicted_deg_per_step"]["up"] is None
     saved = json.loads((tmp_path / "c" / "results" / "fit.json").read_text())
     assert saved["gap"]["up"] is None and saved["gap"]["down"] is not None
-
-
-@pytest.mark.thorough
-def test_looks_at_one_stop_are_nothing_to_estimate(ask, grid_campaign, tmp_path):
-    stop = grid_campaign.moves[grid_campaign.spots[0].move]
-    only = replace(grid_campaign.moves[0], pan_steps=stop.pan_steps, tilt_steps=stop.tilt_steps)
-    campaign = replace(grid_campaign, moves=(only,), spots=tuple(s for s in grid_campaign.spots if s.move == stop.move))
-    repeated = [replace(s, spot=k, move=0, u_left_px=s.u_left_px + 0.02 * k) for k, s in enumerate(campaign.spots * 12)]
-    write_campaign(replace(campaign, spots=tuple(repeated)), tmp_path / "c")
-    code, document = ask("fit", tmp_path / "c", "--no-sample")
-    assert (code, document["error"]["code"]) == (3, "uninformed")
 
 
 def test_all_fixed_is_nothing_to_estimate(ask, grid_campaign, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import io
-import math
 import os
 import shlex
 import shutil
@@ -17,7 +16,6 @@ from support.commands import MOUNTED, assert_error
 from tvsbayes.cli import axis_import
 from tvsbayes.cli.import_command import AXIS, KINDS_OF, import_
 from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign, write_campaign
-from tvsbayes.instrument.rig import read_rig
 
 UNIT = Path(__file__).parents[1] / "head" / "unit.urdf"
 TABLE = "Nr;Pan;Tilt;XL;YL;XR;YR;Blatt\n1;0;0;640,5;360,25;500;360;nah\n2;200;0;700,5;360,25;560;360;nah\n"
@@ -108,17 +106,6 @@ def test_a_campaign_is_copied_only_with_a_correction(ask, say, grid_folder, tmp_
     assert code == 0 and "nothing written" in text and not (tmp_path / "x").exists()
 
 
-def test_a_table_gets_the_other_sign(ask, table, tmp_path):
-    """The approach is kept because it names the direction of the beam."""
-    out = tmp_path / "mine"
-    code, document = ask("import", table, "--to", out, "--flip", "pan_steps", "--pan-approach", "right", "--yes")
-    assert code == 0 and "other sign" in document["assumed"][-1]
-    shutil.copy(MOUNTED / "stereo.json", out)
-    first, second = read_campaign(out).moves
-    assert (first.pan_approach, first.pan_steps, second.pan_steps) == ("right", 0, -200)
-    assert ask("import", table, "--to", out / "2", "--flip", "pan", "--yes")[0] == 2
-
-
 def test_looks_go_to_the_moves_of_a_campaign(ask, grid_campaign, tmp_path):
     out, table = tmp_path / "mine", tmp_path / "t.csv"
     assert ask("new", out)[0] == 0
@@ -127,13 +114,6 @@ def test_looks_go_to_the_moves_of_a_campaign(ask, grid_campaign, tmp_path):
     code, document = ask("import", table, "--to", out, "--yes")
     assert (code, document["moves"], document["spots"]) == (0, None, 1)
     assert (out / "moves.csv").read_bytes() == moves_bytes(grid_campaign.moves)
-
-
-def test_values_are_shown_where_rows_without_a_look_come_first(ask, say, table, tmp_path):
-    table.write_text("pan;tilt;XL;YL;XR;YR\n0;0;;;;\n9;0;;;;\n9;5;;;;\n20;5;640,5;360;500;360\n")
-    column = ask("import", table, "--to", tmp_path / "mine")[1]["columns"]["u_left_px"]
-    assert column == {"column": "XL", "first": ["640.5"], "empty": 3}
-    assert "640.5 (3 of 4 empty)" in say("import", table, "--to", tmp_path / "mine")[1]
 
 
 def test_columns_not_recognised_are_asked_for(ask, say, table, tmp_path, monkeypatch):
@@ -157,16 +137,6 @@ def test_columns_not_recognised_are_asked_for(ask, say, table, tmp_path, monkeyp
     code, _, log = say("import", table, "--to", tmp_path / "asked")
     assert code == 0, log
     assert (tmp_path / "asked" / "moves.csv").read_text().splitlines()[1].startswith("0,0,0.0,1,0,")
-
-
-def test_with_a_closed_standard_input_no_question_is_asked(say, table, tmp_path, monkeypatch):
-    """As a service has it (`<&-`): Python then has None for the stream."""
-    monkeypatch.setattr("sys.stdin", None)
-    code, text, _ = say("import", table, "--to", tmp_path / "mine")
-    assert code == 0 and "nothing written: add --yes" in text
-    (tmp_path / "axis.csv").write_text("steps,encoder_deg\n0,0\n100,1\n200,2.1\n")
-    code, text, _ = say("import", tmp_path / "axis.csv", "--axis", "--to", tmp_path / "axis")
-    assert code == 0 and "nothing written: add --yes" in text
 
 
 def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path):
@@ -211,58 +181,6 @@ def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
     assert code == 2 and assert_error(document, "occupied")["file"].endswith("moves.csv")
 
 
-@pytest.mark.parametrize(
-    ("column", "unit"),
-    [
-        *(("reading [mm]", "mm"), ("encoder deg", "deg"), ("angle_arcsec", "arcsec"), ("encoder", "deg")),
-        *(("Messwert [\u00b5m]", "um"), ("reading [\u03bcm]", "um"), ("encoder_um", "um"), ("encoder_nm", "nm")),
-    ],
-)
-def test_readings_have_the_unit_of_their_column(ask, say, tmp_path, column, unit):
-    """A new folder has the unit of the column; without one it has the template's degrees, which is reported."""
-    log, out = tmp_path / "log.csv", tmp_path / "axis"
-    turns = [*range(0, 40001, 20000), *range(20000, -1, -20000)] * 2
-    log.write_text(f"steps;{column}\n" + "".join(f"{n};{0.0005 * n:.4f}\n" for n in turns))
-    code, document = ask("import", log, "--to", out, "--axis", "--yes")
-    assert code == 0 and ask("check", out)[1]["unit"] == unit
-    remark = f"unit: {unit}, as the file says" if column != "encoder" else "campaign.toml says, deg until you change it"
-    assert any(remark in text for text in document["assumed"])
-    assert "0, 40000" in say("check", out)[1], "counters are no powers of ten"
-
-
-@pytest.mark.parametrize(("first", "names"), [("Leadscrew test,,", "column 1"), ("steps,foo,bar", "bar")])
-def test_a_title_holds_no_names(ask, tmp_path, first, names):
-    log = tmp_path / "log.csv"
-    log.write_text(f"{first}\n0,0,1\n5,1,3\n")
-    code, document = ask("import", log, "--axis", "--to", tmp_path / "mine")
-    candidates = assert_error(document, "missing-column")["candidates"]
-    assert code == 2 and names in candidates[0]["first"]
-
-
-def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_path):
-    """It is written only with --yes; `check` reads the folder, and its rig file has the limits of the joints."""
-    words = "import", "--urdf", UNIT, "--steps-per-turn", 400, "--to"
-    code, text, _ = say(*words, tmp_path / "head")
-    assert code == 0 and "nothing written" in text and "position of tilt's joint falls" in text
-    code, document = ask(*words, tmp_path / "head", "--yes")
-    assert (code, document["joints"]) == (0, {"pan": "pan_joint", "tilt": "tilt_joint"})
-    head = read_campaign(tmp_path / "head")
-    assert head.rig.mechanism.sightings and head.header["urdf"]["steps_per_turn"] == 400.0
-    assert head.rig.priors["degrees_per_step.tilt"].value == 360 / 400 / 20
-    assert head.rig.priors["azimuth_zero_deg"].value == pytest.approx(document["nominal"]["azimuth_zero_deg"])
-    rig = read_rig(tmp_path / "head" / "rig.toml")
-    assert rig.limits.steps["tilt"] == (round(math.degrees(-0.5) / 0.045), round(math.degrees(1.2) / 0.045))
-    assert ask("check", tmp_path / "head")[0] == 0
-    assert ask(*words, tmp_path / "head", "--yes")[0] == 2, "nothing is overwritten"
-    assert ask("new", tmp_path / "laser", "--mechanism", "pan-tilt")[0] == 0
-    assert ask(*words, tmp_path / "laser", "--yes")[0] == 0
-    shutil.copy(MOUNTED / "stereo.json", tmp_path / "laser")
-    laser = read_campaign(tmp_path / "laser")
-    assert laser.rig.priors["elevation_axis_offset_mm"].value == pytest.approx(30.0)
-    code, document = ask("import", UNIT, "--to", tmp_path / "x", "--pan-joint", "pan_joint")
-    assert code == 2 and "--urdf" in document["error"]["remedy"]
-
-
 def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
     """Semicolons, decimal commas, German names; a folder that `new` or a URDF made keeps what it says."""
     steps = [(400 * k, 100 * (k * k % 7)) for k in range(12)]
@@ -303,38 +221,6 @@ def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
     assert ask("new", tmp_path / "scanner")[0] == 0
     assert_error(ask(*words, tmp_path / "scanner", "--yes")[1], "instrument")
     assert not (tmp_path / "scanner" / "sightings.csv").exists()
-
-
-SWEEPS = [(cm, step) for cm in ("17,5", "27,5") for step in (-60, 0, 60, 0)]
-
-
-@pytest.mark.parametrize(
-    ("distances", "targets"),
-    [
-        ([cm for cm, _ in SWEEPS], {"17.5", "27.5"}),
-        # Put back to a distance: another placement. A distance of every look: none.
-        (["17,5", "27,5"] * 4, {""}),
-        ([f"{17 + k},5" for k in range(8)], {""}),
-        ([], {""}),
-    ],
-)
-def test_a_sheet_is_named_by_its_distance_where_each_is_one_run(ask, tmp_path, distances, targets):
-    """Without a name for each placement a fit has no sheet shared by several looks."""
-    file, out = tmp_path / "looks.csv", tmp_path / "out"
-    rows = [f"{step};0;{640 + step};360;{500 + step};360" for _, step in SWEEPS]
-    head = "Pan;Tilt;XL;YL;XR;YR" + ";Abstand [cm]" * bool(distances)
-    cells = [f"{row};{cm}" for row, cm in zip(rows, distances, strict=True)] if distances else rows
-    file.write_text("\n".join([head, *cells]) + "\n")
-    out.mkdir()
-    shutil.copy(MOUNTED / "stereo.json", out)
-    code, document = ask("import", file, "--to", out, "--yes")
-    assert code == 0 and ("Abstand [cm]" in document["unused"]) == (bool(distances) and targets == {""})
-    assert {spot.target for spot in read_campaign(out).spots} == targets
-    assert any("one placement" in text for text in document["assumed"]) == (targets != {""})
-    shutil.rmtree(out)
-    if targets != {""}:
-        code, document = ask("import", file, "--to", out, "--yes", "--column", "target=")
-        assert code == 0 and "Abstand [cm]" in document["unused"]
 
 
 def test_cameras_may_come_first(ask, table, tmp_path):

@@ -36,12 +36,6 @@ def test_hostile_files_are_input_errors(ask, say, grid_folder, command):
     assert "Traceback" not in log
 
 
-def test_control_characters_of_a_name_do_not_reach_the_terminal(say, tmp_path):
-    code, out, log = say("check", tmp_path / "a\x1b[31mb")
-    assert code == 2
-    assert "\x1b" not in out + log
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux")
 @pytest.mark.parametrize("arguments", [("check", "FOLDER", "--json"), ("check", "nothing here", "--json")])
 def test_a_full_disk_behind_stdout_gives_no_traceback(grid_folder, arguments):
@@ -173,11 +167,3 @@ def test_main_silences_messages_of_xla(monkeypatch):
     with pytest.raises(SystemExit):
         main()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
-
-
-def test_missing_packages_are_named_with_what_to_install():
-    """As after an installation without dependencies, on a robot with NumPy alone."""
-    code = "import sys; sys.modules['typer'] = None; from tvsbayes.cli.main import main; main()"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ended.returncode == 1 and "needs the package typer; what to do: pip install" in ended.stderr
-    assert "Traceback" not in ended.stderr

@@ -6,20 +6,10 @@ import pytest
 from msgspec import structs
 from support.commands import MOUNTED
 
-from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.planning import planner
 
 pytestmark = pytest.mark.usefixtures("small_searches", "own_compilation_cache")
-
-
-@pytest.mark.parametrize("more", [(), ("--watch",)])
-def test_a_plan_does_not_replace_the_rig_file_that_it_is_made_for(ask, tmp_path, more):
-    rig = tmp_path / "rig.toml"
-    rig.write_bytes((MOUNTED / "rig.toml").read_bytes())
-    before = rig.read_bytes()
-    code, document = ask("plan", rig, "--given", tmp_path, "-o", tmp_path / "." / "rig.toml", *more)
-    assert code == 2 and "would replace" in document["error"]["message"] and rig.read_bytes() == before
 
 
 @pytest.mark.thorough
@@ -43,15 +33,6 @@ def test_plan_writes_a_plan_and_its_exit_code_states_whether_the_target_is_met(a
     place = tmp_path / "none.csv"
     code, text, _ = say("plan", MOUNTED / "rig.toml", "-o", place)
     assert code == 0 and not place.exists() and f"nothing written to {place}" in text
-
-
-@pytest.mark.thorough
-def test_check_takes_a_rig_with_a_plan(ask):
-    code, document = ask("check", MOUNTED / "rig.toml", MOUNTED / "grid.csv")
-    assert code == 0 and document["kind"] == "rig with plan" and document["warnings"] == []
-    assert set(document["expected"]) == set(TARGETS)
-    code, document = ask("check", MOUNTED / "grid.csv", MOUNTED / "grid.csv")
-    assert code == 2 and document["error"]["code"] == "usage"
 
 
 @pytest.mark.usefixtures("quick")

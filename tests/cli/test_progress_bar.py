@@ -79,18 +79,6 @@ def test_a_terminal_shows_task_and_share_and_clears_the_line():
     assert result.terminal.endswith("\x1b[2K"), "the line is erased at last"
 
 
-@needs_pseudo_terminals
-def test_the_bar_appears_without_reports():
-    """As in the first compilation, which reports nothing for half a minute."""
-    result = on_terminal(SCRIPT, AT_ONCE, "silent")
-    assert (result.code, result.stdout) == (0, "bar\nresult\n") and "%" in result.terminal
-
-
-@needs_pseudo_terminals
-def test_a_short_wait_shows_nothing():
-    assert on_terminal(SCRIPT, NEVER) == Seen(0, "no bar\nresult\n", "")
-
-
 def test_without_a_terminal_nothing_is_shown_and_rich_is_not_loaded():
     done = subprocess.run([sys.executable, "-c", SCRIPT, AT_ONCE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "no bar\nresult\n", "")

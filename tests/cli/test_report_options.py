@@ -7,11 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.axes import runs
-from support.refusals import refusal
 from support.signers import signer
 
-from tvsbayes.cli.report_page import tolerance_of
-from tvsbayes.report.axis_document import figures_by_name
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading, Reference, write_axis
 
 
@@ -58,23 +55,3 @@ def test_a_signed_certificate_lies_beside_the_page(ask, folder, tmp_path):
         "report", folder, "--dcc", "--sign", tmp_path / "cert.pem", "--certificate", tmp_path / "key.pem"
     )
     assert code == 2
-
-
-@pytest.mark.parametrize(
-    ("text", "unit", "limit"),
-    [
-        ("15um", "mm", 0.015),
-        ("15 um", "um", 15.0),
-        ("0,015", "mm", 0.015),
-        ("1/60", "deg", None),
-        ("36arcsec", "deg", 0.01),
-    ],
-)
-def test_a_limit_is_taken_in_the_unit_of_the_figure(text, unit, limit):
-    def stated() -> float:
-        return tolerance_of(text, "A", None, None, figures_by_name(unit)).limit
-
-    if limit is None:
-        assert refusal(stated).code == "usage"
-    else:
-        assert stated() == pytest.approx(limit)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from tvsbayes.cli.report_page import DRAWING, PRINTING, WrittenPage, written_page
+from tvsbayes.cli.report_page import DRAWING, PRINTING, written_page
 
 
 @pytest.fixture
@@ -43,15 +42,3 @@ def test_printing_is_a_stage_of_the_work(shown, tmp_path, pdf):
     assert path.read_bytes() == page.html == b"N1" and page.path == path
     assert page.files == {"report": str(path), **({"pdf": str(path.with_suffix(".pdf"))} if pdf else {})}
     assert page.as_json() == {"criteria": [], "number": "N1", "files": page.files}
-
-
-def test_the_commands_named_for_removed_files_exist(capsys):
-    """`calibrate` has no --dcc, and an axis no certificate."""
-    page = WrittenPage("N1", b"", Path("r/report.html"), {"report": "r/report.html"}, ["report.pdf", "dcc.xml"])
-    page.report_removed(certificates=True)
-    assert "removed: report.pdf, dcc.xml" in (log := capsys.readouterr().err)
-    assert "`tvsbayes report --pdf` or `--dcc`" in log
-    page.report_removed()
-    assert "`tvsbayes report --pdf`" in (log := capsys.readouterr().err) and "--dcc" not in log
-    WrittenPage("N1", b"", page.path, {"pdf": "r/report.pdf"}, ["report.pdf"]).report_removed()
-    assert not capsys.readouterr().err

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import pytest
 
 from tvsbayes.cli.examples import EXAMPLES
@@ -54,22 +50,6 @@ def test_a_terminal_gets_verdicts_in_colour_line_by_line(monkeypatch):
     assert lines[1] == f"\x1b[32m\x1b[1m{good}\x1b[0m" and lines[2] == f"\x1b[31m\x1b[1m{bad}\x1b[0m"
 
 
-@pytest.mark.parametrize(
-    ("line", "colour"),
-    [
-        ("verdict: PRIOR CONFLICT, the numbers hold only if the readings are wrong", 31),
-        ("MOVED (p = 0.0001; false alarms 1 %)", 31),
-        ("CANNOT TELL (p = 0.3; false alarms 1 %)", 33),
-        ("OK (p = 0.3; false alarms 1 %)", 32),
-    ],
-)
-def test_verdicts_of_an_axis_and_of_a_watch_are_coloured(monkeypatch, line, colour):
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "80")
-    assert styled(line, Terminal(True)) == f"\x1b[{colour}m\x1b[1m{line}\x1b[0m"
-
-
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.__name__)
 def test_every_command_has_its_help_with_examples_that_parse(capsys, command):
     name = command.__name__.rstrip("_").replace("_", "-")
@@ -79,19 +59,3 @@ def test_every_command_has_its_help_with_examples_that_parse(capsys, command):
         assert f"    {example}\n" in shown and example.startswith(f"tvsbayes {name}")
         for option in (word.split("=")[0] for word in example.split() if word.startswith("--")):
             assert f"{option} " in shown.split("Examples:")[0], option
-
-
-def test_a_shell_can_complete_commands():
-    environment = os.environ | {"_TVSBAYES_COMPLETE": "complete_bash", "COMP_WORDS": "tvsbayes cali", "COMP_CWORD": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", "tvsbayes"], capture_output=True, text=True, env=environment, check=False
-    )
-    assert done.stdout.split() == ["calibrate"]
-
-
-def test_the_old_spelling_of_out_is_accepted(capsys, tmp_path):
-    for option in ("-o", "--out", "--output"):
-        assert run(["plan", str(tmp_path / "no rig.toml"), option, str(tmp_path / "plan.csv")]) == 2
-        assert "no rig.toml" in capsys.readouterr().err
-    assert run(["plan", "-h"]) == 0
-    assert "--output" not in capsys.readouterr().out

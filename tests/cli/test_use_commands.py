@@ -145,22 +145,6 @@ def test_points_of_a_spreadsheet_are_read(ask, folder, tmp_path, cloud):
     assert (document["error"]["line"], document["error"]["column"]) == (3, "aperture_deg")
 
 
-def test_points_from_a_file_keep_their_order_and_refuse_one_by_one(ask, folder, tmp_path):
-    rows = "20,100,70,left,up", "20,100,150,left,up", "-20,0,75,right,down", "20,100,70,unknown,unknown"
-    points = table_of(tmp_path / "points.csv", *rows)
-    code, document = ask("locate", folder, "--points", points)
-    assert code == 0
-    entries = document["points"]
-    assert len(entries) == 4
-    single = ask("locate", folder, *POINT)[1]
-    np.testing.assert_allclose(entries[0]["xyz_mm"], single["xyz_mm"], rtol=1e-12)
-    np.testing.assert_allclose(entries[0]["u95_mm"], single["u95_mm"], rtol=1e-12)
-    assert entries[1]["xyz_mm"] is None
-    assert entries[1]["refused"]["code"] == "diverging"
-    assert entries[2]["xyz_mm"][1] != entries[0]["xyz_mm"][1]
-    assert entries[3]["u95_mm"][0] > entries[0]["u95_mm"][0]
-
-
 @pytest.mark.parametrize(
     ("row", "code", "column"),
     [

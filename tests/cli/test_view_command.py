@@ -72,10 +72,3 @@ def test_view_replaces_no_data_and_leaves_no_partial_file(say, folder, tmp_path,
     assert sorted(place.name for place in tmp_path.iterdir()) == ["campaign", "page.html"]
     (folder / "results").symlink_to(tmp_path)
     assert say("view", folder)[0] == 2
-
-
-def test_view_refuses_an_axis_and_other_folders(say, tmp_path):
-    assert say("new", tmp_path / "stage", "--axis")[0] == 0
-    code, _, log = say("view", tmp_path / "stage")
-    assert code == 2 and "not an axis" in log
-    assert say("view", tmp_path / "nothing")[0] == 2

@@ -288,6 +288,8 @@ for said in (
     "Position : mm, deviation : um",
 ):
     add(f"axis, {said}", f"{said}\n" + sheet("Target,Deviation", POS, ERR), deviations=True)
+for name in ("reading [mm]", "angle_arcsec", "encoder", "Messwert [\u00b5m]", "reading [\u03bcm]", "encoder_nm"):
+    add(f"axis, {name}", sheet(f"steps,{name}", [0, 20000, 40000, 20000, 0], [0, 10, 20, 10, 0]))
 add("axis, gon beside degrees", sheet("Command (grad),Read (deg)", PLACES, 0.9 * PLACES + 0.01))
 add("axis, a mil beside degrees", sheet("Command (deg),Read (mil)", PLACES, FOUND / 0.05625))
 add("axis, a mil of an angle", sheet("steps,angle (mil)", CMD, READ))
@@ -502,6 +504,12 @@ book = cells("Time Experiment Point Plane Pan Tilt Picture Remark", *BOOKED)
 add("looks, a lab book", book, relative=True, pictures=True)
 merged = ("0 0 7 P1 17.5", "0 0 - P2 27.5", "200 0 - P3 27.5", "200 0 - P4 17.5", "0 0 - - -", "5 0 - P1 17.5")
 add("looks, merged cells and distances", cells("Pan Tilt Exp Point Distance_cm", *merged))
+ways = [-60, 0, 60, 0] * 2
+for distances in (each(4, 17.5, 27.5), [17.5, 27.5] * 4, [17.5 + k for k in range(8)]):
+    # Each in one run is a placement; put back to a distance is another one; a distance of every look is none.
+    px = [[centre + way for way in ways] if k % 2 == 0 else [360] * 8 for k, centre in enumerate((640, 0, 500, 0))]
+    table = sheet("Pan,Tilt,XL,YL,XR,YR,Abstand [cm]", ways, [0] * 8, *px, distances)
+    answered(f"looks, at {distances} cm", table, {"columns": {"target": ""}})
 add("looks, that wait for pictures", cells("Pan Tilt Exp Pt File State", "0 0 1 1 a.png ok", "0 0 1 2 b.png bad"))
 for pictures in (False, True):
     add(f"looks, names of pictures, {pictures}", cells("Pan Tilt File", "0 0 a.png", "5 0 -"), pictures=pictures)

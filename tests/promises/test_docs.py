@@ -90,23 +90,10 @@ def test_every_document_is_reached_from_the_readme():
     assert sum(bool(anchor) for page in PAGES for _, anchor in links(page)) > 10
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_scripts_and_documents_named_in_the_text_exist(page):
-    for path in re.findall(r"(?:experiments|tests|data/docs)/[\w/]+\.(?:py|md)", read(page)):
-        is_output = any(f"> {path}" in line for line in read(page).splitlines())
-        assert is_output or (ROOT / path).is_file(), path
-
-
 def test_commands_are_those_that_exist():
     assert first_column(section(COMMANDS, "Commands")) == NAMES
     assert re.findall(r"^### (.*)$", section(COMMANDS, "Command by command"), flags=re.MULTILINE) == NAMES
     assert re.findall(r"^### (.*)$", section(DOCUMENTS, "Of scanners"), flags=re.MULTILINE) == NAMES
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_command_begins_with_its_commonest_use(name):
-    part = section(section(f"\n{COMMANDS}", "Command by command"), name, 3).lstrip()
-    assert part.startswith(f"```console\n$ tvsbayes {name}"), part[:60]
 
 
 def options_of(name: str) -> set[str]:

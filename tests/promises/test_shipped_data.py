@@ -10,7 +10,6 @@ import pytest
 
 from experiments.inputs import make_schemas, make_twins
 from experiments.paper.table1 import paper_values
-from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, campaign_templates, read_campaign
@@ -165,16 +164,6 @@ def test_schemas_are_those_of_the_records():
     """After a change of a record run `python -m experiments.inputs.make_schemas`."""
     shipped = {path.name: path.read_text(encoding="utf-8") for path in (DATA / "schemas").iterdir()}
     assert shipped == make_schemas.files()
-
-
-def test_invalid_truth_file_is_refused(tmp_path):
-    """A truth.json without its entries is bad input, not a traceback."""
-    path = tmp_path / "truth.json"
-    whole = json.loads((DATA / "twins" / "paper_twin" / "truth.json").read_text(encoding="utf-8"))
-    for document in ({"format": whole["format"], "parameters": 3}, {**whole, "parameters": 3}):
-        path.write_text(json.dumps(document), encoding="utf-8")
-        with pytest.raises(InputError, match=r"truth\.json"):
-            read_truth(path, mounted().stereo)
 
 
 def test_templates_have_the_columns_of_the_format():
