@@ -1,4 +1,4 @@
-"""Tables as people and programs keep them, a habit each: what `test_tables.py` reads of them is frozen.
+"""Tables as people and programs keep them, a habit each: what `test_kept_tables.py` reads of them is frozen.
 
 A key begins with the kind of table: "axis", "looks", "head", or "table" where the cells alone are of interest.
 """
