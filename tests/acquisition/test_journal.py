@@ -6,6 +6,7 @@ import errno
 import itertools
 import os
 import random
+import stat
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -452,3 +453,19 @@ def test_a_full_journal_is_reported_and_stays_readable(tmp_path, monkeypatch):
         journal.append("intent", step=2)
     assert caught.value.code == "journal-full"
     assert len(read_journal(tmp_path / "run").records) == 3
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
+def test_a_file_system_that_flushes_no_folders_will_do(tmp_path, monkeypatch):
+    flush = os.fsync
+
+    def files_only(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        flush(descriptor)
+
+    monkeypatch.setattr(os, "fsync", files_only)
+    journal = Journal.create(tmp_path / "c")
+    journal.append("begun")
+    journal.close()
+    assert [record.event for record in read_journal(tmp_path / "c").records] == ["created", "begun"]

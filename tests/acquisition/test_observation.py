@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK
-from tvsbayes.acquisition.observation import CameraObserver, DetectedSpot, live_detector
+from tvsbayes.acquisition.observation import CameraObserver, DetectedSpot, live_detector, rises_dn
 from tvsbayes.acquisition.simulated_bench import SimulatedCamera
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
@@ -144,3 +144,25 @@ def test_old_frames_never_become_a_spot_whatever_the_buffer(homed, depth):
                 assert spot.pixels_px[0] == 3 * step
                 break
     assert columns == [3.0 * step for step in range(12)]
+
+
+@pytest.mark.parametrize("known", [None, 4095])
+def test_noise_of_twelve_bits_is_no_light(homed, known):
+    """Dark pictures below 256 counts do not show the bit depth: the driver or the first light does."""
+    instrument, positioner = homed
+    rng, stated = np.random.default_rng(1), [] if known is None else [known]
+
+    class Camera:
+        def grab(self):
+            # 100 counts of 4095 are 6 grey levels.
+            pair = rng.integers(90, 190, (2, 4, 4, 3)).astype(np.uint16)
+            if instrument.mechanics.laser_on:
+                pair[:, 1, 1] = 3000
+            return StereoImage(*pair, *stated)
+
+    observer, pairs = CameraObserver(Camera(), keep_pictures=False), []
+    observer.detector = lambda lit, dark: pairs.append((lit.white, rises_dn(dark, lit))) or DetectedSpot("no-spot")
+    for look in range(3):
+        assert observer.observe(positioner, look).spot.status == "no-spot"
+    # 3000 less 90 to 190 counts, in 255 of 4095.
+    assert all(white == 4095 and 174 <= min(rises) <= max(rises) <= 181 for white, rises in pairs) and len(pairs) == 3

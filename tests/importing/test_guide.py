@@ -185,3 +185,14 @@ def test_a_track_log_of_maxim_gives_the_motion_of_its_mount():
     assert (len(cut.rows), cut.counts["damaged row"]) == (199, 1)
     (across,) = read_runs(maxim_log(), "track.log", 2)
     assert {frame.raw_px for frame in across.frames} == {0.1}
+
+
+def test_a_rate_at_the_declination_of_the_run_is_recognised():
+    """Later versions of the guider scale it, and state the rate at the equator beside it."""
+    scaled = RATE_PX * PIXEL / COSINE
+    norm = f'Norm rates RA = {scaled:.1f}"/s @ dec 0, Dec = 7.3"/s; ortho.err. = 8.7 deg\n'
+    (run,) = read_runs(night(pulse_rate=scaled, norm=norm), "log.txt")
+    series = rows_of_run(run, [], "log.txt", {})
+    times, motion = motions(series)
+    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
+    assert any("at the run's declination" in text and "guide speed: 6.1, -22 %" in text for text in series.assumed)
