@@ -24,7 +24,7 @@ from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.true_looks import looks_around
 from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.fitted_calibration import calibration_of
-from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
+from tvsbayes.assessment.weaknesses import weak_directions
 from tvsbayes.coordinates.location import locate
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.twin.simulated_campaign import simulate
@@ -52,7 +52,7 @@ def one_rig(task: tuple[str, float, str, int, str]) -> dict[str, object]:
         held = np.abs(looks.points_mm - found.interval95_mm.mean(axis=1)) <= found.u95_mm
         good = np.array([refused is None for refused in found.refused])
         of = {name: np.flatnonzero(good[part]) + part.indices(len(good))[0] for name, part in PLACES.items()}
-        named = any("zero" in weak.text for weak in weak_directions(fit, moved_directions(fit)))
+        named = any("zero" in weak.text for weak in weak_directions(fit))
         sums = {name: [len(at), float(np.sum(z[at] ** 2)), int(np.sum(held[at]))] for name, at in of.items()}
         return {"points": sums, "shift_named": named}
 

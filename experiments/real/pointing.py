@@ -19,7 +19,7 @@ import numpy as np
 from experiments.common.command_line import act, parser
 from experiments.common.page import heading
 from experiments.common.rows import append_row, output, read_rows
-from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
+from tvsbayes.assessment.weaknesses import weak_directions
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.head.pointing_model import PointingModel, pointing_model
 from tvsbayes.head.pointing_table import AZIMUTH_FROM_DEG, Star, campaign_of, read_stars
@@ -104,7 +104,7 @@ def night(file: Path) -> dict[str, object]:
     row["classic"] = {n: [s * ARCSEC * by_name[t][0], ARCSEC * by_name[t][1]] for n, (t, s) in TERMS.items()}
     row |= {"least_rms": float(np.sqrt(np.mean(np.sum(left**2, axis=1)))), "classic_rms": ARCSEC * classic.rms_deg}
     row |= {"joint": {n: stated(*term) for n, term in TERMS.items()}, "gears": {name: stated(name) for name in GEARS}}
-    row["weak"] = [weak.text for weak in weak_directions(model, moved_directions(model))]
+    row["weak"] = [weak.text for weak in weak_directions(model)]
     return {**row, "answer": posterior.convergence.answer, "cpu_s": time.process_time() - began}
 
 

@@ -256,5 +256,6 @@ def test_an_axis_that_a_search_has_left_without_motion_has_no_waves(clean):
     moving, still = (
         _SeenAxis("pan", np.ones((n, 4, 1)), angle, np.arange(n), np.ones(n)) for angle in (np.arange(n), np.zeros(n))
     )
-    assert _defects_in_place(clean, [moving, moving])[0].places
-    assert not _defects_in_place(clean, [still, still])[0].places
+    name = "the gears have a transmission error"
+    assert _defects_in_place(clean, [moving, moving])[name]
+    assert not _defects_in_place(clean, [still, still])[name]

@@ -14,9 +14,7 @@ from tvsbayes.comparison import departures
 from tvsbayes.comparison.departures import (
     FALSE_ALARM_RATE,
     Departure,
-    DrawnDepartures,
     columns_of,
-    log_chances,
     null_distribution,
     powers,
 )
@@ -133,7 +131,7 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
         for moved in (False, True):
             sample = noise + moved * columns[:, shifted] @ [CHANGES[6].size]
             trial = replace(known, chi2=float(sample @ sample), score=columns.T @ sample)
-            logs = log_chances(DrawnDepartures(trial, (trial,), np.ones(1)), [])
+            logs = trial.log_chances()
             alarms += (not moved) and bool(logs[1:].min() <= null.limit)
             noticed += moved and bool(logs[1 + 6] <= null.limit)
     low, high = binomial_bounds(trials, FALSE_ALARM_RATE)

@@ -7,19 +7,21 @@ are taken as known. Quantities in the units of their names.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from tvsbayes.assessment.weaknesses import moved_directions, whole_gradients
+from tvsbayes.assessment.headlines import gradients, judged_headlines, moved_directions, sds
 from tvsbayes.calibration.pointing import COMPLEX_STEP, INPUT_NAMES
 from tvsbayes.calibration.states import ZERO_NAMES, total_shift
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.gears.priors import HALF_NORMAL_MEAN, HALF_NORMAL_SD
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
-from tvsbayes.instrument.parameters import HEADLINES, INDEX, KINDS, NAMES, QUANTITIES, unit_of
+from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, unit_of
+from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
@@ -34,22 +36,18 @@ PRIOR_PARTS = (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
 
 @dataclass(frozen=True)
 class _SplitInformation:
-    """Information J^T C^-1 J of a campaign on coordinates and errors at places, split by noise.
+    """Information J^T C^-1 J of a campaign on coordinates and errors at places, split by noise; all (p + e, p + e).
 
-    With C = 1 + (stop errors), whitened by the noise of looks, it is (C^-1 J)^T (C^-1 J) and a remainder; matrices (p +
-    e, p + e). Of the unit noise b S b^T is the scatter of looks, b the slopes by the angles and S their variances.
+    With C = 1 + (stop errors), whitened by the noise of looks, it is (C^-1 J)^T (C^-1 J) and a remainder. Of the unit
+    noise b S b^T is the scatter of looks, b the slopes by the angles and S their variances.
 
     Attributes:
-        pixels: name of the noise of the first part.
-        by_pixels, by_looks, by_stops: the parts.
+        noises: parts by cause: the looks' own noise, then `LOOK_SCATTER`, `STOP_ERRORS`.
         posterior: inverse of the sum of all parts and the priors.
         groups: coordinates and errors by their prior.
     """
 
-    pixels: str
-    by_pixels: np.ndarray
-    by_looks: np.ndarray
-    by_stops: np.ndarray
+    noises: dict[str, np.ndarray]
     posterior: np.ndarray
     groups: dict[str, list[int]]
 
@@ -62,14 +60,12 @@ def _split_information(fit: JointFit) -> _SplitInformation:
     scattered = np.einsum("nia,nip->nap", fit.linearised.slope, gain.reshape(-1, 4, gain.shape[1]))
     scattered *= np.sqrt(fit.linearised.scatter_variance)[:, :, None]
     by_looks = np.einsum("nap,naq->pq", scattered, scattered)
-    error_columns = len(NAMES) + np.arange(len(of_play))
+    errors = len(NAMES) + np.arange(len(of_play))
     groups = dict(fit.space.mechanism.prior_groups)
-    groups |= {TRANSMISSION_ERROR: error_columns[~of_play].tolist(), PLAY_VARIATION: error_columns[of_play].tolist()}
+    groups |= {TRANSMISSION_ERROR: errors[~of_play].tolist(), PLAY_VARIATION: errors[of_play].tolist()}
+    own = "pixel and aperture noise" if fit.arrays.read.any() else fit.space.mechanism.noise
     return _SplitInformation(
-        "pixel and aperture noise" if fit.arrays.read.any() else fit.space.mechanism.noise,
-        noise - by_looks,
-        by_looks,
-        information.fisher - noise,
+        {own: noise - by_looks, LOOK_SCATTER: by_looks, STOP_ERRORS: information.fisher - noise},
         np.linalg.inv(information.fisher + np.eye(len(noise))),
         {cause: columns for cause, columns in groups.items() if columns},
     )
@@ -103,19 +99,11 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None, states: Mappin
         states: by axis, at which the zeros are inputs; None: at the homing.
     """
     information = _split_information(fit)
-    parts = {
-        information.pixels: information.by_pixels,
-        LOOK_SCATTER: information.by_looks,
-        STOP_ERRORS: information.by_stops,
-    }
-    for stem, columns in information.groups.items():
-        share = np.zeros_like(information.posterior)
-        share[columns, columns] = 1.0
-        parts[stem] = share
-    inputs = [INDEX[name] for name in INPUT_NAMES]
-    at = physical_at(fit.z, fit.space)
+    priors = {cause: np.isin(range(len(information.posterior)), own) for cause, own in information.groups.items()}
+    parts = information.noises | {cause: np.diag(own.astype(float)) for cause, own in priors.items()}
+    at, own_names = physical_at(fit.z, fit.space), fit.space.mechanism.named(INPUT_NAMES)
     slopes = np.asarray(at.slope)
-    slope, own_names = slopes[inputs], fit.space.mechanism.named(INPUT_NAMES)
+    slope = slopes[[INDEX[name] for name in INPUT_NAMES]]
     moved = np.asarray(at.value) + 1j * COMPLEX_STEP * np.eye(len(NAMES))
     for (axis, state), zero in zip((states or {}).items(), fit.space.mechanism.zeros, strict=bool(states)):
         shift = total_shift({name: moved[:, INDEX[name]] for name in ZERO_NAMES}, axis, state)[:, 0]
@@ -129,8 +117,7 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None, states: Mappin
     return Causes(tuple(kept), np.stack(list(kept.values())))
 
 
-@dataclass(frozen=True)
-class _Cause:
+class _Cause(NamedTuple):
     """One column of `HeadlineCauses`; contribution and dof of shape (quantities,)."""
 
     name: str
@@ -147,74 +134,61 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
     It uses the linear part of each headline in the coordinates and the expected information at known noise scales. The
     uncertainty of the noise scales gives the degrees of freedom: nu = 1/(2 var(ln s)) (GUM G.4.2, eq. G.3).
     """
-    columns = _headline_draws(fit)
-    if not columns:
+    moved = moved_directions(fit)
+    quantities = [of for of in judged_headlines(fit) if moved & set(of.sides or DIRECTIONS)]
+    if not quantities:
         none = np.zeros((0, 0))
         return HeadlineCauses((), (), none, np.zeros(0), np.zeros(0), (), none)
-    information = _split_information(fit)
-    spread = whole_gradients(fit, np.stack(list(columns.values()), axis=1)) @ information.posterior
-    causes = [*_noise_causes(fit, information, tuple(columns), spread), *_prior_causes(fit, spread)]
+    information, names = _split_information(fit), tuple(of.name for of in quantities)
+    drawn = np.stack([fit.draws[name] for name in names], axis=1)
+    spread = gradients(fit, drawn, places=True) @ information.posterior
+    causes = [*_noise_causes(fit, information, quantities, spread), *_prior_causes(fit, spread)]
     kept = [cause for cause in causes if np.any(cause.contribution != 0)]
+    labels, contribution, dof, distribution, centre, u = zip(*kept, strict=True)
     return HeadlineCauses(
-        quantities=tuple(columns),
-        names=tuple(cause.name for cause in kept),
-        contribution=np.stack([cause.contribution for cause in kept], axis=1),
-        u=np.array([cause.u for cause in kept]),
-        centre=np.array([cause.centre for cause in kept]),
-        distribution=tuple(cause.distribution for cause in kept),
-        dof=np.stack([cause.dof for cause in kept], axis=1),
+        quantities=names,
+        names=labels,
+        contribution=np.stack(contribution, axis=1),
+        u=np.array(u),
+        centre=np.array(centre),
+        distribution=distribution,
+        dof=np.stack(dof, axis=1),
     )
 
 
-def _headline_draws(fit: JointFit) -> dict[str, np.ndarray]:
-    """Return draws of judged headlines whose directions moved, by name."""
-    moved = moved_directions(fit)
-    names = [of.name for of in HEADLINES if of.judged and of.applies(moved) and moved & set(of.sides or DIRECTIONS)]
-    return {name: fit.draws[name] for name in names}
-
-
 def _noise_causes(
-    fit: JointFit, information: _SplitInformation, quantities: tuple[str, ...], spread: np.ndarray
-) -> list[_Cause]:
+    fit: JointFit, information: _SplitInformation, quantities: list[Quantity], spread: np.ndarray
+) -> Iterator[_Cause]:
     """Compute causes other than single priors: noise of the campaign, errors of the gears, the cameras' calibration."""
-    moved, every = moved_directions(fit), np.ones(len(quantities))
-    physical = np.asarray(fit.draws.physical)
-
-    def root(part: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(np.einsum("qi,ij,qj->q", spread, part, spread), 0.0))
+    moved, physical = moved_directions(fit), np.asarray(fit.draws.physical)
 
     def freedom(names: Iterable[str]) -> float:
         logs = [np.log(physical[:, INDEX[name]]) for name in names]
         spreads = [float(np.var(x)) for x in logs if np.ptp(x) > 1e-9]
         return min((0.5 / s for s in spreads), default=np.inf)
 
-    def sides(quantity: str) -> tuple[str, ...]:
-        return QUANTITIES[quantity].sides or DIRECTIONS
-
-    def stop_freedom(quantity: str) -> float:
-        return freedom(f"stop_sd_deg.{d}" for d in sides(quantity) if d in moved)
-
-    def look_freedom(quantity: str) -> float:
+    def look_freedom(sides: Iterable[str]) -> float:
         # A scale that may be 0 has no logarithm; its relative sd is used.
-        drawn = [fit.draws[f"look_scatter_deg.{axis}"] for axis in AXES if set(SENSES[axis]) <= set(sides(quantity))]
+        drawn = [fit.draws[f"look_scatter_deg.{axis}"] for axis in AXES if set(SENSES[axis]) <= set(sides)]
         known = [0.5 * (float(np.mean(sds)) / float(np.std(sds))) ** 2 for sds in drawn if np.ptp(sds) > 0]
         return min(known, default=np.inf)
 
-    return [
-        _Cause(information.pixels, root(information.by_pixels), freedom(["pixel_scale"]) * every),
-        _Cause(LOOK_SCATTER, root(information.by_looks), np.array([look_freedom(q) for q in quantities])),
-        _Cause(STOP_ERRORS, root(information.by_stops), np.array([stop_freedom(q) for q in quantities])),
-        *(
-            _Cause(name, np.linalg.norm(spread[:, information.groups[name]], axis=1), np.inf * every)
-            for name in PRIOR_PARTS
-            if name in information.groups
-        ),
-    ]
+    sides = [of.sides or DIRECTIONS for of in quantities]
+    dof = (
+        [freedom(["pixel_scale"])] * len(sides),
+        [look_freedom(each) for each in sides],
+        [freedom(f"stop_sd_deg.{d}" for d in each if d in moved) for each in sides],
+    )
+    for (name, part), of_noise in zip(information.noises.items(), dof, strict=True):
+        yield _Cause(name, sds(spread, part), np.array(of_noise))
+    for name in PRIOR_PARTS:
+        if name in information.groups:
+            contribution = np.linalg.norm(spread[:, information.groups[name]], axis=1)
+            yield _Cause(name, contribution, np.full(len(sides), np.inf))
 
 
-def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
+def _prior_causes(fit: JointFit, spread: np.ndarray) -> Iterator[_Cause]:
     """Compute the causes of all stated priors of the rig that a quantity depends on."""
-    causes = []
     stated = (np.asarray(x).tolist() for x in (fit.space.value, fit.space.u, fit.space.kind))
     for column, (name, centre, u, kind) in enumerate(zip(fit.space.mechanism.rig_names, *stated, strict=True)):
         contribution, shape = spread[:, column], KINDS[kind]
@@ -224,8 +198,7 @@ def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
             centre = math.log(centre)
         elif shape == "half-normal":
             centre, u = u * HALF_NORMAL_MEAN, u * HALF_NORMAL_SD
-        causes.append(_Cause(name, contribution, np.full(len(spread), np.inf), shape, centre, u))
-    return causes
+        yield _Cause(name, contribution, np.full(len(spread), np.inf), shape, centre, u)
 
 
 def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -> BudgetTable:
@@ -240,21 +213,17 @@ def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -
         quantity: one of its quantities.
         estimate: its reported estimate, Laplace or posterior; its sd is the combined uncertainty.
     """
-    row = causes.quantities.index(quantity)
-    sources = []
+    row, sources = causes.quantities.index(quantity), []
     for k, name in enumerate(causes.names):
-        contribution, dof = float(causes.contribution[row, k]), float(causes.dof[row, k])
-        if math.isnan(causes.u[k]):
+        contribution, dof, shape = causes.contribution[row, k], float(causes.dof[row, k]), causes.distribution[k]
+        if math.isnan(u := float(causes.u[k])):
             kind = "B" if name in PRIOR_PARTS else "A"
-            sources.append(
-                Source(name, unit_of(quantity), None, abs(contribution), kind, causes.distribution[k], dof, 1.0)
-            )
-            continue
-        log, u = causes.distribution[k] == "log-normal", float(causes.u[k])
-        label = f"prior of ln {name}" if log else f"prior of {name}"
-        unit = "1" if log else unit_of(name)
-        values = (label, unit, float(causes.centre[k]), u, "B", causes.distribution[k], dof, contribution / u)
-        sources.append(Source(*values))
+            source = Source(name, unit_of(quantity), None, abs(float(contribution)), kind, shape, dof, 1.0)
+        else:
+            label, unit = (f"ln {name}", "1") if shape == "log-normal" else (name, unit_of(name))
+            values = float(causes.centre[k]), u, "B", shape, dof, float(contribution) / u
+            source = Source(f"prior of {label}", unit, *values)
+        sources.append(source)
     notes = (
         "inputs are independent; the last row is what the curvature of the density and the spread of the noise scales "
         "add to linear propagation",

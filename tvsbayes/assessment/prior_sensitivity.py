@@ -7,14 +7,14 @@ coordinates, or a parameter with little information).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from tvsbayes.assessment.weaknesses import headline_gradients, judged_headlines
+from tvsbayes.assessment.headlines import judged_headlines, linear_headlines, scatters, sds
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.gears.priors import half_normal
-from tvsbayes.instrument.parameters import HEADLINES, KINDS, NAMES
+from tvsbayes.instrument.parameters import KINDS
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.estimates import PriorSensitivity
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights, weighted_mean
@@ -32,16 +32,14 @@ K_LIMIT, ENOUGH = 0.5, 1000
 where a prior in conflict with the data shifts it, there are few draws."""
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """Change of the headlines: shift in their present sds, and new sd over the present one; shape (quantities,)."""
 
     shift_sd: np.ndarray
     sd_ratio: np.ndarray
 
 
-@dataclass(frozen=True)
-class NormalModel:
+class NormalModel(NamedTuple):
     """A normal approximation of the d free coordinates, with linear headlines.
 
     Attributes:
@@ -65,21 +63,18 @@ class NormalModel:
         covariance = (vectors / np.maximum(values, min(1.0, factor**-2))) @ vectors.T
         # The data's score at zero does not change.
         mean = covariance @ (self.precision @ self.mean)
-        variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient)
-        before = np.einsum("qi,ij,qj->q", self.gradient, np.linalg.inv(self.precision), self.gradient)
-        return Change(self.gradient @ (mean - self.mean) / self.sd, np.sqrt(variance / before))
+        before = sds(self.gradient, np.linalg.inv(self.precision))
+        return Change(self.gradient @ (mean - self.mean) / self.sd, sds(self.gradient, covariance) / before)
 
 
-@dataclass(frozen=True)
-class SampledHeadlines:
-    """Draws of the free coordinates z (n, d) and of the headlines `labels` (n, quantities), with weights (n,)."""
+class SampledHeadlines(NamedTuple):
+    """Draws of the free coordinates z (n, d) and of headlines (n, quantities), with weights (n,)."""
 
     z: np.ndarray
     values: np.ndarray
     weights: np.ndarray
     half: np.ndarray
     """Coordinates whose quantity is half-normal a priori, shape (d,)."""
-    labels: tuple[str, ...] = ()
 
     @property
     def normal(self) -> NormalModel:
@@ -104,53 +99,39 @@ class SampledHeadlines:
         return Change((mean - centre) / sd, np.sqrt(weights.weights @ (self.values - mean) ** 2) / sd)
 
 
-def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> SampledHeadlines:
-    """Return judged headlines of a posterior's draws."""
-    draws, rows = posterior.joined, np.flatnonzero(fit.free)
-    columns = {of.label: draws[of.name] for of in HEADLINES if of.judged and of.applies(moved)}
-    columns = {name: values for name, values in columns.items() if np.ptp(values) > 1e-12 * np.max(np.abs(values))}
-    half = np.zeros(len(NAMES), dtype=bool)
-    half[: len(fit.space.kind)] = np.asarray(fit.space.kind) == KINDS.index("half-normal")
-    values, weights = np.stack(list(columns.values()), axis=1), posterior.weights.ravel()
-    return SampledHeadlines(posterior.joined_z[:, rows], values, weights, half[rows], tuple(columns))
-
-
-def prior_sensitivity(
-    fit: JointFit, moved: set[str], posterior: Posterior | None = None
-) -> tuple[PriorSensitivity, ...]:
+def prior_sensitivity(fit: JointFit, posterior: Posterior | None = None) -> tuple[PriorSensitivity, ...]:
     """Double and halve the u of each prior in turn; the stereo calibration is one prior of many coordinates.
 
     Args:
         fit: a joint fit.
-        moved: directions in which the campaign ever moved.
         posterior: its sample; without it the Laplace approximation is changed, with a half-normal prior as normal in
             its coordinate.
 
     Returns:
         Priors that change a headline noticeably, largest first.
     """
-    rows = np.flatnonzero(fit.free)
+    rows, names = np.flatnonzero(fit.free), np.array(fit.names)[fit.free]
     sampled = None
     if posterior is None:
-        headlines = judged_headlines(fit, moved)
-        quantities, gradient = tuple(headlines), headline_gradients(fit, headlines)
-        covariance = fit.covariance[np.ix_(rows, rows)]
-        gradient = gradient[:, rows]
-        sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, covariance, gradient))
-        normal = NormalModel(fit.z[rows], np.linalg.inv(covariance), gradient, sd)
+        labels, gradients, _ = linear_headlines(fit)
+        free, covariance = gradients[:, rows], fit.covariance[np.ix_(rows, rows)]
+        normal = NormalModel(fit.z[rows], np.linalg.inv(covariance), free, sds(free, covariance))
     else:
-        sampled = sampled_headlines(fit, moved, posterior)
-        quantities, normal = sampled.labels, sampled.normal
-    names = np.array(fit.names)[rows]
-    groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
+        drawn = {of.label: posterior.joined[of.name] for of in judged_headlines(fit)}
+        drawn = {label: draws for label, draws in drawn.items() if scatters(draws)}
+        kinds = np.append(fit.space.kind, np.zeros(len(fit.names) - len(fit.space.kind)))
+        half, values = kinds[rows] == KINDS.index("half-normal"), np.stack(list(drawn.values()), axis=1)
+        sampled = SampledHeadlines(posterior.joined_z[:, rows], values, posterior.weights.ravel(), half)
+        labels, normal = tuple(drawn), sampled.normal
+    groups = {str(name): np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
     groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
     changes = []
     for parameter, members in groups.items():
         for factor in FACTORS:
             change = None if sampled is None else sampled.changed(members, factor)
-            change = normal.changed(members, factor) if change is None else change
-            for quantity, shift, ratio in zip(quantities, change.shift_sd, change.sd_ratio, strict=True):
+            shifts, ratios = normal.changed(members, factor) if change is None else change
+            for label, shift, ratio in zip(labels, shifts.tolist(), ratios.tolist(), strict=True):
                 if abs(shift) > SENSITIVE_SHIFT or abs(np.log(ratio)) > np.log1p(SENSITIVE_SD):
-                    changes.append(PriorSensitivity(str(parameter), quantity, factor, float(shift), float(ratio)))
+                    changes.append(PriorSensitivity(parameter, label, factor, shift, ratio))
     changes.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
     return tuple(changes[:LISTED])

@@ -6,13 +6,14 @@ reading); coordinates are in sds of their priors. Counters in steps, angles in d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
+from tvsbayes.assessment.headlines import linear_headlines
 from tvsbayes.assessment.residuals import CAUSE_BINS, STEP_PHASES
-from tvsbayes.assessment.weaknesses import headline_gradients, judged_headlines, moved_directions
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
@@ -21,6 +22,7 @@ from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, RIG_NAMES,
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.chances import log_chance
+from tvsbayes.statistics.score import Directions, Score
 
 VALIDATION_LEVEL = 0.01
 """Probability, for all tests together, that a correct campaign fails; `experiments/robustness/model_error.md`."""
@@ -37,13 +39,8 @@ BY_PRIOR = np.isin(NAMES, CREEP_NAMES)
 _POSE = names_of("extrinsics.rotation_rad", "extrinsics.translation_mm")
 
 
-@dataclass(frozen=True)
-class _Defect:
-    """A defect: columns d(prediction)/d(size of the defect), shape (spots, 4, q), for each of its `places`."""
-
-    name: str
-    places: tuple[str, ...]
-    columns: tuple[np.ndarray, ...]
+type Placed = list[tuple[str, np.ndarray]]
+"""Places of a defect, with columns d(prediction)/d(its size) there, shape (spots, 4, q)."""
 
 
 def _times(columns: np.ndarray, pattern: np.ndarray) -> np.ndarray:
@@ -51,8 +48,7 @@ def _times(columns: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     return columns * pattern[:, None, None]
 
 
-@dataclass(frozen=True)
-class _SeenAxis:
+class _SeenAxis(NamedTuple):
     """One axis at the spots: effect of its angle (spots, 4, 1), angle, counter, last move."""
 
     name: str
@@ -93,7 +89,7 @@ def _epipolar(fit: JointFit) -> np.ndarray:
     return shift[:, :, None] * np.concatenate([np.ones((len(place), 1)), place], axis=1)[:, None, :]
 
 
-def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
+def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> dict[str, Placed]:
     """Build defects of motion, drift or slip during the campaign."""
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
     order = np.arange(len(spots))
@@ -106,45 +102,37 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
     cameras, warmed = -jacobian[:, :, pose], -jacobian[:, :, [*pose, INDEX["focal_scale"]]]
     apart = _epipolar(fit)
 
-    def rows(count: int) -> np.ndarray:
-        edges = np.unique(np.linspace(0, len(spots), count + 2)[1:-1].astype(int))
-        return edges[edges > 0]
+    def since(count: int, effect: Callable[[int], np.ndarray], of: str = "") -> Placed:
+        """An effect that begins at one of some spots."""
+        rows = np.unique(np.linspace(0, len(spots), count + 2)[1:-1].astype(int))
+        place = f"{of}from {fit.campaign.looks[:-1]} {{}} on (move {{}})"
+        return [(place.format(spots[row].spot, spots[row].move), effect(row)) for row in rows[rows > 0]]
 
-    def since(row: int) -> np.ndarray:
-        return (order >= row).astype(float)
+    def slipped(axis: _SeenAxis, row: int) -> np.ndarray:
+        # A homing restores the zero.
+        return _times(axis.push, (order >= row) * (segment == segment[row]).astype(float))
 
-    def place(row: int) -> str:
-        return f"from {fit.campaign.looks[:-1]} {spots[row].spot} on (move {spots[row].move})"
-
-    few, many = rows(CHANGE_POINTS), rows(2 * CHANGE_POINTS)
-    places = tuple(map(place, few))
-    slips = tuple((axis, row) for axis in axes for row in many)
-    return [
-        _Defect("the cameras moved", places, tuple(_times(cameras, since(row)) for row in few)),
-        _Defect("the cameras drifted (pose or focal length)", ("with time",), (_times(warmed, drift),)),
-        _Defect(
-            "one camera moved against the other (epipolar)",
-            ("with time", *places),
-            (_times(apart, drift), *(_times(apart, since(row)) for row in few)),
-        ),
-        _Defect(
-            "a ratio drifted",
-            tuple(f"{axis.name}, with time" for axis in axes),
-            tuple(_times(axis.push, drift * (axis.angle_deg - axis.angle_deg.mean())) for axis in axes),
-        ),
-        _Defect(
-            "steps were lost, or a joint slipped",
-            tuple(f"{axis.name} {place(row)}" for axis, row in slips),
-            # A homing restores the zero.
-            tuple(_times(axis.push, since(row) * (segment == segment[row])) for axis, row in slips),
-        ),
-    ]
+    return {
+        "the cameras moved": since(CHANGE_POINTS, lambda row: _times(cameras, order >= row)),
+        "the cameras drifted (pose or focal length)": [("with time", _times(warmed, drift))],
+        "one camera moved against the other (epipolar)": [
+            ("with time", _times(apart, drift)),
+            *since(CHANGE_POINTS, lambda row: _times(apart, order >= row)),
+        ],
+        "a ratio drifted": [
+            (f"{axis.name}, with time", _times(axis.push, drift * (axis.angle_deg - axis.angle_deg.mean())))
+            for axis in axes
+        ],
+        "steps were lost, or a joint slipped": [
+            placed for axis in axes for placed in since(2 * CHANGE_POINTS, partial(slipped, axis), f"{axis.name} ")
+        ],
+    }
 
 
-def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
+def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> dict[str, Placed]:
     """Build defects that depend on position, approach, or sheet."""
     targets = np.array([spot.target for spot in ordered_spots(fit.campaign)])
-    places, waves = [], []
+    waves: Placed = []
     for axis in axes:
         stops = len(np.unique(axis.counter))
         # Any wave fits three stops; a search that failed may end where an axis does not turn.
@@ -152,30 +140,26 @@ def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]
         periods = reach / np.arange(1, min(WAVES, 2 * stops) + 1) if reach else ()
         for period in [*periods, *fit.campaign.rig.harmonic_period_deg.get(axis.name, ())]:
             phase = 2 * np.pi * axis.angle_deg / period
-            waves.append(np.concatenate([_times(axis.push, np.cos(phase)), _times(axis.push, np.sin(phase))], axis=2))
-            places.append(f"{axis.name}, period near {period:.3g} deg")
+            columns = axis.push * np.column_stack([np.cos(phase), np.sin(phase)])[:, None]
+            waves.append((f"{axis.name}, period near {period:.3g} deg", columns))
 
-    def by_group(name: str, groups: Sequence[np.ndarray]) -> _Defect:
-        columns = [
-            np.concatenate([_times(axis.push, (group == value).astype(float)) for value in np.unique(group)], axis=2)
-            for axis, group in zip(axes, groups, strict=True)
-        ]
-        return _Defect(name, tuple(axis.name for axis in axes), tuple(columns))
+    def by_group(group_of: Callable[[_SeenAxis], np.ndarray]) -> Placed:
+        groups = [(axis, group_of(axis)) for axis in axes]
+        return [(axis.name, axis.push * (group[:, None] == np.unique(group))[:, None]) for axis, group in groups]
 
-    edges = [np.unique(np.quantile(axis.leg_steps, np.linspace(0, 1, CAUSE_BINS + 1)[1:-1])) for axis in axes]
-    return [
-        _Defect("the gears have a transmission error", tuple(places), tuple(waves)),
-        by_group(f"stops depend on the step phase (n mod {STEP_PHASES})", [a.counter % STEP_PHASES for a in axes]),
-        by_group(
-            "stops depend on the length of the move",
-            [np.digitize(axis.leg_steps, edge) for axis, edge in zip(axes, edges, strict=True)],
-        ),
-        by_group("the sheets disagree", [targets, targets]),
-    ]
+    def lengths(axis: _SeenAxis) -> np.ndarray:
+        edges = np.quantile(axis.leg_steps, np.linspace(0, 1, CAUSE_BINS + 1)[1:-1])
+        return np.digitize(axis.leg_steps, np.unique(edges))
+
+    return {
+        "the gears have a transmission error": waves,
+        f"stops depend on the step phase (n mod {STEP_PHASES})": by_group(lambda axis: axis.counter % STEP_PHASES),
+        "stops depend on the length of the move": by_group(lengths),
+        "the sheets disagree": by_group(lambda axis: targets),
+    }
 
 
-@dataclass(frozen=True)
-class _Tested:
+class _Tested(NamedTuple):
     """A test before the joint decision; `log_p`, since p of chi-squares of hundreds underflows."""
 
     log_p: float
@@ -185,75 +169,6 @@ class _Tested:
     dof: int
     shift_sd: float
     places: int = 1
-
-
-@dataclass(frozen=True)
-class _Scores:
-    """Scores of all columns, each scaled to unit information, with the fit's coordinates eliminated.
-
-    Attributes:
-        score: shape (q,).
-        variance: shape (q, q).
-        moved_by: shift of every headline by a defect of unit size, in its sds, shape (headlines, q).
-    """
-
-    score: np.ndarray
-    variance: np.ndarray
-    moved_by: np.ndarray
-
-    def test(self, name: str, place: str, rows: slice) -> _Tested | None:
-        """Test some columns; None where the fit can absorb them entirely."""
-        values, vectors = np.linalg.eigh(self.variance[rows, rows])
-        kept = values > ABSORBED
-        if not kept.any():
-            return None
-        along = vectors[:, kept].T @ self.score[rows]
-        chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
-        size = (vectors[:, kept] / values[kept]) @ along
-        shift = float(np.max(np.abs(self.moved_by[:, rows] @ size)))
-        return _Tested(float(log_chance(chi2, dof)), name, place, chi2, dof, shift)
-
-
-@dataclass(frozen=True)
-class _Common:
-    """Arrays common to all tests.
-
-    Attributes:
-        groups: stops of the campaign; the first p columns of their Jacobians are the fit's own, then the defects'.
-        own_score: remaining score of the fit's own columns, shape (p,).
-        followed: inverse information of the directions that the fit can absorb, shape (p, p).
-        scores: scores of the defects' columns.
-    """
-
-    groups: Sequence[StopGroup]
-    own_score: np.ndarray
-    followed: np.ndarray
-    scores: _Scores
-
-
-def _common(fit: JointFit, defects: Sequence[_Defect]) -> _Common:
-    columns_of_fit = fit.linearised.by_coordinates(fit.held)
-    columns_of_all = np.concatenate(
-        [columns_of_fit, *(columns for defect in defects for columns in defect.columns)], axis=2
-    )
-    information = stop_information(linear_spots(fit.linearised, fit.arrays, columns_of_all))
-    score = information.score(columns_of_all)
-    p = columns_of_fit.shape[2]
-    cross, own_score = information.fisher[:p, p:], score[:p] - BY_PRIOR * fit.z
-    values, vectors = np.linalg.eigh(information.fisher[:p, :p] + np.diag(BY_PRIOR))
-    kept = values > KNOWN_DIRECTION
-    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    followed = inverse @ cross
-    whole = np.diag(information.fisher)[p:]
-    scale = 1 / np.sqrt(np.where(whole > 0, whole, 1.0))
-    gradient = headline_gradients(fit, judged_headlines(fit, moved_directions(fit)))
-    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient))
-    scores = _Scores(
-        score=(score[p:] - followed.T @ own_score) * scale,
-        variance=(information.fisher[p:, p:] - cross.T @ followed) * np.outer(scale, scale),
-        moved_by=gradient @ fit.covariance @ cross * scale / sd[:, None],
-    )
-    return _Common(information.groups, own_score, inverse, scores)
 
 
 def validate(fit: JointFit) -> Validation:
@@ -277,40 +192,49 @@ def validate(fit: JointFit) -> Validation:
         All tests and the verdict, without tests of defects that the fit can absorb entirely.
     """
     axes = _seen_axes(fit)
-    defects = [*_defects_in_time(fit, axes), *_defects_in_place(fit, axes)]
-    common = _common(fit, defects)
-    results = [_single_spots(fit, common)]
-    start = 0
-    for defect in defects:
+    defects, own = _defects_in_time(fit, axes) | _defects_in_place(fit, axes), fit.linearised.by_coordinates(fit.held)
+    columns = np.concatenate([own, *(each for placed in defects.values() for _, each in placed)], axis=2)
+    information, p = stop_information(linear_spots(fit.linearised, fit.arrays, columns)), own.shape[2]
+    score = information.score(columns)
+    score[:p] -= BY_PRIOR * fit.z
+    # Directions that the fit can follow.
+    followed = Directions.of(information.fisher[:p, :p] + np.diag(BY_PRIOR), KNOWN_DIRECTION).inverse
+    left = Score(score, information.fisher).given(slice(p), followed).at(slice(p, None))
+    whole = np.diag(information.fisher)[p:]
+    scale = np.sqrt(np.where(whole > 0, whole, 1.0))
+    headlines = linear_headlines(fit)
+    moved_by = headlines.gradients @ fit.covariance @ information.fisher[:p, p:] / headlines.sd[:, None]
+    results, start = [_single_spots(fit, information.groups, followed, score[:p])], 0
+    for name, placed in defects.items():
         tested = []
-        for place, columns in zip(defect.places, defect.columns, strict=True):
-            rows = slice(start, start + columns.shape[2])
-            start = rows.stop
-            one = common.scores.test(defect.name, place, rows)
-            if one is not None:
-                tested.append(one)
+        for place, effect in placed:
+            rows = slice(start, start := start + effect.shape[2])
+            one, known = left.at(rows), Directions.of(left.information[rows, rows], ABSORBED, scale[rows])
+            if dof := len(known.values):
+                shift = np.max(np.abs(moved_by[:, rows] @ known.inverse @ one.value))
+                log_p, chi2 = known.log_chances(one.value), known.chi2(one.value)
+                tested.append(_Tested(float(log_p), name, place, float(chi2), dof, float(shift)))
         if tested:
-            worst = min(tested, key=lambda a: a.log_p)
-            results.append(replace(worst, log_p=worst.log_p + np.log(len(tested)), places=len(tested)))
+            worst = min(tested, key=lambda one: one.log_p)
+            results.append(worst._replace(log_p=worst.log_p + np.log(len(tested)), places=len(tested)))
     return _holm(results)
 
 
-def _single_spots(fit: JointFit, common: _Common) -> _Tested:
+def _single_spots(fit: JointFit, groups: Sequence[StopGroup], followed: np.ndarray, own_score: np.ndarray) -> _Tested:
     """Test the spot that all others predict worst; its effect on headlines is not computed (`--robust` drops it).
 
     As `linear_spots.leave_one_out_chi2`, with the fit's coordinates eliminated.
     """
-    spots = ordered_spots(fit.campaign)
-    p, shift = len(common.own_score), common.followed @ common.own_score
-    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in common.groups])
-    blocks = []
-    for group in common.groups:
-        fitted = group.jacobian[:, :p]
-        left = group.precision - fitted @ common.followed @ fitted.T
+    spots, p = ordered_spots(fit.campaign), len(own_score)
+    errors, blocks = [], []
+    for group in groups:
+        fitted = group.jacobian[:, :p] @ followed
+        errors.append((group.residual - fitted @ own_score).reshape(-1, 4))
+        left = group.precision - fitted @ group.jacobian[:, :p].T
         blocks += [left[k : k + 4, k : k + 4] for k in range(0, len(left), 4)]
     values, vectors = np.linalg.eigh(np.stack(blocks))
     kept = values > ABSORBED
-    along = np.einsum("nij,ni->nj", vectors, errors)
+    along = np.einsum("nij,ni->nj", vectors, np.concatenate(errors))
     distances = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=1)
     # Without a reading the fourth component is empty.
     dof = np.maximum(kept.sum(axis=1) - ~fit.arrays.read, 1)
@@ -335,14 +259,9 @@ def _holm(tested: Sequence[_Tested]) -> Validation:
         bad += 1
     tests = tuple(
         ValidationTest(
-            name=a.name,
-            where=a.where,
-            chi2=a.chi2,
-            dof=a.dof,
-            places=a.places,
+            **{name: value for name, value in a._asdict().items() if name != "log_p"},
             p=float(min(1.0, np.exp(a.log_p))),
             failed=rank < bad,
-            shift_sd=a.shift_sd,
         )
         for rank, a in enumerate(tested)
     )

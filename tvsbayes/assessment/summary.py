@@ -12,11 +12,11 @@ import numpy as np
 from msgspec import structs
 
 from tvsbayes.assessment.gear_waves import gear_periods
+from tvsbayes.assessment.headlines import moved_directions
 from tvsbayes.assessment.prior_sensitivity import prior_sensitivity
 from tvsbayes.assessment.score_tests import validate
 from tvsbayes.assessment.weaknesses import (
     leverage,
-    moved_directions,
     poorly_known_stops,
     prior_conflicts,
     sum_directions,
@@ -296,15 +296,15 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         parameters=parameters,
         noise=fit_noise(fit.chi2, observations - determined, parameters),
         weak_directions=(
-            *weak_directions(fit, moved),
+            *weak_directions(fit),
             *sum_directions(fit.free, np.asarray(source.draws.physical), source.weights),
         ),
-        leverage=leverage(fit, moved),
+        leverage=leverage(fit),
         classic_predicted=_classic_predicted(source),
         excluded_spots=fit.excluded_spots,
         suspect_spots=fit.suspect_spots,
         prior_conflicts=prior_conflicts(fit),
-        prior_sensitivity=prior_sensitivity(fit, moved, usable),
+        prior_sensitivity=prior_sensitivity(fit, usable),
         estimator="laplace" if usable is None else "posterior",
         tier=None if usable is None else usable.tier,
         sampling=None if posterior is None else posterior.convergence.sampling,

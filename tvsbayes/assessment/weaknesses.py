@@ -5,25 +5,20 @@ Directions and gradients are in the coordinates, each in sds of its prior, of th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
+from itertools import islice
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from tvsbayes.assessment.headlines import linear_headlines, moved_directions, scatters
 from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.linear_spots import standard_deviations_without
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import (
-    HEADLINES,
-    INDEX,
-    NAMES,
-    NOISE_NAMES,
-    QUANTITIES,
-    STEREO_PARAMETER_NAMES,
-    names_of,
-)
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, QUANTITIES, STEREO_PARAMETER_NAMES, names_of
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
-from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
+from tvsbayes.instrument.stops import few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
 from tvsbayes.results.estimates import CONFLICT_LIMIT, Leverage, WeakDirection, conflict_sentence
 
@@ -33,11 +28,13 @@ LOADING_LIMIT = 0.3
 WEAK_VARIANCE = 0.5
 """A direction of parameter space is weak if more than this share of its prior variance remains."""
 LISTED = 8
-
-
-def moved_directions(fit: JointFit) -> set[str]:
-    """Return the directions in which the campaign ever moved."""
-    return set(legs_of(fit.campaign.moves))
+SUM_KNOWN = "only the sum of the variances of {} is known (correlation {:+.2f}): the priors divide it"
+SUMS_KNOWN = "only the sums of the variances of {} are known (correlation {:+.2f}): the priors divide them"
+SET_BY_PRIOR = "{} is set by the prior: {:.0f} % of its variance is left; state it better or accept it"
+MOVE_TOGETHER = (
+    "{} move together, set by the prior: {:.0f} % of that direction's variance is left; state one of them better or "
+    "accept it"
+)
 
 
 def _used_moves(fit: JointFit) -> set[int]:
@@ -45,34 +42,32 @@ def _used_moves(fit: JointFit) -> set[int]:
     return {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
 
 
-def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirection | None:
-    """Return ratio and backlash of an axis, if they are correlated or the stops cannot separate them."""
+def _correlation(a: ArrayLike, b: ArrayLike) -> float:
+    return float(np.corrcoef(np.asarray(a), np.asarray(b))[0, 1])
+
+
+def _backlash_direction(fit: JointFit, axis: str, direction: str) -> Iterator[WeakDirection]:
+    """Ratio and backlash of an axis, if they are correlated or the stops cannot separate them."""
     index = INDEX[f"backlash_deg.{axis}"]
-    if not fit.free[index]:
-        return None
     ratio = fit.draws.effective_deg_per_step[:, DIRECTIONS.index(direction)]
-    if np.ptp(ratio) == 0:
-        # Fixed by the priors and so uncorrelated with the backlash.
-        return None
-    correlation = float(np.corrcoef(ratio, fit.draws.physical[:, index])[0, 1])
+    # A ratio fixed by the priors is uncorrelated with the backlash.
+    if not fit.free[index] or np.ptp(ratio) == 0:
+        return
+    correlation = _correlation(ratio, fit.draws.physical[:, index])
     stops = observed_stops(fit.campaign.moves, _used_moves(fit), axis)
-    if one_sided(stops, axis) is None and not inseparable(correlation):
-        return None
-    reason = separation(stops, axis) or "the legs differ too little; add a cleared approach or longer legs"
-    text = f"{axis} ratio and {axis} backlash move together (correlation {correlation:+.2f}): {reason}"
-    return WeakDirection(text, {f"effective.{direction}": 1.0, f"backlash_deg.{axis}": correlation})
+    if one_sided(stops, axis) is not None or inseparable(correlation):
+        reason = separation(stops, axis) or "the legs differ too little; add a cleared approach or longer legs"
+        text = f"{axis} ratio and {axis} backlash move together (correlation {correlation:+.2f}): {reason}"
+        yield WeakDirection(text, {f"effective.{direction}": 1.0, f"backlash_deg.{axis}": correlation})
 
 
-def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
-    """Return gear error and ratio of an axis seen at few counters, if the error between them is set by the prior."""
-    steps = {getattr(fit.campaign.moves[move], f"{axis}_steps") for move in _used_moves(fit)}
-    counters, count = sorted(steps), len(NAMES)
+def _counters_direction(fit: JointFit, axis: Axis) -> Iterator[WeakDirection]:
+    """Gear error and ratio of an axis seen at few counters, if the error between them is set by the prior."""
+    counters = sorted({getattr(fit.campaign.moves[move], f"{axis}_steps") for move in _used_moves(fit)})
     if not 2 <= len(counters) <= FEW_COUNTERS or not len(fit.information.place_mean):
-        return None
-    gears = fit.arrays.gears
-    places, errors = gears.places, np.flatnonzero(~gears.of_play)
-    valid = np.asarray(places.valid)
-    physical = np.asarray(fit.mode.physical)
+        return
+    gears, count, physical = fit.arrays.gears, len(NAMES), np.asarray(fit.mode.physical)
+    places, errors, valid = gears.places, np.flatnonzero(~gears.of_play), np.asarray(gears.places.valid)
     ratio = np.radians(physical[[INDEX[f"degrees_per_step.{a}"] for a in AXES]])
     scales = scales_at(physical, np.asarray(fit.space.harmonic_period_deg))
     known = KnownPlaces(np.asarray(places.steps)[valid], np.asarray(places.on_tilt)[valid], ratio, scales)
@@ -83,18 +78,15 @@ def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
     widest = int(np.argmax(np.diff(counters)))
     at = known.between(np.array([counters[widest : widest + 2]]).mean(axis=1), AXES.index(axis))
     share, remainder = at.error[0], at.error_rest[0]
-    left, prior = (
-        share @ covariance @ share + remainder**2,
-        share @ share + remainder**2,
-    )
+    left, prior = (share @ matrix @ share + remainder**2 for matrix in (covariance, np.eye(len(share))))
     if left < WEAK_VARIANCE * prior or prior <= LEAST_ERROR_RAD**2:
-        return None
+        return
     wanted = int(np.clip(np.ceil(np.ptp(counters) * abs(np.degrees(ratio[AXES.index(axis)])) / SPACING_DEG) + 1, 4, 7))
     regular = np.linspace(counters[0], counters[-1], wanted).round().astype(int).tolist()
     room = np.ptp(counters) / (wanted - 1) / 2
     telling = [n for n in regular if np.abs(np.subtract(counters, n)).min() > room]
     names = {f"effective.{SENSES[axis][0]}": 1.0, f"transmission_error_deg.{axis}": 1.0}
-    return WeakDirection(too_few_counters(axis, counters, telling), names)
+    yield WeakDirection(too_few_counters(axis, counters, telling), names)
 
 
 def sum_directions(free: np.ndarray, physical: np.ndarray, weights: np.ndarray) -> tuple[WeakDirection, ...]:
@@ -120,13 +112,13 @@ def sum_directions(free: np.ndarray, physical: np.ndarray, weights: np.ndarray) 
     if not columns:
         return ()
     labels, least = [QUANTITIES[scales[k]].label for k in columns], correlation[np.ix_(columns, columns)].min()
-    listed = f"{', '.join(labels[:-1])} and {labels[-1]}"
-    plural, verb, them = ("", "is", "it") if len(columns) == 2 else ("s", "are", "them")
-    text = f"only the sum{plural} of the variances of {listed} {verb} known (correlation {least:+.2f}): "
-    text += f"the priors divide {them}"
-    if any(scales[k].startswith("stop_sd_deg") for k in columns):
-        text += "; look twice at some stops"
-    return (WeakDirection(text, {scales[k]: float(correlation[columns[0], k]) for k in columns}),)
+    text = (SUMS_KNOWN if len(columns) > 2 else SUM_KNOWN).format(_listed(labels), least)
+    twice = "; look twice at some stops" if any(scales[k].startswith("stop_sd_deg") for k in columns) else ""
+    return (WeakDirection(text + twice, {scales[k]: float(correlation[columns[0], k]) for k in columns}),)
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
 SHIFTS = {
@@ -139,125 +131,70 @@ SHIFTS = {
 """Shifts of a zero in time: in words, and what separates them from the gears."""
 
 
-def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
-    """Return gear parameters of an axis that cannot be separated from a shift of its zero."""
-    negative, positive = (fit.draws.effective_deg_per_step[:, DIRECTIONS.index(d)] for d in SENSES[axis])
-    backlash = fit.draws.physical[:, INDEX[f"backlash_deg.{axis}"]]
-    contrast = f"the contrast of {SENSES[axis][0]} and {SENSES[axis][1]}"
-    quantities = {
-        contrast: (negative - positive, f"ratio_contrast_deg_per_step.{axis}"),
-        f"the {axis} ratio": (0.5 * (negative + positive), f"degrees_per_step.{axis}"),
-        f"the {axis} backlash": (backlash, f"backlash_deg.{axis}"),
-    }
-    directions = []
+def _shift_directions(fit: JointFit, axis: Axis) -> Iterator[WeakDirection]:
+    """Gear parameters of an axis that cannot be separated from a shift of its zero."""
+    physical, senses = np.asarray(fit.draws.physical), SENSES[axis]
+    negative, positive = (np.asarray(fit.draws.effective_deg_per_step)[:, DIRECTIONS.index(d)] for d in senses)
+    quantities = (
+        (f"the contrast of {' and '.join(senses)}", negative - positive, f"ratio_contrast_deg_per_step.{axis}"),
+        (f"the {axis} ratio", 0.5 * (negative + positive), f"degrees_per_step.{axis}"),
+        (f"the {axis} backlash", physical[:, INDEX[f"backlash_deg.{axis}"]], f"backlash_deg.{axis}"),
+    )
     for block, (words, remedy) in SHIFTS.items():
         shift = f"{block}.{axis}"
-        if not fit.free[INDEX[shift]]:
-            continue
-        draws = fit.draws.physical[:, INDEX[shift]]
-        for what, (values, name) in quantities.items():
-            if np.ptp(values) > 1e-12 * np.max(np.abs(values)):
-                correlation = float(np.corrcoef(values, draws)[0, 1])
-                if inseparable(correlation):
-                    text = f"{what} and {words} are poorly separated (correlation {correlation:+.2f}): {remedy}"
-                    directions.append(WeakDirection(text, {name: 1.0, shift: correlation}))
-    return directions
+        for what, values, name in quantities if fit.free[INDEX[shift]] else ():
+            if scatters(values) and inseparable(together := _correlation(values, physical[:, INDEX[shift]])):
+                text = f"{what} and {words} are poorly separated (correlation {together:+.2f}): {remedy}"
+                yield WeakDirection(text, {name: 1.0, shift: together})
 
 
-def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
+def _prior_directions(fit: JointFit) -> Iterator[WeakDirection]:
+    """Directions of the coordinates of which the prior's variance is left, the largest first."""
+    noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES, *names_of("creep_minutes")}
+    rows = np.array([i for i, name in enumerate(fit.names) if fit.free[i] and name not in noise], dtype=int)
+    values, vectors = np.linalg.eigh(fit.covariance[np.ix_(rows, rows)])
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        if value < WEAK_VARIANCE:
+            return
+        order = np.argsort(-np.abs(vector))
+        named = [i for i in order if abs(vector[i]) > LOADING_LIMIT] or order[:1]
+        loadings = {fit.names[rows[i]]: float(vector[i]) for i in named}
+        sentence = MOVE_TOGETHER if len(loadings) > 1 else SET_BY_PRIOR
+        # Rounding may give slightly more than the prior's variance; more than 100 % is not reported.
+        yield WeakDirection(sentence.format(_listed(list(loadings)), min(100.0, 100 * value)), loadings)
+
+
+def weak_directions(fit: JointFit) -> tuple[WeakDirection, ...]:
     """Describe parameter combinations that data and priors do not determine: axes never moved, play, priors alone."""
-    directions = []
+    directions, moved = list[WeakDirection](), moved_directions(fit)
     for axis, pair in SENSES.items():
         if not moved & set(pair):
             stated = "its ratio and backlash are those of the prior"
             text = f"the {axis} axis was never moved: {stated}; add moves on that axis"
             directions.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
             continue
-        weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
-        of_axis = weak, _counters_direction(fit, axis), *_shift_directions(fit, axis)
-        directions += [one for one in of_axis if one is not None]
-    noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES, *names_of("creep_minutes")}
-    rows = np.array([i for i, name in enumerate(fit.names) if fit.free[i] and name not in noise])
-    if rows.size == 0:
-        return tuple(directions)
-    eigenvalues, vectors = np.linalg.eigh(fit.covariance[np.ix_(rows, rows)])
-    for value, vector in list(zip(eigenvalues, vectors.T, strict=True))[::-1]:
-        if value < WEAK_VARIANCE or len(directions) >= LISTED:
-            break
-        order = np.argsort(-np.abs(vector))
-        loadings = {fit.names[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
-        if not loadings:
-            loadings = {fit.names[rows[order[0]]]: float(vector[order[0]])}
-        names = list(loadings)
-        # Rounding may give slightly more than the prior's variance; more than 100 % is not reported.
-        left = f"{min(100.0, 100 * value):.0f} % of"
-        if len(names) == 1:
-            text = f"{names[0]} is set by the prior: {left} its variance is left; state it better or accept it"
-        else:
-            listed = ", ".join(names[:-1]) + " and " + names[-1]
-            text = f"{listed} move together, set by the prior: {left} that direction's variance is left; "
-            text += "state one of them better or accept it"
-        directions.append(WeakDirection(text, loadings))
-    return tuple(directions)
+        directions += _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
+        directions += [*_counters_direction(fit, axis), *_shift_directions(fit, axis)]
+    return (*directions, *islice(_prior_directions(fit), max(LISTED - len(directions), 0)))
 
 
-def judged_headlines(fit: JointFit, moved: set[str]) -> dict[str, np.ndarray]:
-    """Return the Laplace draws (draws,) of judged headlines, by label."""
-    # Parameters in coordinates, where a backlash is Gaussian.
-    quantities = {
-        of.label: fit.draws_z[:, INDEX[of.name]] if of.name in INDEX else fit.draws[of.name]
-        for of in HEADLINES
-        if of.judged and of.applies(moved)
-    }
-    # Quantities fixed by the priors scatter by rounding only and are left out.
-    return {name: v for name, v in quantities.items() if np.ptp(v) > 1e-12 * np.max(np.abs(v))}
-
-
-def headline_gradients(fit: JointFit, headlines: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return d(quantity)/d(coordinates), shape (q, p), of `judged_headlines`."""
-    return gradients(fit, np.stack(list(headlines.values()), axis=1))
-
-
-def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
-    """Compute d(quantity)/d(coordinates), shape (q, p), of quantities with values (draws, q) on the Laplace draws.
-
-    Regression on the moment-matched draws gives the gradient of the linear part, averaged over the posterior.
-    """
-    centred = fit.draws_z - fit.draws_z.mean(axis=0)
-    cross = (values - values.mean(axis=0)).T @ centred / len(centred)
-    return np.linalg.solve(fit.covariance, cross.T).T
-
-
-def whole_gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
-    """Compute d(quantity)/d(coordinates, then errors at places), shape (q, p + e), as `gradients` does."""
-    draws = np.concatenate([fit.draws_z, fit.draws_places], axis=1)
-    centred = draws - draws.mean(axis=0)
-    cross = (values - values.mean(axis=0)).T @ centred / len(centred)
-    return np.linalg.solve(with_places(fit.z, fit.covariance, fit.information).covariance, cross.T).T
-
-
-def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
+def leverage(fit: JointFit) -> tuple[Leverage, ...]:
     """Find stops without which a headline's sd would more than double."""
-    quantities = judged_headlines(fit, moved)
-    gradients = headline_gradients(fit, quantities)
-    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance, gradients))
-    ordered = ordered_spots(fit.campaign)
-    entries = []
+    headlines, ordered, entries = linear_headlines(fit), ordered_spots(fit.campaign), []
     for group in fit.information.groups:
         members = [s for s in ordered[group.rows] if s.spot not in fit.excluded_spots]
         if not members:
             continue
-        factors = standard_deviations_without(group, fit.covariance, gradients) / sd
-        for name, factor in zip(quantities, factors, strict=True):
-            if factor > LEVERAGE_LIMIT or not np.isfinite(factor):
-                move = fit.campaign.moves[members[0].move]
-                approach = ""
-                if move.pan_approach:
-                    approach = f" and its recorded approach ({move.pan_approach}, {move.tilt_approach})"
-                size = f"{factor:.1f} times" if np.isfinite(factor) else "beyond all bounds"
-                text = f"without move {move.move}{approach} the sd of {name} would grow {size}"
+        factors = standard_deviations_without(group, fit.covariance, headlines.gradients) / headlines.sd
+        move = fit.campaign.moves[members[0].move]
+        recorded = f" and its recorded approach ({move.pan_approach}, {move.tilt_approach})"
+        without = f"without move {move.move}{recorded if move.pan_approach else ''} the sd of {{}} would grow {{}}"
+        for label, factor in zip(headlines.labels, factors.tolist(), strict=True):
+            bounded = np.isfinite(factor)
+            if factor > LEVERAGE_LIMIT or not bounded:
+                text = without.format(label, f"{factor:.1f} times" if bounded else "beyond all bounds")
                 spots = tuple(s.spot for s in members)
-                entries.append(Leverage(move.move, spots, name, float(factor) if np.isfinite(factor) else None, text))
+                entries.append(Leverage(move.move, spots, label, factor if bounded else None, text))
     entries.sort(key=lambda e: -(e.factor if e.factor is not None else np.inf))
     return tuple(entries[:LISTED])
 

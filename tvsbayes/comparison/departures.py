@@ -7,12 +7,13 @@ parameters (formulation 9); a change is such a shift for the new data alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK, MovedPart, SeenChange, Verdict, Watch
 from tvsbayes.statistics.chances import log_chance
+from tvsbayes.statistics.score import Directions, Score
 
 LOOKS_MIN = 4
 """Least number of usable new looks."""
@@ -80,14 +81,14 @@ class Departure:
         """Return the columns of each change among the shifts."""
         return columns_of(self.changes)
 
-    def given(self, known: list[slice]) -> Departure:
-        """Condition on some changes being free; score and information of the others remain."""
-        if not known:
-            return self
-        rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
-        load = self.information[:, rows] @ _inverse(self.information[np.ix_(rows, rows)])
-        information = self.information - load @ self.information[rows]
-        return replace(self, score=self.score - load @ self.score[rows], information=information)
+    def log_chances(self, known: Sequence[slice] = ()) -> np.ndarray:
+        """Log p of all residuals, then of every change where some, `known`, are free; 0 of these, (1 + c,)."""
+        left, rows = Score(self.score, self.information), np.r_[tuple(known)] if known else np.zeros(0, dtype=int)
+        left = left.given(rows, _directions(left.at(rows).information).inverse)
+        each = [left.at(part) for part in self.columns]
+        own = [_directions(of.information).log_chances(of.value) for of in each]
+        logs = [np.zeros(()) if part in known else log_p for part, log_p in zip(self.columns, own, strict=True)]
+        return np.array([log_chance(self.chi2, self.dof), *logs])
 
 
 @dataclass(frozen=True)
@@ -104,40 +105,16 @@ class DrawnDepartures:
     drawn: tuple[Departure, ...]
     weights: np.ndarray
 
-
-def _directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute eigenvalues of the scaled information not explained by old parameters, and unscaled vectors."""
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    kept = values > FOLLOWED
-    return values[kept], vectors[:, kept] / scale[:, None]
+    def log_chances(self, known: Sequence[slice] = ()) -> np.ndarray:
+        """Logs of the means of `Departure.log_chances` over the noise scales."""
+        with np.errstate(divide="ignore"):
+            weights = np.log(self.weights)
+        return np.logaddexp.reduce([each.log_chances(known) for each in self.drawn] + weights[:, None], axis=0)
 
 
-def _inverse(information: np.ndarray) -> np.ndarray:
-    values, vectors = _directions(information)
-    return (vectors / values) @ vectors.T
-
-
-def _log_chances(score: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Compute log p of chi-squares of scores (..., q); 0 where the information has no direction."""
-    values, vectors = _directions(information)
-    if not len(values):
-        return np.zeros(score.shape[:-1])
-    return log_chance(np.sum((score @ vectors) ** 2 / values, axis=-1), len(values))
-
-
-def log_chances(departures: DrawnDepartures, known: list[slice]) -> np.ndarray:
-    """Compute log p of all residuals, then of every change given known ones, averaged over noise scales, (1 + c,)."""
-    chances = []
-    for departure in departures.drawn:
-        left, logs = departure.given(known), [log_chance(departure.chi2, departure.dof)]
-        for rows in departure.columns:
-            own = _log_chances(left.score[rows], left.information[rows, rows])
-            logs.append(np.zeros(()) if rows in known else own)
-        chances.append(np.array(logs))
-    with np.errstate(divide="ignore"):
-        weights = np.log(departures.weights)
-    return np.logaddexp.reduce(np.array(chances) + weights[:, None], axis=0)
+def _directions(information: np.ndarray) -> Directions:
+    """Directions that old parameters do not explain."""
+    return Directions.of(information, FOLLOWED, np.sqrt(np.maximum(np.diag(information), 1e-300)))
 
 
 @dataclass(frozen=True)
@@ -166,7 +143,7 @@ def null_distribution(departure: Departure, seed: int) -> NullDistribution:
     values, vectors = np.linalg.eigh(departure.information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     scores = generator.standard_normal((NULL_DRAWS, len(root))) @ root.T
-    own = [_log_chances(scores[:, rows], departure.information[rows, rows]) for rows in departure.columns]
+    own = [_directions(departure.information[rows, rows]).log_chances(scores[:, rows]) for rows in departure.columns]
     return NullDistribution(np.sort(np.min([np.zeros(NULL_DRAWS), *own], axis=0)), len(departure.changes))
 
 
@@ -186,9 +163,7 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
     generator, shares = np.random.default_rng(seed), []
     for change, rows in zip(departure.changes, departure.columns, strict=True):
         block = departure.information[rows, rows]
-        values, _ = _directions(block)
-        dof = len(values)
-        if not dof:
+        if not (dof := len(_directions(block).values)):
             shares.append(0.0)
             continue
         ways = generator.standard_normal((DIRECTIONS_ASKED, len(change.names)))
@@ -202,23 +177,18 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
 def _moved(departures: DrawnDepartures, limit: float) -> tuple[MovedPart, ...]:
     """Find changes that explain the looks, the best first, each given those before it."""
     moved: list[int] = []
-    places = departures.centre.columns
+    centre, places = departures.centre, departures.centre.columns
     while len(moved) < len(places):
-        logs = log_chances(departures, [places[k] for k in moved])[1:]
-        best = int(np.argmin(logs))
-        if logs[best] > limit:
+        logs = departures.log_chances([places[k] for k in moved])[1:]
+        if logs.min() > limit:
             break
-        moved.append(best)
-    if not moved:
-        return ()
-    rows = np.concatenate([np.arange(places[k].start, places[k].stop) for k in moved])
-    covariance = _inverse(departures.centre.information[np.ix_(rows, rows)])
-    sizes, us = covariance @ departures.centre.score[rows], np.sqrt(np.diag(covariance))
+        moved.append(int(np.argmin(logs)))
     parts: list[MovedPart] = []
-    start = 0
-    for change in (departures.centre.changes[k] for k in moved):
-        own = slice(start, start := start + len(change.parts))
-        value, u = sizes[own], us[own]
+    left = Score(centre.score, centre.information).at(np.r_[tuple(places[k] for k in moved)])
+    covariance = _directions(left.information).inverse
+    sizes, us = covariance @ left.value, np.sqrt(np.diag(covariance))
+    for change in (centre.changes[k] for k in moved):
+        (value, sizes), (u, us) = (np.split(each, [len(change.parts)]) for each in (sizes, us))
         ratio = np.abs(value) / u
         significant = [k for k in np.argsort(-ratio).tolist() if ratio[k] > TOLD_U] or [int(np.argmax(ratio))]
         parts += [MovedPart(change.parts[k], float(value[k]), float(u[k]), change.unit) for k in significant]
@@ -235,7 +205,7 @@ def tested(departures: DrawnDepartures, looks: int, same_cameras: bool, seed: in
         seed: seed of the null distribution.
     """
     null = null_distribution(departures.centre, seed)
-    logs = log_chances(departures, [])
+    logs = departures.log_chances()
     able = powers(departures.centre, null.limit, seed)
     changes = tuple(
         SeenChange(change.what, change.size, change.unit, power, float(np.exp(log_p)))

@@ -7,12 +7,12 @@ JAX is loaded by the computation, not by the import.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tvsbayes.estimators.four_point import Selection, classic_of, experiment_rows, four_point_ratios, select_experiments
+from tvsbayes.estimators.four_point import classic_of, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import OPTICS_NAMES
 from tvsbayes.results.comparison_record import Gap, GapTerm
@@ -71,26 +71,44 @@ def explain_gap(fit: JointFit, posterior: Posterior | None = None, draws: int = 
     Returns:
         By direction; None without complete experiments.
     """
-    selection = select_experiments(fit.campaign)
+    from tvsbayes.posterior.draws import derived_of
+    from tvsbayes.posterior.predictive import by_way, looks, turned_by
+
+    selection, measured = select_experiments(fit.campaign), classic_of(fit.campaign)
     result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
-    if not len(selection.experiments):
-        return result
-    measured = classic_of(fit.campaign)
-    if measured is None:
+    if not len(selection.experiments) or measured is None:
         return result
     chosen = _chosen_draws(fit, posterior, draws)
-    idealised = _idealised(fit, selection, chosen)
+    z, errors_rad, rows = chosen.z, chosen.place_errors_rad, experiment_rows(fit.campaign, selection)
+    # Without play there is no variation of play either.
+    straight_rad = np.where(np.arange(errors_rad.shape[1]) < errors_rad.shape[1] // 2, errors_rad, 0.0)
+    spaces = [fit.space]
+    for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
+        spaces.append(_ideal(spaces[-1], names))
+    ratios = []
+    for space in spaces:
+        repeating_rad = errors_rad if space is spaces[0] else straight_rad
+
+        def of_way(way: JointFit, values: np.ndarray, space=space, repeating_rad=repeating_rad) -> np.ndarray:
+            return looks(replace(way, space=space), z[values], turned_by(way.arrays, repeating_rad[values]))[:, rows]
+
+        pixels = by_way(chosen.ways, of_way)
+        ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, fit.campaign.stereo_pair))
+    full, ideal = (
+        np.asarray(derived_of(replace(fit, space=space), z[None], errors_rad[None]).effective_deg_per_step)[0]
+        for space in (spaces[0], spaces[-1])
+    )
     # An experiment with coincident spots, or spots outside the lens model, has no ratio.
-    sound = np.all([np.isfinite(r).all(axis=0) for r in idealised.classic], axis=0)
+    sound = np.all([np.isfinite(each).all(axis=0) for each in ratios], axis=0)
     for k, direction in enumerate(DIRECTIONS):
-        rows, classic = (selection.direction == direction) & sound, measured.directions[direction]
-        if rows.any() and classic is not None:
-            result[direction] = _gap(classic.mean_deg_per_step, chosen, idealised, k, rows)
+        mine, classic = (selection.direction == direction) & sound, measured.directions[direction]
+        if mine.any() and classic is not None:
+            means = [each[:, mine].mean(axis=1) for each in ratios]
+            result[direction] = _gap(classic.mean_deg_per_step, chosen, means, full[:, k], ideal[:, k], k)
     return result
 
 
-@dataclass(frozen=True)
-class _Chosen:
+class _Chosen(NamedTuple):
     """Draws used for the terms.
 
     Attributes:
@@ -125,54 +143,21 @@ def _chosen_draws(fit: JointFit, posterior: Posterior | None, draws: int) -> _Ch
     return _Chosen(posterior.coordinates(draws), errors_rad, False, ratios, posterior.weights.ravel(), ways)
 
 
-@dataclass(frozen=True)
-class _Idealised:
-    """The classic estimator on the model's own spots, from the estimated rig to the ideal one.
+def _gap(
+    reported: float, chosen: _Chosen, classic: Sequence[np.ndarray], full: np.ndarray, ideal: np.ndarray, k: int
+) -> Gap:
+    """Compute the gap of direction k from the reported classic mean.
 
-    Attributes:
-        classic: ratios (n, experiments), deg/step: as estimated, without backlash, with the stated cameras, with ideal
-            optics.
-        full: effective ratios (n, 4) of the estimated rig, deg/step.
-        ideal: effective ratios of the ideal optics.
+    Args:
+        reported: that mean.
+        chosen: draws.
+        classic: the classic mean (n,) on the model's own spots, each: as estimated, without backlash, with the stated
+            cameras, with ideal optics.
+        full: effective ratio (n,) of the estimated rig.
+        ideal: effective ratio (n,) of the ideal optics.
+        k: number of the direction.
     """
-
-    classic: tuple[np.ndarray, ...]
-    full: np.ndarray
-    ideal: np.ndarray
-
-
-def _idealised(joint: JointFit, selection: Selection, chosen: _Chosen) -> _Idealised:
-    from tvsbayes.posterior.draws import derived_of
-    from tvsbayes.posterior.predictive import by_way, looks, turned_by
-
-    z, errors_rad = chosen.z, chosen.place_errors_rad
-    # Without play there is no variation of play either.
-    straight_rad = np.where(np.arange(errors_rad.shape[1]) < errors_rad.shape[1] // 2, errors_rad, 0.0)
-
-    spaces = [joint.space]
-    for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
-        spaces.append(_ideal(spaces[-1], names))
-    full, ideal = (
-        np.asarray(derived_of(replace(joint, space=space), z[None], errors_rad[None]).effective_deg_per_step)[0]
-        for space in (spaces[0], spaces[-1])
-    )
-    rows = experiment_rows(joint.campaign, selection)
-    ratios = []
-    for space in spaces:
-        repeating_rad = errors_rad if space is spaces[0] else straight_rad
-
-        def of_way(fit: JointFit, values: np.ndarray, space=space, repeating_rad=repeating_rad) -> np.ndarray:
-            return looks(replace(fit, space=space), z[values], turned_by(fit.arrays, repeating_rad[values]))[:, rows]
-
-        pixels = by_way(chosen.ways, of_way)
-        ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, joint.campaign.stereo_pair))
-    return _Idealised(tuple(ratios), full, ideal)
-
-
-def _gap(reported: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: np.ndarray) -> Gap:
-    """Compute the gap of direction k, whose experiments are `rows`, from the reported classic mean."""
-    whole, unplayed, scaled, straight = (r[:, rows].mean(axis=1) for r in idealised.classic)
-    full, ideal = idealised.full[:, k], idealised.ideal[:, k]
+    whole, unplayed, scaled, straight = classic
     parts = {
         BACKLASH: whole - unplayed,
         STEREO_SCALE: unplayed - scaled,
@@ -206,7 +191,7 @@ def camera_influence(fit: JointFit, values: np.ndarray) -> np.ndarray:
 
     The parameters are the focal scale and the stereo coordinates; the prior of coordinate j shifts the mode by S e_j.
     """
-    from tvsbayes.assessment.weaknesses import gradients
+    from tvsbayes.assessment.headlines import gradients
     from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 
     fisher = fit.information.fisher

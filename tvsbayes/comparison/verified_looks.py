@@ -21,7 +21,7 @@ from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.calibration.predicted_angles import PredictedAngles
 from tvsbayes.calibration.states import homings_of, states_at
 from tvsbayes.comparison.departures import LOOKS_MIN
-from tvsbayes.comparison.watched_looks import WatchedLooks
+from tvsbayes.comparison.watched_looks import WatchedLooks, usable_looks
 from tvsbayes.compensation.promise import refuse_answer
 from tvsbayes.compensation.verification import (
     IDENTIFIED,
@@ -36,7 +36,6 @@ from tvsbayes.compensation.verification import (
     verification_of,
 )
 from tvsbayes.errors import InputError, NothingToEstimate, Reason
-from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.inference.stored_posterior import answer_of
@@ -257,14 +256,8 @@ def verify_looks(
     Raises:
         NothingToEstimate: fewer than `LOOKS_MIN` usable looks.
     """
-    used = in_sight(looks) if ordered_spots(looks) else np.zeros(0, dtype=bool)
-    if used.sum() < LOOKS_MIN:
-        raise NothingToEstimate(
-            "too-few-looks",
-            f"{looks.looks_table.file}: {int(used.sum())} fresh looks can be used; verify takes at least {LOOKS_MIN}",
-            file=looks.looks_table.file,
-            remedy="aim at more points; `tvsbayes plan CAMPAIGN --verify` names them",
-        )
+    remedy = "aim at more points; `tvsbayes plan CAMPAIGN --verify` names them"
+    used = usable_looks(looks, "fresh looks can be used; verify takes at least", remedy)
     aimed = AimedLooks.of(calibration, looks, used)
     nominal = aimed.nominal_steps({name: prior.value for name, prior in fit.campaign.rig.priors.items()})
     watched = WatchedLooks(fit, looks)

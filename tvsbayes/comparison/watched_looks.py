@@ -7,7 +7,7 @@ them; nothing is refitted. A change is a shift of parameters for the new looks a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 from msgspec import structs
@@ -30,6 +30,7 @@ from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.watch_record import Watch
+from tvsbayes.statistics.score import Score
 
 NOISE_DRAWS = 32
 """Draws of the noise scales, geometry and cameras integrated out, over which probabilities are averaged."""
@@ -78,33 +79,18 @@ def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
     return replace(campaign, moves=(*campaign.moves, *later), spots=(*campaign.spots, *second))
 
 
-@dataclass(frozen=True)
-class _ScoreInformation:
-    """Score and information of columns of linearised spots, with the coordinates eliminated.
+def _fitted(spots: LinearSpots, prior: np.ndarray) -> tuple[float, Score]:
+    """Fit the first columns, coordinates with prior N(0, 1) that are at `prior` (p,), in a linear model.
 
-    Attributes:
-        chi2: squared length of the remaining residuals and priors, up to a constant.
-        score: score of the columns after the coordinates, shape (q,).
-        information: information of these columns, shape (q, q).
+    Returns the squared length of the remaining residuals and priors, up to a constant, and what is left of the others.
     """
-
-    chi2: float
-    score: np.ndarray
-    information: np.ndarray
-
-    @classmethod
-    def of(cls, spots: LinearSpots, prior: np.ndarray) -> _ScoreInformation:
-        """Eliminate the first columns, coordinates with prior N(0, 1) that are at `prior`, shape (p,)."""
-        information, count = stop_information(spots), len(prior)
-        score = information.score(spots.jacobian)
-        gradient, cross = score[:count] - prior, information.fisher[:count, count:]
-        precision = information.fisher[:count, :count] + np.eye(count)
-        left = np.linalg.solve(precision, np.column_stack([gradient, cross]))
-        return cls(
-            chi2=float(spots.residual.ravel() @ information.residual - gradient @ left[:, 0]),
-            score=score[count:] - cross.T @ left[:, 0],
-            information=information.fisher[count:, count:] - cross.T @ left[:, 1:],
-        )
+    information, count = stop_information(spots), len(prior)
+    score = information.score(spots.jacobian)
+    score[:count] -= prior
+    inverse = np.linalg.inv(information.fisher[:count, :count] + np.eye(count))
+    chi2 = spots.residual.ravel() @ information.residual - score[:count] @ inverse @ score[:count]
+    rest = Score(score, information.fisher).given(slice(count), inverse)
+    return float(chi2), rest.at(slice(count, None))
 
 
 class WatchedLooks:
@@ -128,8 +114,9 @@ class WatchedLooks:
         The shifts are those of the changes, or with `angles` the mirror angles (pan, tilt) of every usable look, deg.
         """
         linear, prior = self.linear(z, angles=angles), np.where(self.problem.held, 0.0, z)
-        whole, before = (_ScoreInformation.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
-        return Departure(whole.chi2 - before.chi2, self.dof, whole.score, whole.information, self.changes)
+        chi2, shifts = _fitted(linear, prior)
+        before, _ = _fitted(rows_of(linear, slice(self.first)), prior)
+        return Departure(chi2 - before, self.dof, shifts.value, shifts.information, self.changes)
 
     def linear(self, z: np.ndarray, *, angles: bool = False) -> LinearSpots:
         """Linearise both sessions at z, with columns for the coordinates, then for the changes or the looks' angles.
@@ -163,12 +150,13 @@ class WatchedLooks:
 
     def _unit_sizes(self, value: np.ndarray) -> np.ndarray:
         """Return physical values of a shift by one unit of the changes, shape (q,)."""
-        sizes = []
-        for change in self.changes:
-            for name in change.names:
-                radians = np.radians(1.0) if "rotation_rad" in name else 1.0
-                sizes.append(0.01 * value[COORDINATES[name]] if change.unit == "%" else radians)
-        return np.array(sizes)
+        return np.array(
+            [
+                0.01 * value[COORDINATES[name]] if change.unit == "%" else np.radians(1.0) if "_rad" in name else 1.0
+                for change in self.changes
+                for name in change.names
+            ]
+        )
 
     def departures(self, seed: int) -> DrawnDepartures:
         """Compute departures over the first session's marginal of the noise scales."""
@@ -180,6 +168,19 @@ class WatchedLooks:
 def rows_of(spots: LinearSpots, rows: slice) -> LinearSpots:
     """Select spots of a linearised campaign, in their order."""
     return LinearSpots(**{part.name: getattr(spots, part.name)[rows] for part in fields(spots)})
+
+
+def usable_looks(looks: Campaign, words: str, remedy: str) -> np.ndarray:
+    """Return the mask of usable looks (looks,), of which there must be enough for a test.
+
+    Raises:
+        NothingToEstimate: fewer than `LOOKS_MIN`, in `words` between both numbers, with a remedy.
+    """
+    used, file = in_sight(looks) if ordered_spots(looks) else np.zeros(0, dtype=bool), looks.looks_table.file
+    if used.sum() < LOOKS_MIN:
+        message = f"{file}: {used.sum()} {words} {LOOKS_MIN}"
+        raise NothingToEstimate("too-few-looks", message, file=file, remedy=remedy)
+    return used
 
 
 def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
@@ -195,15 +196,7 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         NothingToEstimate: fewer than `LOOKS_MIN` usable looks.
     """
     refuse_same_looks(fit.campaign, looks)
-    usable = int(in_sight(looks).sum()) if ordered_spots(looks) else 0
-    if usable < LOOKS_MIN:
-        file = looks.looks_table.file
-        raise NothingToEstimate(
-            "too-few-looks",
-            f"{file}: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
-            file=file,
-            remedy=looks.look_again,
-        )
+    usable_looks(looks, "new looks can be used; a calibration is watched with at least", looks.look_again)
     watched = WatchedLooks(fit, looks)
     hashes = input_hashes(fit.campaign)["stereo"], input_hashes(looks)["stereo"]
     result = tested(watched.departures(seed), watched.looks, hashes[0] == hashes[1], seed)
