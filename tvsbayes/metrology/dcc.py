@@ -15,9 +15,10 @@ import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.parsers import expat
 from xml.sax.saxutils import escape
 
@@ -27,7 +28,15 @@ from markupsafe import Markup
 from tvsbayes.errors import InputError, NotConverged, escaped
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.metrology.budget_tables import PROBABILITY
-from tvsbayes.metrology.traceability import NOT_STATED, Performance, Traceability, plain_text, stated_in
+from tvsbayes.metrology.traceability import (
+    NOT_STATED,
+    Measured,
+    Performance,
+    Traceability,
+    performed,
+    plain_text,
+    stated_in,
+)
 from tvsbayes.results.fit_record import Provenance
 
 COUNTRY_NOT_STATED = "ZZ"
@@ -54,15 +63,10 @@ _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 """Characters that XML 1.0 cannot hold, escaped or not."""
 
 
-@dataclass(frozen=True)
-class Parties:
-    """Issuer and customer of a certificate.
+class Parties(NamedTuple):
+    """Issuer and customer of a certificate, and ISO 3166-1 codes, two capital letters, of the countries.
 
-    Attributes:
-        laboratory: name of the laboratory.
-        customer: name of the customer.
-        country: ISO 3166-1 code of the place of measurement, two capital letters.
-        customer_country: code of the customer's country.
+    `country` is that of the measurement.
     """
 
     laboratory: str = NOT_STATED
@@ -74,8 +78,7 @@ class Parties:
 NO_PARTIES = Parties()
 
 
-@dataclass(frozen=True)
-class Embedded:
+class Embedded(NamedTuple):
     """The HTML report that a certificate carries, and the number on its first page."""
 
     number: str
@@ -87,8 +90,19 @@ class Embedded:
         return base64.b64encode(self.html).decode()
 
 
-@dataclass(frozen=True)
-class Statement:
+class Issue(NamedTuple):
+    """An issue of a certificate: its day, for and by whom, the report to embed, whether a signature will be added.
+
+    The same inputs and issue give the same bytes. The report's number is part of the core data.
+    """
+
+    issued: datetime.date
+    parties: Parties = NO_PARTIES
+    report: Embedded | None = None
+    signed: bool = False
+
+
+class Statement(NamedTuple):
     """A declaration with its name; `traceable` if it states whether the results are."""
 
     name: str
@@ -96,26 +110,23 @@ class Statement:
     traceable: bool | None = None
 
 
-@dataclass(frozen=True)
-class Real:
+class Real(NamedTuple):
     """An `si:real` of D-SI 2.2.1, with the entries of its uncertainty in the element `kind`; "" for none."""
 
     value: str
     unit: str
     kind: str = ""
-    entries: Mapping[str, str] = field(default_factory=dict)
+    entries: Mapping[str, str] = {}
 
 
-@dataclass(frozen=True)
-class Quantity:
+class Quantity(NamedTuple):
     """A named value; None where there is none."""
 
     name: str
     real: Real | None
 
 
-@dataclass(frozen=True)
-class Result:
+class Result(NamedTuple):
     """A result: its quantities, and a description where it needs one."""
 
     name: str
@@ -154,8 +165,7 @@ def dcc_real(
     return Real(text, unit, "coverageIntervalMU", {"valueStandardMU": standard, **ends, **covered})
 
 
-@dataclass(frozen=True)
-class Equipment:
+class Equipment(NamedTuple):
     """A thing that measured; `certificate` None where it has none of its own."""
 
     identifier: str
@@ -166,13 +176,10 @@ class Equipment:
     normal: bool = False
 
 
-@dataclass(frozen=True)
-class Content:
+class Content(NamedTuple):
     """What an instrument certifies.
 
     Attributes:
-        title: name of the campaign.
-        header: keys of `campaign.toml` outside the instrument's.
         item: name of the measured object where the header has no `instrument`.
         measured: name of the result.
         scope: under which conditions it holds.
@@ -181,44 +188,37 @@ class Content:
         equipment: what measured.
         results: results.
         statements: declarations besides those that every certificate has.
-        performance: when it was measured.
         traceability: of the length standard.
         provenance: how the results were made.
     """
 
-    title: str
-    header: Mapping[str, object]
     item: str
     measured: str
     scope: str
     method: tuple[str, str]
     references: Sequence[tuple[str, str]]
     equipment: Sequence[Equipment]
-    results: Sequence[Result]
-    statements: Sequence[Statement]
-    performance: Performance
+    results: Iterable[Result]
+    statements: Iterable[Statement]
     traceability: Traceability
     provenance: Provenance
 
 
-def common_statements(content: Content, parties: Parties) -> list[Statement]:
+def common_statements(
+    content: Content, parties: Parties, *, synthetic: bool, performance: Performance
+) -> Iterator[Statement]:
     """Declarations of every certificate."""
-    statements = [
-        Statement("accreditation", NOT_ACCREDITED),
-        Statement("traceability", content.traceability.statement, content.traceability.declared),
-        Statement("scope", ITEM_ONLY),
-        *content.statements,
-    ]
-    if content.header.get("synthetic"):
-        statements.append(Statement("synthetic data", "The campaign was simulated: no instrument was measured."))
-    if not content.performance.recorded:
-        text = "The campaign does not record its date; the date of issue stands for it."
-        statements.append(Statement("dates", text))
+    yield Statement("accreditation", NOT_ACCREDITED)
+    yield Statement("traceability", content.traceability.statement, content.traceability.declared)
+    yield Statement("scope", ITEM_ONLY)
+    yield from content.statements
+    if synthetic:
+        yield Statement("synthetic data", "The campaign was simulated: no instrument was measured.")
+    if not performance.recorded:
+        yield Statement("dates", "The campaign does not record its date; the date of issue stands for it.")
     for name, country in (("country", parties.country), ("country of the customer", parties.customer_country)):
         if country == COUNTRY_NOT_STATED:
-            text = f"The {name} was not stated; {COUNTRY_NOT_STATED} stands for it."
-            statements.append(Statement(name, text))
-    return statements
+            yield Statement(name, f"The {name} was not stated; {COUNTRY_NOT_STATED} stands for it.")
 
 
 def check_certifiable(parties: Parties, *, own: bool, converged: bool) -> None:
@@ -252,45 +252,39 @@ def check_certifiable(parties: Parties, *, own: bool, converged: bool) -> None:
         raise NotConverged("not-converged", "no certificate of a fit that has not converged", remedy=again)
 
 
-def certificate_xml(
-    content: Content,
-    identifier: str,
-    *,
-    issued: datetime.date,
-    parties: Parties,
-    report: Embedded | None,
-    signed: bool = False,
-) -> bytes:
+def certificate_xml(content: Content, campaign: Measured, title: str, identifier: str, issue: Issue) -> bytes:
     """Write DCC-schema XML: not accredited, traceable only as far as the campaign declares.
 
     Args:
         content: what is certified; names are used as given, as text.
+        campaign: the measured campaign.
+        title: its name.
         identifier: unique identifier.
-        issued: date of issue; the same inputs and date give the same bytes.
-        parties: laboratory, customer, countries.
-        report: the HTML report to embed; its number is part of the core data.
-        signed: whether a signature will be added.
+        issue: see there.
 
     Returns:
         UTF-8 XML, DCC 3.3.0.
     """
-    made = content.provenance
+    made, header, when = content.provenance, campaign.header, performed(campaign, issue.issued)
     # PTB's Schematron requires a letter and up to four numbers; the whole version is in the description.
     release = _RELEASE.match(made.shown_versions["tvsbayes"])
     listed = ", ".join(f"{name} {version}" for name, version in made.shown_versions.items())
+    named = f" Method as named by the user: {header['method']}" if header.get("method") else ""
+    synthetic = bool(header.get("synthetic"))
     return _rendered(
+        **issue._asdict(),
         content=content,
-        parties=parties,
-        report=report,
-        issued=issued,
+        title=title,
+        header=header,
+        performance=when,
+        named=named,
         identifier=identifier,
         release=f"v{release.group() if release else '0'}",
         software=f"{listed}; seed {made.seed}; command: {made.command}",
-        statements=common_statements(content, parties),
-        signed=signed,
+        statements=common_statements(content, issue.parties, synthetic=synthetic, performance=when),
         used=" ".join(("method", "software", *(each.identifier for each in content.equipment))),
         conditions={
-            refers: Quantity(name, stated(content.header, "environment", key, unit))
+            refers: Quantity(name, stated(header, "environment", key, unit))
             for refers, (key, name, unit) in CONDITIONS.items()
         },
     )

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterator
-from dataclasses import astuple
 
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
@@ -17,9 +16,9 @@ from tvsbayes.metrology.dcc import (
     Content,
     Embedded,
     Equipment,
+    Issue,
     Parties,
     Quantity,
-    Real,
     Result,
     Statement,
     certificate_xml,
@@ -27,10 +26,10 @@ from tvsbayes.metrology.dcc import (
     dcc_real,
     stated,
 )
-from tvsbayes.metrology.traceability import NOT_STATED, header_table, performed, traceability
+from tvsbayes.metrology.traceability import NOT_STATED, header_table, traceability
 from tvsbayes.results.estimates import Estimate
 from tvsbayes.results.fit_record import FitRecord
-from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning
+from tvsbayes.results.metrology_tables import FIGURES
 from tvsbayes.statistics.intervals import NORMAL_95
 
 METHOD = (
@@ -76,11 +75,9 @@ def _results(fit: FitRecord) -> Iterator[Result]:
             return Quantity(name, None)
         return Quantity(name, dcc_real(unit, estimate.value, estimate.sd, estimate.interval95, shape))
 
-    ratios = [
-        quantity(f"effective degrees per step, {direction}", entry, DEG_PER_STEP)
-        for direction, entry in summary.effective.items()
-    ]
-    yield Result("effective degrees of beam per motor step", ratios)
+    ratios = summary.effective.items()
+    listed = [quantity(f"effective degrees per step, {direction}", entry, DEG_PER_STEP) for direction, entry in ratios]
+    yield Result("effective degrees of beam per motor step", listed)
     plays = []
     for axis in AXES:
         moved = any(summary.effective[d] is not None for d in SIDES[axis])
@@ -88,18 +85,16 @@ def _results(fit: FitRecord) -> Iterator[Result]:
         plays.append(quantity(f"backlash of the {axis} axis", play, DEG))
     yield Result("backlash", plays)
     for table in () if fit.evidence is None else fit.evidence.positioning:
-        if table.predicted is not None:
+        figures = []
+        for name, (symbol, term) in FIGURES.items() if table.predicted else ():
+            figure = (table.predicted or {})[name]
+            # Medians and intervals of a simulation: u is the half width over 1.96.
+            u = (figure.interval95[1] - figure.interval95[0]) / (2 * NORMAL_95)
+            real = dcc_real(DEG, figure.median, u, figure.interval95, "simulated tests")
+            figures.append(Quantity(f"{symbol}, {term}", real))
+        if figures:
             title = f"ISO 230-2-style figures of the {table.axis} axis, posterior predictive"
-            yield Result(title, list(_figures(table)), "; ".join(table.notes))
-
-
-def _figures(table: AxisPositioning) -> Iterator[Quantity]:
-    for name, (symbol, term) in FIGURES.items():
-        figure = (table.predicted or {})[name]
-        low, high = figure.interval95
-        # Medians and intervals of a simulation: u is the half width over 1.96.
-        u = (high - low) / (2 * NORMAL_95)
-        yield Quantity(f"{symbol}, {term}", dcc_real(DEG, figure.median, u, figure.interval95, "simulated tests"))
+            yield Result(title, figures, "; ".join(table.notes))
 
 
 def dcc_bytes(
@@ -132,39 +127,27 @@ def dcc_bytes(
     """
     check_certifiable(parties, own=fit.provenance.inputs == input_hashes(campaign), converged=fit.summary.converged)
     summary = fit.summary
-    besides = [campaign.title, *astuple(parties), None if report is None else report.number]
     pose = summary.reference_pose_deg
     kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
     where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    method = METHOD
-    if named := campaign.header.get("method"):
-        method += f" Method as named by the user: {named}"
     board = str(header_table(campaign, "traceability").get("board_certificate", NOT_STATED))
     pitch = stated(campaign.header, "traceability", "pitch_mm", MM)
+    pitches = [] if pitch is None else [Quantity("pitch", pitch)]
     content = Content(
-        title=campaign.title,
-        header=campaign.header,
         item="stepper-driven two-mirror laser positioner",
         measured="degrees of beam per motor step, and backlash",
         scope=f"Effective ratios hold {where}. Values and intervals from {kind}. {COVERAGE}",
-        method=(
-            "joint estimate from stereo spots",
-            METHOD + (f" Method as named by the user: {named}" if named else ""),
-        ),
+        method=("joint estimate from stereo spots", METHOD),
         references=REFERENCES,
         equipment=(
             Equipment("cameras", "stereo camera pair", _cameras(campaign)),
-            Equipment("board", "calibration board (length standard)", "", board, _pitch(pitch), normal=True),
+            Equipment("board", "calibration board (length standard)", "", board, pitches, normal=True),
         ),
-        results=list(_results(fit)),
-        statements=list(_statements(fit)),
-        performance=performed(campaign, issued),
+        results=_results(fit),
+        statements=_statements(fit),
         traceability=traceability(campaign),
         provenance=fit.provenance,
     )
-    name = identifier or fit.certificate_id(issued, besides)
-    return certificate_xml(content, name, issued=issued, parties=parties, report=report, signed=signed)
-
-
-def _pitch(pitch: Real | None) -> tuple[Quantity, ...]:
-    return () if pitch is None else (Quantity("pitch", pitch),)
+    besides = [campaign.title, *parties, None if report is None else report.number]
+    number = identifier or fit.certificate_id(issued, besides)
+    return certificate_xml(content, campaign, campaign.title, number, Issue(issued, parties, report, signed))

@@ -9,7 +9,6 @@ import datetime
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple
 
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.campaign import title_of
@@ -19,6 +18,7 @@ from tvsbayes.metrology.dcc import (
     Content,
     Embedded,
     Equipment,
+    Issue,
     Parties,
     Quantity,
     Real,
@@ -100,30 +100,25 @@ def axis_certificate(
         found, allowed = f"readings in {escaped(campaign.unit)}", ", ".join(SI)
         raise InputError("unit", f"no certificate of {found}: D-SI has no such unit", found=found, allowed=allowed)
     origin, when = provenance(axis_hashes(campaign), results.fit.seed), performed(campaign, issued)
-    title = title_of(campaign.header, campaign.path)
     low, high = summary.range_command
+    reference = Equipment("reference", "reference that read the axis", "", certificate_of(campaign), (), normal=True)
     content = Content(
-        title=title,
-        header=campaign.header,
         item="geared axis",
         measured="line, play and positioning by ISO 230-2",
         scope=f"Commands from {low:.10g} to {high:.10g}. {summary.classic.iso230_basis}. {COVERAGE}",
-        method=("readings of an axis by a reference", METHOD + _named(campaign)),
+        method=("readings of an axis by a reference", METHOD),
         references=(("norm", "ISO 230-2"), ("norm", "JCGM 100:2008"), ("norm", "JCGM 106:2012")),
-        equipment=(
-            Equipment("reference", "reference that read the axis", "", certificate_of(campaign), (), normal=True),
-        ),
-        results=list(_results(summary)),
-        statements=list(_statements(campaign, criteria, when)),
-        performance=when,
+        equipment=(reference,),
+        results=_results(summary),
+        statements=_statements(campaign, criteria),
         traceability=axis_traceability(campaign, when),
         provenance=origin,
     )
-    besides = [summary.as_json(), origin.inputs, issued.isoformat(), title, astuple(parties), report.number]
+    title = title_of(campaign.header, campaign.path)
+    besides = [summary.as_json(), origin.inputs, issued.isoformat(), title, parties, report.number]
     digest = hashlib.sha256(json.dumps(besides, sort_keys=True, default=str).encode()).hexdigest()
-    return certificate_xml(
-        content, f"tvsbayes-{digest[:32]}", issued=issued, parties=parties, report=report, signed=signed
-    )
+    number = f"tvsbayes-{digest[:32]}"
+    return certificate_xml(content, campaign, title, number, Issue(issued, parties, report, signed))
 
 
 def certificate_of(campaign: AxisCampaign) -> str:
@@ -140,11 +135,7 @@ def axis_traceability(campaign: AxisCampaign, when: Performance) -> Traceability
     return length_traceability(campaign, certificate, "the reference", "the reference that read the axis")
 
 
-def _named(campaign: AxisCampaign) -> str:
-    return f" Method as named by the user: {named}" if (named := campaign.header.get("method")) else ""
-
-
-def _statements(campaign: AxisCampaign, criteria: Sequence[Criterion], when: Performance) -> Iterator[Statement]:
+def _statements(campaign: AxisCampaign, criteria: Sequence[Criterion]) -> Iterator[Statement]:
     if (until := campaign.reference.valid_until) is not None:
         yield Statement("validity of the reference", f"{certificate_of(campaign)}: valid until {until}.")
     calibrated = header_table(campaign, "traceability").get("reference_calibrated")
@@ -166,34 +157,25 @@ def _results(summary: AxisSummary) -> Iterator[Result]:
         return dcc_real(in_unit, factor * estimate.value, factor * estimate.sd, (factor * low, factor * high), shape)
 
     # Targets are commands in the readings' unit: the ratio is a number.
-    ratio = unit + r"\per\one" if unit != ONE else ONE
-    sides = [
-        Quantity(f"{summary.unit} per command, {side}", real(estimate, ratio))
-        for side, estimate in summary.effective_per_command.items()
-    ]
+    ratio, lines = unit + r"\per\one" if unit != ONE else ONE, summary.effective_per_command.items()
+    sides = [Quantity(f"{summary.unit} per command, {side}", real(estimate, ratio)) for side, estimate in lines]
     yield Result("line through the positions read", sides)
-    play = summary.effective_backlash
+    play, classic = summary.effective_backlash, summary.classic
     yield Result("mean play over the positions read", [Quantity("play", None if play is None else real(play, unit))])
-    classic = summary.classic
-    u = classic.iso230_u or {}
-    figures = [
-        Quantity(
-            f"{classic.symbols[name]}, {AXIS_TERMS[name]}", _figure(unit, factor * value, factor * (u[name] or 0.0))
-        )
-        for name, value in (classic.iso230 or {}).items()
-        if value is not None
-    ]
+    figures, values = [], [(name, value) for name, value in (classic.iso230 or {}).items() if value is not None]
+    for name, size in values:
+        u = factor * ((classic.iso230_u or {})[name] or 0.0)
+        figures.append(Quantity(f"{classic.symbols[name]}, {AXIS_TERMS[name]}", _figure(unit, factor * size, u)))
     if figures:
         yield Result("positioning by ISO 230-2", figures, classic.iso230_basis)
-    targets = [
-        Quantity(f"{name} at {row.position:.10g}, {side}", dcc_real(unit, factor * value, None))
-        for row in classic.iso230_targets
-        for side, mean, s in zip(
-            ("forward", "backward"), (row.mean_forward, row.mean_backward), (row.s_forward, row.s_backward), strict=True
-        )
-        for name, value in (("mean deviation", mean), ("s of its runs", s))
-        if value is not None
-    ]
+    targets = []
+    for row in classic.iso230_targets:
+        means, scatters = (row.mean_forward, row.mean_backward), (row.s_forward, row.s_backward)
+        for side, *both in zip(("forward", "backward"), means, scatters, strict=True):
+            for name, value in zip(("mean deviation", "s of its runs"), both, strict=True):
+                if value is not None:
+                    real_value = dcc_real(unit, factor * value, None)
+                    targets.append(Quantity(f"{name} at {row.position:.10g}, {side}", real_value))
     if targets:
         yield Result("deviations by position, actual less target", targets)
 
