@@ -1,6 +1,15 @@
+{% macro listed(values) %}{% for value in values %}{{ number(value) }}{{ ", " if not loop.last }}{% endfor %}{% endmacro %}
 /* Laser positioner calibration, written by tvsbayes (steps-for --export header). C99, no allocation.
-@ORIGIN@
- * @EXPECTED_ERROR@
+{% if origin %}
+ * Campaign: {{ plain(origin.campaign) }}, measured {{ origin.measured or "on an unrecorded date" }}; exported {{ origin.exported }} by tvsbayes {{ origin.tvsbayes }}.
+ * SHA-256 of the same calibration as JSON, without its origin: {{ sha256 }}.
+{% else %}
+ * Of a calibration without a campaign.
+{% endif %}
+ * Expected error ({{ plain(calibration.estimator) }}, 95 %) at pan {{ error.pan_steps }}, tilt {{ error.tilt_steps }} steps: azimuth {{ "%.3f deg, elevation %.3f deg; at 1 m %.2f mm." | format(error.u95_azimuth_deg, error.u95_elevation_deg, error.u95_at_1_m_mm | max) }}
+{% for line in promise %}
+ * {{ line }}
+{% endfor %}
  * Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner, z up; mm.
  * Counters are absolute steps after homing; a side is +1 (reached left or up) or -1 (right or down).
  * tvs_beam and tvs_locate compute the beam and a point from counters; tvs_steps_for_point and tvs_steps_for_direction
@@ -21,7 +30,30 @@
 
 #include <math.h>
 
-@VALUES@
+{% for name, value in calibration.estimates.items() %}
+#define TVS_{{ name | replace(".", "_") | upper }} {{ number(value) }}
+{% endfor %}
+{% for axis in gears %}
+#define TVS_PERIOD_{{ axis | upper }}_DEG {{ number(calibration.period_deg.get(axis, 0.0)) }}
+#define TVS_OVERSHOOT_{{ axis | upper }}_STEPS {{ calibration.overshoot_steps[axis] }}
+{% endfor %}
+#define TVS_AZIMUTH_CONVENTION {{ calibration.azimuth | int }}
+{% for axis, (low, high) in calibration.seen_steps.items() %}
+{% set upper, table = axis | upper, gears[axis] %}
+#define TVS_SEEN_{{ upper }}_LOW {{ number(low) }}
+#define TVS_SEEN_{{ upper }}_HIGH {{ number(high) }}
+#define TVS_TABLE_{{ upper }}_SIZE {{ table.steps | length }}
+#define TVS_TABLE_{{ upper }}_FIRST {{ number(table.steps[0]) }}
+#define TVS_TABLE_{{ upper }}_LAST {{ number(table.steps[-1]) }}
+#define TVS_BEYOND_{{ upper }}_ERROR_U_DEG {{ number(table.beyond_u_transmission_error_deg) }}
+#define TVS_BEYOND_{{ upper }}_PLAY_U_DEG {{ number(table.beyond_u_play_variation_deg) }}
+{% for name, field in tables.items() %}
+static const double TVS_{{ name }}_{{ upper }}_DEG[] = {
+{% for row in table[field] | batch(4) %}
+    {{ listed(row) }}{{ "," if not loop.last else "};" }}
+{% endfor %}
+{% endfor %}
+{% endfor %}
 
 #define TVS_RAD 0.017453292519943295
 
