@@ -87,8 +87,8 @@ def test_calibration_of_a_fit_brings_its_causes(mounted_rig):
     fit = fit_of(*linear_problem(), mounted_rig)
     one = calibration_of(fit)
     causes = causes_of(fit, states=one.states)
-    assert (one.estimator, one.causes) == ("laplace", causes.names)
-    np.testing.assert_array_equal(one.cause_covariance, causes.covariance)
+    assert (one.estimator, one.causes) == ("laplace", tuple(causes))
+    np.testing.assert_array_equal(one.cause_covariance, np.stack(list(causes.values())))
     at_homing = fit.draws.physical[:, [INDEX[name] for name in INPUT_NAMES]]
     shifts = shifts_at(one.zeros, one.states)
     for axis, zero in enumerate(("pan_zero_emission_deg", "tilt_zero_deg")):

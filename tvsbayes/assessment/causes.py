@@ -71,22 +71,10 @@ def _split_information(fit: JointFit) -> _SplitInformation:
     )
 
 
-@dataclass(frozen=True)
-class Causes:
-    """Covariance of the inputs of a coordinate by cause.
-
-    Attributes:
-        names: causes.
-        covariance: their parts, shape (causes, inputs, inputs), ordered as `INPUT_NAMES`, then further inputs; they add
-            up.
-    """
-
-    names: tuple[str, ...]
-    covariance: np.ndarray
-
-
-def causes_of(fit: JointFit, by_places: np.ndarray | None = None, states: Mapping[Axis, State] | None = None) -> Causes:
-    """Split the covariance of a fit by cause (formulation 5).
+def causes_of(
+    fit: JointFit, by_places: np.ndarray | None = None, states: Mapping[Axis, State] | None = None
+) -> dict[str, np.ndarray]:
+    """Split the covariance of the inputs of a coordinate by cause (formulation 5).
 
     An error e of the data shifts an estimate by S J^T C^-1 e, an error of prior j by its sd by S e_j, with S the
     posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S (pixels, and the scatter of looks
@@ -97,6 +85,9 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None, states: Mappin
         fit: a converged fit.
         by_places: further inputs, as d(input)/d(errors at places, N(0, 1) a priori), shape (inputs, errors).
         states: by axis, at which the zeros are inputs; None: at the homing.
+
+    Returns:
+        Parts (inputs, inputs) by cause, ordered as `INPUT_NAMES`, then further inputs; they add up.
     """
     information = _split_information(fit)
     priors = {cause: np.isin(range(len(information.posterior)), own) for cause, own in information.groups.items()}
@@ -113,8 +104,7 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None, states: Mappin
         spread = np.concatenate([spread, by_places @ information.posterior[len(NAMES) :]])
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
     # A fixed prior, or one without effect on any input, is no cause.
-    kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
-    return Causes(tuple(kept), np.stack(list(kept.values())))
+    return {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
 
 
 class _Cause(NamedTuple):

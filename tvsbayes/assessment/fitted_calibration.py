@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, Causes, causes_of
+from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, causes_of
 from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
 from tvsbayes.assessment.summary import equal_laplace_draws, seen_range
 from tvsbayes.calibration.drawn_looks import noise_of_a_look
@@ -144,20 +144,12 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     counters = seen_range(fit)
     range_steps = np.array([counters[axis] for axis in AXES], dtype=float)
     calibration = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, range_steps, gears)
-    by_places = gears.by_places if gears.table.size else None
-    causes = causes_of(fit, by_places, calibration.states)
-    causes = _with_left_open(causes, gears) if gears.table.size else causes
-    return replace(calibration, causes=causes.names, cause_covariance=causes.covariance)
-
-
-def _with_left_open(causes: Causes, gears: DrawnGears) -> Causes:
-    """Add the conditional covariance of the gears' errors between and beyond the counters seen."""
-    parts, first = dict(zip(causes.names, causes.covariance, strict=True)), len(INPUT_NAMES)
+    causes = causes_of(fit, gears.by_places if gears.table.size else None, calibration.states)
+    # What the errors of the gears between and beyond the counters seen leave open.
     for name, part in gears.table.parts.items():
         cause = TRANSMISSION_ERROR if name.startswith(ERROR_AT) else PLAY_VARIATION
-        open_covariance = np.zeros(causes.covariance.shape[1:])
-        place = slice(first + part.start, first + part.stop)
-        open_covariance[place, place] = np.cov(gears.left_open[:, part], rowvar=False)
-        if np.any(open_covariance):
-            parts[cause] = parts.get(cause, 0.0) + open_covariance
-    return Causes(tuple(parts), np.stack(list(parts.values())))
+        place, own = len(INPUT_NAMES) + part.start, np.cov(gears.left_open[:, part], rowvar=False)
+        if np.any(own):
+            after = len(calibration.mean) - place - len(own)
+            causes[cause] = causes.get(cause, 0.0) + np.pad(own, ((place, after),) * 2)
+    return replace(calibration, causes=tuple(causes), cause_covariance=np.stack(list(causes.values())))

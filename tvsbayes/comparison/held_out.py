@@ -20,7 +20,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL, HoldOut, Prediction, Score
 from tvsbayes.statistics.chances import student_log_density
-from tvsbayes.statistics.intervals import coverage_factor
+from tvsbayes.statistics.intervals import WithSd, coverage_factor
 from tvsbayes.statistics.streams import Stream, random_stream
 
 if TYPE_CHECKING:
@@ -30,6 +30,11 @@ BLOCKS_MIN = 3
 """Least number of blocks for an interval."""
 HOLD_OUT_DRAWS, REGIONS = 256, 4
 """Draws behind a prediction of the joint estimator; largest number of regions of an axis."""
+ONE_LENGTH = "all experiments have |N| = {}: a constant lost motion looks like a ratio {}"
+DECIDED = (
+    "over {} blocks (fold and direction) the classic error is {:.2g} times the joint one, 95 % interval {:.2g} to "
+    "{:.2g}"
+)
 
 
 def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: dict[str, float]) -> HoldOut:
@@ -42,38 +47,27 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
         unseen: see `HoldOut`.
     """
     angle, blocks = np.array([p.angle_deg for p in predictions]), [(p.fold, p.direction) for p in predictions]
-    of_block = {b: np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)}
+    of_block = [np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)]
     scores, means = {}, {}
-    dof: dict[str, list[float]] = {
-        "classic": [p.classic_dof for p in predictions],
-        "joint": [np.inf] * len(predictions),
-    }
     for name in ("classic", "joint"):
-        predicted = np.array([getattr(p, f"{name}_deg") for p in predictions])
-        u = np.array([getattr(p, f"{name}_u_deg") for p in predictions])
+        predicted, u = (np.array([getattr(p, f"{name}_{field}") for p in predictions]) for field in ("deg", "u_deg"))
+        dof = np.array([p.classic_dof if name == "classic" else np.inf for p in predictions])
         error = angle - predicted
-        means[name] = np.array([error[rows].mean() for rows in of_block.values()])
+        means[name] = np.array([error[rows].mean() for rows in of_block])
         scores[name] = Score(
             rms_deg=float(np.sqrt(np.mean(error**2))),
             rms_block_deg=float(np.sqrt(np.mean(means[name] ** 2))),
-            coverage=float(np.mean(np.abs(error) <= np.array([coverage_factor(n) for n in dof[name]]) * u)),
-            log_density=float(np.mean(student_log_density(error, np.array(dof[name]), u))),
+            coverage=float(np.mean(np.abs(error) <= np.array([coverage_factor(n) for n in dof]) * u)),
+            log_density=float(np.mean(student_log_density(error, dof, u))),
         )
-    blocks_seen = len(of_block)
     ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg
-    interval, verdict = None, CANNOT_TELL
-    if len(lengths) == 1:
-        reason = f"all experiments have |N| = {lengths[0]}: a constant lost motion looks like a ratio in all of them"
-    elif blocks_seen < BLOCKS_MIN:
-        reason = f"{blocks_seen} blocks (fold and direction) are too few to estimate their scatter"
-    else:
-        interval = ratio_interval(means["classic"], means["joint"])
-        if interval[0] > 1:
-            verdict = BETTER_JOINT
-        elif interval[1] < 1:
-            verdict = BETTER_CLASSIC
-        reason = f"over {blocks_seen} blocks (fold and direction) the classic error is {ratio:.2g} times the "
-        reason += f"joint one, 95 % interval {interval[0]:.2g} to {interval[1]:.2g}"
+    interval, verdict, reason = None, CANNOT_TELL, ONE_LENGTH.format(lengths[0], "in all of them")
+    if len(lengths) > 1 and len(of_block) < BLOCKS_MIN:
+        reason = f"{len(of_block)} blocks (fold and direction) are too few to estimate their scatter"
+    elif len(lengths) > 1:
+        interval = low, high = ratio_interval(means["classic"], means["joint"])
+        verdict = BETTER_JOINT if low > 1 else BETTER_CLASSIC if high < 1 else CANNOT_TELL
+        reason = DECIDED.format(len(of_block), ratio, low, high)
     return HoldOut(
         by, tuple(predictions), scores["classic"], scores["joint"], float(ratio), interval, verdict, reason, unseen
     )
@@ -147,8 +141,7 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
     folds = folds_of(campaign, selection, by)
     if len(folds) < 2:
         if by == "steps":
-            what = f"all experiments have |N| = {lengths[0]}: a constant lost motion looks like a ratio there"
-            return undecided(f"{what}; measure a second |N|")
+            return undecided(ONE_LENGTH.format(lengths[0], "there; measure a second |N|"))
         what = "all experiments start at one counter: no other region is left to predict it from"
         return undecided(f"{what}; measure experiments from a second starting counter")
     angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo_pair) * selection.steps
@@ -232,17 +225,10 @@ def predict_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) ->
     return angles
 
 
-class JointAngle(NamedTuple):
-    """An angle predicted by the joint estimator, deg."""
-
-    angle_deg: float
-    u_deg: float
-
-
 def predict_joint(
     taught: JointFit, selection: Selection, out: np.ndarray, generator: np.random.Generator
-) -> dict[int, JointAngle]:
-    """Predict the classic chain's angle on the joint's beams for each left-out experiment, by row.
+) -> dict[int, WithSd[float]]:
+    """Predict the classic chain's angle on the joint's beams for each left-out experiment, by row, deg.
 
     Stop errors and pixel noise are drawn again. Draws outside the cameras' lens model give no angle.
     """
@@ -258,5 +244,5 @@ def predict_joint(
     for k, e in enumerate(np.flatnonzero(out).tolist()):
         finite = draws[np.isfinite(draws[:, k]), k]
         if len(finite) > 1:
-            angles[e] = JointAngle(float(finite.mean()), float(finite.std(ddof=1)))
+            angles[e] = WithSd(float(finite.mean()), float(finite.std(ddof=1)))
     return angles
