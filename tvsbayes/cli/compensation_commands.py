@@ -151,7 +151,7 @@ def verify(
     """
     from tvsbayes.calibration.calibration_file import calibration_json, content_sha256
     from tvsbayes.comparison.verified_looks import accepted_calibration
-    from tvsbayes.compensation.verification import compensation_of_file, stored_compensation
+    from tvsbayes.compensation.verification import stored_compensation
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
@@ -171,7 +171,7 @@ def verify(
     known = read_axis(campaign) if mechanism is None else read_campaign(campaign)
     made = None
     if isinstance(known, AxisCampaign):
-        made = stored_compensation(known) if table_file is None else compensation_of_file(known, table_file)
+        made = stored_compensation(known, table_file)
     with waiting() as progress:
         new, distance = fresh if made is None else read_axis(fresh), distance_mm or 1000.0
         result = verified(known, new, made=made, distance_mm=distance, seed=seed, tell=report_line, progress=progress)

@@ -26,11 +26,9 @@ from tvsbayes.compensation.promise import refuse_answer
 from tvsbayes.compensation.verification import (
     IDENTIFIED,
     SEPARATE,
-    Judged,
     Trial,
     VerifyStop,
     discriminating_visits,
-    judged,
     other_axis,
     size_of,
     verification_of,
@@ -213,18 +211,18 @@ def _other(aimed: AimedLooks) -> np.ndarray:
     return covariance
 
 
-def _millimetres(aimed: AimedLooks, trial: Trial, judgement: Judged, distance_mm: float, seed: int) -> Millimetres:
+def _millimetres(aimed: AimedLooks, trial: Trial, distance_mm: float, seed: int) -> Millimetres:
     """Compute errors of points at a distance, and the promised bound of 95 % of them, from those of mirror angles."""
     slopes, kept = aimed.slopes_mm(distance_mm), less_means(trial.free)
 
     def lengths(angles: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.einsum("mxa,...ma->...mx", slopes, angles.reshape(*angles.shape[:-1], -1, 2)), axis=-1)
 
-    promised = judgement.promised.less(trial.free)
+    promised = trial.at(1.0, 1.0).less(trial.free)
     drawn = lengths(promised.drawn(PROMISED_DRAWS, random_stream(seed, Stream.PROMISED_LENGTHS)))
     return Millimetres(
         distance_mm=distance_mm,
-        before=size_of(lengths(kept @ judgement.without.pooled().mean)),
+        before=size_of(lengths(kept @ trial.at(0.0, 0.0).pooled().mean)),
         after=size_of(lengths(kept @ trial.value)),
         promised95=float(np.quantile(drawn, 0.95)),
     )
@@ -275,16 +273,15 @@ def verify_looks(
     homings = homings_of(fit.campaign)
     free = [frees_shift(homings[axis]) for axis in AXES]
     trial = Trial(at, error, aim, _other(aimed), travel, np.tile(np.diag(free), len(aimed.steps)), angles.noise)
-    judgement = judged(trial, seed)
     return verification_of(
         trial,
-        judgement,
         len(aimed.steps),
         homing=any(free),
+        seed=seed,
+        together=2,
         # Directions have no lengths.
-        millimetres=_millimetres(aimed, trial, judgement, distance_mm, seed) if looks.has_images else None,
+        millimetres=_millimetres(aimed, trial, distance_mm, seed) if looks.has_images else None,
         unit="deg",
-        needed=None if judgement.needed is None else -(-judgement.needed // 2),
         looks=True,
         remarks=_remarks(fit, looks, aimed),
     )

@@ -9,8 +9,9 @@ shift (`statistics.predicted_readings.frees_shift`). Commands in the campaign's 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
@@ -44,22 +45,29 @@ TRIED_STOPS = 2 * TRIED * STATES
 UNIT_COMMANDS = 0.2
 """Largest difference of the ratio from 1 or -1 for commands to count in the unit of readings."""
 ONE_SIDED = "every stop was read from one side: the play is not determined; its prior sets the error on the other side"
+BY_POSITION = (
+    "the axis goes round: the table is by position, for the turns read alone; one by phase, both sides, is "
+    "`--to csv --period N` (or header), N the commands of a turn, about {}"
+)
 SIDES = (("forward", 1), ("backward", -1))
 
 
-@dataclass(frozen=True)
-class _Expected:
+class _Expected(NamedTuple):
     """Readings expected at commands (m,) at the table's state: mean and variance by side, (2, m), forward first."""
 
     command: np.ndarray
     mean: np.ndarray
     variance: np.ndarray
-    both_sides: bool
 
 
-def _expected(machine: PredictedMachine, commands: np.ndarray, both_sides: bool) -> _Expected:
-    mean, covariance = machine.expected(np.tile(commands, 2), np.repeat([1, -1], len(commands))).pooled()
-    return _Expected(commands, mean.reshape(2, -1), np.diag(covariance).reshape(2, -1), both_sides)
+def _both_sides(machine: PredictedMachine, commands: np.ndarray) -> PredictedReadings:
+    """Predict readings at commands (m,) from both sides, (2 m,), forward first."""
+    return machine.expected(np.tile(commands, 2), np.repeat([1, -1], len(commands)))
+
+
+def _expected(machine: PredictedMachine, commands: np.ndarray) -> _Expected:
+    mean, covariance = _both_sides(machine, commands).pooled()
+    return _Expected(commands, mean.reshape(2, -1), np.diag(covariance).reshape(2, -1))
 
 
 def run_up_of(machine: PredictedMachine, commands: np.ndarray, fitted: float, resolution: float = 0.0) -> float:
@@ -67,7 +75,7 @@ def run_up_of(machine: PredictedMachine, commands: np.ndarray, fitted: float, re
 
     The margin is a step of the controller where one is known, else the scatter of stops.
     """
-    readings = machine.expected(np.tile(commands, 2), np.repeat([1, -1], len(commands)))
+    readings = _both_sides(machine, commands)
     apart = np.concatenate([np.eye(len(commands)), -np.eye(len(commands))], axis=1)
     variance = np.diagonal(apart @ readings.covariance @ apart.T, axis1=1, axis2=2)
     gap = np.abs(readings.mean @ apart.T) + NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
@@ -124,56 +132,46 @@ def table_commands(rows: AxisRows) -> np.ndarray:
     return commands
 
 
-@dataclass(frozen=True)
-class _Shaped:
-    """Errors in the terms of a format: a correction without rounding, the format's numbers, the line by phase."""
-
-    correction: Correction
-    settings: dict[str, float] = field(default_factory=dict)
-    per_command: float = 0.0
+type _Shaped = tuple[Correction, dict[str, float]]
+"""Errors in the terms of a format: a correction without rounding of commands, the format's numbers."""
 
 
-def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wish, line: np.ndarray) -> _Shaped:
+def _shaped(form: Format, at: _Expected, nominal: float, wish: Wish, fit: AxisFit, fitted: float) -> _Shaped:
     """Express the errors in the terms of a format, as corrections of commands."""
     command = at.command
     if form.holds == "table":
         offset = _offset(at, nominal)
         forward, backward = _rounded((offset + nominal * command - at.mean) / fitted, nominal, wish.target)
-        return _Shaped(Correction(command, forward, backward, wish.resolution))
-    middle = at.mean.mean(axis=0)
+        return Correction(command, forward, backward, wish.resolution), {}
     if form.holds == "period":
         return _folded(at, fitted, float(wish.period or 0.0), wish.resolution)
     # The line of the format, through command 0, up to one shift.
-    slope = float(np.polyfit(command, middle, 1)[0])
+    slope = float(np.polyfit(command, at.mean.mean(axis=0), 1)[0])
     play = float(np.mean(at.mean[1] - at.mean[0])) * float(np.sign(slope))
     factor, taken, settings = nominal / slope, 0.0, {}
     axis, in_force = "XYZABC".index(wish.letter), wish.in_force or 1.0
     if wish.target in ("grbl", "grblhal"):
         settings[f"${100 + axis}"] = round(in_force * factor, 3)
         factor = settings[f"${100 + axis}"] / in_force
-    if wish.target == "grblhal" and at.both_sides:
+    if wish.target == "grblhal" and fit.rows.both_sides:
         taken = settings[f"${160 + axis}"] = max(round(play, 3), 0.0)
     if wish.target == "klipper":
         settings["rotation_distance"] = round(in_force / factor, 6)
         factor = in_force / settings["rotation_distance"]
     if wish.target == "urdf":
-        settings = {**_joint(line), "axis_backlash": play}
+        settings = {**_joint(fit), "axis_backlash": play}
     half = 0.5 * taken / abs(slope)
     added = (factor - 1) * command
-    return _Shaped(Correction(command, added + half, added - half, wish.resolution), settings)
+    return Correction(command, added + half, added - half, wish.resolution), settings
 
 
-def _line_draws(fit: AxisFit) -> np.ndarray:
-    """Draw zero at command 0 and slope of the line through the readings, (draws, 2)."""
+def _joint(fit: AxisFit) -> dict[str, float]:
+    """Compute zero and reduction of a joint with their covariance, from draws of the line through the readings."""
     model = fit.model
     slope = model.line_terms(per_command=1.0) + line_weights(model, fit.w)
     level = model.line_terms(offset=1.0) + model.functional(fit.rows.command, fit.w).mean(axis=-2)
     both = np.stack([level - model.middle * slope, slope], axis=-2)
-    return fit.linear.drawn(both, random_stream(fit.seed, Stream.PROMISE))
-
-
-def _joint(line: np.ndarray) -> dict[str, float]:
-    """Compute zero and reduction of a joint with their covariance, from draws (n, 2) of zero and unit per command."""
+    line = fit.linear.drawn(both, random_stream(fit.seed, Stream.PROMISE))
     joint = np.column_stack([line[:, 0], 1.0 / line[:, 1]])
     covariance = np.cov(joint.T)
     return {
@@ -205,22 +203,20 @@ def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _
         InputError: the range is shorter than a period, or the table too coarse for it.
     """
     low, high = float(at.command[0]), float(at.command[-1])
-    spacing = float(np.max(np.diff(at.command)))
-    _refuse_period(period, spacing, high - low)
+    _refuse_period(period, float(np.max(np.diff(at.command))), high - low)
     middle = at.mean.mean(axis=0)
     off = middle - np.polyval(np.polyfit(at.command, middle, 1), at.command)
-
     # The mean over periods is fitted by harmonics.
     amplitudes = np.linalg.lstsq(_harmonics(at.command, period), off, rcond=None)[0]
     command = np.linspace(low, high, PERIOD_NODES)
     added = -_harmonics(command, period) @ amplitudes / fitted
-    return _Shaped(Correction(command, added, added, resolution), {"period_command": period})
+    return Correction(command, added, added, resolution), {"period_command": period}
 
 
 def _by_phase(
     machine: PredictedMachine, rows: AxisRows, fitted: float, period: float, resolution: float
-) -> tuple[_Expected, _Shaped]:
-    """Average each side's errors from one line over periods: the readings of the first period, and the correction.
+) -> tuple[_Expected, Correction, float]:
+    """Average each side's errors from one line over periods: readings of the first one, correction, line's slope.
 
     The line's slope is that beside four harmonics of the period, where more than one period was read.
 
@@ -233,18 +229,16 @@ def _by_phase(
     _refuse_period(period, gap, high - low)
     nodes = low + period * np.linspace(0.0, 1.0, PHASE_NODES)
     periods = np.linspace(0, (high - low) // period - 1, PERIODS_MAX).round()
-    each = [_expected(machine, nodes + k * period, rows.both_sides) for k in np.unique(periods)]
-    command, mean = np.array([at.command for at in each]), np.array([at.mean for at in each])
+    each = [_expected(machine, nodes + k * period) for k in np.unique(periods)]
+    command, mean, variance = map(np.array, zip(*each, strict=True))
     at_once, middle = command.ravel(), mean.mean(axis=1).ravel()
     waves = _harmonics(at_once, period) if len(each) > 1 else np.zeros((len(at_once), 0))
     line = np.linalg.lstsq(np.column_stack([at_once, np.ones_like(at_once), waves]), middle, rcond=None)[0][:2]
     off = (mean - np.polyval(line, command)[:, None]).mean(axis=0)
     off[:, [0, -1]] = off[:, [0, -1]].mean(axis=1, keepdims=True)
-    variance = np.mean([at.variance for at in each], axis=0)
     forward, backward = _rounded(-off / fitted, 1.0, "csv")
     correction = Correction(nodes, forward, backward, resolution, period)
-    at = _Expected(nodes, np.polyval(line, nodes) + off, variance, rows.both_sides)
-    return at, _Shaped(correction, {"period_command": period}, float(line[0]))
+    return _Expected(nodes, np.polyval(line, nodes) + off, variance.mean(axis=0)), correction, float(line[0])
 
 
 def _harmonics(command: np.ndarray, period: float) -> np.ndarray:
@@ -387,21 +381,21 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         job.begin("table")
         by_phase = form.holds == "table" and wish.period is not None
         if by_phase:
-            at, shaped = _by_phase(machine, rows, fitted, float(wish.period or 0.0), wish.resolution)
-            nominal = _nominal(campaign, shaped.per_command, wish)
+            period = float(wish.period or 0.0)
+            at, correction, slope = _by_phase(machine, rows, fitted, period, wish.resolution)
+            nominal, settings, aim = _nominal(campaign, slope, wish), {"period_command": period}, None
         else:
-            at = _expected(machine, table_commands(rows), rows.both_sides)
-            shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
+            at = _expected(machine, table_commands(rows))
+            correction, settings = _shaped(form, at, nominal, wish, fit, fitted)
+            aim = _offset(at, nominal) if form.holds == "table" else None
         job.begin("promise")
-        aimed = (_offset(at, nominal) if form.holds == "table" and not by_phase else None, nominal)
-        offset, tried = tried_use(machine, shaped.correction, (low, high), aimed, reading_u(campaign), seed)
+        offset, tried = tried_use(machine, correction, (low, high), (aim, nominal), reading_u(campaign), seed)
         promise = promised_sides(tried, shift, form.zero_free)
         run_up = run_up_of(machine, rows.positions, fitted, wish.resolution)
     added = tried.added_variance(shift)
     by_side = np.array([added[tried.side == side].mean() for _, side in SIDES])
-    table = _table(replace(at, variance=at.variance + by_side[:, None]), shaped.correction)
-    use, state = machine.use, machine.state
-    around = _by_position_alone(campaign, form, by_phase, TURNS.get(campaign.unit, 0.0) / abs(fitted), high - low)
+    use, turn = machine.use, TURNS.get(campaign.unit, 0.0) / abs(fitted)
+    goes_round = form.holds == "table" and not by_phase and campaign.unit in TURNS and high - low >= turn
     return Compensation(
         target=wish.target,
         machine=str(campaign.header.get("serial") or campaign.header.get("name") or ""),
@@ -416,17 +410,17 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         hours=use.hours,
         travel_command=use.travel,
         homings=machine.homings,
-        table=table,
-        settings=shaped.settings,
+        table=_table(at._replace(variance=at.variance + by_side[:, None]), correction),
+        settings=settings,
         promise=promise,
         unsaid=(
             *form.unsaid,
             *((OF_PHASE,) if by_phase else ()),
-            *around,
+            *((BY_POSITION.format(number(turn, 4)),) if goes_round else ()),
             *(() if rows.both_sides else (ONE_SIDED,)),
             *_unreachable(campaign, low, high, run_up),
         ),
-        state={name: float(value) for name, value in state._asdict().items()},
+        state={name: float(value) for name, value in machine.state._asdict().items()},
         kelvin=use.kelvin if rows.kelvin is not None else None,
     )
 
@@ -458,18 +452,6 @@ def tried_use(
         shifts=machine.shifts(states, machine.state),
         scatter=machine.scatter(side, states, u),
         aim=offset + nominal * command,
-    )
-
-
-def _by_position_alone(
-    campaign: AxisCampaign, form: Format, by_phase: bool, turn: float, read: float
-) -> tuple[str, ...]:
-    """Say of an axis that goes round, a turn of `turn` commands, what a table by position does not hold."""
-    if form.holds != "table" or by_phase or campaign.unit not in TURNS or read < turn:
-        return ()
-    return (
-        "the axis goes round: the table is by position, for the turns read alone; one by phase, both sides, is "
-        f"`--to csv --period N` (or header), N the commands of a turn, about {number(turn, 4)}",
     )
 
 

@@ -119,21 +119,6 @@ class Trial:
         return self.travel**2 * (self.free.T.astype(float) @ self.free)
 
 
-@dataclass(frozen=True)
-class Judged:
-    """Result of a verification: verdict, p, probabilities of the hypotheses, readings needed (as in `Verification`).
-
-    `promised` and `without` are the predictions if the correction is applied and if it is not.
-    """
-
-    verdict: Verdict
-    p: float
-    worlds: dict[str, float]
-    needed: int | None
-    promised: PredictedReadings
-    without: PredictedReadings
-
-
 def _log_densities(trial: Trial) -> dict[str, float]:
     """Compute the log density of the readings by hypothesis."""
     promised = trial.at(1.0, 1.0)
@@ -147,20 +132,6 @@ def _log_densities(trial: Trial) -> dict[str, float]:
     sizes = np.geomspace(least, max(0.5 * trial.travel, 2 * least), OTHERS)
     others = [promised.log_density(trial.value, trial.shift + size**2 * trial.other) for size in sizes]
     return log_densities | {OTHER_MACHINE: log_mean(others)}
-
-
-def judged(trial: Trial, seed: int) -> Judged:
-    """Decide by the probabilities of the hypotheses and the distance of the readings from the prediction."""
-    promised, without = trial.at(1.0, 1.0), trial.at(0.0, 0.0)
-    logs = _log_densities(trial)
-    total = float(np.logaddexp.reduce(list(logs.values())))
-    worlds = {name: float(np.exp(logs[name] - total)) for name in WORLDS}
-    p = _p_value(promised, trial.value, trial.shift, seed)
-    verdict = _verdict(worlds, p)
-    needed: int | None = 0
-    if verdict == CANNOT_TELL:
-        needed = needed_readings(promised, promised.pooled().mean - without.pooled().mean, trial.noise)
-    return Judged(verdict, p, worlds, needed, promised, without)
 
 
 def _p_value(promised: PredictedReadings, value: np.ndarray, shift: np.ndarray, seed: int) -> float:
@@ -181,29 +152,46 @@ def size_of(error: np.ndarray) -> ErrorSize:
     return ErrorSize(float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))))
 
 
-def verification_of(trial: Trial, judgement: Judged, readings: int, *, homing: bool, **said: Any) -> Verification:
-    """State a result: errors and their bound less the free shifts; where those are of a `homing` with them as well."""
+def verification_of(
+    trial: Trial, readings: int, *, homing: bool, seed: int, together: int = 1, **said: Any
+) -> Verification:
+    """Decide by the probabilities of the hypotheses and the distance of the readings from the prediction.
+
+    Args:
+        trial: readings and predictions.
+        readings: number of readings as users count them.
+        homing: whether errors with the free shifts are stated as well, those of a homing.
+        seed: seed of all draws.
+        together: number of values of one reading.
+        said: further fields of `Verification`.
+    """
+    promised, without = trial.at(1.0, 1.0), trial.at(0.0, 0.0)
+    logs = _log_densities(trial)
+    total = float(np.logaddexp.reduce(list(logs.values())))
+    worlds = {name: float(np.exp(logs[name] - total)) for name in WORLDS}
+    p = _p_value(promised, trial.value, trial.shift, seed)
+    needed: int | None = 0
+    verdict: Verdict = KEPT if worlds[APPLIED] >= SURE else CANNOT_TELL
+    if p < P_MIN or worlds[APPLIED] < UNLIKELY:
+        verdict = BROKEN
+    if verdict == CANNOT_TELL:
+        needed = needed_readings(promised, promised.pooled().mean - without.pooled().mean, trial.noise)
     kept, error, every = less_means(trial.free), trial.value - trial.aim, np.arange(len(trial.aim))
-    first = size_of(kept @ error), bound_of(judgement.promised.less(trial.free), kept @ trial.aim, every)
+    first = size_of(kept @ error), bound_of(promised.less(trial.free), kept @ trial.aim, every)
     return Verification(
-        verdict=judgement.verdict,
-        p=judgement.p,
-        worlds=judgement.worlds,
-        before=size_of(kept @ (judgement.without.pooled().mean - trial.aim)),
+        verdict=verdict,
+        p=p,
+        worlds=worlds,
+        before=size_of(kept @ (without.pooled().mean - trial.aim)),
         after=first[0],
         promised95=first[1],
         readings=readings,
+        needed=None if needed is None else -(-needed // together),
         shift_free=ShiftFree(*first) if homing else None,
         after_with_homing=size_of(error) if homing else None,
-        promised95_with_homing=bound_of(judgement.promised, trial.aim, every) if homing else None,
+        promised95_with_homing=bound_of(promised, trial.aim, every) if homing else None,
         **said,
     )
-
-
-def _verdict(worlds: dict[str, float], p: float) -> Verdict:
-    if p < P_MIN or worlds[APPLIED] < UNLIKELY:
-        return BROKEN
-    return KEPT if worlds[APPLIED] >= SURE else CANNOT_TELL
 
 
 def needed_readings(promised: PredictedReadings, off: np.ndarray, noise: np.ndarray) -> int | None:
@@ -281,9 +269,9 @@ def verify_readings(
             free=np.ones((int(made.shift_free), len(aim)), dtype=bool),
             noise=machine.noise(fresh.side, fresh.variance),
         )
-        judgement = judged(trial, seed)
-    said = {"unit": campaign.unit, "needed": judgement.needed, "remarks": _remarks(made, fresh, campaign)}
-    return verification_of(trial, judgement, len(fresh.value), homing=made.shift_matters, **said)
+        remarks, homing = _remarks(made, fresh, campaign), made.shift_matters
+        readings = len(fresh.value)
+        return verification_of(trial, readings, homing=homing, seed=seed, unit=campaign.unit, remarks=remarks)
 
 
 AGAIN = "run `tvsbayes compensate` on this folder, and apply what it writes"
@@ -320,30 +308,21 @@ def table_in(campaign: AxisCampaign, path: Path) -> Compensation | None:
     return None
 
 
-def compensation_of_file(campaign: AxisCampaign, path: Path) -> Compensation:
-    """Read the compensation whose table a file holds.
+def stored_compensation(campaign: AxisCampaign, file: Path | None = None) -> Compensation:
+    """Read the compensation in `results/`, or the one whose table a file holds; it must exist.
 
     Raises:
-        InputError: as `table_in`, or there is none.
+        InputError: there is none, it belongs to other data, or it is damaged, or the file cannot be read.
     """
-    made = table_in(campaign, path)
+    made = compensation_in(campaign) if file is None else table_in(campaign, file)
     if made is None:
-        what, allowed = "no table whose promise is kept", "a table that `compensate -o` made of these data"
-        raise refusal("other-table", file=escaped(str(path), 200), found=what, allowed=allowed, remedy=AGAIN)
+        found, allowed = "no compensation of these data", "the one whose table is in force"
+        code, name = "missing-file", "results/compensation.json"
+        if file is not None:
+            found, allowed = "no table whose promise is kept", "a table that `compensate -o` made of these data"
+            code, name = "other-table", escaped(str(file), 200)
+        raise refusal(code, file=name, found=found, allowed=allowed, remedy=AGAIN)
     return made
-
-
-def stored_compensation(campaign: AxisCampaign) -> Compensation:
-    """Read the compensation, which must exist.
-
-    Raises:
-        InputError: there is none, it belongs to other data, or it is damaged.
-    """
-    compensation = compensation_in(campaign)
-    if compensation is None:
-        what, allowed = "no compensation of these data", "the one whose table is in force"
-        raise refusal("missing-file", file="results/compensation.json", found=what, allowed=allowed, remedy=AGAIN)
-    return compensation
 
 
 def verify_axis(
