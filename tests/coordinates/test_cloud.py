@@ -12,8 +12,8 @@ from support.bent_rig import ROUNDING_MM, calibration
 
 from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
 from tvsbayes.coordinates.cloud_files import cloud_place, columns_of, write_cloud
-from tvsbayes.coordinates.location import locate_linear
-from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOKS, LookRows, look_blocks
+from tvsbayes.coordinates.location import Settings, locate_linear, settings_of
+from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOKS, look_blocks
 from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_rays
 from tvsbayes.errors import InputError
 
@@ -24,42 +24,40 @@ BEHIND_DEG = 150.0
 """A reading that no beam of these looks meets."""
 
 
-def looks(count: int, seed: int = 1, first_line: int = 2) -> LookRows:
+def looks(count: int, seed: int = 1, first_line: int = 2) -> Settings:
     """Drawn looks; every seventh has no point."""
     generator = np.random.default_rng(seed)
     pan, tilt = generator.uniform(-80, 80, count), generator.uniform(-60, 60, count)
     reading = np.where(np.arange(count) % 7 == 6, BEHIND_DEG, generator.uniform(60, 75, count))
     sides = zip(generator.choice(["left", "right"], count), generator.choice(["up", "down"], count), strict=True)
-    approach = tuple((str(one), str(other)) for one, other in sides)
-    lines = range(first_line, first_line + count)
-    return LookRows(tuple(lines), tuple(pan.tolist()), tuple(tilt.tolist()), tuple(reading.tolist()), approach)
+    approach = [(str(one), str(other)) for one, other in sides]
+    return settings_of(pan, tilt, reading, approach, range(first_line, first_line + count))
 
 
 def test_points_are_those_of_the_law_and_of_the_published_equations():
     one, rows = calibration(), looks(50)
     (block,) = cloud(one, [rows], SIMPLE)
-    law = locate_linear(one, rows.settings)
+    law = locate_linear(one, rows)
     met = np.isfinite(law.value).all(axis=1)
     np.testing.assert_array_equal(block.xyz_mm, law.value[met])
     np.testing.assert_array_equal(block.sd_mm, np.sqrt(np.diagonal(law.covariance[met], 0, 1, 2)))
     np.testing.assert_array_equal(block.lines, np.arange(2, 52)[met])
-    assert [each.line for each in block.refused] == [2 + k for k in range(6, 50, 7)]
-    assert {each.error.code for each in block.refused} == {"diverging"}
+    assert [line for line, _ in block.refused] == [2 + k for k in range(6, 50, 7)]
+    assert {error.code for _, error in block.refused} == {"diverging"}
     # A simple calibration's point lies on its beam, and the aperture, 170 mm from the beam's origin, reads the angle.
-    ray = simple_rays(SIMPLE["nominal"], rows.settings.steps[met])
+    ray = simple_rays(SIMPLE["nominal"], rows.steps[met])
     along = block.simple_xyz_mm["nominal"].T - ray.origin_mm
     np.testing.assert_allclose(np.cross(along, ray.direction, axis=0), 0.0, atol=ROUNDING_MM)
     sight = block.simple_xyz_mm["nominal"] - [0.0, 70.0 - 170.0, 0.0]
     angle = np.degrees(np.arccos(sight[:, 1] / np.linalg.norm(sight, axis=1)))
     # In deg of an angle seen from 100 mm the same is more than enough.
-    np.testing.assert_allclose(angle, np.array(rows.aperture_deg)[met], atol=ROUNDING_MM)
+    np.testing.assert_allclose(angle, rows.aperture_deg[met], atol=ROUNDING_MM)
 
 
 def test_a_cloud_holds_what_a_robot_is_given_and_no_more():
     """Readings up to the one that beam and line of sight never meet under, with u that grows on the way there."""
     reading = np.linspace(85.0, 91.5, 40)
-    count = len(reading)
-    rows = LookRows(tuple(range(count)), (20.0,) * count, (10.0,) * count, tuple(reading), (("left", "up"),) * count)
+    count, rows = len(reading), settings_of(20.0, 10.0, reading)
     one, code = calibration(), []
     for deg in reading:
         try:
@@ -69,12 +67,12 @@ def test_a_cloud_holds_what_a_robot_is_given_and_no_more():
         else:
             code.append(None)
     (block,) = cloud(one, [rows], {})
-    law = np.isfinite(locate_linear(one, rows.settings).value).all(axis=1)
+    law = np.isfinite(locate_linear(one, rows).value).all(axis=1)
     kept = np.array([each is None for each in code])
     # Some have a point of the estimates that more than a thousandth of the draws have not.
     assert 0 < kept.sum() < law.sum() < count
     np.testing.assert_array_equal(block.lines, np.flatnonzero(kept))
-    assert [(each.line, each.error.code) for each in block.refused] == [(k, c) for k, c in enumerate(code) if c]
+    assert [(line, error.code) for line, error in block.refused] == [(k, c) for k, c in enumerate(code) if c]
 
 
 def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
@@ -123,7 +121,7 @@ def test_a_cloud_does_not_replace_the_looks_that_it_is_made_of(tmp_path, name):
 
 
 def test_what_fails_half_way_leaves_the_old_cloud(tmp_path):
-    def failing() -> Iterator[LookRows]:
+    def failing() -> Iterator[Settings]:
         yield looks(20)
         raise InputError("number", "a bad cell")
 
@@ -143,18 +141,18 @@ def test_the_sample_is_even_whatever_the_blocks(count):
     samples = []
     for size in (count, 7):
         sample = EvenSample()
-        parts = (LookRows(*(getattr(rows, name)[k : k + size] for name in vars(rows))) for k in range(0, count, size))
-        assert sum(len(part.lines) for part in sample.of(parts)) == count
-        samples.append(sample.looks)
+        parts = (rows[k : k + size] for k in range(0, count, size))
+        assert sum(map(len, sample.of(parts))) == count
+        samples.append(sample.looks.lines.tolist())
     assert samples[0] == samples[1] and len(samples[0]) <= CHECKED_MAX
     stride = 1 if count <= CHECKED_MAX else 4
-    assert [look[0] for look in samples[0]] == list(rows.pan_steps[::stride])
+    assert samples[0] == rows.lines[::stride].tolist()
 
 
 def test_the_law_is_checked_by_draws():
     sample = EvenSample()
     list(sample.of([looks(28)]))
-    check = checked(calibration(), sample, 600, 0)
+    check = checked(calibration(), sample.looks, 600, 0)
     assert check.points == 24 and 0 < check.held <= 24
     # Half of the points differ by less than the worst one; none by as much as the ranges themselves.
     assert 0 < check.off_mm < check.most_off_mm < 1000

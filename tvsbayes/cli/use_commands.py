@@ -119,16 +119,15 @@ def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool
     from tvsbayes.coordinates.looks_file import read_looks
     from tvsbayes.instrument.campaign import read_campaign
 
-    points = read_looks(file)
-    looks = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
+    looks = read_looks(file)
     measured = read_campaign(campaign)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
-        from tvsbayes.coordinates.location import locate as locate_points
+        from tvsbayes.coordinates.location import locate_settings
         from tvsbayes.report.command_text import locations_text
 
         _refuse_head(calibration)
-        located = locate_points(calibration, *looks, draws=draws, seed=seed, progress=job.part(LOCATING))
+        located = locate_settings(calibration, looks, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [located.as_json(k) for k in range(len(located.refused))]
     document = {"estimator": located.estimator, "draws": located.draws, "points": entries}
     finish(document, locations_text(located, measured.aperture_read), as_json)
@@ -155,7 +154,9 @@ def _write_cloud(campaign: Path, file: Path, out: Path, draws: int, seed: int, a
         sample = EvenSample()
         blocks = points_of(calibration, sample.of(look_blocks(file, job.at)), simple)
         written = write_cloud(blocks, out, tuple(simple))
-        check = checked(calibration, sample, draws, seed)
+        # The file has looks: an empty one is refused.
+        assert sample.looks is not None
+        check = checked(calibration, sample.looks, draws, seed)
     document = {"estimator": calibration.estimator, **written.as_json(), "checked": asdict(check)}
     finish(document, cloud_text(written, check, calibration), as_json)
 

@@ -8,27 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.calibration.located_point import meets
 from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.coordinates.location import Linear, Settings, locate, locate_linear
-from tvsbayes.coordinates.looks_file import LookRows
+from tvsbayes.coordinates.location import Linear, Settings, joined, locate_linear, locate_settings
 from tvsbayes.coordinates.simple_calibration import SimpleCalibration, assumed_geometry
 from tvsbayes.errors import InputError
 
 CHECKED_MAX = 200
 """Largest number of looks validated by draws."""
-
-
-@dataclass(frozen=True)
-class Refused:
-    """A look without a point: its line in the file, and the reason."""
-
-    line: int
-    error: InputError
 
 
 @dataclass(frozen=True)
@@ -41,7 +31,7 @@ class CloudBlock:
         covariance_mm2: covariance by the law of propagation, shape (n, 3, 3).
         extrapolated: whether the counters are outside those of the campaign's looks, shape (n,).
         simple_xyz_mm: points by simpler calibrations, by name, shapes (n, 3); NaN where they have none.
-        refused: the other looks.
+        refused: lines of the other looks, and the reasons.
     """
 
     lines: np.ndarray
@@ -49,7 +39,7 @@ class CloudBlock:
     covariance_mm2: np.ndarray
     extrapolated: np.ndarray
     simple_xyz_mm: Mapping[str, np.ndarray]
-    refused: tuple[Refused, ...]
+    refused: tuple[tuple[int, InputError], ...]
 
     @property
     def sd_mm(self) -> np.ndarray:
@@ -58,7 +48,7 @@ class CloudBlock:
 
 
 def cloud(
-    calibration: Calibration, looks: Iterable[LookRows], simple: Mapping[str, SimpleCalibration]
+    calibration: Calibration, looks: Iterable[Settings], simple: Mapping[str, SimpleCalibration]
 ) -> Iterator[CloudBlock]:
     """Compute points of looks, one block of points for each block of looks.
 
@@ -70,17 +60,13 @@ def cloud(
     Raises:
         InputError: a calibration without draws.
     """
-    for rows in looks:
-        settings = rows.settings
+    for settings in looks:
         linear = locate_linear(calibration, settings)
         meets = _meets(calibration, settings, linear)
         pan, tilt = settings.steps[meets].T
         reading = settings.aperture_deg[meets]
-        refused = tuple(
-            Refused(rows.lines[k], _refusal(calibration, settings, k)) for k in np.flatnonzero(~meets).tolist()
-        )
         yield CloudBlock(
-            lines=np.array(rows.lines)[meets],
+            lines=settings.lines[meets],
             xyz_mm=linear.value[meets],
             covariance_mm2=linear.covariance[meets],
             extrapolated=~np.asarray(calibration.covers(pan, tilt)),
@@ -88,7 +74,9 @@ def cloud(
                 name: assumed_geometry(one, pan, tilt).points(reading, calibration.azimuth).T
                 for name, one in simple.items()
             },
-            refused=refused,
+            refused=tuple(
+                (int(settings.lines[k]), _refusal(calibration, settings, k)) for k in np.flatnonzero(~meets).tolist()
+            ),
         )
 
 
@@ -108,34 +96,21 @@ def _refusal(calibration: Calibration, settings: Settings, row: int) -> InputErr
     return calibration.refusal(pan, tilt, float(settings.aperture_deg[row]), (pan_side, tilt_side))
 
 
-class SampledLook(NamedTuple):
-    """A look of a sample: absolute counters, reading, and directions of the last moves of (pan, tilt)."""
-
-    pan_steps: float
-    tilt_steps: float
-    aperture_deg: float
-    approach: tuple[str, str]
-
-
 class EvenSample:
     """At most `CHECKED_MAX` looks, evenly spread over a stream of unknown length, which is passed through `of`."""
 
     def __init__(self) -> None:
-        self.looks: list[SampledLook] = []
+        self.looks: Settings | None = None
         self._stride, self._passed = 1, 0
 
-    def of(self, blocks: Iterable[LookRows]) -> Iterator[LookRows]:
+    def of(self, blocks: Iterable[Settings]) -> Iterator[Settings]:
         """Collect looks and pass the blocks on."""
         for rows in blocks:
-            for k in range(-self._passed % self._stride, len(rows.lines), self._stride):
-                if (self._passed + k) % self._stride:
-                    continue
-                settings = rows.pan_steps[k], rows.tilt_steps[k], rows.aperture_deg[k]
-                self.looks.append(SampledLook(*settings, rows.approach[k]))
-                if len(self.looks) > CHECKED_MAX:
-                    self.looks = self.looks[::2]
-                    self._stride *= 2
-            self._passed += len(rows.lines)
+            chosen = rows[-self._passed % self._stride :: self._stride]
+            looks = chosen if self.looks is None else joined([self.looks, chosen])
+            while len(looks) > CHECKED_MAX:
+                looks, self._stride = looks[::2], 2 * self._stride
+            self.looks, self._passed = looks, self._passed + len(rows)
             yield rows
 
 
@@ -155,10 +130,9 @@ class LawChecked:
     most_off_mm: float | None
 
 
-def checked(calibration: Calibration, sample: EvenSample, draws: int, seed: int) -> LawChecked:
-    """Validate some of the points by draws (JCGM 101, 8)."""
-    pan, tilt, reading, approach = zip(*sample.looks, strict=True)
-    located = locate(calibration, pan, tilt, reading, approach, draws=draws, seed=seed)
+def checked(calibration: Calibration, looks: Settings, draws: int, seed: int) -> LawChecked:
+    """Validate points of some looks by draws (JCGM 101, 8)."""
+    located = locate_settings(calibration, looks, draws=draws, seed=seed)
     accepted = np.array([error is None for error in located.refused])
     agrees = np.asarray(located.digits_held).min(axis=1) >= 1
     off = located.law_off_mm[accepted]

@@ -170,7 +170,7 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
             body.add(kept, block, names)
             points += len(block.lines)
             extrapolated += int(block.extrapolated.sum())
-            refused += [(one.line, one.error.code, one.error.message) for one in block.refused]
+            refused += [(line, error.code, error.message) for line, error in block.refused]
         kept.seek(0)
         stream.write(body.header(names, points))
         shutil.copyfileobj(kept, stream)

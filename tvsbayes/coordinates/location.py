@@ -129,14 +129,19 @@ class Settings:
         steps: counters (pan, tilt), shape (n, 2).
         side: approach sides, +1 left or up, -1 right or down, 0 unknown, shape (n, 2).
         aperture_deg: readings, shape (n,).
+        lines: their lines in a file, from 1, shape (n,); else their numbers.
     """
 
     steps: np.ndarray
     side: np.ndarray
     aperture_deg: np.ndarray
+    lines: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.steps)
 
     def __getitem__(self, chosen: slice) -> Settings:
-        return Settings(self.steps[chosen], self.side[chosen], self.aperture_deg[chosen])
+        return Settings(*(each[chosen] for each in vars(self).values()))
 
     def of_one_approach(self) -> Iterator[np.ndarray]:
         """Group the rows of points by their sides."""
@@ -165,21 +170,23 @@ def settings_of(
     tilt_steps: float | Sequence[float] | np.ndarray,
     aperture_deg: float | Sequence[float] | np.ndarray,
     approach: tuple[str, str] | Sequence[tuple[str, str]] = HOME_APPROACH,
+    lines: Sequence[int] | None = None,
 ) -> Settings:
-    """Build the settings of many points; arguments and errors as in `locate`."""
+    """Build the settings of many points; arguments and errors as in `locate`, `lines` in their file."""
     numbers = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (pan_steps, tilt_steps, aperture_deg)]
     pan, tilt, reading = np.broadcast_arrays(*numbers)
     single = len(approach) == 2 and isinstance(approach[0], str)
     pairs = cast("Sequence[tuple[str, str]]", [approach] if single else approach)
     known = {(pan_side, tilt_side): sides_of((pan_side, tilt_side)) for pan_side, tilt_side in pairs}
     side = np.broadcast_to(np.array([known[pan_side, tilt_side] for pan_side, tilt_side in pairs]), (len(pan), 2))
-    return Settings(np.stack([pan, tilt], axis=1), side, np.array(reading))
+    numbered = np.arange(len(pan)) if lines is None else np.asarray(lines)
+    return Settings(np.stack([pan, tilt], axis=1), side, np.array(reading), numbered)
 
 
 def carry(calibration: Calibration, rigs: Drawn, settings: Settings) -> np.ndarray:
     """Propagate every draw through the geometry for every point: (draws, points, 3), NaN where nothing meets."""
     noise = rigs.noise.T[:, :, None]
-    xyz = np.empty((len(rigs.inputs), len(settings.steps), 3))
+    xyz = np.empty((len(rigs.inputs), len(settings), 3))
     for rows in settings.of_one_approach():
         steps, side = settings.steps[rows].T, settings.side[rows[0]]
         values = rigs.values_at(calibration, (steps[0], steps[1]))
@@ -193,7 +200,7 @@ def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
 
     Without draws it computes a million points a minute. Validate some of them with `locate`.
     """
-    count, inputs = len(settings.steps), len(calibration.look_inputs) + NOISES
+    count, inputs = len(settings), len(calibration.look_inputs) + NOISES
     value, jacobian = np.empty((count, 3)), np.empty((count, 3, inputs))
     covariance = np.empty((count, 3, 3))
     for rows in settings.of_one_approach():
@@ -243,21 +250,28 @@ def locate(
         ValueError: there are fewer than 500 draws (formulation 5), or lists differ in length.
     """
     require_kind(calibration, "moved_points", "a calibration, of calibration_of(posterior) or load_calibration(folder)")
+    settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)
+    return locate_settings(calibration, settings, draws=draws, seed=seed, progress=progress)
+
+
+def locate_settings(
+    calibration: Calibration, settings: Settings, *, draws: int = DRAWS, seed: int = 0, progress: Show | None = None
+) -> Locations:
+    """Locate points of looks; arguments and errors as in `locate`."""
     if draws < 500:
         raise ValueError(f"{draws} draws; a coordinate's interval needs at least 500")
-    settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)
-    if not len(settings.steps):
+    if not len(settings):
         raise ValueError("no points: the lists are empty")
     given = drawn(calibration, draws, seed)
     size, parts = max(BLOCK // draws, 1), []
     with Job({"locating": 1.0}, progress) as job:
-        for begin in range(0, len(settings.steps), size):
+        for begin in range(0, len(settings), size):
             block = settings[begin : begin + size]
             points = carry(calibration, given, block), locate_linear(calibration, block)
             parts.append(_statistics(block, *points, given, calibration))
-            done = begin + len(block.steps)
-            job.at(done / len(settings.steps), f"{done} of {len(settings.steps)} points")
-        located = _together(parts)
+            done = begin + len(block)
+            job.at(done / len(settings), f"{done} of {len(settings)} points")
+        located = joined(parts)
     requests = zip(settings.steps.tolist(), settings.aperture_deg.tolist(), settings.side.tolist(), strict=True)
     refused = tuple(
         None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))
@@ -269,16 +283,16 @@ def locate(
     return replace(located, refused=refused, unseen=unseen, extrapolated=np.array([bool(words) for words in unseen]))
 
 
-def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
+def joined[T: (Locations, Settings, Validation)](parts: Sequence[T]) -> T:
     """Join blocks of points: arrays are concatenated, other fields are the same in every block."""
 
-    def joined(values: list[Any]) -> Any:
+    def together(values: list[Any]) -> Any:
         if isinstance(values[0], Validation):
-            return _together(values)
+            return joined(values)
         return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
 
     names = [field.name for field in fields(parts[0])]
-    return replace(parts[0], **{name: joined([getattr(part, name) for part in parts]) for name in names})
+    return replace(parts[0], **{name: together([getattr(part, name) for part in parts]) for name in names})
 
 
 def _statistics(settings: Settings, xyz: np.ndarray, law: Linear, given: Drawn, calibration: Calibration) -> Locations:

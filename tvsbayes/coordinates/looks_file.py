@@ -52,34 +52,10 @@ class Look:
 LOOKS = CsvKind(Look, "FILE.csv")
 
 
-@dataclass(frozen=True)
-class LookRows:
-    """Rows of a file of looks.
-
-    Attributes:
-        lines: lines in the file, from 1.
-        pan_steps, tilt_steps: absolute counters.
-        aperture_deg: readings.
-        approach: directions of the last moves of (pan, tilt).
-    """
-
-    lines: tuple[int, ...]
-    pan_steps: tuple[float, ...]
-    tilt_steps: tuple[float, ...]
-    aperture_deg: tuple[float, ...]
-    approach: tuple[tuple[str, str], ...]
-
-    @property
-    def settings(self) -> Settings:
-        """Return the looks as arrays."""
-        return settings_of(self.pan_steps, self.tilt_steps, self.aperture_deg, self.approach)
-
-
-def _rows(table: Table) -> LookRows:
+def _rows(table: Table) -> Settings:
     """Check the cells of a table and return its rows."""
-    cells_of = {name: tuple(cells) for name, cells in LOOKS.values(table).items()}
-    pairs = zip(cells_of.pop("pan_approach"), cells_of.pop("tilt_approach"), strict=True)
-    return LookRows(lines=tuple(table.lines), approach=tuple(pairs), **cells_of)
+    pan, tilt, pan_approach, tilt_approach, reading = LOOKS.values(table).values()
+    return settings_of(pan, tilt, reading, list(zip(pan_approach, tilt_approach, strict=True)), table.lines)
 
 
 def _no_points(path: Path) -> InputError:
@@ -104,7 +80,7 @@ def _part(table: Table, begin: int) -> Table:
     return Table(table.file, table.lines[begin:end], {name: cells[begin:end] for name, cells in table.columns.items()})
 
 
-def read_looks(path: Path) -> LookRows:
+def read_looks(path: Path) -> Settings:
     """Read all looks of a file.
 
     Raises:
@@ -118,7 +94,7 @@ def read_looks(path: Path) -> LookRows:
     return _rows(table)
 
 
-def look_blocks(path: Path, advance: Advance = unshown) -> Iterator[LookRows]:
+def look_blocks(path: Path, advance: Advance = unshown) -> Iterator[Settings]:
     """Read the looks of a file of any length, block by block.
 
     Args:
