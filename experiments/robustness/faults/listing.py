@@ -313,8 +313,8 @@ FAULTS = (
     # Compensation.
     Fault("corrections of both sides change places", "Correction.sent", Argument("side", "-value"),
           "test_both_sides_are_linear_between_lines_and_constant_beyond"),
-    Fault("LinuxCNC's table has the wrong sign", "formats._linuxcnc",
-          Reads("added", "{k: -v for k, v in value.items()}"), "test_linuxcnc_sends_the_corrected_command_by_its_rule"),
+    Fault("LinuxCNC's table has the wrong sign", "formats._triplets",
+          Local("sides", "(-value[0], -value[1])"), "test_linuxcnc_sends_the_corrected_command_by_its_rule"),
     Fault("a table is made of a fit that is not accepted", "refuse_answer", Never("answer"),
           "test_no_table_is_made_of_what_is_not_accepted"),
     Fault("a scanner's lost play goes for a kept promise", "AimedLooks.off_deg", Local("half", "0 * value"),
