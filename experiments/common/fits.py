@@ -8,7 +8,7 @@ import numpy as np
 from tvsbayes.estimators.joint_fit import JointFit, fit, fit_at
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import RIG_NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.model.parameter_space import coordinates_of
 from tvsbayes.statistics.least_squares import newton_mode
 from tvsbayes.twin.true_rig import Truth
@@ -16,7 +16,7 @@ from tvsbayes.twin.true_rig import Truth
 
 def physical_of(truth: Truth) -> np.ndarray:
     """A true rig and its cameras in the order of `tvsbayes.instrument.parameters.NAMES`, shape (65,)."""
-    return np.array([*(truth.parameters[name] for name in RIG_NAMES), *truth.stereo.vector])
+    return np.array([*(truth.parameters[name] for name in TWO_MIRROR.rig_names), *truth.stereo.vector])
 
 
 def fit_from_truth(campaign: Campaign, truth: Truth) -> JointFit:

@@ -16,7 +16,8 @@ import numpy as np
 
 from experiments.common.jax_density import innovations, log_density, without_padding
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import NOISE_NAMES
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 """Of draws (chain, draw)."""
@@ -83,7 +84,7 @@ def build_transport(joint: JointFit) -> Transport:
             out.append(np.asarray(whitened(jnp.asarray(z), joint.space, arrays))[: len(part)])
         return np.concatenate(out)
 
-    geometry = [k for k in range(size) if NAMES[index[k]] not in NOISE_NAMES]
+    geometry = [k for k in range(size) if TWO_MIRROR.names[index[k]] not in NOISE_NAMES]
     stiff = [k for k in geometry if root[k, k] < STIFF_SD]
     centre = residuals(np.zeros((1, size)))[0]
     plus, minus = residuals(STEP * np.eye(size)), residuals(-STEP * np.eye(size))

@@ -20,7 +20,7 @@ from experiments.common.command_line import study
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import commit
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
-from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
+from tvsbayes.instrument.parameters import TERMS, Prior, names_of
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.twin.simulated_campaign import simulate
@@ -36,7 +36,7 @@ def head_of(kind: str) -> Rig:
         table = RigTable(ratios, mechanism=SIGHTING_HEAD)
         return Rig(table, None, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 20.0, "look_s": 5.0})
     mounted = mounted_rig()
-    stated = {n: p for n, p in mounted.table.priors.items() if n in HEAD.documented}
+    stated = {n: p for n, p in mounted.table.priors.items() if n in HEAD.parameters}
     table = RigTable(stated, mechanism=HEAD)
     table = replace(table, priors={**table.priors, "elevation_zero_deg": Prior(0.0, 2.0)})
     return replace(mounted, table=table, truth=dict(table.priors))
@@ -58,7 +58,7 @@ def plan_of(kind: str, seed: int) -> tuple[PlanStep, ...]:
 
 def one_head(task: tuple[str, int]) -> dict[str, object]:
     kind, seed = task
-    run, names = simulate(head_of(kind), plan_of(kind, seed), seed), [term.name for term in HEAD_TERMS.values()]
+    run, names = simulate(head_of(kind), plan_of(kind, seed), seed), [term.name for term in TERMS]
     row = {"kind": kind, "seed": seed, "commit": commit()}
     return row | tried(run.campaign, run.truth, "importance", names=names)
 

@@ -22,7 +22,8 @@ from experiments.common.rigs import creeping_rig, shipped_plan
 from experiments.common.rows import commit
 from tvsbayes.assessment.gear_waves import gear_periods
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.parameters import RIG_PRIORS, names_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
@@ -42,7 +43,7 @@ def moving_rig(periodic: bool) -> Rig:
     priors = {name: prior for name, prior in rig.table.priors.items() if name not in PERIODIC_NAMES}
     table = replace(rig.table, priors=priors, harmonic_period_deg={axis: (PERIOD_DEG,) for axis in AXES})
     wave = "harmonic_amplitude_deg.pan.1"
-    return replace(rig, table=table, truth={**rig.truth, wave: RIG_PRIORS[wave]})
+    return replace(rig, table=table, truth={**rig.truth, wave: TWO_MIRROR.priors[wave]})
 
 
 def temperature_degC(time_s: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space
 from tvsbayes.posterior.draws import Posterior, derived_of
@@ -174,7 +174,7 @@ def ranks(simulated, result, z: np.ndarray, place_errors_rad: np.ndarray) -> dic
         log_posterior = evaluate(both, still, space, arrays).log_density
     log_likelihood = log_posterior + 0.5 * np.sum(both**2, axis=1)
     values = {"log-likelihood": log_likelihood, "log-posterior": log_posterior}
-    values |= {NAMES[i]: np.append(true[i], physical[:, i]) for i in np.flatnonzero(result.free)}
+    values |= {TWO_MIRROR.names[i]: np.append(true[i], physical[:, i]) for i in np.flatnonzero(result.free)}
     ratio = truth.effective_deg_per_step(simulated.campaign)
     for k, direction in enumerate(DIRECTIONS):
         effective = draws.effective_deg_per_step[0, :, k]

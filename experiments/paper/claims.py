@@ -26,7 +26,7 @@ from tvsbayes.assessment.causes import headline_causes
 from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import RUN_UP_STEPS, four_point_protocol, mixed_protocol, paper_protocol
 from tvsbayes.model.compilation_cache import use_compilation_cache
@@ -177,7 +177,7 @@ def known(knowledge: Knowledge, names: tuple[str, ...]) -> Knowledge:
     """The same with parameters taken as known."""
     precision = knowledge.precision.copy()
     for name in names:
-        precision[INDEX[name], INDEX[name]] += KNOWN
+        precision[TWO_MIRROR.index[name], TWO_MIRROR.index[name]] += KNOWN
     return replace(knowledge, precision=precision)
 
 

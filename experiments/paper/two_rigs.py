@@ -42,8 +42,9 @@ from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
@@ -112,11 +113,11 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
         entry["log_evidence"], entry["chi2"] = result.log_evidence, result.chi2
         entry["homing_side"] = result.homing_side
         for quantity in QUANTITIES:
-            column, mode = draws[:, INDEX[quantity]], float(result.mode.physical[INDEX[quantity]])
+            column, mode = draws[:, TWO_MIRROR.index[quantity]], float(result.mode.physical[TWO_MIRROR.index[quantity]])
             entry[quantity] = [mode, float(column.std()), *np.quantile(column, (0.025, 0.975)).tolist()]
         if model == "both":
             entry["effective"] = effective_ratios(result)
-        equal = draws[:, INDEX["degrees_per_step.tilt"]] / draws[:, INDEX["degrees_per_step.pan"]]
+        equal = draws[:, TWO_MIRROR.index["degrees_per_step.tilt"]] / draws[:, TWO_MIRROR.index["degrees_per_step.pan"]]
         entry["tilt over pan"] = [float(equal.mean()), float(equal.std())]
         row["models"][model] = entry
     row |= {"truth": {n: v for n, v in truth.parameters.items() if "step" in n}}

@@ -28,7 +28,7 @@ from experiments.common.rigs import TWINS, dense_plan, mounted_rig, small_plan, 
 from experiments.sampler.nuts_reference import hamiltonian
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.draws import Posterior, headline_names
 from tvsbayes.posterior.sampling import TIERS, sample
@@ -97,7 +97,7 @@ def by_nuts(joint: JointFit, setting: Setting) -> dict[str, object]:
 
 def summary(posterior: Posterior) -> dict[str, dict[str, float]]:
     """Mean and sd with their Monte Carlo errors, of every free parameter and headline."""
-    free = [NAMES[i] for i in np.flatnonzero(posterior.fit.free)]
+    free = [TWO_MIRROR.names[i] for i in np.flatnonzero(posterior.fit.free)]
     names = list(dict.fromkeys((*free, *headline_names(posterior.fit))))
     table = posterior.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
     fields = zip(names, table.mean, table.sd, table.mcse_mean, table.mcse_sd, strict=True)

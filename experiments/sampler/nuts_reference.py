@@ -30,8 +30,8 @@ from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, input_hashes
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import derived_quantities
@@ -54,7 +54,7 @@ def quantities(joint: JointFit, z_of: Callable[[jax.Array], jax.Array], draws: n
     derived = derived_quantities(z, errors_rad, joint.space, joint.seen_line)
     shape = draws.shape[:2]
     physical = np.asarray(derived.physical)
-    named = {NAMES[k]: physical[:, k].reshape(shape) for k in np.flatnonzero(joint.free)}
+    named = {TWO_MIRROR.names[k]: physical[:, k].reshape(shape) for k in np.flatnonzero(joint.free)}
     for kind in RATIOS:
         ratio = np.asarray(getattr(derived, kind)).reshape(*shape, len(DIRECTIONS))
         named |= {f"{kind}.{direction}": ratio[..., k] for k, direction in enumerate(DIRECTIONS)}

@@ -16,7 +16,8 @@ from tvsbayes.acquisition.simulated_bench import SIMULATED_START, SimulatedOpera
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.parameters import RIG_NAMES, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.twin.physics import mirror_chain
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import draw_truth
@@ -88,7 +89,7 @@ def test_a_look_lasts_from_laser_on_to_laser_off(mounted_rig):
 
 def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
     """Scale x root of the hours between two motions, over 200 of them; nothing moves while a camera looks on."""
-    still = {name: 0.0 for name in RIG_NAMES if name.startswith(("stop_sd_deg", "backlash_deg"))}
+    still = {name: 0.0 for name in TWO_MIRROR.rig_names if name.startswith(("stop_sd_deg", "backlash_deg"))}
     instrument, positioner = at_rest(mounted_rig, **still, **{"drift_deg_per_root_hour.pan": 0.3})
     changes, angle_deg = [], instrument.state_deg().mirror_angles_deg[0]
     for number in range(200):

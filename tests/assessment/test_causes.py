@@ -15,7 +15,7 @@ from support.linear_fit import ROWS, fit_of, linear_problem, refitted, slope_of
 from support.written_rows import move_row
 
 from tvsbayes.assessment.causes import causes_of, headline_budget, headline_causes
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.metrology.budget_tables import CORRELATIONS
 from tvsbayes.results.estimates import Estimate
@@ -27,19 +27,24 @@ def linear_fit(mounted_rig):
     """A linear campaign with headlines that are linear in its coordinates: (fit, gradient, Jacobian, load)."""
     jacobian, load = linear_problem()
     # What the rig fixes moves no spot.
-    jacobian[:, [INDEX[name] for name in RIG_NAMES if mounted_rig.table.priors[name].u == 0]] = 0.0
+    jacobian[:, [TWO_MIRROR.index[name] for name in TWO_MIRROR.rig_names if mounted_rig.table.priors[name].u == 0]] = (
+        0.0
+    )
     fit = fit_of(jacobian, load, mounted_rig)
-    covariance = np.linalg.inv(fit.information.fisher + np.eye(len(NAMES)))
+    covariance = np.linalg.inv(fit.information.fisher + np.eye(len(TWO_MIRROR.names)))
     rng = np.random.default_rng(12)
     draws_z = laplace_draws(fit.z, covariance, 1)
-    gradient = rng.normal(size=(6, len(NAMES))) * 1e-3
+    gradient = rng.normal(size=(6, len(TWO_MIRROR.names))) * 1e-3
     # Nothing depends on a coordinate that is fixed, and noise scales carry no headline.
-    gradient[:, : len(RIG_NAMES)][:, np.asarray(fit.space.u) == 0] = 0.0
-    physical = np.full((len(draws_z), len(NAMES)), 0.5)
+    gradient[:, : len(TWO_MIRROR.rig_names)][:, np.asarray(fit.space.u) == 0] = 0.0
+    physical = np.full((len(draws_z), len(TWO_MIRROR.names)), 0.5)
     values = draws_z @ gradient.T
-    physical[:, INDEX["backlash_deg.pan"]], physical[:, INDEX["backlash_deg.tilt"]] = values[:, 4], values[:, 5]
+    physical[:, TWO_MIRROR.index["backlash_deg.pan"]], physical[:, TWO_MIRROR.index["backlash_deg.tilt"]] = (
+        values[:, 4],
+        values[:, 5],
+    )
     for k, name in enumerate(("stop_sd_deg.left", "stop_sd_deg.right", "pixel_scale")):
-        physical[:, INDEX[name]] = np.exp((0.1, 0.2, 0.05)[k] * rng.standard_normal(len(draws_z)))
+        physical[:, TWO_MIRROR.index[name]] = np.exp((0.1, 0.2, 0.05)[k] * rng.standard_normal(len(draws_z)))
     rows = ((0, 0, 0.0, 0, 0, "left", "up"), (1, 0, 1.0, 9, 0), (2, 0, 2.0, 0, 0), (3, 0, 3.0, 0, 9))
     moves = tuple(move_row(*row) for row in rows)
     draws = drawn_quantities(len(physical), physical=physical, effective_deg_per_step=values[:, :4])
@@ -64,10 +69,12 @@ def test_headline_causes_are_what_refitting_shows(linear_fit):
     sd_by = {name: causes.contribution[:, k] for k, name in enumerate(causes.names)}
     np.testing.assert_allclose(sd_by["pixel noise"], np.linalg.norm(pixels, axis=1), rtol=1e-6)
     np.testing.assert_allclose(sd_by["stop errors of the campaign"], np.linalg.norm(stops, axis=1), rtol=1e-6)
-    cameras = gradient @ by_prior[:, len(RIG_NAMES) :]
+    cameras = gradient @ by_prior[:, len(TWO_MIRROR.rig_names) :]
     np.testing.assert_allclose(sd_by["stereo calibration"], np.linalg.norm(cameras, axis=1), rtol=1e-6)
     for name in ("mirror_offset_mm", "laser_tilt_deg.y", "focal_scale", "backlash_deg.pan"):
-        np.testing.assert_allclose(sd_by[name], gradient @ by_prior[:, INDEX[name]], atol=1e-6 * scale, rtol=1e-6)
+        np.testing.assert_allclose(
+            sd_by[name], gradient @ by_prior[:, TWO_MIRROR.index[name]], atol=1e-6 * scale, rtol=1e-6
+        )
     # They add up to the variance: each is counted once.
     total = np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient)
     np.testing.assert_allclose((causes.contribution**2).sum(axis=1), total, rtol=1e-6)
@@ -162,10 +169,10 @@ def test_causes_are_what_refitting_shows(mounted_rig, readings):
         "pixel and aperture noise" if readings else "pixel noise": pixels @ pixels.T,
         "stop errors of the campaign": stops @ stops.T,
     }
-    stereo = slope @ by_prior[:, len(RIG_NAMES) :]
+    stereo = slope @ by_prior[:, len(TWO_MIRROR.rig_names) :]
     expected["stereo calibration"] = stereo @ stereo.T
     for stem in ("mirror_offset_mm", "laser_tilt_deg", "extrinsics", "focal_scale"):
-        columns = [INDEX[name] for name in RIG_NAMES if name.split(".")[0] == stem]
+        columns = [TWO_MIRROR.index[name] for name in TWO_MIRROR.rig_names if name.split(".")[0] == stem]
         moved = slope @ by_prior[:, columns]
         expected["focal scale" if stem == "focal_scale" else f"prior of {stem}"] = moved @ moved.T
     for name, part in expected.items():
@@ -179,7 +186,7 @@ def test_causes_add_up_to_the_posterior(mounted_rig):
     fit = fit_of(jacobian, load, mounted_rig)
     causes = causes_of(fit)
     inverse = np.linalg.inv(np.eye(ROWS) + load @ load.T)
-    posterior = np.linalg.inv(jacobian.T @ inverse @ jacobian + np.eye(len(NAMES)))
+    posterior = np.linalg.inv(jacobian.T @ inverse @ jacobian + np.eye(len(TWO_MIRROR.names)))
     slope = slope_of(fit)
     total = slope @ posterior @ slope.T
     scale = np.sqrt(np.outer(np.diag(total), np.diag(total)))

@@ -18,7 +18,8 @@ from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
 from tvsbayes.calibration.states import shifts_at
 from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.instrument.campaign import input_hashes
-from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 
 ROUNDING = 1e-12
 """Of a hundred operations on numbers of order 1."""
@@ -89,7 +90,7 @@ def test_calibration_of_a_fit_brings_its_causes(mounted_rig):
     causes = causes_of(fit, states=one.states)
     assert (one.estimator, one.causes) == ("laplace", tuple(causes))
     np.testing.assert_array_equal(one.cause_covariance, np.stack(list(causes.values())))
-    at_homing = fit.draws.physical[:, [INDEX[name] for name in INPUT_NAMES]]
+    at_homing = fit.draws.physical[:, [TWO_MIRROR.index[name] for name in INPUT_NAMES]]
     shifts = shifts_at(one.zeros, one.states)
     for axis, zero in enumerate(("pan_zero_emission_deg", "tilt_zero_deg")):
         at_homing[:, INPUT_NAMES.index(zero)] += shifts[:, axis]
@@ -108,7 +109,7 @@ def test_a_calibration_holds_every_way_of_homing_that_counts(mounted_rig):
     first = fit_of(*linear_problem(), mounted_rig)
     physical = first.draws.physical.copy()
     object.__setattr__(first, "draws", Drawn(physical.copy(), first.draws.place_errors_rad))
-    physical[:, INDEX["degrees_per_step.pan"]] += 0.1
+    physical[:, TWO_MIRROR.index["degrees_per_step.pan"]] += 0.1
     other = copy(first)
     object.__setattr__(other, "draws", Drawn(physical, first.draws.place_errors_rad))
     ways = Alternative({"pan": "left"}, 0.6, first), Alternative({"pan": "right"}, 0.4, other)

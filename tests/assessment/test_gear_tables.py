@@ -14,7 +14,7 @@ from tvsbayes.assessment.fitted_calibration import calibration_of_draws
 from tvsbayes.assessment.gear_tables import Process, conditional, drawn_gears
 from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.calibration.pointing import NOISE_NAMES, Calibration
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_PRIORS
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.model.gear_processes import GearScales, place_root
 from tvsbayes.twin.gear_errors import AxisErrors, matern_waves
 
@@ -57,11 +57,11 @@ def fitted(steps: dict[str, list[float]], scales: dict[str, float], ratios: dict
     counters = np.array([*steps["pan"], *steps["tilt"], 0.0, 0.0])
     on_tilt = np.array([*(False for _ in steps["pan"]), *(True for _ in steps["tilt"]), False, False])
     valid = np.arange(len(counters)) < len(counters) - 2
-    mode = np.array([RIG_PRIORS[name].value if name in RIG_PRIORS else 0.0 for name in NAMES])
+    mode = np.array([TWO_MIRROR.priors[name].value if name in TWO_MIRROR.priors else 0.0 for name in TWO_MIRROR.names])
     for axis, ratio in ratios.items():
-        mode[INDEX[f"degrees_per_step.{axis}"]] = ratio
+        mode[TWO_MIRROR.index[f"degrees_per_step.{axis}"]] = ratio
         for block, value in scales.items():
-            mode[INDEX[f"{block}.{axis}"]] = value
+            mode[TWO_MIRROR.index[f"{block}.{axis}"]] = value
     rad = np.radians([scales["transmission_error_deg"]] * 2)
     shape = GearScales(
         rad,
@@ -75,6 +75,7 @@ def fitted(steps: dict[str, list[float]], scales: dict[str, float], ratios: dict
     root = place_root(shape, angle, on_tilt, valid)
     places = SimpleNamespace(steps=counters, on_tilt=on_tilt, valid=valid)
     fit = SimpleNamespace(
+        space=SimpleNamespace(mechanism=TWO_MIRROR),
         arrays=SimpleNamespace(gears=SimpleNamespace(places=places, at_places=lambda errors: errors)),
         linearised=SimpleNamespace(place_root=root),
         mode=SimpleNamespace(physical=mode),
@@ -129,7 +130,7 @@ def test_every_draw_has_scales_of_its_own():
     rng = np.random.default_rng(6)
     physical = np.tile(mode, (DRAWS, 1))
     large = np.arange(DRAWS) % 2 == 1
-    physical[large, INDEX["transmission_error_deg.pan"]] *= 2
+    physical[large, TWO_MIRROR.index["transmission_error_deg.pan"]] *= 2
     gears = drawn_gears(fit, physical, rng.standard_normal((DRAWS, len(root))) @ root.T, 3)
     part = gears.table.parts["transmission_error_at_deg.pan"]
     for column in (part.start, part.stop - 1):
@@ -160,7 +161,7 @@ def calibrated(gears: list[AxisErrors], seed: int) -> Calibration:
     """A calibration of the true rig, except for errors of its gears away from the places."""
     fit, mode, _ = fitted(STEPS, SCALES, RATIOS)
     for name, value in {**TRUE, **dict.fromkeys(NOISE_NAMES, 1e-9)}.items():
-        mode[INDEX[name]] = value
+        mode[TWO_MIRROR.index[name]] = value
     angles = [np.array(STEPS[axis]) * ratio for axis, ratio in RATIOS.items()]
     known = [
         np.concatenate([*(getattr(one, kind)(at) for one, at in zip(gears, angles, strict=True)), np.zeros(2)])
@@ -169,7 +170,7 @@ def calibrated(gears: list[AxisErrors], seed: int) -> Calibration:
     tiled = np.tile(mode, (TWIN_DRAWS, 1))
     drawn = drawn_gears(fit, tiled, np.tile(np.radians(np.concatenate(known)), (TWIN_DRAWS, 1)), seed)
     counters = np.array([[-200.0, 210.0], [-90.0, 140.0]])
-    calibration = calibration_of_draws(NAMES, tiled, small_campaign(), "posterior", 0, counters, drawn)
+    calibration = calibration_of_draws(TWO_MIRROR.names, tiled, small_campaign(), "posterior", 0, counters, drawn)
     return replace(calibration, azimuth=False, period_deg={})
 
 

@@ -10,7 +10,7 @@ from scipy.stats import halfnorm, multivariate_normal
 
 from tvsbayes.assessment.gear_tables import Process
 from tvsbayes.assessment.gear_waves import DRAWS, gear_periods, wave_draws
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_PRIORS
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 
 PERIOD, SD, LENGTH, SCALE = 25.0, 0.02, 7.0, 0.05
 """deg: of the wave, of the process beside it, of the half-normal prior of the wave's sd."""
@@ -81,17 +81,20 @@ def test_waves_of_a_posterior_by_axis():
     steps = np.append(np.round(ANGLES / ratio), [0.0, 5.0])
     on_tilt, valid = np.arange(count + 2) < count, np.arange(count + 2) <= count
     at_places = 0.05 * np.cos(2 * np.pi * ratio * steps[:count] / PERIOD - np.radians(40.0))
-    values = np.array([RIG_PRIORS[name].value if name in RIG_PRIORS else 0.0 for name in NAMES])
+    values = np.array(
+        [TWO_MIRROR.priors[name].value if name in TWO_MIRROR.priors else 0.0 for name in TWO_MIRROR.names]
+    )
     scales = {"transmission_error_deg": 1e-3, "transmission_error_length_deg": LENGTH, "harmonic_amplitude_deg": 0.05}
     for block, value in scales.items():
-        values[INDEX[f"{block}.tilt" + ".1" * block.startswith("harmonic")]] = value
-    values[INDEX["degrees_per_step.tilt"]] = ratio
+        values[TWO_MIRROR.index[f"{block}.tilt" + ".1" * block.startswith("harmonic")]] = value
+    values[TWO_MIRROR.index["degrees_per_step.tilt"]] = ratio
     drawn = SimpleNamespace(
         physical=np.tile(values, (DRAWS, 1)),
         place_errors_rad=np.radians(np.tile(np.concatenate([at_places, np.zeros(count + 4)]), (DRAWS, 1))),
     )
     places = SimpleNamespace(steps=steps, on_tilt=on_tilt, valid=valid)
     fit = SimpleNamespace(
+        space=SimpleNamespace(mechanism=TWO_MIRROR),
         arrays=SimpleNamespace(gears=SimpleNamespace(places=places)),
         campaign=SimpleNamespace(rig=SimpleNamespace(harmonic_period_deg={"tilt": (PERIOD,)})),
     )

@@ -34,7 +34,8 @@ from tvsbayes.estimators.joint_fit import JointFit, fit_at
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import CREEP_NAMES, NOISE_NAMES
 from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.fit_text import fit_text, validation_lines
 from tvsbayes.report.scanner_document import verdict_of
@@ -45,7 +46,7 @@ from tvsbayes.statistics.least_squares import Mode
 from tvsbayes.twin.simulated_campaign import simulate
 
 PAN = (0, 70, 141, 200, 142, 71)
-CREEPS = np.isin(NAMES, CREEP_NAMES)
+CREEPS = np.isin(TWO_MIRROR.names, CREEP_NAMES)
 TILT = (-60, -36, -12, 13, 36, 61, 37, 12, -12, -36)
 
 
@@ -72,7 +73,7 @@ def with_residual(fit: JointFit, residual: np.ndarray) -> JointFit:
 
 
 def own_columns(fit: JointFit) -> np.ndarray:
-    held = np.isin(NAMES, NOISE_NAMES) | ~fit.free
+    held = np.isin(TWO_MIRROR.names, NOISE_NAMES) | ~fit.free
     return np.where(held, 0.0, -fit.linearised.residual_jacobian)
 
 
@@ -84,7 +85,7 @@ def drawn(fit: JointFit, seed: int) -> np.ndarray:
 def test_what_the_fit_can_follow_is_not_seen(clean):
     """Adding J a changes no test: the true rig may lie anywhere, and no refit is needed to see a defect."""
     residual = drawn(clean, 1)
-    size = np.where(CREEPS, 0.0, 0.3 * np.random.default_rng(2).standard_normal(len(NAMES)))
+    size = np.where(CREEPS, 0.0, 0.3 * np.random.default_rng(2).standard_normal(len(TWO_MIRROR.names)))
     before, after = (validate(with_residual(clean, r)).tests for r in (residual, residual + own_columns(clean) @ size))
     first, second = ({t.name: t for t in tests} for tests in (before, after))
     assert len(first) >= 8
@@ -95,7 +96,10 @@ def test_what_the_fit_can_follow_is_not_seen(clean):
 
 def test_a_creep_is_known_by_its_prior_wherever_the_fit_is_linearised(clean):
     """From z to z + a with the residual that follows: a mode between zero and the true creep decides no test."""
-    residual, size = drawn(clean, 1), np.where(CREEPS, np.random.default_rng(3).standard_normal(len(NAMES)), 0.0)
+    residual, size = (
+        drawn(clean, 1),
+        np.where(CREEPS, np.random.default_rng(3).standard_normal(len(TWO_MIRROR.names)), 0.0),
+    )
     moved = replace(with_residual(clean, residual - own_columns(clean) @ size), z=clean.z + size)
     first, second = ({t.name: t.chi2 for t in validate(fit).tests} for fit in (with_residual(clean, residual), moved))
     assert second == pytest.approx(first, rel=KNOWN_DIRECTION)
@@ -105,7 +109,7 @@ def test_a_creep_is_known_by_its_prior_wherever_the_fit_is_linearised(clean):
 def test_p_values_are_uniform_and_false_alarms_rare(clean):
     """Twenty-five clean campaigns with creeps by their prior: Kolmogorov-Smirnov and numbers of alarms, at 1e-4."""
     rng = np.random.default_rng(4)
-    creeps = [own_columns(clean) @ np.where(CREEPS, rng.standard_normal(len(NAMES)), 0.0) for _ in range(25)]
+    creeps = [own_columns(clean) @ np.where(CREEPS, rng.standard_normal(len(TWO_MIRROR.names)), 0.0) for _ in range(25)]
     validations = [validate(with_residual(clean, drawn(clean, k) + creep)) for k, creep in enumerate(creeps)]
     alarms = sum(not v.passed for v in validations)
     assert alarms <= stats.binom.isf(1e-4, len(validations), VALIDATION_LEVEL)
@@ -136,7 +140,7 @@ def planted(fit: JointFit, name: str) -> np.ndarray:
     lin = fit.linearised
     pan, tilt = (np.radians(1) * lin.slope[:, :, k] for k in (0, 1))
     angle = np.degrees(lin.mirror_angles_rad)
-    pose = [INDEX[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]
+    pose = [TWO_MIRROR.index[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]
     units = np.asarray(fit.space.u)[pose]
     turned = -lin.residual_jacobian[:, :, pose] @ (np.radians([1.5, -1.0, 0.5]) / units)
     counters = np.array([fit.campaign.moves[s.move].pan_steps for s in spots])

@@ -9,7 +9,8 @@ import pytest
 
 from tvsbayes.assessment.weaknesses import _shift_directions
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.model.headlines import MODELLED, Derived
 
 DRAWS = 4000
 
@@ -17,15 +18,16 @@ DRAWS = 4000
 def fit_with(correlation: float, shift: str, *, free: bool = True) -> SimpleNamespace:
     """A fit whose contrast of pan goes with a shift of the zero; everything else is independent."""
     rng = np.random.default_rng(3)
-    physical = rng.standard_normal((DRAWS, len(NAMES)))
+    physical = rng.standard_normal((DRAWS, len(TWO_MIRROR.names)))
     ratios = 0.06 + 1e-5 * rng.standard_normal((DRAWS, len(DIRECTIONS)))
-    column = physical[:, INDEX[shift]]
+    column = physical[:, TWO_MIRROR.index[shift]]
     apart = correlation * column + np.sqrt(1 - correlation**2) * rng.standard_normal(DRAWS)
     left, right = DIRECTIONS.index("left"), DIRECTIONS.index("right")
     mean = 0.5 * (ratios[:, left] + ratios[:, right])
     ratios[:, left], ratios[:, right] = mean + 1e-4 * apart, mean - 1e-4 * apart
-    draws = SimpleNamespace(physical=physical, effective_deg_per_step=ratios)
-    return SimpleNamespace(draws=draws, free=np.full(len(NAMES), free))
+    draws = Derived(physical, np.zeros((DRAWS, len(MODELLED))), np.zeros((DRAWS, 2, 2)), np.zeros((DRAWS, 0)))
+    draws.modelled[:, [MODELLED[f"effective_deg_per_step.{direction}"] for direction in DIRECTIONS]] = ratios
+    return SimpleNamespace(draws=draws, names=TWO_MIRROR.names, free=np.full(len(TWO_MIRROR.names), free))
 
 
 @pytest.mark.parametrize(

@@ -14,14 +14,13 @@ from tvsbayes.assessment.summary import CLASSIC_DRAWS, _classic_predicted, summa
 from tvsbayes.estimators.four_point import classic, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import Alternative, fit
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import (
     CREEP_NAMES,
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     HOME_SD_NAMES,
-    INDEX,
-    NAMES,
     RECEIVER_NAMES,
     Prior,
     names_of,
@@ -64,8 +63,8 @@ def summary(fitted) -> FitSummary:
 
 def test_every_parameter_of_the_contract_is_there_and_only_those(fitted, summary):
     optional = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *CREEP_NAMES, *names_of("thermal_deg_per_K"), *HOME_SD_NAMES)
-    absent = {name for name in optional if not fitted.free[INDEX[name]]}
-    expected = set(NAMES) - set(RECEIVER_NAMES) - absent
+    absent = {name for name in optional if not fitted.free[TWO_MIRROR.index[name]]}
+    expected = set(TWO_MIRROR.names) - set(RECEIVER_NAMES) - absent
     expected |= {f"degrees_per_step.{d}" for d in ("left", "right", "up", "down")} | {"effective_mirror_offset_mm"}
     assert set(summary.parameters) == expected
 
@@ -86,7 +85,7 @@ def test_intervals_of_several_ways_of_homing_are_those_of_their_sds(fitted, summ
     """Two ways whose backlashes lie five sds apart: no interval is the first way's alone."""
     name = "backlash_deg.pan"
     apart, physical = 5 * summary.parameters[name].sd, np.array(fitted.draws.physical)
-    physical[:, INDEX[name]] += apart
+    physical[:, TWO_MIRROR.index[name]] += apart
     other = replace(fitted, draws=eqx.tree_at(lambda d: d.physical, fitted.draws, physical))
     ways = Alternative({"pan": "left"}, 0.6, fitted), Alternative({"pan": "right"}, 0.4, other)
     alone, both = summary.parameters, summarise(replace(fitted, alternatives=ways)).parameters
@@ -243,7 +242,7 @@ def test_aperture_readings_bring_their_parameters(mounted_rig):
     assert set(RECEIVER_NAMES) <= set(parameters)
     # Readings of 0.02 deg see C0 (0.2 deg) only together with the zero (0.1 deg) and the axes' offsets.
     assert parameters["pan_zero_emission_deg"].informed
-    assert fitted.free[INDEX["pan_zero_emission_deg"]]
+    assert fitted.free[TWO_MIRROR.index["pan_zero_emission_deg"]]
 
 
 @pytest.mark.thorough

@@ -17,7 +17,7 @@ from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
-from tvsbayes.instrument.parameters import NAMES, RIG_PRIORS
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.pipeline import load_calibration
 
 POINT = ("--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 70)
@@ -29,13 +29,15 @@ def drawn_calibration(campaign) -> Calibration:
     """Normal draws about the default rig; mirror errors and tilts of 0.1 deg."""
     generator = np.random.default_rng(8)
     columns = []
-    for name in NAMES:
-        value = RIG_PRIORS[name].value if name in RIG_PRIORS else 0.0
+    for name in TWO_MIRROR.names:
+        value = TWO_MIRROR.priors[name].value if name in TWO_MIRROR.priors else 0.0
         value = 0.1 if name.startswith(("mirror1", "mirror2", "laser_tilt", "tilt_axis", "backlash")) else value
         sd = RELATIVE_SD * abs(value) if name.startswith(("degrees", "mirror", "laser", "backlash")) else 0.0
         columns.append(value + sd * generator.standard_normal(600))
     causes = ("pixel noise", "stereo calibration")
-    calibration = calibration_of_draws(NAMES, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
+    calibration = calibration_of_draws(
+        TWO_MIRROR.names, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign)
+    )
     parts = np.stack([0.25 * calibration.covariance, 0.75 * calibration.covariance])
     return replace(calibration, causes=causes, cause_covariance=parts)
 

@@ -14,7 +14,8 @@ from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.error_map import error_map
 from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_calibration, simple_rays
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
-from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.twin.physics import aperture_angle_deg
 
 
@@ -25,9 +26,11 @@ def direction_result(mean: float) -> DirectionResult:
 def test_simple_calibration_is_nominal_or_classic():
     nominal = simple_calibration()
     assert nominal == SimpleCalibration({"left": 0.06, "right": 0.06, "up": 0.07, "down": 0.07}, 170.0, 70.0, 90.0, 0.0)
-    assert simple_calibration(RIG_PRIORS | {"aperture_zero_deg": Prior(5.0, 0.0)}).aperture_zero_deg == 5.0
+    assert simple_calibration(TWO_MIRROR.priors | {"aperture_zero_deg": Prior(5.0, 0.0)}).aperture_zero_deg == 5.0
     results = {"left": direction_result(0.0594), "right": None, "up": direction_result(0.069), "down": None}
-    classic = simple_calibration(RIG_PRIORS | {"mirror_offset_mm": Prior(20.0, 1.0)}, ClassicResult(results, (), ()))
+    classic = simple_calibration(
+        TWO_MIRROR.priors | {"mirror_offset_mm": Prior(20.0, 1.0)}, ClassicResult(results, (), ())
+    )
     assert classic.deg_per_step == {"left": 0.0594, "right": 0.06, "up": 0.069, "down": 0.07}
     assert (classic.baseline_mm, classic.origin_y_mm) == (180.0, 80.0)
 

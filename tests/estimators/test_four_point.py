@@ -24,7 +24,8 @@ from tvsbayes.estimators.four_point import (
     stereo_variance,
 )
 from tvsbayes.instrument.campaign import Campaign, Spot
-from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, distort, triangulate, undistort
 from tvsbayes.twin.physics import project
@@ -81,7 +82,7 @@ def make_campaign(
         for point, row in enumerate(pixels, 1):
             move, target = start + (point > 2), "d1" if point in (1, 4) else "d2"
             spots.append(spot_row(len(spots), move, target, number, point, *map(float, row), *(0.08,) * 4))
-    priors = {**RIG_PRIORS, "focal_scale": Prior(1.0, focal_u)}
+    priors = {**TWO_MIRROR.priors, "focal_scale": Prior(1.0, focal_u)}
     return Campaign(tuple(moves), tuple(spots), stereo, RigTable(priors))
 
 

@@ -16,8 +16,9 @@ from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.mode_search import SEARCHING
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, Prior, names_of
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, Prior, names_of
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.rig import read_rig
@@ -53,11 +54,11 @@ def test_truth_is_found_within_its_uncertainty(mixed_run, mixed_fit):
     z = (mixed_fit.mode.effective_deg_per_step - [ratios[d] for d in ("left", "right", "up", "down")]) / sd
     assert np.all(np.abs(z) < FAR)
     for name in ("backlash_deg.pan", "backlash_deg.tilt", "mirror_offset_mm", "extrinsics.rotation_rad.z"):
-        index = INDEX[name]
+        index = TWO_MIRROR.index[name]
         error = mixed_fit.mode.physical[index] - true.get(name, np.nan)
         assert abs(error) < FAR * mixed_fit.draws.physical[:, index].std(), name
     for name in ("pixel_scale", *names_of("stop_sd_deg")):
-        index = INDEX[name]
+        index = TWO_MIRROR.index[name]
         spread = np.log(mixed_fit.draws.physical[:, index]).std()
         assert abs(np.log(mixed_fit.mode.physical[index] / true[name])) < FAR * spread, name
     offset = effective_mirror_offset_mm(true, pose)
@@ -160,13 +161,13 @@ def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(wobbling):
     freed = fit(wobbling.campaign, model=ModelChoice(perfect_gears=True, harmonics=True))
     assert plain.converged and freed.converged, (plain.problems, freed.problems)
     for name in HARMONIC_NAMES:
-        index = INDEX[name]
+        index = TWO_MIRROR.index[name]
         assert freed.free[index] == (".pan." in name) and not plain.free[index], name
         error = freed.mode.physical[index] - PAN_ERROR_DEG.get(name, 0.0)
         assert abs(error) <= 4 * SD * freed.draws.physical[:, index].std(), name
-    amplitude_sd = freed.draws.physical[:, INDEX["harmonic_deg.pan.1.sin"]].std()
+    amplitude_sd = freed.draws.physical[:, TWO_MIRROR.index["harmonic_deg.pan.1.sin"]].std()
     assert amplitude_sd < 0.1 * PAN_ERROR_DEG["harmonic_deg.pan.1.sin"], "the campaign knows it to a tenth"
-    pan = [INDEX["stop_sd_deg.left"], INDEX["stop_sd_deg.right"]]
+    pan = [TWO_MIRROR.index["stop_sd_deg.left"], TWO_MIRROR.index["stop_sd_deg.right"]]
     # What the plain model must call chance: 0.1 deg / sqrt(2) beside 0.02 deg.
     np.testing.assert_allclose(freed.mode.physical[pan], 0.02, rtol=0.4)
     np.testing.assert_allclose(plain.mode.physical[pan], 0.074, rtol=0.4)
@@ -187,12 +188,12 @@ def test_gears_without_play_put_it_into_the_stops(mixed_run, mixed_fit):
     result = fit(mixed_run.campaign, model=ModelChoice(no_backlash=True))
     assert result.converged, result.problems
     for axis in ("pan", "tilt"):
-        index = INDEX[f"backlash_deg.{axis}"]
+        index = TWO_MIRROR.index[f"backlash_deg.{axis}"]
         assert not result.free[index]
         assert np.all(result.draws.physical[:, index] == 0.0) and result.mode.physical[index] == 0.0
     assert np.all(np.isfinite(result.covariance)) and np.isfinite(result.chi2)
     assert result.log_density < mixed_fit.log_density - 10
-    sds = [INDEX[name] for name in names_of("stop_sd_deg")]
+    sds = [TWO_MIRROR.index[name] for name in names_of("stop_sd_deg")]
     assert np.max(result.mode.physical[sds] / mixed_fit.mode.physical[sds]) > 2
 
 
@@ -200,9 +201,9 @@ def test_gears_without_play_put_it_into_the_stops(mixed_run, mixed_fit):
 def test_a_fixed_parameter_stays_and_the_rest_follows(mixed_run, mixed_fit):
     campaign = with_priors(mixed_run.campaign, mirror_offset_mm=Prior(35.0, 0.0))
     result = fit(campaign)
-    assert np.all(result.draws.physical[:, INDEX["mirror_offset_mm"]] == 35.0)
+    assert np.all(result.draws.physical[:, TWO_MIRROR.index["mirror_offset_mm"]] == 35.0)
     # The translation along y takes over what the mirror offset may not say.
-    y = INDEX["extrinsics.translation_mm.y"]
+    y = TWO_MIRROR.index["extrinsics.translation_mm.y"]
     assert result.draws.physical[:, y].std() < mixed_fit.draws.physical[:, y].std()
 
 
@@ -210,7 +211,7 @@ def test_the_mode_is_a_stationary_maximum(mixed_fit):
     """By differences of the density that fits descend, along the axes of the covariance."""
     root = np.linalg.cholesky(mixed_fit.covariance)
     # Scales of repeating errors are where the density is highest with everything else integrated out.
-    free = mixed_fit.free & ~np.isin(NAMES, GEAR_ERROR_NAMES)
+    free = mixed_fit.free & ~np.isin(TWO_MIRROR.names, GEAR_ERROR_NAMES)
     columns = root.T[free]
 
     def density(points):
@@ -231,8 +232,11 @@ def test_the_mode_is_a_stationary_maximum(mixed_fit):
 
 def test_laplace_draws_have_exactly_their_moments():
     rng = np.random.default_rng(5)
-    z, factor = rng.standard_normal(len(NAMES)), rng.standard_normal((len(NAMES), len(NAMES)))
-    covariance = factor @ factor.T + np.eye(len(NAMES))
+    z, factor = (
+        rng.standard_normal(len(TWO_MIRROR.names)),
+        rng.standard_normal((len(TWO_MIRROR.names), len(TWO_MIRROR.names))),
+    )
+    covariance = factor @ factor.T + np.eye(len(TWO_MIRROR.names))
     draws = laplace_draws(z, covariance, seed=1)
     rounding = 1e-10 * np.abs(covariance).max()
     np.testing.assert_allclose(draws.mean(axis=0), z, atol=rounding)

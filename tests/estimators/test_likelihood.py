@@ -19,7 +19,8 @@ from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.gears.priors import half_normal_coordinate
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import HOME_SD_NAMES, INDEX, LOOK_SCATTER_NAMES, NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import HOME_SD_NAMES, LOOK_SCATTER_NAMES
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.model.parameter_space import parameter_space
@@ -35,14 +36,14 @@ value_and_gradient = jax.jit(jax.value_and_grad(log_density))
 
 def random_points(dozen, count: int, scale: float) -> np.ndarray:
     """Coordinates about the true rig; `scale` in prior standard deviations."""
-    return dozen.z + scale * np.random.default_rng(31).standard_normal((count, len(NAMES)))
+    return dozen.z + scale * np.random.default_rng(31).standard_normal((count, len(TWO_MIRROR.names)))
 
 
 def astray(dozen) -> np.ndarray:
     """The true rig seen through extrinsics that are off by 0.3 rad and 60 mm in prior units of 0.03 and 5."""
     z = dozen.z.copy()
     for name, offset in (("rotation_rad.x", 10), ("rotation_rad.z", -10), ("translation_mm.y", 12)):
-        z[INDEX[f"extrinsics.{name}"]] += offset
+        z[TWO_MIRROR.index[f"extrinsics.{name}"]] += offset
     return z
 
 
@@ -70,11 +71,11 @@ def test_homings_shift_the_zeros_by_their_scatter(dozen, evaluate, homings):
     campaign = replace(dozen.campaign, rig=replace(dozen.campaign.rig, absolute=absolute))
     arrays, z = jax.tree.map(jnp.asarray, campaign_arrays(campaign)), random_points(dozen, 1, 0.3)[0]
     if coordinates:
-        z[[INDEX[name] for name in HOME_SD_NAMES]] = coordinates
+        z[[TWO_MIRROR.index[name] for name in HOME_SD_NAMES]] = coordinates
     evaluated = evaluate(z, dozen.space, arrays)
     dense = dense_log_density(campaign, evaluated)
     assert evaluated.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
-    z[[INDEX[name] for name in HOME_SD_NAMES]] = 0.0
+    z[[TWO_MIRROR.index[name] for name in HOME_SD_NAMES]] = 0.0
     plain = evaluate(z, dozen.space, dozen.arrays).log_likelihood
     assert abs(plain - dense) > LOG_UNIT, "it changes nothing here"
 
@@ -83,11 +84,11 @@ def test_homings_shift_the_zeros_by_their_scatter(dozen, evaluate, homings):
 def test_looks_that_scatter_equal_a_dense_gaussian(dozen, evaluate, coordinates):
     """Of either axis, of both, and of one alone."""
     z = random_points(dozen, 1, 0.3)[0]
-    z[[INDEX[name] for name in LOOK_SCATTER_NAMES]] = coordinates
+    z[[TWO_MIRROR.index[name] for name in LOOK_SCATTER_NAMES]] = coordinates
     evaluated = evaluate(z, dozen.space, dozen.arrays)
     dense = dense_log_density(dozen.campaign, evaluated)
     assert evaluated.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
-    without = evaluate(np.where(np.isin(NAMES, LOOK_SCATTER_NAMES), -36.0, z), dozen.space, dozen.arrays)
+    without = evaluate(np.where(np.isin(TWO_MIRROR.names, LOOK_SCATTER_NAMES), -36.0, z), dozen.space, dozen.arrays)
     assert abs(without.log_likelihood - dense) > LOG_UNIT, "scatter changes nothing here"
 
 
@@ -99,7 +100,10 @@ def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evalua
         dozen.arrays,
         (np.ones(shape, bool), np.full((*shape, 2), 0.5)),
     )
-    index, stops = [INDEX[name] for name in LOOK_SCATTER_NAMES], [INDEX[n] for n in NAMES if n.startswith("stop_sd")]
+    index, stops = (
+        [TWO_MIRROR.index[name] for name in LOOK_SCATTER_NAMES],
+        [TWO_MIRROR.index[n] for n in TWO_MIRROR.names if n.startswith("stop_sd")],
+    )
     logs = []
     for scatter_deg in (1e-9, 0.005, 0.02):
         z = dozen.z.copy()
@@ -134,7 +138,7 @@ def test_padding_changes_nothing(grid_campaign, monkeypatch):
     monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 4096)
     long = campaign_arrays(grid_campaign)
     assert long.spots.pixels.shape == (4096, 4) and short.spots.pixels.shape == (512, 4)
-    z = np.repeat(0.3 * np.random.default_rng(31).standard_normal((1, len(NAMES))), BATCH, axis=0)
+    z = np.repeat(0.3 * np.random.default_rng(31).standard_normal((1, len(TWO_MIRROR.names))), BATCH, axis=0)
     one, two = (density.evaluate(z, no_draw(BATCH, arrays), space, arrays) for arrays in (short, long))
     assert two.log_density[0] == pytest.approx(float(one.log_density[0]), abs=FINE_UNIT, rel=1e-12)
     assert short.gears.filled and long.gears.filled == short.gears.filled
@@ -176,7 +180,7 @@ def test_density_with_gradient_against_the_librarys_and_its_differences(dozen, w
     """What experiments differentiate is the density that fits and samplers evaluate."""
     z = {
         "0.5 sd away": random_points(dozen, 1, 0.5)[0],
-        "prior mean": np.zeros(len(NAMES)),
+        "prior mean": np.zeros(len(TWO_MIRROR.names)),
         "astray": astray(dozen),
     }[where]
     arrays = without_padding(dozen.arrays, len(dozen.campaign.moves))
@@ -194,7 +198,7 @@ def test_density_with_gradient_against_the_librarys_and_its_differences(dozen, w
 @pytest.fixture(scope="module")
 def far_out():
     """Three prior standard deviations in every coordinate at once: behind the cameras, off the image."""
-    return 3.0 * np.random.default_rng(41).standard_normal((100, len(NAMES)))
+    return 3.0 * np.random.default_rng(41).standard_normal((100, len(TWO_MIRROR.names)))
 
 
 def test_density_is_finite_everywhere(dozen, far_out):
@@ -297,7 +301,7 @@ def test_angles_are_compared_on_the_circle(dozen, evaluate):
 
 def test_the_scatter_of_homings_is_estimated_where_several_were_seen(dozen):
     """Of one segment it stays at its median, of an absolute encoder at none."""
-    campaign, columns = dozen.campaign, [INDEX[name] for name in HOME_SD_NAMES]
+    campaign, columns = dozen.campaign, [TWO_MIRROR.index[name] for name in HOME_SD_NAMES]
     first, *others = (replace(move, segment=0) for move in campaign.moves)
     once = first, *(replace(move, pan_approach="", tilt_approach="") for move in others)
     for given, expected in (

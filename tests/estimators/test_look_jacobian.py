@@ -12,7 +12,8 @@ import pytest
 from tvsbayes.estimators.likelihood import look_terms
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.estimators.looks import observe
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import NOISE_NAMES
 from tvsbayes.model.laser_path import mirror_angles
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -37,7 +38,7 @@ def both(dozen):
         parts = jnp.stack(look_jacobian(dozen.space.point(z), dozen.space, looks, dozen.arrays))
         return parts, jax.jacfwd(whole)(z, looks.range_mm).transpose(0, 2, 1), looks
 
-    z = dozen.z + 0.5 * np.random.default_rng(61).standard_normal(len(NAMES))
+    z = dozen.z + 0.5 * np.random.default_rng(61).standard_normal(len(TWO_MIRROR.names))
     with jax.enable_x64(True):
         return jax.tree.map(np.asarray, compute(jnp.asarray(z)))
 
@@ -49,6 +50,6 @@ def test_parts_make_the_whole(both, dozen):
     scale = np.abs(whole[:, :, :count]).max(axis=2, keepdims=True)
     assert np.max(np.abs(parts - whole)[:, :, :count] - ROUNDING * scale) <= 0
     moving = scale[:, :, 0].max(axis=0) > 0
-    assert not moving[[INDEX[name] for name in NOISE_NAMES]].any()
+    assert not moving[[TWO_MIRROR.index[name] for name in NOISE_NAMES]].any()
     # Neither the noise scales nor the harmonics (8) nor, without temperatures, the shifts by them (2) move a look.
-    assert moving.sum() == len(NAMES) - len(NOISE_NAMES) - 8 - 2
+    assert moving.sum() == len(TWO_MIRROR.names) - len(NOISE_NAMES) - 8 - 2

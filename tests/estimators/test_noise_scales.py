@@ -9,13 +9,14 @@ from support.dense_spots import dense_covariance
 from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.noise_scales import MarginalScales, noise_draws
-from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, names_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, names_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.statistics.weighted_draws import effective_draws
 
-STOPS = [INDEX[name] for name in names_of("stop_sd_deg")]
-PIXEL = INDEX["pixel_scale"]
-SCATTER = [INDEX[name] for name in LOOK_SCATTER_NAMES]
+STOPS = [TWO_MIRROR.index[name] for name in names_of("stop_sd_deg")]
+PIXEL = TWO_MIRROR.index["pixel_scale"]
+SCATTER = [TWO_MIRROR.index[name] for name in LOOK_SCATTER_NAMES]
 
 
 def dense_density(fit, z: np.ndarray) -> float:

@@ -29,12 +29,13 @@ from tvsbayes.estimators import likelihood
 from tvsbayes.estimators.annealed_stage import Fixed, linear_campaign
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES, names_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import NOISE_NAMES, names_of
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space, physical_at
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-NOISE = np.isin(NAMES, NOISE_NAMES)
+NOISE = np.isin(TWO_MIRROR.names, NOISE_NAMES)
 LOG_UNIT = 1.0
 """One unit of log density; a covariance of nearly equal places, factored, leaves 1e-8 of it."""
 FINE_UNIT = 1e-8 * LOG_UNIT
@@ -89,7 +90,7 @@ def found_at(evaluate, varying: Varying, z: np.ndarray) -> SimpleNamespace:
 
 @pytest.fixture(scope="module", params=SCALES)
 def point(request, varying, evaluate) -> SimpleNamespace:
-    moved = varying.z + np.where(NOISE, 0.0, 0.3 * np.random.default_rng(33).standard_normal(len(NAMES)))
+    moved = varying.z + np.where(NOISE, 0.0, 0.3 * np.random.default_rng(33).standard_normal(len(TWO_MIRROR.names)))
     with jax.enable_x64(True):
         z = coordinates_with(varying.space, moved, SCALES[request.param])
         evaluated = found_at(evaluate, varying, z)
@@ -157,7 +158,10 @@ def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying,
     # The scatter of looks is in the unit noise of the linearised campaign.
     values = {n: 0.0 if n.startswith("look_scatter") else value for n, value in point.values.items()}
     covariance = residual_covariance(angle_covariances(varying.campaign, values), lin.slope)
-    residual, jacobian = lin.residual.ravel(), np.where(NOISE, 0.0, -lin.residual_jacobian).reshape(-1, len(NAMES))
+    residual, jacobian = (
+        lin.residual.ravel(),
+        np.where(NOISE, 0.0, -lin.residual_jacobian).reshape(-1, len(TWO_MIRROR.names)),
+    )
     solved = np.linalg.solve(covariance, np.column_stack([residual, jacobian]))
     prior = np.where(NOISE, 0.0, point.z)
     value, root = point.reduced.value, point.reduced.jacobian
@@ -169,7 +173,7 @@ def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying,
     assert value @ value == pytest.approx(pixels @ np.linalg.solve(covariance, pixels) + prior @ prior, rel=ALGEBRA)
     slope = -jacobian.T @ solved[:, 0] + prior
     np.testing.assert_allclose(root.T @ value, slope, atol=ALGEBRA * np.abs(slope).max())
-    curvature = jacobian.T @ solved[:, 1:] + np.eye(len(NAMES))
+    curvature = jacobian.T @ solved[:, 1:] + np.eye(len(TWO_MIRROR.names))
     np.testing.assert_allclose(root.T @ root, curvature, atol=ALGEBRA * np.abs(curvature).max())
 
 

@@ -40,7 +40,7 @@ def head_rig() -> Rig:
     """A head of 0.045 deg a step with an error of a hundredth of it, and sightings of 0.005 deg."""
     ratios = dict.fromkeys(names_of("degrees_per_step"), Prior(RATIO, 0.01 * RATIO))
     nominal = head_joints(UNIT, "unit.urdf", {"pan": None, "tilt": None}).terms
-    terms = {name: Prior(value, 0.3) for name, value in nominal.items() if name in SIGHTING_HEAD.documented}
+    terms = {name: Prior(value, 0.3) for name, value in nominal.items() if name in SIGHTING_HEAD.parameters}
     table = RigTable({**ratios, **terms}, mechanism=SIGHTING_HEAD)
     costs = {"move_s": 1.5, "look_s": 1.0}
     return Rig(table, None, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, costs)

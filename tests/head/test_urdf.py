@@ -13,15 +13,15 @@ from tvsbayes.errors import InputError
 from tvsbayes.head.urdf import HeadModel, ratios_of
 from tvsbayes.importing.urdf import head_joints
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.chains import HeadOptics
-from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
-from tvsbayes.instrument.parameters import HEAD_TERMS
+from tvsbayes.instrument.chains import chain_of
+from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
+from tvsbayes.instrument.parameters import BLOCKS, REGISTRY, TERMS
 
 UNIT = (Path(__file__).parent / "unit.urdf").read_bytes()
 BY_NAME = dict.fromkeys(AXES)
 ROUNDING = 1e-9
 """Of unit vectors: numbers are written with 12 digits."""
-TERMS = [term.name for term in HEAD_TERMS.values()]
+TERM_NAMES = [term.name for term in TERMS]
 OFF = {
     "azimuth_zero_deg": 3.0,
     "elevation_zero_deg": -2.0,
@@ -36,9 +36,13 @@ OFF = {
 
 def beam_of(terms, azimuth_deg, elevation_deg):
     """Origin (m) over the pan joint but for its height, and direction, for angles from the joints' zeros."""
-    optics = HeadOptics.of(
-        lambda name: (1.0 if name.endswith(("mm", "mm.y", "mm.z")) else math.pi / 180) * terms.get(name, 0.0)
-    )
+    unit = {"deg": math.pi / 180, "mm": 1.0}
+
+    def block(name: str) -> float | list[float]:
+        parts = [unit[REGISTRY[part].unit] * terms.get(part, 0.0) for part in BLOCKS[name]]
+        return parts if len(parts) > 1 else parts[0]
+
+    optics = chain_of(HEAD, block)
     ray = optics.leaving(math.radians(azimuth_deg), math.radians(elevation_deg + terms["elevation_zero_deg"]), np)
     return np.array([*ray.direction], dtype=float)
 
@@ -52,7 +56,7 @@ def by_another_parser(data, pan, tilt):
 
 
 def model(head, steps_per_turn=None, **off):
-    terms = {name: head.terms.get(name, 0.0) + off.get(name, 0.0) for name in TERMS}
+    terms = {name: head.terms.get(name, 0.0) + off.get(name, 0.0) for name in TERM_NAMES}
     ratios = {name: value * off.get(name, 1.0) for name, value in ratios_of(head, 200.0).items()}
     values = {**ratios, **terms}
     return HeadModel(
@@ -130,4 +134,4 @@ def test_without_a_model_there_are_properties():
     assert np.shape(document["covariance"]) == (len(document["names"]),) * 2
     # A joint that turns down where elevation grows counts down.
     assert document["joints"]["tilt"]["steps_per_rad"] < 0 < document["joints"]["pan"]["steps_per_rad"]
-    assert set(document["names"]) <= SIGHTING_HEAD.documented | set(TERMS)
+    assert set(document["names"]) <= set(SIGHTING_HEAD.names) | set(TERM_NAMES)

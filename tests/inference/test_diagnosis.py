@@ -15,7 +15,7 @@ from tvsbayes.inference.chain import GROUPS, Chain, better
 from tvsbayes.inference.density import Points
 from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT, autocorrelation_steps, diagnose
 from tvsbayes.inference.importance import Sample
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.results.convergence import Convergence, Importance, NamedValue, Reweighted
 
 WALKERS, STEPS = 64, 400
@@ -42,7 +42,7 @@ def independent(steps: int = STEPS) -> np.ndarray:
 class TwoNormals:
     """A density of the two parameters, mapped by hand; nothing was integrated out."""
 
-    headlines = (NAMES[RATIO], NAMES[BACKLASH])
+    headlines = (TWO_MIRROR.names[RATIO], TWO_MIRROR.names[BACKLASH])
     fixed = frozenset()
 
     def valued(self, w, generator):
@@ -57,7 +57,9 @@ class TwoNormals:
     def quantities(self, points):
         """By their names, and one that no draw changes."""
         z = points.parts["z"]
-        return {NAMES[k]: z[:, k] for k in (RATIO, BACKLASH)} | {"effective_mirror_offset_mm": np.zeros(len(z))}
+        return {TWO_MIRROR.names[k]: z[:, k] for k in (RATIO, BACKLASH)} | {
+            "effective_mirror_offset_mm": np.zeros(len(z))
+        }
 
 
 @pytest.fixture
@@ -134,9 +136,9 @@ def weighted(shift: float = 0.0) -> Sample:
     draws = np.sqrt(2) * np.random.default_rng(7).standard_normal((8000, 2))
     weights = np.exp(-0.25 * np.sum(draws**2, axis=1))
     weights /= weights.sum()
-    z = np.zeros((8000, len(NAMES)))
+    z = np.zeros((8000, len(TWO_MIRROR.names)))
     z[:, [BACKLASH, RATIO]] = draws + np.array([0.0, shift])
-    worst = NamedValue(NAMES[RATIO], 0.1)
+    worst = NamedValue(TWO_MIRROR.names[RATIO], 0.1)
     importance = Importance(True, (), 8, 8000, 0.5, worst, 0.1, worst, 0.001, 0.0, 0.01, 0, "accepted")
     points = Points(draws, np.zeros(8000), {"z": z})
     quantities = TwoNormals().quantities(points)
@@ -156,9 +158,9 @@ def test_a_chain_that_says_something_else_is_known_no_better_than_both_agree(jud
     sample = judged(chain_of(independent()), weighted(shift))
     agreement = sample.convergence.agreement
     assert sample.convergence.answer == answer and not agreement.agrees
-    error = sample.convergence.monte_carlo_error[NAMES[RATIO]]
+    error = sample.convergence.monte_carlo_error[TWO_MIRROR.names[RATIO]]
     assert error.mean == pytest.approx(abs(shift), abs=5 * 0.022)
-    assert agreement.worst.quantity.startswith(NAMES[RATIO]) and agreement.worst.value > AGREEMENT_LIMIT
+    assert agreement.worst.quantity.startswith(TWO_MIRROR.names[RATIO]) and agreement.worst.value > AGREEMENT_LIMIT
     (message,) = sample.convergence.missing
     words = f"emcee and importance sampling differ on {agreement.worst.quantity} by {agreement.worst.value:.1f} Monte"
     assert message.startswith(words)
@@ -169,7 +171,7 @@ def test_where_every_headline_is_fixed_the_others_must_agree(judged, monkeypatch
     monkeypatch.setattr(TwoNormals, "headlines", ("effective_mirror_offset_mm",))
     assert judged(chain_of(independent()), weighted()).convergence.converged
     sample = judged(chain_of(independent()), weighted(-0.15))
-    assert sample.convergence.missing and NAMES[RATIO] in sample.convergence.agreement.worst.quantity
+    assert sample.convergence.missing and TWO_MIRROR.names[RATIO] in sample.convergence.agreement.worst.quantity
 
 
 @pytest.mark.parametrize(

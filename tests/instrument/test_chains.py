@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tvsbayes.calibration.optics import beam_components
-from tvsbayes.instrument.chains import HeadOptics
+from tvsbayes.instrument.chains import HeadOptics, chain_of
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
-from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
+from tvsbayes.instrument.parameters import BLOCKS, TERMS, Prior, names_of
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.plan import PlanBuilder
 from tvsbayes.instrument.rig import Rig, RigTable
@@ -40,13 +40,20 @@ POINTING = {
 }
 """TPOINT's -IA, AN, -AW, NPAE, CA, TF, TX: what they add to azimuth and elevation."""
 TERM_DEG = 0.3
+EVERY_TERM = replace(HEAD, key="every-term", constants={})
+"""A head that lacks nothing."""
 ROUNDING = 1e-11
 """Of unit vectors; mm of origins are a hundred times longer."""
 
 
 def optics_of(values: dict[str, float]) -> HeadOptics:
     """A head of terms in rad and mm; those that are not named are 0."""
-    return HeadOptics.of(lambda name: values.get(name, 0.0))
+
+    def block(name: str) -> float | list[float]:
+        parts = [values.get(part, 0.0) for part in BLOCKS[name]]
+        return parts if len(parts) > 1 else parts[0]
+
+    return chain_of(HEAD, block)
 
 
 @pytest.mark.parametrize("name", POINTING)
@@ -65,7 +72,7 @@ def test_first_order_is_tpoint(name):
 @pytest.fixture(scope="module")
 def truths():
     """Heads with terms of degrees and offsets of centimetres."""
-    wide = {term.name: Prior(0.0, 15.0 if term.unit == "mm" else 3.0) for term in HEAD_TERMS.values()}
+    wide = {term.name: Prior(0.0, 15.0 if term.unit == "mm" else 3.0) for term in TERMS}
     table = RigTable(mechanism=SIGHTING_HEAD)
     rig = Rig(table, None, {**table.priors, **wide}, {}, {}, {}, {})
     rng = np.random.default_rng(50)
@@ -78,10 +85,10 @@ def truths():
 def test_twin_and_model_are_the_same_optics(truths):
     rng = np.random.default_rng(51)
     poses = rng.uniform([-np.pi, -0.5], [np.pi, 1.7], (len(truths), 6, 2))
-    values = np.array([[*(t.parameters[n] for n in HEAD.rig_names), *np.zeros(24)] for t in truths])
+    values = np.array([[*(t.parameters[n] for n in EVERY_TERM.rig_names), *np.zeros(24)] for t in truths])
 
     def rays(v, p):
-        return trace(model_of(v, mechanism=HEAD).optics, p[:, 0], p[:, 1])
+        return trace(model_of(v, mechanism=EVERY_TERM).optics, p[:, 0], p[:, 1])
 
     with jax.enable_x64(True):
         model_rays = jax.jit(jax.vmap(rays))(jnp.asarray(values), jnp.asarray(poses))
@@ -106,9 +113,7 @@ def test_headlines_are_continuous_around_the_circle_and_through_the_zenith(azimu
         plan.look()
     still = names_of("transmission_error_deg", "play_variation_deg", "creep_deg")
     table = RigTable(dict.fromkeys(names_of("degrees_per_step"), Prior(0.05, 0.0005)), mechanism=SIGHTING_HEAD)
-    terms = dict.fromkeys(
-        (term.name for term in HEAD_TERMS.values() if term.name in table.priors), Prior(0.0, TERM_DEG)
-    )
+    terms = dict.fromkeys((term.name for term in TERMS if term.name in table.priors), Prior(0.0, TERM_DEG))
     true = {**table.priors, **terms, **dict.fromkeys(still, Prior(0.0, 0.0))}
     true |= {"azimuth_zero_deg": Prior(azimuth_zero_deg, 0.1), "tangent_flexure_deg": Prior(0.0, 0.0)}
     rig = Rig(table, None, true, {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 1.0, "look_s": 1.0})

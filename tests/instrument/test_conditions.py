@@ -21,7 +21,8 @@ from tvsbayes.instrument.conditions import (
     unseen_shifts,
     warm_minutes,
 )
-from tvsbayes.instrument.parameters import CREEP_NAMES, RIG_PRIORS, ZERO_SHIFT_NAMES, Prior, names_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import CREEP_NAMES, ZERO_SHIFT_NAMES, Prior, names_of
 
 HEAD = 'format = "tvsbayes-campaign/1"\n'
 CREATED = "created = 2026-01-15T10:00:00Z\n"
@@ -51,7 +52,7 @@ def test_moves_without_times_have_no_warm_up(times_s):
     """Equal times, or those counted by an import; then a creep is not determined."""
     moves = moves_at(times_s)
     assert not warm_minutes(moves).any()
-    assert set(unseen_shifts(moves, RIG_PRIORS)) == set(ZERO_SHIFT_NAMES)
+    assert set(unseen_shifts(moves, TWO_MIRROR.priors)) == set(ZERO_SHIFT_NAMES)
 
 
 @pytest.mark.parametrize(
@@ -107,9 +108,9 @@ def test_the_temperature_column_round_trips_where_present():
 
 def test_shifts_determined_by_the_moves():
     warm, both = moves_at([0.0, 7.0]), moves_at([0.0, 7.0], [20.0, 21.0])
-    still = {**RIG_PRIORS, **dict.fromkeys(names_of("creep_deg"), Prior(0.0, 0.0))}
-    assert unseen_shifts(warm, RIG_PRIORS) == names_of("thermal_deg_per_K")
-    assert unseen_shifts(both, RIG_PRIORS) == ()
+    still = {**TWO_MIRROR.priors, **dict.fromkeys(names_of("creep_deg"), Prior(0.0, 0.0))}
+    assert unseen_shifts(warm, TWO_MIRROR.priors) == names_of("thermal_deg_per_K")
+    assert unseen_shifts(both, TWO_MIRROR.priors) == ()
     assert unseen_shifts(both, still) == ("creep_minutes",)
     assert CREEP_NAMES == (*names_of("creep_deg"), "creep_minutes")
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from support.printed_vector import VECTOR
 
+from tvsbayes.instrument.chains import chain_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.mirrors import (
     Mirror,
     Optics,
@@ -35,7 +37,7 @@ def optics() -> Optics:
         values = [math.radians(VECTOR[n]) if name.endswith("_deg") else VECTOR[n] for n in BLOCKS[name]]
         return values if len(values) > 1 else values[0]
 
-    return Optics.of(block)
+    return chain_of(TWO_MIRROR, block)
 
 
 def vectors(seed: int, count: int = 50) -> Vectors:

@@ -3,18 +3,7 @@
 from __future__ import annotations
 
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
-from tvsbayes.instrument.parameters import (
-    BLOCKS,
-    KINDS,
-    NAMES,
-    NOISE_NAMES,
-    RECEIVER_NAMES,
-    REGISTRY,
-    RIG_NAMES,
-    RIG_PRIORS,
-    names_of,
-    unit_of,
-)
+from tvsbayes.instrument.parameters import BLOCKS, KINDS, NOISE_NAMES, RECEIVER_NAMES, REGISTRY, names_of, unit_of
 
 
 def test_the_order_of_stored_draws():
@@ -29,8 +18,7 @@ def test_the_order_of_stored_draws():
         *("creep_deg", "creep_minutes", "thermal_deg_per_K", "home_sd_deg"),
         *("stereo.left", "stereo.right", "stereo.rotation_rad", "stereo.translation_mm"),
     )
-    assert tuple(BLOCKS) == blocks
-    assert NAMES == names_of(*blocks), "the parameters of a block follow each other"
+    assert TWO_MIRROR.names == names_of(*blocks), "the parameters of a block follow each other"
     assert BLOCKS["stop_sd_deg"] == tuple(f"stop_sd_deg.{d}" for d in ("left", "right", "up", "down"))
     assert BLOCKS["harmonic_deg"][:3] == ("harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin", "harmonic_deg.pan.2.cos")
     cameras = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -38,7 +26,7 @@ def test_the_order_of_stored_draws():
 
 
 def test_every_default_lies_in_its_range():
-    for name, prior in RIG_PRIORS.items():
+    for name, prior in TWO_MIRROR.priors.items():
         parameter = REGISTRY[name]
         assert parameter.low <= prior.value <= parameter.high and 0 <= prior.u <= parameter.u_max, name
         assert prior.distribution in KINDS
@@ -50,16 +38,20 @@ def test_noise_and_receiver():
     plain = (*BLOCKS["stop_sd_deg"], "pixel_scale", "aperture_sd_deg")
     assert NOISE_NAMES == (*plain, *names_of(*gears, "harmonic_amplitude_deg", "look_scatter_deg", "home_sd_deg"))
     assert RECEIVER_NAMES == ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg", "aperture_sd_deg")
-    assert {RIG_PRIORS[name].distribution for name in plain} == {"log-normal"}
+    assert {TWO_MIRROR.priors[name].distribution for name in plain} == {"log-normal"}
 
 
 def test_every_prior_is_in_one_group():
     assert next(iter(TWO_MIRROR.prior_groups)) == "stereo calibration"
-    assert TWO_MIRROR.prior_groups["stereo calibration"] == list(range(len(RIG_NAMES), len(NAMES)))
+    assert TWO_MIRROR.prior_groups["stereo calibration"] == list(
+        range(len(TWO_MIRROR.rig_names), len(TWO_MIRROR.names))
+    )
     plays = TWO_MIRROR.prior_groups["prior of backlash_deg"]
-    assert [NAMES[column] for column in plays] == list(BLOCKS["backlash_deg"])
+    assert [TWO_MIRROR.names[column] for column in plays] == list(BLOCKS["backlash_deg"])
     assert len(TWO_MIRROR.prior_groups["prior of extrinsics"]) == 6 and len(TWO_MIRROR.prior_groups["focal scale"]) == 1
-    assert sorted(column for group in TWO_MIRROR.prior_groups.values() for column in group) == list(range(len(NAMES)))
+    assert sorted(column for group in TWO_MIRROR.prior_groups.values() for column in group) == list(
+        range(len(TWO_MIRROR.names))
+    )
 
 
 def test_units_of_contract_names():

@@ -11,13 +11,8 @@ from support.small_campaign import small_stereo
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.documents import parse_toml
-from tvsbayes.instrument.parameters import (
-    AMPLITUDE_NAMES,
-    HARMONIC_NAMES,
-    HOME_SD_NAMES,
-    RIG_PRIORS,
-    Prior,
-)
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import AMPLITUDE_NAMES, HARMONIC_NAMES, HOME_SD_NAMES, Prior
 from tvsbayes.instrument.rig import PERIODIC_NAMES, RigTable, parse_rig_table, read_rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import write_stereo
 
@@ -53,7 +48,7 @@ def test_one_camera_of_both_pictures_may_be_a_number(tmp_path):
 def test_rig_table_round_trip():
     priors = {
         name: Prior(p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution)
-        for name, p in RIG_PRIORS.items()
+        for name, p in TWO_MIRROR.priors.items()
         if name not in PERIODIC_NAMES
     }
     table = RigTable(priors, "azimuth")
@@ -86,8 +81,8 @@ def test_rig_table_round_trip():
 def test_scatter_of_looks_and_shifts_of_zeros_are_written_where_they_are_stated(stated):
     """At their defaults the text of the table, and so the hash of campaigns, is that of earlier versions."""
     later = "look_scatter|creep|thermal|home_sd"
-    assert not re.search(later, rig_table_toml(RigTable(dict(RIG_PRIORS))))
-    table = RigTable({**RIG_PRIORS, **stated})
+    assert not re.search(later, rig_table_toml(RigTable(dict(TWO_MIRROR.priors))))
+    table = RigTable({**TWO_MIRROR.priors, **stated})
     text = rig_table_toml(table)
     assert rig_table(text) == table and len(re.findall(later, text)) == len(stated)
 
@@ -107,14 +102,17 @@ def test_periods_in_every_spelling():
 
 def test_a_table_completes_its_priors_and_refuses_harmonics_without_a_period():
     assert RigTable({"mirror_offset_mm": Prior(31.0, 1.0)}).priors == {
-        **RIG_PRIORS,
+        **TWO_MIRROR.priors,
         **dict.fromkeys(AMPLITUDE_NAMES, Prior(0.0, 0.0, "half-normal")),
         "mirror_offset_mm": Prior(31.0, 1.0),
     }
-    assert RigTable(RIG_PRIORS) == RigTable()
+    assert RigTable(TWO_MIRROR.priors) == RigTable()
     assert RigTable(harmonic_period_deg={"pan": (360.0, 36.0)}).priors == {
         **RigTable().priors,
-        **{f"harmonic_amplitude_deg.pan.{number}": RIG_PRIORS["harmonic_amplitude_deg.pan.1"] for number in (1, 2)},
+        **{
+            f"harmonic_amplitude_deg.pan.{number}": TWO_MIRROR.priors["harmonic_amplitude_deg.pan.1"]
+            for number in (1, 2)
+        },
     }
     for prior in (Prior(0.05, 0.0), Prior(0.0, 0.1)):
         with pytest.raises(InputError, match=r"harmonic_deg\.tilt\.1\.cos has no period") as caught:
@@ -279,9 +277,9 @@ def test_rig_file(tmp_path):
     assert rig.table.priors["baseline_mm"] == Prior(199.0, 0.2)
     assert rig.truth["mirror_offset_mm"] == Prior(31.0, 1.0)  # absent from [truth]: the prior
     assert rig.truth["backlash_deg.pan"] == Prior(0.0, 0.3, "half-normal")
-    assert rig.table.priors["backlash_deg.pan"] == RIG_PRIORS["backlash_deg.pan"]
+    assert rig.table.priors["backlash_deg.pan"] == TWO_MIRROR.priors["backlash_deg.pan"]
     assert rig.truth["focal_scale"] == Prior(1.002, 0.0)
-    assert set(rig.truth) == set(RIG_PRIORS)
+    assert set(rig.truth) == set(TWO_MIRROR.priors)
     assert rig.sheets_mm == {"d1": 175.0, "far wall": 1000.5}
     assert rig.positioner["baud"] == 115200 and rig.positioner["pan_min_steps"] == -2000
     assert rig.cameras == {

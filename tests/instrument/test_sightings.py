@@ -12,7 +12,6 @@ from tvsbayes.estimators.plausibility import check_campaign, misfit_causes
 from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.mechanisms import MECHANISMS, SIGHTING_HEAD, TWO_MIRROR
-from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.plan import PlanBuilder
 from tvsbayes.instrument.rig import Rig, RigTable, parse_rig_table, rig_table_toml
 from tvsbayes.instrument.sightings import tangent_frames
@@ -51,7 +50,7 @@ def test_folder_of_sightings_round_trips(simulated, tmp_path):
     assert campaign.spots == simulated.campaign.spots
     assert campaign.rig == simulated.campaign.rig
     text = (tmp_path / "campaign.toml").read_text() + (tmp_path / "truth.json").read_text()
-    scanners = set(NAMES) - SIGHTING_HEAD.documented
+    scanners = set(TWO_MIRROR.names) - set(SIGHTING_HEAD.names)
     assert not [name for name in scanners if f'"{name}"' in text]
     truth = read_truth(tmp_path / "truth.json", campaign.stereo)
     assert truth.parameters["azimuth_zero_deg"] == simulated.truth.parameters["azimuth_zero_deg"]

@@ -248,7 +248,6 @@ CHILD = """
 import json, sys
 import jax, numpy as np
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.headlines import headlines
@@ -260,7 +259,7 @@ empty = use_compilation_cache()
 rig = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
 space = parameter_space(rig.table, rig.stereo)
 seen.clear()
-found = headlines(np.full(len(NAMES), 0.1), space, np.array([0.1, 0.2]))
+found = headlines(np.full(len(TWO_MIRROR.names), 0.1), space, np.array([0.1, 0.2]))
 print(json.dumps({"empty": empty, "traces": headlines.traces, "hits": seen.count("cache_hits"),
     "misses": seen.count("cache_misses"), "value": np.asarray(found.value).tolist()}))
 """

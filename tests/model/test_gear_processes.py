@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.small_campaign import small_stereo
 
-from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.gear_processes import GearScales, Places, place_root
 from tvsbayes.model.headlines import SeenLine, effective_deg_per_step, line_deg_per_step
@@ -77,10 +77,10 @@ def line():
     """(errors, share) -> slopes of the line, local slopes: a bent rig at three pan counters and one of tilt."""
     with jax.enable_x64(True):
         space = parameter_space(RigTable(), small_stereo())
-        z = np.zeros(len(NAMES))
+        z = np.zeros(len(TWO_MIRROR.names))
         bent = ("laser_tilt_deg.x", "mirror1_error_deg", "tilt_axis_skew_deg", "tilt_zero_deg")
         for k, name in enumerate((*bent, "ratio_contrast_deg_per_step.pan", "backlash_deg.pan")):
-            z[INDEX[name]] = 0.7 - 0.3 * k
+            z[TWO_MIRROR.index[name]] = 0.7 - 0.3 * k
         model = jax.jit(lambda z: space.model(z))(z)
     steps, on_tilt = np.array([-200.0, 0.0, 300.0, 120.0]), np.array([False, False, False, True])
     pose_rad = np.array([0.05, 0.14])

@@ -13,17 +13,14 @@ from scipy import stats
 from support.small_campaign import small_stereo
 
 from tvsbayes.gears.priors import half_normal_sd
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
-    INDEX,
     KINDS,
-    NAMES,
     NOISE_NAMES,
     RECEIVER_NAMES,
-    RIG_NAMES,
-    RIG_PRIORS,
     Prior,
 )
 from tvsbayes.instrument.rig import RigTable
@@ -60,7 +57,7 @@ def physical():
     compiled = jax.jit(jax.vmap(one, in_axes=(0, None)))
 
     def run(z, space):
-        padded = np.zeros((ROWS, len(NAMES)))
+        padded = np.zeros((ROWS, len(TWO_MIRROR.names)))
         padded[: len(z)] = z
         with jax.enable_x64(True):
             space = jax.tree.map(jnp.asarray, space)
@@ -73,10 +70,10 @@ def test_physical_values_are_scipys_quantiles(physical):
     """Coordinate z is the prior's quantile at Phi(z), for every kind, out to twelve standard deviations."""
     z = np.linspace(-12.0, 12.0, 97)
     space = parameter_space(table(), small_stereo())
-    values, slopes = physical(np.tile(z[:, None], (1, len(NAMES))), space)
+    values, slopes = physical(np.tile(z[:, None], (1, len(TWO_MIRROR.names))), space)
     assert np.isfinite(values).all() and np.isfinite(slopes).all()
     kinds = set()
-    for index, name in enumerate(RIG_NAMES):
+    for index, name in enumerate(TWO_MIRROR.rig_names):
         prior = table().priors[name]
         kinds.add(prior.distribution)
         if prior.distribution == "half-normal":
@@ -95,9 +92,9 @@ def test_physical_values_are_scipys_quantiles(physical):
 
 def test_a_stray_coordinate_of_a_half_normal_is_still_a_number(physical):
     """A diverging fit may try values outside every prior; Phi(-40) underflows, and infinities reach the gradient."""
-    z = np.zeros((3, len(NAMES)))
-    z[:, INDEX["backlash_deg.pan"]] = [35.0, 40.0, 1e3]
-    values = physical(z, parameter_space(table(), small_stereo()))[0][:, INDEX["backlash_deg.pan"]]
+    z = np.zeros((3, len(TWO_MIRROR.names)))
+    z[:, TWO_MIRROR.index["backlash_deg.pan"]] = [35.0, 40.0, 1e3]
+    values = physical(z, parameter_space(table(), small_stereo()))[0][:, TWO_MIRROR.index["backlash_deg.pan"]]
     assert np.all(np.isfinite(values)) and values[1] == values[2] > values[0] > 17.0
 
 
@@ -105,8 +102,8 @@ def test_u_zero_fixes_every_kind(physical):
     fixed = {name: replace(prior, u=0.0) for name, prior in table().priors.items()}
     stereo = replace(small_stereo(), parameter_covariance=np.zeros((24, 24)))
     space = parameter_space(RigTable(fixed), stereo)
-    values, slopes = physical(np.linspace(-12, 12, 9)[:, None] * np.ones(len(NAMES)), space)
-    expected = np.array([*(fixed[name].value for name in RIG_NAMES), *stereo.vector])
+    values, slopes = physical(np.linspace(-12, 12, 9)[:, None] * np.ones(len(TWO_MIRROR.names)), space)
+    expected = np.array([*(fixed[name].value for name in TWO_MIRROR.rig_names), *stereo.vector])
     np.testing.assert_allclose(values, np.broadcast_to(expected, values.shape), rtol=0, atol=1e-12)
     assert np.all(slopes == 0)
     assert not free_mask(space, has_aperture=True).any()
@@ -115,12 +112,12 @@ def test_u_zero_fixes_every_kind(physical):
 def test_free_parameters():
     """Those with u > 0; the receiver's only with readings; zero rows of the stereo covariance never."""
     space = parameter_space(table(), small_stereo())
-    unstated = {name for name in GEAR_ERROR_NAMES if RIG_PRIORS[name].u == 0 or name in AMPLITUDE_NAMES}
+    unstated = {name for name in GEAR_ERROR_NAMES if TWO_MIRROR.priors[name].u == 0 or name in AMPLITUDE_NAMES}
     fixed = {"stereo.left.k3", "stereo.right.k3", *HARMONIC_NAMES, *unstated}
     for has_aperture in (True, False):
-        free = {name for name, yes in zip(NAMES, free_mask(space, has_aperture), strict=True) if yes}
-        assert set(NAMES) - free == fixed | (set() if has_aperture else set(RECEIVER_NAMES))
-    assert set(NOISE_NAMES) <= set(RIG_NAMES)
+        free = {name for name, yes in zip(TWO_MIRROR.names, free_mask(space, has_aperture), strict=True) if yes}
+        assert set(TWO_MIRROR.names) - free == fixed | (set() if has_aperture else set(RECEIVER_NAMES))
+    assert set(NOISE_NAMES) <= set(TWO_MIRROR.rig_names)
 
 
 def test_stereo_root_squares_to_the_covariance():
@@ -220,14 +217,14 @@ def leaves(model) -> dict[str, np.ndarray]:
 
 
 def test_every_name_drives_its_field_and_nothing_else():
-    assert set(FIELDS) == set(NAMES)
-    base = 10.0 + np.arange(len(NAMES))
-    rows = np.vstack([base, base + np.eye(len(NAMES))])
+    assert set(FIELDS) == set(TWO_MIRROR.names)
+    base = 10.0 + np.arange(len(TWO_MIRROR.names))
+    rows = np.vstack([base, base + np.eye(len(TWO_MIRROR.names))])
     models = leaves(eqx.filter_jit(jax.vmap(model_of))(jnp.asarray(rows)))
     for known in ("transmission.harmonics.period_rad", "transmission.harmonics.on_wheel", "gears.period_rad"):
         models.pop(known)
-    assert sum(leaf[0].size for leaf in models.values()) == len(NAMES)
-    for row, name in enumerate(NAMES, start=1):
+    assert sum(leaf[0].size for leaf in models.values()) == len(TWO_MIRROR.names)
+    for row, name in enumerate(TWO_MIRROR.names, start=1):
         path, index, unit = FIELDS[name]
         for field, values in models.items():
             change = values[row] - values[0]
@@ -238,7 +235,7 @@ def test_every_name_drives_its_field_and_nothing_else():
             np.testing.assert_allclose(change, expected, atol=1e-13, err_msg=f"{name} -> {field}")
 
 
-modelled = jax.jit(lambda space: space.model(jnp.zeros(len(NAMES))))
+modelled = jax.jit(lambda space: space.model(jnp.zeros(len(TWO_MIRROR.names))))
 """At the middle of all priors, compiled once."""
 
 
@@ -264,15 +261,17 @@ def test_a_full_turn_is_the_wheels_period_and_less_the_pinions(stated, period_de
 
 def test_coordinates_are_the_inverse(physical):
     """Out to five standard deviations, for every kind, and where a prior fixes a value."""
-    z = np.random.default_rng(3).uniform(-5.0, 5.0, (200, len(NAMES)))
+    z = np.random.default_rng(3).uniform(-5.0, 5.0, (200, len(TWO_MIRROR.names)))
     space = parameter_space(table(), small_stereo())
     values, _ = physical(z, space)
     back = coordinates_of(space, values)
     fixed = np.concatenate([np.asarray(space.u) == 0, np.zeros(24, dtype=bool)])
     assert np.all(back[:, fixed] == 0)
     # A large half-normal is the tail of a probability near 0, a small one near 1: rounding 1e-16 / phi(5).
-    rig = ~fixed[: len(RIG_NAMES)]
-    np.testing.assert_allclose(back[:, : len(RIG_NAMES)][:, rig], z[:, : len(RIG_NAMES)][:, rig], atol=1e-9)
+    rig = ~fixed[: len(TWO_MIRROR.rig_names)]
+    np.testing.assert_allclose(
+        back[:, : len(TWO_MIRROR.rig_names)][:, rig], z[:, : len(TWO_MIRROR.rig_names)][:, rig], atol=1e-9
+    )
     again, _ = physical(back, space)
     np.testing.assert_allclose(again, values, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(coordinates_of(space, values[3]), back[3], rtol=1e-12, atol=1e-12)
@@ -292,11 +291,11 @@ def test_one_point_in_numpy_is_that_of_jax(physical):
     space = parameter_space(table(), small_stereo())
     rng = np.random.default_rng(6)
     for scale in (1.0, 4.0, 60.0):
-        z = scale * rng.standard_normal(len(NAMES))
+        z = scale * rng.standard_normal(len(TWO_MIRROR.names))
         point, (values, slopes) = physical_at(z, space), physical(z[None], space)
         # The tails of both inverses of Phi agree to some hundred roundings.
         np.testing.assert_allclose(point.value, values[0], rtol=1e-12, atol=1e-300)
         # Along all coordinates at once: those of the rig have their own alone, the root of the cameras is tested above.
         np.testing.assert_allclose(point.slope.sum(axis=1), slopes[0], rtol=1e-11, atol=1e-300)
-        rig = point.slope[: len(RIG_NAMES)]
+        rig = point.slope[: len(TWO_MIRROR.rig_names)]
         np.testing.assert_array_equal(rig, np.eye(*rig.shape) * rig)

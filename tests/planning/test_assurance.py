@@ -9,11 +9,11 @@ import pytest
 from support.coarse_planning import ROUNDING
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, RIG_NAMES
-from tvsbayes.model.parameter_space import STOP_COLUMNS
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import CREEP_NAMES, NOISE_NAMES
 from tvsbayes.planning.assurance import Assurance, Family, judged_z
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
-from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, information_of
+from tvsbayes.planning.expectation import information_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
@@ -40,7 +40,7 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
     drawn = draw_instruments(knowledge, 2, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
     # Looks count without creep, by the median of its time constant.
-    drawn.z[:, [INDEX[name] for name in CREEP_NAMES]] = 0.0
+    drawn.z[:, [TWO_MIRROR.index[name] for name in CREEP_NAMES]] = 0.0
     assurance = Assurance(family, target, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
     first = assurance.values([2])
     reported = {**first, **assurance.values([6, 2])}
@@ -94,9 +94,9 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
 def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, seen):
     """Thousands of stops give the true sd; none leave the prior's root mean square; the scatter is 1 / sqrt(2 n)."""
     true = knowledge.z.copy()
-    columns = STOP_COLUMNS.ravel()
+    columns = TWO_MIRROR.stop_columns.ravel()
     true[columns] = 1.5
-    truth, exact = believers(knowledge, true), np.zeros((1, PARAMETERS, PARAMETERS))
+    truth, exact = believers(knowledge, true), np.zeros((1, len(TWO_MIRROR.names), len(TWO_MIRROR.names)))
     many = np.tile(np.arange(len(pool.looks)), 40)
 
     def scales(chosen, noise):
@@ -107,7 +107,7 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, s
     one = scales(many[:1], 0.0)
     assert (np.abs(one) < 1.5).all()
     # E s^2 of a log-normal with sd u of ln s is exp(2 u^2) times the square of its median: its root lies at z = u.
-    unseen = ~np.isin(columns, STOP_COLUMNS[np.arange(2), (pool.looks.side[many[0]] > 0).astype(int)])
+    unseen = ~np.isin(columns, TWO_MIRROR.stop_columns[np.arange(2), (pool.looks.side[many[0]] > 0).astype(int)])
     np.testing.assert_allclose(one[unseen], np.asarray(knowledge.space.u)[columns][unseen], rtol=1e-12)
     per_direction = len(many) / 2
     # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
@@ -116,7 +116,7 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, pool, s
 
 def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, pool, seen):
     """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
-    columns = STOP_COLUMNS.ravel()
+    columns = TWO_MIRROR.stop_columns.ravel()
     true = knowledge.z.copy()
     true[columns] = 1.5
     truth = believers(knowledge, true)
@@ -129,11 +129,11 @@ def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(kn
         )
         return (high - low)[0, columns]
 
-    exact = np.zeros((PARAMETERS, PARAMETERS))
-    geometry = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    exact = np.zeros((len(TWO_MIRROR.names), len(TWO_MIRROR.names)))
+    geometry = ~np.isin(TWO_MIRROR.names, NOISE_NAMES) & (np.arange(len(TWO_MIRROR.names)) < len(TWO_MIRROR.rig_names))
     # No information is gained where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
     precision = np.diag(knowledge.precision)
-    unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
+    unknown = np.diag(np.divide(1.0, precision, out=np.zeros(len(TWO_MIRROR.names)), where=precision > 0))
     left_over = 1 - np.sum(geometry & (precision > 0)) / (2 * seen.seen[chosen].sum())
     # Scatter is 1 / sqrt(information) but for the prior, which 30 stops of a direction outweigh 50 times.
     assert scatter(exact) / scatter(unknown) == pytest.approx(1 / math.sqrt(left_over), rel=0.03)

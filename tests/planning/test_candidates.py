@@ -11,9 +11,10 @@ from support.coarse_planning import with_priors
 from support.commands import steps
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.parameters import INDEX, NAMES, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.planning.candidates import Positions, candidates, from_all_sides, run_up_steps
-from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.looks import Looks, arrange, covariance_of
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.target import parse_target, sensitivity
@@ -23,12 +24,12 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 
 def test_a_run_up_takes_up_play_and_stops_of_its_own_axis():
     """By hand: 1.5 (0.3 + 4 x 0.05) / 0.06 = 12.5 steps of pan, 1.5 (0.1 + 4 x 0.02) / 0.07 = 3.9 of tilt."""
-    physical = np.zeros(len(NAMES))
+    physical = np.zeros(len(TWO_MIRROR.names))
     values = {"degrees_per_step.pan": -0.06, "degrees_per_step.tilt": 0.07}
     values |= {"stop_sd_deg.left": 0.01, "stop_sd_deg.right": 0.05, "stop_sd_deg.up": 0.02, "stop_sd_deg.down": 0.01}
     for name, value in values.items():
-        physical[INDEX[name]] = value
-    np.testing.assert_array_equal(run_up_steps(physical, np.array([0.3, 0.1])), [13, 4])
+        physical[TWO_MIRROR.index[name]] = value
+    np.testing.assert_array_equal(run_up_steps(physical, TWO_MIRROR, np.array([0.3, 0.1])), [13, 4])
 
 
 def test_limits_are_kept(mounted_rig, pool):
@@ -72,8 +73,8 @@ def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
     information = information_of(steps, vague)
     covariance = covariance_of(vague.precision + information.fisher)
     # The whole way out went left: it is k_left = k + c / 2 that the turn measures.
-    left = np.zeros(PARAMETERS)
-    left[[INDEX["degrees_per_step.pan"], INDEX["ratio_contrast_deg_per_step.pan"]]] = 1e-3, 1e-4
+    left = np.zeros(len(TWO_MIRROR.names))
+    left[[TWO_MIRROR.index["degrees_per_step.pan"], TWO_MIRROR.index["ratio_contrast_deg_per_step.pan"]]] = 1e-3, 1e-4
     k = math.sqrt(left @ covariance @ left)
     stop_deg = 0.04
     assert k < 2 * stop_deg / 6000

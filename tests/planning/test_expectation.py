@@ -13,12 +13,11 @@ from support.dozen_spots import dozen_plan
 
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.gears.priors import half_normal_coordinate
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import (
-    NOISE_COLUMNS,
     design_arrays,
     expect,
     information_of,
@@ -48,7 +47,7 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     safe = np.where(scale > 0, scale, 1.0)
     # The spots are triangulated from pixels without noise: linear triangulation is exact to 1e-9 of its point.
     assert np.abs(planned / np.outer(safe, safe) - of_fit / np.outer(safe, safe)).max() < 1e-6
-    assert (scale[~NOISE_COLUMNS] > 0).sum() > 40
+    assert (scale[~knowledge.noise] > 0).sum() > 40
 
 
 def test_looks_that_scatter_tell_a_plan_less(knowledge):
@@ -62,7 +61,7 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
     fishers = {}
     for stop_deg, scatter_deg in ((0.05, 0.0), (0.03, 0.04), (0.03, 0.0)):
         z, space = knowledge.z.copy(), knowledge.space
-        for name, index in INDEX.items():
+        for name, index in TWO_MIRROR.index.items():
             if name.startswith("stop_sd_deg"):
                 z[index] = np.log(stop_deg / float(space.value[index])) / float(space.u[index])
             if name.startswith("look_scatter_deg"):
@@ -70,7 +69,7 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
         fishers[stop_deg, scatter_deg] = information_of(plan.steps, knowledge, z=z).fisher
     both, sum_alone, less = fishers[0.03, 0.04], fishers[0.05, 0.0], fishers[0.03, 0.0]
     np.testing.assert_allclose(both, sum_alone, atol=1e-9 * np.abs(sum_alone).max())
-    ratio = INDEX["degrees_per_step.pan"]
+    ratio = TWO_MIRROR.index["degrees_per_step.pan"]
     assert both[ratio, ratio] < 0.9 * less[ratio, ratio]
 
 

@@ -13,7 +13,8 @@ from support.coarse_planning import ROUNDING, with_priors
 from support.commands import steps
 
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, Prior, names_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import CREEP_NAMES, Prior, names_of
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
@@ -23,7 +24,7 @@ from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.planning.assurance import Assurance, Family, instrument_gears, judged_z
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
-from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.gear_places import FittedErrors, GearPlaces, regular_places, windows_of
 from tvsbayes.planning.limits import split_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covariance_of, information_of_looks
@@ -39,7 +40,7 @@ MIRRORS = names_of(
     *("mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
     *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
 )
-ERRORS = [INDEX[f"transmission_error_deg.{axis}"] for axis in ("pan", "tilt")]
+ERRORS = [TWO_MIRROR.index[f"transmission_error_deg.{axis}"] for axis in ("pan", "tilt")]
 WORST = parse_target("u(worst) <= 2e-4 deg/step")
 
 
@@ -60,12 +61,12 @@ def real(real_rig, small_searches):
 
 
 def some_places(error_deg=0.04, play_deg=0.02) -> GearPlaces:
-    physical = np.zeros(len(NAMES))
-    for index, name in enumerate(NAMES):
+    physical = np.zeros(len(TWO_MIRROR.names))
+    for index, name in enumerate(TWO_MIRROR.names):
         block = name.split(".")[0]
         values = {"transmission_error_deg": error_deg, "play_variation_deg": play_deg}
         physical[index] = {**values, "transmission_error_length_deg": LENGTH_DEG}.get(block, 0.0)
-    scales = scales_at(physical, np.full((2, 3), 360.0))
+    scales = scales_at(physical, np.full((2, 3), 360.0), TWO_MIRROR)
     reached = np.column_stack([np.linspace(0, 240, 9), np.linspace(-90, 90, 9)])
     return regular_places(reached, np.array([PAN, TILT]), scales)
 
@@ -124,7 +125,7 @@ def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
     """
     known, _ = real
     gears, pose = known.gears, np.radians([7.0, 3.0])
-    z = known.z + 0.3 * np.random.default_rng(2).standard_normal(PARAMETERS)
+    z = known.z + 0.3 * np.random.default_rng(2).standard_normal(len(TWO_MIRROR.names))
     share = gears.line_through(np.array([[0, -60], [60, 20], [200, 75]]), np.ones(3))
     places = Places(placed(gears.steps), placed(gears.on_tilt), placed(np.ones(len(gears.steps), dtype=bool)))
 
@@ -143,7 +144,9 @@ def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
         headlines = replace(gears, share=one).headlines(z, known.space, pose)
         np.testing.assert_allclose(np.asarray(headlines.value)[:4], slopes(z, nothing, one), rtol=1e-12)
         step = np.random.default_rng(3).standard_normal(known.size)
-        ends = [slopes(z + h * step[:PARAMETERS], h * step[PARAMETERS:], one) for h in (1e-5, -1e-5)]
+        ends = [
+            slopes(z + h * step[: len(TWO_MIRROR.names)], h * step[len(TWO_MIRROR.names) :], one) for h in (1e-5, -1e-5)
+        ]
         wanted = (ends[0] - ends[1]) / 2e-5
         # Central differences of angles near 1 rad in float64: 1e-16 / 1e-5 in 100 steps, some 1e-11 deg/step.
         np.testing.assert_allclose(np.asarray(headlines.gradient)[:4] @ step, wanted, atol=1e-9)
@@ -161,9 +164,9 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
     drawn = draw_instruments(known, 3, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
     # Looks count without creep, by the median of its time constant.
-    drawn.z[:, [INDEX[name] for name in CREEP_NAMES]] = 0.0
+    drawn.z[:, [TWO_MIRROR.index[name] for name in CREEP_NAMES]] = 0.0
     # Cameras turned away from an eighth of the looks.
-    drawn.z[2, INDEX["extrinsics.rotation_rad.y"]] = 10.0
+    drawn.z[2, TWO_MIRROR.index["extrinsics.rotation_rad.y"]] = 10.0
     assurance = Assurance(family, WORST, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
     reported, steps = assurance.values([6])[6], family.arranged(6).steps
     for row in range(3):
@@ -200,16 +203,22 @@ def test_what_a_fit_says_at_its_places_is_carried_to_others():
     """Nothing taught leaves the prior; errors known at the fit's counters are known at those of the plan between."""
     gears = some_places(play_deg=0.0)
     old = replace(gears, steps=gears.steps * 0.9, share=gears.share / 0.9)
-    nothing = np.eye(PARAMETERS + old.size)
-    assert FittedErrors(old, nothing).covariance_at(gears) == pytest.approx(np.eye(PARAMETERS + gears.size), abs=1e-6)
+    nothing = np.eye(len(TWO_MIRROR.names) + old.size)
+    assert FittedErrors(old, nothing).covariance_at(gears) == pytest.approx(
+        np.eye(len(TWO_MIRROR.names) + gears.size), abs=1e-6
+    )
     known = nothing.copy()
-    known[PARAMETERS:, PARAMETERS:] *= 1e-6
-    known[0, PARAMETERS] = known[PARAMETERS, 0] = 1e-4
-    left = gears.root @ FittedErrors(old, known).covariance_at(gears)[PARAMETERS:, PARAMETERS:] @ gears.root.T
+    known[len(TWO_MIRROR.names) :, len(TWO_MIRROR.names) :] *= 1e-6
+    known[0, len(TWO_MIRROR.names)] = known[len(TWO_MIRROR.names), 0] = 1e-4
+    left = (
+        gears.root
+        @ FittedErrors(old, known).covariance_at(gears)[len(TWO_MIRROR.names) :, len(TWO_MIRROR.names) :]
+        @ gears.root.T
+    )
     inside = np.abs(gears.steps) < 80
     count = len(gears.steps)
     assert np.sqrt(np.diag(left)[:count][inside]).max() < 0.1 * np.radians(0.04)
-    follows = FittedErrors(old, known).covariance_at(gears)[0, PARAMETERS:]
+    follows = FittedErrors(old, known).covariance_at(gears)[0, len(TWO_MIRROR.names) :]
     assert follows[:count] @ gears.root[:count, :count].T @ np.ones(count) != 0
 
 
@@ -274,7 +283,7 @@ def test_a_point_between_the_places_has_what_they_leave_open(real):
         at = sensitivity(target, known.z, known.space, known.rig.table, pose, known.gears)
         assert at.gradient.shape == (1, known.size)
         left_open[y_mm] = float(at.own[GEARS_AT_POINT][0])
-        errors = float(np.sum(at.gradient[0, PARAMETERS:] ** 2)) + left_open[y_mm]
+        errors = float(np.sum(at.gradient[0, len(TWO_MIRROR.names) :] ** 2)) + left_open[y_mm]
         # Errors of 0.05 and half the play's 0.02 deg, root mean squares of half-normals. A look there meets a stop
         # error of 0.04 deg and the scatter of looks, both as most probable: the median of a half-normal of 0.01 deg.
         of_a_look = np.hypot(0.04, 0.01 * stats.halfnorm.median())

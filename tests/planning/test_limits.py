@@ -12,11 +12,12 @@ from msgspec import structs
 from support.coarse_planning import with_priors
 
 from tvsbayes.instrument.axes import HOME_APPROACH
-from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, run_plan
 from tvsbayes.planning import planner
 from tvsbayes.planning.candidates import candidates
-from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, arrange, information_of_looks
 from tvsbayes.planning.search import DesignProblem
@@ -120,7 +121,7 @@ def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, pool):
 def test_errors_of_the_gears_at_the_point_are_not_called_its_stop(knowledge):
     """Stop 3 mm and reading 4 mm make 5 mm; with 12 mm of the gears, which nearer looks would reduce, 13 mm."""
     parts = {STOP_AT_POINT: np.array([9.0]), NOISE_AT_POINT: np.array([16.0]), GEARS_AT_POINT: np.array([144.0])}
-    point, none = Sensitivity(at({SCALE: 1e-3})[None], parts), np.zeros((PARAMETERS, PARAMETERS))
+    point, none = Sensitivity(at({SCALE: 1e-3})[None], parts), np.zeros((len(TWO_MIRROR.names), len(TWO_MIRROR.names)))
 
     def needed(limit_mm: float) -> str | None:
         target = parse_target(f"u(x) at 1000,0,0 mm <= {limit_mm} mm")
@@ -133,12 +134,12 @@ def test_errors_of_the_gears_at_the_point_are_not_called_its_stop(knowledge):
     assert needed(13.1) is None
 
 
-SCALE, STEREO = INDEX["focal_scale"], PARAMETERS - 1
+SCALE, STEREO = TWO_MIRROR.index["focal_scale"], len(TWO_MIRROR.names) - 1
 
 
 def at(columns: dict[int, float]) -> np.ndarray:
     """A vector over the coordinates with a few entries, shape (p,)."""
-    vector = np.zeros(PARAMETERS)
+    vector = np.zeros(len(TWO_MIRROR.names))
     vector[list(columns)] = list(columns.values())
     return vector
 
@@ -160,7 +161,7 @@ def test_shares_of_two_parameters_by_hand(knowledge):
 
 def test_after_data_priors_and_campaign_are_one_share(knowledge):
     """Precision 2 of all and data diag(2, 0): S = diag(1/4, 1/2), S g = (1/2, 3/2); 2 (1/4 + 9/4) and 2 / 4."""
-    known = replace(knowledge, precision=2 * np.eye(PARAMETERS), after_data=True)
+    known = replace(knowledge, precision=2 * np.eye(len(TWO_MIRROR.names)), after_data=True)
     gradient = at({SCALE: 2.0, STEREO: 3.0})[None]
     shares = split_of(known, np.diag(at({SCALE: 2.0})), None, Sensitivity(gradient))
     assert shares == pytest.approx({"the campaign and its priors": 5.0 / 5.5, "looks": 0.5 / 5.5})
@@ -176,7 +177,7 @@ def test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high(knowle
     What is needed is never rounded up: 0.255, 0.2578 and 0.2598 of 0.002 are 0.00051, 0.000516 and 0.0005196, of which
     two digits that are enough are 0.00051.
     """
-    nothing, only = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({SCALE: 2.0})[None])
+    nothing, only = np.zeros((len(TWO_MIRROR.names), len(TWO_MIRROR.names))), Sensitivity(at({SCALE: 2.0})[None])
     limit = limit_of(knowledge, nothing, only, target_of(0.51))
     assert (limit.floor, limit.cause, limit.reachable) == (2.0, "focal scale", False)
     for share in (0.255, 0.2578, 0.2598):
@@ -187,7 +188,10 @@ def test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high(knowle
 
 def test_two_inputs_are_required_where_one_is_not_enough(knowledge):
     """4^2 + 3^2 with a target of 2: the larger to a tenth of its u, the smaller to sqrt(4 - 0.4^2) / 3 = 0.653."""
-    nothing, both = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({STEREO: 4.0, SCALE: 3.0})[None])
+    nothing, both = (
+        np.zeros((len(TWO_MIRROR.names), len(TWO_MIRROR.names))),
+        Sensitivity(at({STEREO: 4.0, SCALE: 3.0})[None]),
+    )
     limit = limit_of(knowledge, nothing, both, target_of(2.0))
     assert limit.shares == pytest.approx({"stereo calibration": 16 / 25, "focal scale": 9 / 25})
     stereo = "the stereo calibration to 10 % of its present uncertainty"

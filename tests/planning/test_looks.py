@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from support.coarse_planning import ROUNDING
 
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.plan import plan_minutes
 from tvsbayes.planning.candidates import Positions
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
     LookArrays,
@@ -81,28 +82,28 @@ def test_an_arranged_plan_travels_and_costs_what_its_steps_do(knowledge, pool, h
 def test_looks_taken_again_count_as_often_as_they_are_taken():
     """Row by row with the contrast's column written out, at two points of parameter space."""
     generator = np.random.default_rng(7)
-    rows = generator.standard_normal((2, 5, 4, PARAMETERS + 2))
+    rows = generator.standard_normal((2, 5, 4, len(TWO_MIRROR.names) + 2))
     seen = Seen(rows, rows[..., :2], np.ones((2, 5), dtype=bool), np.zeros((2, 5, 2)))
     chosen, path = np.array([3, 0, 3, 3, 1, 0]), generator.integers(0, 900, (6, 2))
 
     class Space:
-        u = generator.uniform(0.5, 1.0, PARAMETERS)
+        u = generator.uniform(0.5, 1.0, len(TWO_MIRROR.names))
 
     for homed in (None, np.radians([0.05, 0.1]) ** 2):
         informations = information_of_looks(seen, chosen, path, Space, homed)
         for one, information in zip(rows, informations, strict=True):
             every = one[chosen].copy()
             for axis, column in enumerate(CONTRAST_COLUMNS):
-                every[:, :, column] = every[:, :, PARAMETERS + axis] * path[:, axis, None]
+                every[:, :, column] = every[:, :, len(TWO_MIRROR.names) + axis] * path[:, axis, None]
                 every[:, :, column] *= Space.u[column] * np.pi / 360
             whole = np.einsum("kia,kib->ab", every, every)
             if homed is not None:
-                whole[PARAMETERS:, PARAMETERS:] += np.diag(1 / homed)
+                whole[len(TWO_MIRROR.names) :, len(TWO_MIRROR.names) :] += np.diag(1 / homed)
                 # Beside a prior that is taken off again: few looks leave most directions open.
-                prior = np.diag([1.0] * PARAMETERS + [0.0] * 2)
-                covariance = np.linalg.inv(whole + prior)[:PARAMETERS, :PARAMETERS]
-                whole = np.linalg.inv(covariance) - np.eye(PARAMETERS)
-            whole = whole[:PARAMETERS, :PARAMETERS]
+                prior = np.diag([1.0] * len(TWO_MIRROR.names) + [0.0] * 2)
+                covariance = np.linalg.inv(whole + prior)[: len(TWO_MIRROR.names), : len(TWO_MIRROR.names)]
+                whole = np.linalg.inv(covariance) - np.eye(len(TWO_MIRROR.names))
+            whole = whole[: len(TWO_MIRROR.names), : len(TWO_MIRROR.names)]
             assert np.abs(information - whole).max() < ROUNDING * np.abs(whole).max()
 
 

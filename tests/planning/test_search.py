@@ -10,11 +10,11 @@ import pytest
 from msgspec import structs
 from support.coarse_planning import ROUNDING
 
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.planning import search
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import PARAMETERS
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of, information_of_looks
 from tvsbayes.planning.search import (
     CONTRAST_PRECISION,
@@ -98,9 +98,11 @@ def test_a_search_after_data_knows_no_home_offset(knowledge, seen):
     rows[..., CONTRAST_COLUMNS] = 0
     shown, picks = replace(seen, rows=rows), np.arange(6)
     wide, precision = shown.rows, search_precision(known)
-    whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[:PARAMETERS, :PARAMETERS]
+    whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[
+        : len(TWO_MIRROR.names), : len(TWO_MIRROR.names)
+    ]
     exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, known.home_variances_rad2)
-    contrasts = np.isin(np.arange(PARAMETERS), CONTRAST_COLUMNS)
+    contrasts = np.isin(np.arange(len(TWO_MIRROR.names)), CONTRAST_COLUMNS)
     expected = covariance_of(known.precision + exact + CONTRAST_PRECISION * np.diag(contrasts))
     assert whole == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING * expected.max())
     without = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, None)

@@ -12,8 +12,9 @@ from support.coarse_planning import with_priors
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.planning.expectation import PARAMETERS, prior_knowledge
+from tvsbayes.planning.expectation import prior_knowledge
 from tvsbayes.planning.target import NOISE_AT_POINT, STOP_AT_POINT, Target, parse_target, sensitivity
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
 
@@ -64,7 +65,7 @@ def test_a_point_has_its_own_uncertainty(knowledge):
     from_beam_mm2, from_aperture_mm2 = 1000.0**2 + 70.0**2, 1000.0**2 + 100.0**2
     expected_mm = math.hypot(stop_rad * from_beam_mm2, reading_rad * from_aperture_mm2) / base_mm
     # The tilt's stop enters x to second order; small angles of the triangle are left out: (b / d)^2 = 3 %.
-    assert at.value(np.zeros((PARAMETERS, PARAMETERS))) == pytest.approx(expected_mm, rel=0.03)
+    assert at.value(np.zeros((len(TWO_MIRROR.names), len(TWO_MIRROR.names)))) == pytest.approx(expected_mm, rel=0.03)
     assert at.value(knowledge.covariance) > 10 * expected_mm
 
 

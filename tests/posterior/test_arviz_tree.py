@@ -10,7 +10,7 @@ from support.drawn_quantities import drawn_quantities
 from support.small_posterior import SEED, mapped_already, small_fit
 
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
-from tvsbayes.instrument.parameters import AMPLITUDE_NAMES, INDEX, NAMES
+from tvsbayes.instrument.parameters import AMPLITUDE_NAMES
 from tvsbayes.posterior.arviz_tree import COORDS, RESAMPLED, VARIABLES, _dataset, _variables, data_tree
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.results.tiers import IMPORTANCE
@@ -22,7 +22,7 @@ SHAPE = 2, 3
 @pytest.fixture
 def draws():
     """Every parameter has values of its own in every draw."""
-    physical = np.arange(np.prod(SHAPE) * len(NAMES), dtype=float).reshape(*SHAPE, len(NAMES))
+    physical = np.arange(np.prod(SHAPE) * len(TWO_MIRROR.names), dtype=float).reshape(*SHAPE, len(TWO_MIRROR.names))
     return drawn_quantities(*SHAPE, physical=physical)
 
 
@@ -35,7 +35,7 @@ def test_amplitudes_of_stated_periods_have_a_dimension_of_their_own(draws, count
     assert variable.sizes == {"chain": 2, "draw": 3, dim: count}
     assert [f"harmonic_amplitude_deg.{label}" for label in variable[dim].values] == list(varying)
     for label, name in zip(variable[dim].values, varying, strict=True):
-        np.testing.assert_array_equal(variable.sel({dim: label}), draws.physical[..., INDEX[name]])
+        np.testing.assert_array_equal(variable.sel({dim: label}), draws.physical[..., TWO_MIRROR.index[name]])
 
 
 def test_every_variable_of_several_names_has_a_dimension_with_as_many_labels(draws):

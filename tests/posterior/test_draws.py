@@ -11,7 +11,6 @@ from support.two_parameters import autoregressive
 
 from tvsbayes.inference.summaries import propagated
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
-from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.tiers import CHAIN
 
@@ -42,11 +41,11 @@ def test_the_longer_tail_is_the_worse_known():
 
 def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():
     """200 steps of 0.06 deg take up 0.3 deg of play, two take 0.12 deg of it; every direction, by hand."""
-    physical = np.zeros((2, 3, len(NAMES)))
+    physical = np.zeros((2, 3, len(TWO_MIRROR.names)))
     values = {"degrees_per_step.pan": 0.06, "ratio_contrast_deg_per_step.pan": 0.002, "backlash_deg.pan": 0.3}
     values |= {"degrees_per_step.tilt": 0.07, "ratio_contrast_deg_per_step.tilt": 0.004, "backlash_deg.tilt": 0.5}
     for name, value in values.items():
-        physical[..., INDEX[name]] = value
+        physical[..., TWO_MIRROR.index[name]] = value
     shape = physical.shape[:2]
     draws = drawn_quantities(*shape, physical=physical)
     fit = SimpleNamespace(space=SimpleNamespace(mechanism=TWO_MIRROR))

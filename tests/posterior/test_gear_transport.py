@@ -21,8 +21,9 @@ from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, names_of
-from tvsbayes.model.parameter_space import DRIFT_COLUMNS, coordinates_of, free_mask, parameter_space, physical_at
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, names_of
+from tvsbayes.model.parameter_space import coordinates_of, free_mask, parameter_space, physical_at
 from tvsbayes.posterior.transport import SCALE_NAMES, WALK_INFORMATION, Transport, transport
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -53,14 +54,15 @@ def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str,
         lin = linearised_at(z, space, arrays)
         information = stop_information(linear_spots(lin, arrays, -np.asarray(lin.residual_jacobian)))
     free = free_mask(space, has_aperture=True)
-    free[[INDEX[name] for name in held]] = False
-    covariance = np.linalg.inv(np.eye(len(NAMES)) + information.fisher)
-    noise = np.isin(NAMES, SCALE_NAMES)
+    free[[TWO_MIRROR.index[name] for name in held]] = False
+    covariance = np.linalg.inv(np.eye(len(TWO_MIRROR.names)) + information.fisher)
+    noise = np.isin(TWO_MIRROR.names, SCALE_NAMES)
     # Scales as wide as a dozen spots leave them.
     covariance[noise], covariance[:, noise] = 0.0, 0.0
     covariance[noise, noise] = 0.3**2
     return SimpleNamespace(
         campaign=campaign,
+        names=TWO_MIRROR.names,
         space=space,
         arrays=arrays,
         z=z,
@@ -99,7 +101,7 @@ def scattered(dozen) -> SimpleNamespace:
 
 def values_at(fitted: SimpleNamespace, z: np.ndarray) -> dict[str, float]:
     """Parameters by name, and the periods, deg."""
-    values = dict(zip(NAMES, physical_at(z, fitted.space).value.tolist(), strict=True))
+    values = dict(zip(TWO_MIRROR.names, physical_at(z, fitted.space).value.tolist(), strict=True))
     for axis, periods in PERIODS_DEG.items():
         for number in (1, 2, 3):
             values[f"period_deg.{axis}.{number}"] = (*periods, 360.0, 360.0)[number - 1]
@@ -109,9 +111,9 @@ def values_at(fitted: SimpleNamespace, z: np.ndarray) -> dict[str, float]:
 def dense_density(fitted: SimpleNamespace, path: Transport, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Precision and score of the coordinates y that are no scales, by the covariance of all residuals at z."""
     values, mode, at = values_at(fitted, z), values_at(fitted, fitted.z), fitted.linearised
-    if fitted.free[INDEX["creep_minutes"]]:
+    if fitted.free[TWO_MIRROR.index["creep_minutes"]]:
         # The model itself at another time constant.
-        only = np.where(np.arange(len(NAMES)) == INDEX["creep_minutes"], z, fitted.z)
+        only = np.where(np.arange(len(TWO_MIRROR.names)) == TWO_MIRROR.index["creep_minutes"], z, fitted.z)
         at = linearised_at(only, fitted.space, fitted.arrays)
     pixels = values["pixel_scale"] / mode["pixel_scale"]
     others = path.free[path.noise :]
@@ -149,7 +151,7 @@ def check_dense(fitted: SimpleNamespace, path: Transport, least: float) -> None:
 
 def test_the_map_has_mean_and_covariance_of_the_dense_campaign_at_any_scales(fitted, path):
     """Scales of pixels, stops, gears, play and the time constant of a creep together."""
-    assert path.pixels.sum() == 1 and np.isin(LOOK_SCATTER_NAMES, np.array(NAMES)[path.free]).sum() == 0
+    assert path.pixels.sum() == 1 and np.isin(LOOK_SCATTER_NAMES, np.array(TWO_MIRROR.names)[path.free]).sum() == 0
     check_dense(fitted, path, 0.01)
 
 
@@ -163,7 +165,7 @@ def test_a_creep_moves_the_map_with_its_time_constant(fitted, path):
 def test_looks_that_scatter_more_or_less_than_at_the_mode(scattered):
     """Where every look has a stop of its own the scatter adds to its error: the map is exact."""
     path = transport(scattered)
-    names = np.array(NAMES)[path.free[: path.noise]]
+    names = np.array(TWO_MIRROR.names)[path.free[: path.noise]]
     assert set(LOOK_SCATTER_NAMES) <= set(names) and path.pixels.sum() == 0
     check_dense(scattered, path, 0.01)
     # Of scatter alone.
@@ -183,7 +185,7 @@ def test_a_drift_takes_from_the_map_what_it_takes_from_the_dense_campaign(dozen,
     path = transport(fitted)
     dense, _ = dense_density(fitted, path, fitted.z)
     without = path.physical.copy()
-    without[DRIFT_COLUMNS] = 0.0
+    without[TWO_MIRROR.columns("drift_deg_per_root_hour")] = 0.0
     paths = (path, replace(path, physical=without))
     factors = [each.conditional(np.zeros((1, path.noise))).own[0] for each in paths]
     drifting, still = ((factor @ factor.T)[::-1, ::-1] for factor in factors)

@@ -25,7 +25,8 @@ from tvsbayes.inference.importance import Acceptance, Pool, Weighing, k_max, unc
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.inference.tables import Tables
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import BLOCKS, Prior
 from tvsbayes.pipeline import unusable
 from tvsbayes.posterior.draws import Posterior, headline_names
 from tvsbayes.posterior.importance import importance_run
@@ -192,7 +193,7 @@ def test_draws_of_the_same_weight_say_what_weighted_ones_say(posterior):
     assert abs(values.mean() - known.mean) < allowed
     thinned = posterior.thinned(1000)
     chosen = posterior.by_name["backlash_deg.pan"][posterior.chosen(1000)]
-    np.testing.assert_array_equal(np.asarray(thinned.physical)[:, INDEX["backlash_deg.pan"]], chosen)
+    np.testing.assert_array_equal(np.asarray(thinned.physical)[:, TWO_MIRROR.index["backlash_deg.pan"]], chosen)
     np.testing.assert_array_equal(posterior.coordinates(1000), posterior.z[0, posterior.chosen(1000)])
     starts = small_run().starts(64)
     assert len(np.unique(starts, axis=0)) == 64

@@ -15,7 +15,8 @@ from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, names_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import names_of
 from tvsbayes.posterior import predictive
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.homing_mixture import mixed
@@ -57,7 +58,9 @@ def taken_again_deg(dozen, physical: np.ndarray, play_deg: np.ndarray, seed: int
         return np.zeros((len(z), len(play_deg), 4))
 
     linearised = SimpleNamespace(play_sd_rad=np.radians(play_deg))
-    fit = SimpleNamespace(campaign=dozen.campaign, arrays=dozen.arrays, linearised=linearised)
+    fit = SimpleNamespace(
+        campaign=dozen.campaign, space=dozen.space, arrays=dozen.arrays, linearised=linearised
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tvsbayes.posterior.predictive.looks", looks)
         generator = np.random.default_rng(seed)
@@ -72,12 +75,12 @@ def errors_deg(dozen):
     play_deg = np.zeros((len(ordered_spots(dozen.campaign)), 2))
     # Two spots of one segment: where the play stands is one place for both.
     play_deg[[4, 5], 1] = PLAY_SD_DEG
-    physical = np.ones((DRAWS, len(NAMES)))
+    physical = np.ones((DRAWS, len(TWO_MIRROR.names)))
     for name, sd in SDS_DEG.items():
-        physical[:, INDEX[f"stop_sd_deg.{name}"]] = sd
-    physical[:, [INDEX[name] for name in names_of("home_sd_deg")]] = HOME_SD_DEG
+        physical[:, TWO_MIRROR.index[f"stop_sd_deg.{name}"]] = sd
+    physical[:, [TWO_MIRROR.index[name] for name in names_of("home_sd_deg")]] = HOME_SD_DEG
     for name in ("pixel_scale", *names_of("drift_deg_per_root_hour", "look_scatter_deg")):
-        physical[:, INDEX[name]] = 0.0
+        physical[:, TWO_MIRROR.index[name]] = 0.0
     return taken_again_deg(dozen, physical, play_deg, 4), play_deg
 
 
@@ -112,9 +115,9 @@ def test_an_absolute_zero_walks_on_over_homings(dozen):
     """From the first move on; that of the other axis is set by its homings and walks from there."""
     campaign = replace(dozen.campaign, rig=replace(dozen.campaign.rig, absolute=("pan",)))
     spots, moves = ordered_spots(campaign), campaign.moves
-    physical = np.zeros((DRAWS, len(NAMES)))
-    physical[:, [INDEX[name] for name in names_of("drift_deg_per_root_hour")]] = 2.0
-    physical[:, [INDEX[name] for name in names_of("home_sd_deg")]] = HOME_SD_DEG
+    physical = np.zeros((DRAWS, len(TWO_MIRROR.names)))
+    physical[:, [TWO_MIRROR.index[name] for name in names_of("drift_deg_per_root_hour")]] = 2.0
+    physical[:, [TWO_MIRROR.index[name] for name in names_of("home_sd_deg")]] = HOME_SD_DEG
     of_pan = replace(dozen, campaign=campaign, arrays=campaign_arrays(campaign))
     errors = taken_again_deg(of_pan, physical, np.zeros((len(spots), 2)), 6)
     begun = {m.segment: m.time_s for m in reversed(moves)}
@@ -128,8 +131,8 @@ def test_looks_taken_again_scatter_about_their_stops(dozen):
     count = len(ordered_spots(dozen.campaign))
     none = np.zeros(dozen.arrays.spots.homed.shape)
     dozen = replace(dozen, arrays=eqx.tree_at(lambda a: a.spots.homed, dozen.arrays, none))
-    physical = np.zeros((DRAWS, len(NAMES)))
-    physical[:, [INDEX[name] for name in names_of("look_scatter_deg")]] = 0.2, 0.1
+    physical = np.zeros((DRAWS, len(TWO_MIRROR.names)))
+    physical[:, [TWO_MIRROR.index[name] for name in names_of("look_scatter_deg")]] = 0.2, 0.1
     errors = taken_again_deg(dozen, physical, np.zeros((count, 2)), 5)
     tolerance = 5 * np.sqrt(2 / DRAWS)
     np.testing.assert_allclose(errors.var(axis=0), np.full((count, 2), (0.04, 0.01)), rtol=tolerance)

@@ -25,7 +25,7 @@ from support.two_parameters import (
     route,
 )
 
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import (
@@ -97,7 +97,7 @@ def test_centring_straightens_the_posterior_of_a_campaign():
 def test_w_keeps_the_curvature_far_from_the_mode():
     """Where a stop scatters by four of its posterior sds more than at the mode, ratios are far wider; not in w."""
     fitted, path = small_fit()
-    names = np.array(NAMES)[path.free[: path.noise]]
+    names = np.array(TWO_MIRROR.names)[path.free[: path.noise]]
     plain, count = uncentred(path), path.noise
     for which in np.flatnonzero(np.char.startswith(names, "stop_sd_deg")):
         w = np.zeros((1, count))

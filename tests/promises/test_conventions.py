@@ -14,8 +14,8 @@ import pytest
 from support.printed_vector import VECTOR
 
 from tvsbayes.estimators.looks import aperture_angle, observe
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.mirrors import Turn, Vectors
-from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.geometry import project, rotation_matrix
 from tvsbayes.model.laser_path import trace
@@ -32,17 +32,17 @@ RANGE_MM, BASELINE_MM, C0_RAD = 250.0, 200.0, np.radians(91.0)
 
 @pytest.fixture(scope="module")
 def nominal(mounted_rig) -> np.ndarray:
-    """Values of the default priors with the mounted rig's cameras, in the units of NAMES."""
+    """Values of the default priors with the mounted rig's cameras, in the units of TWO_MIRROR.names."""
     space = parameter_space(RigTable(), mounted_rig.stereo)
     values = np.concatenate([space.value, space.stereo_mean])
-    values[INDEX["extrinsics.translation_mm.y"]] = -100.0
+    values[TWO_MIRROR.index["extrinsics.translation_mm.y"]] = -100.0
     return values
 
 
 def with_values(values: np.ndarray, **changes: float) -> np.ndarray:
     values = values.copy()
     for name, value in changes.items():
-        values[INDEX[name]] = value
+        values[TWO_MIRROR.index[name]] = value
     return values
 
 
@@ -127,7 +127,7 @@ def test_frame_s_looks_along_x(mounted_rig):
 def test_every_name_has_its_unit():
     """A float of a module's interface has its unit in its name; ratios and scales have none."""
     units = ("_deg", "_mm", "_rad", "_minutes", "deg_per_step", "degrees_per_step")
-    without = [n for n in NAMES if not any(u in n for u in units)]
+    without = [n for n in TWO_MIRROR.names if not any(u in n for u in units)]
     assert [n for n in without if not n.startswith("stereo.")] == ["pixel_scale", "focal_scale"]
 
 

@@ -21,7 +21,8 @@ import tvsbayes
 from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED
 from tvsbayes.cli.main import app, run
 from tvsbayes.errors import TvsError
-from tvsbayes.instrument.parameters import RIG_PRIORS, unit_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.model.compilation_cache import CacheState
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -172,7 +173,7 @@ def expanded(cell: str) -> list[str]:
     """`backlash_deg.pan`, `.tilt` -> both names; harmonics by their pattern."""
     if "(" in cell:
         stem = re.match(r"`(\w+)\.", cell)[1]
-        return [name for name in RIG_PRIORS if name.startswith(stem)]
+        return [name for name in TWO_MIRROR.priors if name.startswith(stem)]
     words = re.findall(r"`([\w.]+)`", cell)
     return [words[0], *(words[0].rpartition(".")[0] + word for word in words[1:])]
 
@@ -183,13 +184,13 @@ def test_table_of_parameters_is_the_registry():
     for row in table.splitlines()[2:]:
         names, unit, prior, _ = (cell.strip() for cell in row.strip("|").split("|"))
         for name in expanded(names):
-            stated = RIG_PRIORS[name]
+            stated = TWO_MIRROR.priors[name]
             assert unit_of(name) == unit, name
             values = [stated.u] if stated.distribution == "half-normal" else [stated.value, stated.u]
             assert number(prior) == values, name
             assert (stated.distribution == "normal") != prior.startswith(stated.distribution), name
             all_names.append(name)
-    assert sorted(all_names) == sorted(RIG_PRIORS)
+    assert sorted(all_names) == sorted(TWO_MIRROR.priors)
 
 
 def test_map_lists_the_rooms_in_the_order_of_imports():

@@ -70,7 +70,7 @@ OF_ONE_INSTRUMENT = {
 }
 """Rooms and modules that may know which instrument they serve. Others ask what the instrument has:
 images, names, rows of the table."""
-IDENTITY = {"key", "word", "terms", "sightings"}
+IDENTITY = {"key", "word", "path", "sightings"}
 """Fields of a mechanism that tell which it is."""
 LINES_MAX = 600
 """Of a module: a longer one has two subjects."""
@@ -171,9 +171,9 @@ def names_of_instruments() -> set[str]:
 
 @cache
 def words_of_instruments() -> set[object]:
-    """Words for mechanisms, and names of parameters that not all of them have."""
+    """Words for mechanisms, and names of parameters of the beam's path, which not all of them have."""
     kinds = mechanisms.MECHANISMS.values()
-    names = [set(kind.names) for kind in kinds]
+    names = [{parameter.name for parameter in kind.path} for kind in kinds]
     return {kind.word for kind in kinds} | {kind.key for kind in kinds} | set.union(*names) - set.intersection(*names)
 
 
@@ -208,10 +208,10 @@ def decides_on_instrument(tree: ast.AST) -> set[str]:
 def test_decisions_on_the_instrument_are_found():
     """Each way to ask which instrument it is, and what may be asked."""
     asks = ("x = 1 if rig.mechanism.sightings else 2", "if kind is HEAD: pass", "[x for x in y if isinstance(x, Spot)]")
-    asks += ('x = "azimuth_zero_deg" in values', "x = not mechanism.terms", "match look:\n case Spot(): pass")
+    asks += ('x = "azimuth_zero_deg" in values', "x = not mechanism.path", "match look:\n case Spot(): pass")
     assert all(decides_on_instrument(ast.parse(code)) for code in asks)
     may = ("if rig.has_images: pass", "if not mechanism.all_round: pass", "x = CHAINS[mechanism.word]")
-    may += ("class Spot: pass\nx = isinstance(y, Spot)", "x = name in mechanism.documented")
+    may += ("class Spot: pass\nx = isinstance(y, Spot)", "x = name in mechanism.parameters")
     assert not any(decides_on_instrument(ast.parse(code)) for code in may)
 
 

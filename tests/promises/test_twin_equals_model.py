@@ -16,8 +16,9 @@ from tvsbayes.estimators.annealed_stage import Fixed, linear_campaign
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.looks import aperture_angle
 from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.mirrors import Vectors
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, Prior, names_of
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, Prior, names_of
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.model.gear_processes import Places
@@ -63,7 +64,7 @@ def truths(mounted_rig):
 @pytest.fixture(scope="module")
 def values(truths) -> np.ndarray:
     """(rigs, 65) in the units of NAMES."""
-    return np.array([[*(t.parameters[n] for n in RIG_NAMES), *t.stereo.vector] for t in truths])
+    return np.array([[*(t.parameters[n] for n in TWO_MIRROR.rig_names), *t.stereo.vector] for t in truths])
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +182,7 @@ def test_headlines_of_a_fit(mounted_rig):
             space = parameter_space(mounted_rig.table, mounted_rig.stereo)
             places = Places(*map(jnp.asarray, (at.steps, at.on_tilt, np.ones(len(at.steps), bool))))
             seen_line = SeenLine(np.radians(pose_deg), places, line_share(at, used))
-            true = np.array([*(p[name] for name in RIG_NAMES), *truth.stereo.vector])
+            true = np.array([*(p[name] for name in TWO_MIRROR.rig_names), *truth.stereo.vector])
             # Fixed parameters have their prior value, as in the rig of the point.
             z = coordinates_of(space, true)[None]
             repeated = np.radians(np.concatenate([error_deg, play_deg]))[None]
@@ -240,7 +241,7 @@ def test_errors_that_repeat_drift_and_scatter(mounted_rig):
         run = simulate(rig, plan, seed)
         with jax.enable_x64(True):
             space, arrays = parameter_space(table, rig.stereo), campaign_arrays(run.campaign)
-            true = np.array([*(run.truth.parameters[name] for name in RIG_NAMES), *run.truth.stereo.vector])
+            true = np.array([*(run.truth.parameters[name] for name in TWO_MIRROR.rig_names), *run.truth.stereo.vector])
             z = coordinates_of(space, true)
             # With all coordinates held, the squares of a stage's residuals are the quadratic form of the campaign.
             terms = linear_campaign(z, space, arrays, Fixed(np.ones(len(z), dtype=bool), z, np.array(1.0)))

@@ -25,7 +25,6 @@ from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
-from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.pipeline import load_calibration
@@ -218,10 +217,12 @@ def test_causes_and_parameters_are_called_by_words():
     """Every prior and every parameter but the cameras'; budgets say the part and the unit as well."""
     labels = {cause: cause_in_words(cause) for cause in TWO_MIRROR.prior_groups if cause.startswith("prior of ")}
     assert all(words != cause for cause, words in labels.items())
-    tables = [share_in_words(cause) for cause in labels] + [source_in_words(f"prior of {name}") for name in RIG_NAMES]
-    tables += [name_in_words(name) for name in RIG_NAMES]
+    tables = [share_in_words(cause) for cause in labels] + [
+        source_in_words(f"prior of {name}") for name in TWO_MIRROR.rig_names
+    ]
+    tables += [name_in_words(name) for name in TWO_MIRROR.rig_names]
     assert not any("_" in words for words in tables), tables
-    assert len(set(tables[-len(RIG_NAMES) :])) == len(RIG_NAMES)
+    assert len(set(tables[-len(TWO_MIRROR.rig_names) :])) == len(TWO_MIRROR.rig_names)
     assert share_in_words("prior of laser_tilt_deg") == "prior of the laser's direction"
     assert source_in_words("prior of laser_tilt_deg.x") == "prior of the laser's direction, x, deg"
     assert source_in_words("prior of something else") == "prior of something else"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.drawn_quantities import drawn_quantities
 
-from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 
 
 def test_seeds_do_not_depend_on_the_number_of_campaigns(job):
@@ -25,8 +25,8 @@ def test_estimates_of_a_posterior_go_by_its_weights():
     from tvsbayes.studies.study_job import sampled_estimates
 
     weights = np.array([[0.5, 0.25, 0.25]])
-    physical = np.zeros((1, 3, len(NAMES)))
-    physical[0, :, INDEX["backlash_deg.pan"]] = [0.1, 0.3, 0.5]
+    physical = np.zeros((1, 3, len(TWO_MIRROR.names)))
+    physical[0, :, TWO_MIRROR.index["backlash_deg.pan"]] = [0.1, 0.3, 0.5]
     ratio = np.zeros((1, 3, 4))
     ratio[0, :, 0], ratio[0, :, 1] = [0.06, 0.07, 0.08], [0.05, 0.05, 0.09]
     draws = drawn_quantities(1, 3, physical=physical, effective_deg_per_step=ratio)

@@ -10,6 +10,7 @@ import pytest
 from support.commands import steps
 
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
@@ -72,11 +73,10 @@ def dozen_campaign(rig: Rig) -> SimulatedCampaign:
 
 def coordinates(space: Any, truth: Truth) -> np.ndarray:
     """Coordinates z of a true rig."""
-    from tvsbayes.instrument.parameters import RIG_NAMES
     from tvsbayes.model.parameter_space import coordinates_of
 
     # Older truths do not name the harmonics, which are zero then.
-    physical = [*(truth.parameters.get(name, 0.0) for name in RIG_NAMES), *truth.stereo.vector]
+    physical = [*(truth.parameters.get(name, 0.0) for name in TWO_MIRROR.rig_names), *truth.stereo.vector]
     return coordinates_of(space, np.array(physical))
 
 

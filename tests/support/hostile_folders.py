@@ -44,7 +44,7 @@ from tvsbayes.instrument.campaign import (
     parse_spots,
     write_campaign,
 )
-from tvsbayes.instrument.parameters import RIG_PRIORS
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.plan import parse_plan
 from tvsbayes.instrument.rig import parse_rig_table, read_rig
 from tvsbayes.instrument.stereo_pair import parse_stereo
@@ -104,7 +104,7 @@ def drawn_calibration() -> Calibration:
     generator = np.random.default_rng(8)
     names, columns = tuple(dict.fromkeys((*INPUT_NAMES, *NOISE_NAMES))), []
     for name in names:
-        value = RIG_PRIORS[name].value
+        value = TWO_MIRROR.priors[name].value
         columns.append(value + 0.01 * abs(value) * generator.standard_normal(600))
     calibration = calibration_of_draws(names, np.stack(columns, axis=1), CAMPAIGN, "posterior", 0, seen_steps(CAMPAIGN))
     parts = np.stack([0.25 * calibration.covariance, 0.75 * calibration.covariance])

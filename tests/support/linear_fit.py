@@ -16,7 +16,8 @@ from tvsbayes.estimators.campaign_arrays import SpotArrays
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import Linearised, StopGroup, StopInformation
 from tvsbayes.estimators.mode_search import NOISE_NAMES
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import HARMONIC_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import parameter_space
 
@@ -32,12 +33,12 @@ def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     Pixel errors are unit normal; `stereo` scales what one prior sd of the cameras does.
     """
     rng = np.random.default_rng(17)
-    jacobian = rng.normal(size=(ROWS, len(NAMES))) * np.exp(rng.normal(size=len(NAMES)))
+    jacobian = rng.normal(size=(ROWS, len(TWO_MIRROR.names))) * np.exp(rng.normal(size=len(TWO_MIRROR.names)))
     # Effects of cameras and rig are alike: no data separate them.
-    mix = rng.normal(size=(len(RIG_NAMES), len(NAMES) - len(RIG_NAMES)))
-    jacobian[:, len(RIG_NAMES) :] = 0.02 * stereo * jacobian[:, : len(RIG_NAMES)] @ mix
+    mix = rng.normal(size=(len(TWO_MIRROR.rig_names), len(TWO_MIRROR.names) - len(TWO_MIRROR.rig_names)))
+    jacobian[:, len(TWO_MIRROR.rig_names) :] = 0.02 * stereo * jacobian[:, : len(TWO_MIRROR.rig_names)] @ mix
     # Fixed in the rig, which has no transmission error; scales of errors move no spot.
-    jacobian[:, [INDEX[name] for name in (*HARMONIC_NAMES, *NOISE_NAMES)]] = 0.0
+    jacobian[:, [TWO_MIRROR.index[name] for name in (*HARMONIC_NAMES, *NOISE_NAMES)]] = 0.0
     load = np.zeros((SPOTS, 4, STATES))
     starts = [(begin, end) for spots in REDRAWN for begin, end in pairwise((*spots, SPOTS))]
     for state, (begin, end) in enumerate(starts):
@@ -56,10 +57,10 @@ def linearised(jacobian: np.ndarray, load: np.ndarray) -> Linearised:
         "zero_variance": (2,),
         "scatter_variance": (2,),
     }
-    shapes |= {"residual": (4,), "place_columns": (4, 0), "predicted_jacobian": (5, len(NAMES))}
+    shapes |= {"residual": (4,), "place_columns": (4, 0), "predicted_jacobian": (5, len(TWO_MIRROR.names))}
     arrays = {name: np.zeros((SPOTS, *shape)) for name, shape in shapes.items()}
     return Linearised(
-        z=np.zeros(len(NAMES)),
+        z=np.zeros(len(TWO_MIRROR.names)),
         slope=slope.reshape(SPOTS, 4, 2),
         stop_variance=np.ones((SPOTS, 2)),
         place_root=np.zeros((0, 0)),
@@ -100,15 +101,17 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
     fit = object.__new__(JointFit)
     with jax.enable_x64(True):
         space = jax.tree.map(jnp.asarray, parameter_space(rig.table, rig.stereo))
-    physical = np.full((50, len(NAMES)), 0.5) + 1e-3 * np.random.default_rng(3).normal(size=(50, len(NAMES)))
+    physical = np.full((50, len(TWO_MIRROR.names)), 0.5) + 1e-3 * np.random.default_rng(3).normal(
+        size=(50, len(TWO_MIRROR.names))
+    )
     values = {
         "information": StopInformation(groups, jacobian.T @ gain, *without_places(jacobian.shape[1])),
         "linearised": linearised(jacobian, load),
-        "free": np.ones(len(NAMES), dtype=bool),
+        "free": np.ones(len(TWO_MIRROR.names), dtype=bool),
         "arrays": partial_arrays(spots=spot_arrays(readings), count=np.int32(SPOTS), gears=no_gears(SPOTS)),
         "draws_places": np.zeros((2048, 0)),
         "space": space,
-        "z": 0.1 * np.random.default_rng(4).normal(size=len(NAMES)),
+        "z": 0.1 * np.random.default_rng(4).normal(size=len(TWO_MIRROR.names)),
         "draws": SimpleNamespace(physical=physical, place_errors_rad=np.zeros((len(physical), 0))),
         "campaign": small_campaign(),
         "sides": {},
@@ -127,20 +130,20 @@ def refitted(jacobian: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.nda
     """How the estimate moves with every datum (parameters, rows) and prior (parameters, parameters), by lstsq."""
     variances, vectors = np.linalg.eigh(np.eye(ROWS) + load @ load.T)
     whitener = vectors @ np.diag(variances**-0.5) @ vectors.T
-    system = np.concatenate([whitener @ jacobian, np.eye(len(NAMES))])
-    right = np.zeros((len(system), ROWS + len(NAMES)))
-    right[:ROWS, :ROWS], right[ROWS:, ROWS:] = whitener, np.eye(len(NAMES))
+    system = np.concatenate([whitener @ jacobian, np.eye(len(TWO_MIRROR.names))])
+    right = np.zeros((len(system), ROWS + len(TWO_MIRROR.names)))
+    right[:ROWS, :ROWS], right[ROWS:, ROWS:] = whitener, np.eye(len(TWO_MIRROR.names))
     moved = np.linalg.lstsq(system, right, rcond=None)[0]
     return moved[:, :ROWS], moved[:, ROWS:]
 
 
 def slope_of(fit: JointFit) -> np.ndarray:
     """d(inputs)/dz by central differences."""
-    columns = [INDEX[name] for name in INPUT_NAMES]
+    columns = [TWO_MIRROR.index[name] for name in INPUT_NAMES]
     with jax.enable_x64(True):
         physical = jax.jit(lambda z: fit.space.physical(z))
         moved = [
             [np.asarray(physical(jnp.asarray(fit.z + s * 1e-4 * row)))[columns] for s in (1, -1)]
-            for row in np.eye(len(NAMES))
+            for row in np.eye(len(TWO_MIRROR.names))
         ]
     return np.array([(plus - minus) / 2e-4 for plus, minus in moved]).T

@@ -9,7 +9,8 @@ from support.written_rows import move_row, spot_row
 
 from tvsbayes.files.documents import StatedValue
 from tvsbayes.instrument.campaign import Campaign, Spot
-from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 
@@ -70,7 +71,7 @@ def small_campaign() -> Campaign:
     spots[6] = spot_row(22, 4, "d1", None, None, *[None] * 8, status="undetected", ruv_right=-0.5)
     refused = {f: getattr(last, f) for f in Spot.__slots__} | {"status": "saturated, 41 px", "v_left_px": 1e4}
     spots[7] = Spot(**refused)
-    priors = dict(RIG_PRIORS)
+    priors = dict(TWO_MIRROR.priors)
     priors["mirror_offset_mm"] = Prior(31.0, 2.0)
     priors["stop_sd_deg.up"] = Prior(0.05, 0.0, "log-normal")
     priors["focal_scale"] = Prior(1.001, 0.001)

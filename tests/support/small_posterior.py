@@ -13,7 +13,7 @@ from support.varying_gears import perfect_rig
 
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.inference.importance import ImportanceRun
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.posterior.importance import importance_run
@@ -34,7 +34,7 @@ def play_priors(path: Transport) -> tuple[np.ndarray, np.ndarray]:
     """
     others = path.free[path.noise :]
     precision, score, step = np.ones(len(others)), np.zeros(len(others)), 1e-4
-    wide = np.array(NAMES)[others[: len(others) - path.narrow]]
+    wide = np.array(TWO_MIRROR.names)[others[: len(others) - path.narrow]]
     for place in np.flatnonzero(np.char.startswith(wide, "backlash_deg")):
         at = path.mode[others[place]]
         before, value, after = stats.halfnorm.ppf(stats.norm.cdf(at + step * np.array([-1, 0, 1])))

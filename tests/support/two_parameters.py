@@ -10,13 +10,14 @@ from scipy import optimize, stats
 from support.partial_arrays import no_gears, partial_arrays
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.posterior.linear_campaign import LinearCampaign
 from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.stop_states import StopStates
 from tvsbayes.posterior.transport import Transport, curvatures
 
-RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
+RATIO, BACKLASH = TWO_MIRROR.index["degrees_per_step.pan"], TWO_MIRROR.index["backlash_deg.pan"]
 STRETCH = 0.3
 """Log of the factor on the second coordinate per unit of the first."""
 AT_MODE = 7.0
@@ -54,8 +55,9 @@ def route() -> Transport:
     The first scales the noise of the one datum of the second, which has no prior.
     """
     return Scaled(
-        mode=np.zeros(len(NAMES)),
-        physical=np.zeros(len(NAMES)),
+        mechanism=TWO_MIRROR,
+        mode=np.zeros(len(TWO_MIRROR.names)),
+        physical=np.zeros(len(TWO_MIRROR.names)),
         free=np.array([BACKLASH, RATIO]),
         root=np.eye(2),
         noise=1,
@@ -75,7 +77,7 @@ def route() -> Transport:
 
 NARROW_SD, CURVE, TURN = 0.02, 0.4, 0.15
 """Of the ridge below: its width, how it bends, how its slope along the second coordinate changes with the first."""
-WIDE = INDEX["tilt_zero_deg"]
+WIDE = TWO_MIRROR.index["tilt_zero_deg"]
 
 
 def ridge_residual(z: np.ndarray) -> np.ndarray:
@@ -129,11 +131,11 @@ def play_density(z: np.ndarray) -> np.ndarray:
 
 def play_near_zero() -> Transport:
     """The map of these two at the mode of their density."""
-    mode = np.zeros(len(NAMES))
+    mode = np.zeros(len(TWO_MIRROR.names))
     free = np.array([BACKLASH, RATIO])
 
     def of_two(z: np.ndarray) -> np.ndarray:
-        whole = np.zeros((1, len(NAMES)))
+        whole = np.zeros((1, len(TWO_MIRROR.names)))
         whole[0, free] = z
         return whole
 
@@ -152,7 +154,7 @@ def play_near_zero() -> Transport:
 
 def fit() -> SimpleNamespace:
     """What a diagnosis reads of a fit."""
-    free = np.isin(np.arange(len(NAMES)), [RATIO, BACKLASH])
+    free = np.isin(np.arange(len(TWO_MIRROR.names)), [RATIO, BACKLASH])
     return SimpleNamespace(
         free=free, log_density=AT_MODE, reference_pose_rad=np.zeros(2), space=None, arrays=no_places()
     )

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import BLOCKS, GEAR_ERROR_NAMES, INDEX, NAMES, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import BLOCKS, GEAR_ERROR_NAMES, Prior
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 
@@ -45,9 +46,9 @@ def coordinates_with(space: ParameterSpace, z: np.ndarray, values: Mapping[str, 
     """The point z with these parameters, in the units of their names, in place of its own."""
     physical = physical_at(z, space).value
     for name, value in values.items():
-        physical[INDEX[name]] = value
-    named = [INDEX[name] for name in values]
+        physical[TWO_MIRROR.index[name]] = value
+    named = [TWO_MIRROR.index[name] for name in values]
     point = z.copy()
     point[named] = coordinates_of(space, physical)[named]
-    assert point.shape == (len(NAMES),)
+    assert point.shape == (len(TWO_MIRROR.names),)
     return point

@@ -7,9 +7,7 @@ import pytest
 from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12
 from support.printed_vector import VECTOR as PRINTED
 
-from tvsbayes.instrument.parameters import (
-    RIG_PRIORS,
-)
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.twin.physics import (
     aperture_angle_deg,
     beam_jacobian,
@@ -22,7 +20,7 @@ from tvsbayes.twin.physics import (
     transmission,
 )
 
-NOMINAL = {name: prior.value for name, prior in RIG_PRIORS.items()}
+NOMINAL = {name: prior.value for name, prior in TWO_MIRROR.priors.items()}
 VECTOR = NOMINAL | PRINTED
 POSE_DEG = (10.0, 5.0)
 

@@ -21,7 +21,7 @@ from tvsbayes.acquisition.journal import Record
 from tvsbayes.cameras.capture import without_password
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.counter_limits import HOME_KEYS
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, LATE_NAMES, RIG_PRIORS
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, LATE_NAMES, REGISTRY
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
@@ -115,7 +115,7 @@ def check_same(created: Mapping[str, object], rig: Rig, plan: Sequence[PlanStep]
     present = data_entries(rig, bool(header.get("synthetic")))
     # Journals may lack the scatter of looks and the shift of zeros, which their twins did not have.
     for name in LATE_NAMES:
-        prior = RIG_PRIORS[name]
+        prior = REGISTRY[name].prior
         silent = {f"rig.{name}": [prior.value, prior.u], f"truth.{name}": [prior.value, 0.0]}
         present = {key: value for key, value in present.items() if key in recorded or value != silent.get(key)}
     changed = changes(recorded, present)

@@ -14,16 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.assessment.headlines import gradients, judged_headlines, moved_directions, sds
-from tvsbayes.calibration.pointing import COMPLEX_STEP, INPUT_NAMES
+from tvsbayes.calibration.pointing import COMPLEX_STEP, input_names
 from tvsbayes.calibration.states import ZERO_NAMES, total_shift
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.gears.priors import HALF_NORMAL_MEAN, HALF_NORMAL_SD
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
-from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, unit_of
+from tvsbayes.instrument.parameters import KINDS, unit_of
 from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
-from tvsbayes.model.parameter_space import physical_at
+from tvsbayes.model.parameter_space import named_at, physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
 from tvsbayes.statistics.predicted_readings import State
 
@@ -60,7 +60,7 @@ def _split_information(fit: JointFit) -> _SplitInformation:
     scattered = np.einsum("nia,nip->nap", fit.linearised.slope, gain.reshape(-1, 4, gain.shape[1]))
     scattered *= np.sqrt(fit.linearised.scatter_variance)[:, :, None]
     by_looks = np.einsum("nap,naq->pq", scattered, scattered)
-    errors = len(NAMES) + np.arange(len(of_play))
+    errors = len(fit.z) + np.arange(len(of_play))
     groups = dict(fit.space.mechanism.prior_groups)
     groups |= {TRANSMISSION_ERROR: errors[~of_play].tolist(), PLAY_VARIATION: errors[of_play].tolist()}
     own = "pixel and aperture noise" if fit.arrays.read.any() else fit.space.mechanism.noise
@@ -87,21 +87,21 @@ def causes_of(
         states: by axis, at which the zeros are inputs; None: at the homing.
 
     Returns:
-        Parts (inputs, inputs) by cause, ordered as `INPUT_NAMES`, then further inputs; they add up.
+        Parts (inputs, inputs) by cause, ordered as `input_names`, then further inputs; they add up.
     """
     information = _split_information(fit)
     priors = {cause: np.isin(range(len(information.posterior)), own) for cause, own in information.groups.items()}
     parts = information.noises | {cause: np.diag(own.astype(float)) for cause, own in priors.items()}
-    at, own_names = physical_at(fit.z, fit.space), fit.space.mechanism.named(INPUT_NAMES)
-    slopes = np.asarray(at.slope)
-    slope = slopes[[INDEX[name] for name in INPUT_NAMES]]
-    moved = np.asarray(at.value) + 1j * COMPLEX_STEP * np.eye(len(NAMES))
-    for (axis, state), zero in zip((states or {}).items(), fit.space.mechanism.zeros, strict=bool(states)):
-        shift = total_shift({name: moved[:, INDEX[name]] for name in ZERO_NAMES}, axis, state)[:, 0]
+    mechanism, at = fit.space.mechanism, physical_at(fit.z, fit.space)
+    own_names, slopes = input_names(mechanism), np.asarray(at.slope)
+    slope = named_at(fit.z, fit.space, own_names).slope
+    moved = np.asarray(at.value) + 1j * COMPLEX_STEP * np.eye(len(slopes))
+    for (axis, state), zero in zip((states or {}).items(), mechanism.zeros, strict=bool(states)):
+        shift = total_shift({name: moved[:, mechanism.index[name]] for name in ZERO_NAMES}, axis, state)[:, 0]
         slope[own_names.index(zero)] += shift.imag / COMPLEX_STEP @ slopes
-    spread = slope @ information.posterior[: len(NAMES)]
+    spread = slope @ information.posterior[: len(slopes)]
     if by_places is not None:
-        spread = np.concatenate([spread, by_places @ information.posterior[len(NAMES) :]])
+        spread = np.concatenate([spread, by_places @ information.posterior[len(slopes) :]])
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
     # A fixed prior, or one without effect on any input, is no cause.
     return {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
@@ -153,7 +153,7 @@ def _noise_causes(
     moved, physical = moved_directions(fit), np.asarray(fit.draws.physical)
 
     def freedom(names: Iterable[str]) -> float:
-        logs = [np.log(physical[:, INDEX[name]]) for name in names]
+        logs = [np.log(physical[:, fit.names.index(name)]) for name in names]
         spreads = [float(np.var(x)) for x in logs if np.ptp(x) > 1e-9]
         return min((0.5 / s for s in spreads), default=np.inf)
 

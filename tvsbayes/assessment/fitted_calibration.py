@@ -18,7 +18,7 @@ from tvsbayes.calibration.drawn_looks import noise_of_a_look
 from tvsbayes.calibration.frames import EXTRINSICS_NAMES
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration, input_names
 from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, shifts_at, states_of
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
@@ -56,7 +56,8 @@ def calibration_of_draws(
         range_steps: lowest and highest counter of each axis with a look, shape (2, 2).
         gears: errors of the gears by draw; None without repeating errors.
     """
-    column = {name: physical[:, i] for i, name in enumerate(names)}
+    constants = {name: np.full(len(physical), value) for name, value in campaign.rig.mechanism.constants.items()}
+    column = constants | {name: physical[:, i] for i, name in enumerate(names)}
     generator = random_stream(seed, Stream.CALIBRATION_NOISE)
 
     def standard() -> np.ndarray:
@@ -65,11 +66,11 @@ def calibration_of_draws(
         return (normal - normal.mean()) / normal.std()
 
     if not campaign.aperture_read:
-        for name in RECEIVER_NAMES:
+        for name in (name for name in RECEIVER_NAMES if name in campaign.rig.priors):
             prior, off = campaign.rig.priors[name], standard()
             log = prior.distribution == "log-normal"
             column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
-    named_inputs = campaign.rig.mechanism.named(INPUT_NAMES)
+    named_inputs = input_names(campaign.rig.mechanism)
     inputs = np.stack([column[name] for name in named_inputs], axis=1)
     zeros, extrinsics = (columns_of(names, physical, wanted) for wanted in (ZERO_NAMES, EXTRINSICS_NAMES))
     states = states_of(campaign) if len(zeros) else {}

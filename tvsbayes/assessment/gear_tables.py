@@ -17,7 +17,7 @@ from tvsbayes.calibration.gear_table import NO_GEARS, GearTable, regular_counter
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, Axis
-from tvsbayes.instrument.parameters import INDEX, PERIODS_MAX
+from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.model.gear_processes import FLOOR_RAD2
 from tvsbayes.model.headlines import DEGREES
 from tvsbayes.statistics.gaussian_process import JITTER, repeated
@@ -128,20 +128,21 @@ def seen_places(fit: JointFit) -> dict[Axis, np.ndarray]:
 
 def process_of(fit: JointFit, physical: np.ndarray, kind: str, axis: Axis) -> Process:
     """Return the scales of `ERROR_AT` or `PLAY_AT` of an axis from draws (n, parameters)."""
-    length = physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]
+    index = fit.space.mechanism.index
+    length = physical[:, index[f"transmission_error_length_deg.{axis}"]]
     if kind == PLAY_AT:
-        return Process(physical[:, INDEX[f"play_variation_deg.{axis}"]], length, np.zeros((len(physical), 0)))
+        return Process(physical[:, index[f"play_variation_deg.{axis}"]], length, np.zeros((len(physical), 0)))
     periods = np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist()[:PERIODS_MAX]
-    columns = [INDEX[f"harmonic_amplitude_deg.{axis}.{k + 1}"] for k in range(len(periods))]
-    return Process(physical[:, INDEX[f"transmission_error_deg.{axis}"]], length, physical[:, columns], tuple(periods))
+    columns = [index[f"harmonic_amplitude_deg.{axis}.{k + 1}"] for k in range(len(periods))]
+    return Process(physical[:, index[f"transmission_error_deg.{axis}"]], length, physical[:, columns], tuple(periods))
 
 
-def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray]) -> GearTable:
+def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray], index: Mapping[str, int]) -> GearTable:
     """Choose regular counters around those seen, by the draws' median lengths."""
     columns = []
     for axis in AXES:
-        length = float(np.median(physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]))
-        steps = length / abs(float(np.median(physical[:, INDEX[f"degrees_per_step.{axis}"]])))
+        length = float(np.median(physical[:, index[f"transmission_error_length_deg.{axis}"]]))
+        steps = length / abs(float(np.median(physical[:, index[f"degrees_per_step.{axis}"]])))
         low, high = float(seen_steps[axis].min()), float(seen_steps[axis].max())
         reach = MARGIN_LENGTHS * steps
         nodes = regular_counters(low - reach, high + reach, steps / COUNTERS_PER_LENGTH)
@@ -169,7 +170,8 @@ def drawn_gears(
         none = np.zeros((count, 0))
         return DrawnGears(NO_GEARS, none, none, np.zeros((0, 0)))
     steps, seen_of = np.asarray(fit.arrays.gears.places.steps), seen_places(fit)
-    table = _table(physical, {axis: steps[seen_of[axis]] for axis in AXES})
+    index = fit.space.mechanism.index
+    table = _table(physical, {axis: steps[seen_of[axis]] for axis in AXES}, index)
     # The derivative of the table by the places at the fit's scales, these in units in which they are N(0, 1) a priori.
     mode = np.asarray(fit.mode.physical)
     root = fit.arrays.gears.at_places(np.asarray(fit.linearised.place_root).T * DEGREES).T
@@ -180,10 +182,10 @@ def drawn_gears(
         part, at = table.parts[f"{kind}.{axis}"], seen_of[axis] + (0 if kind == ERROR_AT else errors // 2)
         known, new = steps[seen_of[axis]], np.array(table.steps[AXES.index(axis)])
         normal = generator.standard_normal((count, len(new) + 1))
-        process, ratio = process_of(fit, physical, kind, axis), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
+        process, ratio = process_of(fit, physical, kind, axis), physical[:, index[f"degrees_per_step.{axis}"], None]
         values = place_errors_rad[:, at] * DEGREES
         drawn = conditional(process, ratio * known, values, ratio * new, normal[:, :-1])
-        own_ratio = float(mode[INDEX[f"degrees_per_step.{axis}"]])
+        own_ratio = float(mode[index[f"degrees_per_step.{axis}"]])
         follows = _following(process_of(fit, mode[None], kind, axis), own_ratio * known, own_ratio * new)
         inner = slice(part.start, part.stop - 1)
         by_places[inner] = follows @ root[at]

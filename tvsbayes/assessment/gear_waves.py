@@ -13,7 +13,6 @@ import numpy as np
 from tvsbayes.assessment.gear_tables import BLOCK, Process, process_of, seen_places
 from tvsbayes.calibration.optics import ERROR_AT
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.headlines import DEGREES
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.estimates import GearPeriod, Measured
@@ -114,7 +113,7 @@ def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:
     for axis in AXES:
         process = process_of(fit, physical, ERROR_AT, axis)
         at, steps = places[axis], np.asarray(fit.arrays.gears.places.steps)[places[axis]]
-        angle_deg = physical[:, INDEX[f"degrees_per_step.{axis}"], None] * steps
+        angle_deg = physical[:, fit.space.mechanism.index[f"degrees_per_step.{axis}"], None] * steps
         for number, period in enumerate(process.periods):
             if np.any(process.amplitudes[:, number] > 0) and len(at):
                 one = wave_draws(process, number, angle_deg, errors_deg[:, at], rng.standard_normal((DRAWS, 2)))

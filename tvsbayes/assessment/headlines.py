@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit, with_places
-from tvsbayes.instrument.parameters import HEADLINES, INDEX
+from tvsbayes.instrument.parameters import HEADLINES
 from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.instrument.stops import legs_of
 
@@ -57,9 +57,10 @@ class LinearHeadlines(NamedTuple):
 
 def linear_headlines(fit: JointFit) -> LinearHeadlines:
     """Linearise the judged headlines of a fit."""
+    index = fit.space.mechanism.index
     # Parameters in coordinates, where a backlash is Gaussian.
     drawn = {
-        of.label: fit.draws_z[:, INDEX[of.name]] if of.name in INDEX else fit.draws[of.name]
+        of.label: fit.draws_z[:, index[of.name]] if of.name in index else fit.draws[of.name]
         for of in judged_headlines(fit)
     }
     drawn = {label: draws for label, draws in drawn.items() if scatters(draws)}

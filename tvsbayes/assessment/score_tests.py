@@ -18,7 +18,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.instrument.parameters import CREEP_NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.chances import log_chance
@@ -34,9 +34,7 @@ ABSORBED = 1e-3
 """Share of a defect's effect below which the fit has absorbed it: the remainder is its curvature only."""
 KNOWN_DIRECTION = 1e-4
 """Information (in prior sds) above which the fit can move along a direction."""
-BY_PRIOR = np.isin(NAMES, CREEP_NAMES)
-"""Coordinates known by their priors, as errors of stops are: creeps of any size would absorb what changes in time."""
-_POSE = names_of("extrinsics.rotation_rad", "extrinsics.translation_mm")
+_POSE = ("extrinsics.rotation_rad", "extrinsics.translation_mm")
 
 
 type Placed = list[tuple[str, np.ndarray]]
@@ -75,13 +73,13 @@ def _epipolar(fit: JointFit) -> np.ndarray:
     They are the part of a residual that neither a mirror angle nor a range explains, independent of the beam's model.
     """
     jacobian, slope = np.asarray(fit.linearised.residual_jacobian), np.asarray(fit.linearised.slope)
-    readings = -jacobian[:, :, INDEX["aperture_zero_deg"]]
+    readings = -jacobian[:, :, fit.space.mechanism.columns("aperture_zero_deg")].sum(axis=2)
     # Without a reading the last of the four components is empty.
     readings = np.where(np.any(readings, axis=1, keepdims=True), readings, np.eye(4)[3])
     slopes = np.concatenate([slope.transpose(0, 2, 1), readings[:, None]], axis=1)
     normal = np.linalg.svd(slopes)[2][:, -1]
     row = np.linalg.pinv(np.asarray(fit.space.stereo_root))[:, STEREO_PARAMETER_NAMES.index("stereo.right.cy")]
-    shift = -jacobian[:, :, len(RIG_NAMES) :] @ row
+    shift = -jacobian[:, :, fit.space.rig :] @ row
     shift = normal * np.sum(normal * shift, axis=1, keepdims=True)
     place = np.asarray(fit.linearised.predicted)[:, :2]
     spread = place.std(axis=0)
@@ -98,9 +96,6 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> dict[str, Plac
     time = order if np.ptp(time) == 0 else time
     drift = (time - time.mean()) / max(np.ptp(time), 1)
     segment = np.array([moves[spot.move].segment for spot in spots])
-    jacobian, pose = np.asarray(fit.linearised.residual_jacobian), [INDEX[name] for name in _POSE]
-    cameras, warmed = -jacobian[:, :, pose], -jacobian[:, :, [*pose, INDEX["focal_scale"]]]
-    apart = _epipolar(fit)
 
     def since(count: int, effect: Callable[[int], np.ndarray], of: str = "") -> Placed:
         """An effect that begins at one of some spots."""
@@ -112,13 +107,20 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> dict[str, Plac
         # A homing restores the zero.
         return _times(axis.push, (order >= row) * (segment == segment[row]).astype(float))
 
-    return {
-        "the cameras moved": since(CHANGE_POINTS, lambda row: _times(cameras, order >= row)),
-        "the cameras drifted (pose or focal length)": [("with time", _times(warmed, drift))],
-        "one camera moved against the other (epipolar)": [
-            ("with time", _times(apart, drift)),
-            *since(CHANGE_POINTS, lambda row: _times(apart, order >= row)),
-        ],
+    defects: dict[str, Placed] = {}
+    if fit.campaign.has_images:
+        jacobian, columns = -np.asarray(fit.linearised.residual_jacobian), fit.space.mechanism.columns
+        cameras, warmed = jacobian[:, :, columns(*_POSE)], jacobian[:, :, columns(*_POSE, "focal_scale")]
+        apart = _epipolar(fit)
+        defects = {
+            "the cameras moved": since(CHANGE_POINTS, lambda row: _times(cameras, order >= row)),
+            "the cameras drifted (pose or focal length)": [("with time", _times(warmed, drift))],
+            "one camera moved against the other (epipolar)": [
+                ("with time", _times(apart, drift)),
+                *since(CHANGE_POINTS, lambda row: _times(apart, order >= row)),
+            ],
+        }
+    return defects | {
         "a ratio drifted": [
             (f"{axis.name}, with time", _times(axis.push, drift * (axis.angle_deg - axis.angle_deg.mean())))
             for axis in axes
@@ -196,9 +198,11 @@ def validate(fit: JointFit) -> Validation:
     columns = np.concatenate([own, *(each for placed in defects.values() for _, each in placed)], axis=2)
     information, p = stop_information(linear_spots(fit.linearised, fit.arrays, columns)), own.shape[2]
     score = information.score(columns)
-    score[:p] -= BY_PRIOR * fit.z
+    # Creeps are known by their priors, as errors of stops are: of any size they would absorb what changes in time.
+    by_prior = np.isin(fit.names, CREEP_NAMES)
+    score[:p] -= by_prior * fit.z
     # Directions that the fit can follow.
-    followed = Directions.of(information.fisher[:p, :p] + np.diag(BY_PRIOR), KNOWN_DIRECTION).inverse
+    followed = Directions.of(information.fisher[:p, :p] + np.diag(by_prior), KNOWN_DIRECTION).inverse
     left = Score(score, information.fisher).given(slice(p), followed).at(slice(p, None))
     whole = np.diag(information.fisher)[p:]
     scale = np.sqrt(np.where(whole > 0, whole, 1.0))

@@ -29,11 +29,9 @@ from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     HOME_SD_NAMES,
-    INDEX,
     LATE_NAMES,
     QUANTITIES,
     RECEIVER_NAMES,
-    RIG_NAMES,
     names_of,
 )
 from tvsbayes.instrument.stops import legs_of
@@ -126,11 +124,10 @@ class _Source:
 
 def _absent(fit: JointFit) -> set[str]:
     """Return parameters absent from the model: of gear errors, scatter of looks and of homings, shifts of zeros."""
-    none = {name for name in ABSENT_AT_ZERO if not fit.free[INDEX[name]] and fit.values[name] == 0}
+    none = {name for name in ABSENT_AT_ZERO if not fit.free[fit.names.index(name)] and fit.values[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")
-    none |= set(fit.space.mechanism.fixed)
     homed = np.asarray(fit.arrays.spots.homed).any(axis=0)
     none |= {name for name, seen in zip(HOME_SD_NAMES, homed, strict=True) if not seen}
     return none | ({"creep_minutes"} if set(names_of("creep_deg")) <= none else set())
@@ -154,7 +151,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
         if source.posterior is not None or len(fit.mixture) > 1:
             estimates[name] = estimate
             continue
-        if index >= len(RIG_NAMES):
+        if index >= fit.space.rig:
             # Stereo parameters mix coordinates linearly.
             ends = (estimate.value - NORMAL_95 * estimate.sd, estimate.value + NORMAL_95 * estimate.sd)
         else:
@@ -297,7 +294,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         noise=fit_noise(fit.chi2, observations - determined, parameters),
         weak_directions=(
             *weak_directions(fit),
-            *sum_directions(fit.free, np.asarray(source.draws.physical), source.weights),
+            *sum_directions(fit.names, fit.free, np.asarray(source.draws.physical), source.weights),
         ),
         leverage=leverage(fit),
         classic_predicted=_classic_predicted(source),

@@ -16,7 +16,8 @@ from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.linear_spots import standard_deviations_without
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, QUANTITIES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.instrument.mechanisms import RATIO_COLUMNS
+from tvsbayes.instrument.parameters import NOISE_NAMES, QUANTITIES, STEREO_PARAMETER_NAMES, names_of
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
 from tvsbayes.instrument.stops import few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
@@ -48,7 +49,7 @@ def _correlation(a: ArrayLike, b: ArrayLike) -> float:
 
 def _backlash_direction(fit: JointFit, axis: str, direction: str) -> Iterator[WeakDirection]:
     """Ratio and backlash of an axis, if they are correlated or the stops cannot separate them."""
-    index = INDEX[f"backlash_deg.{axis}"]
+    index = fit.names.index(f"backlash_deg.{axis}")
     ratio = fit.draws.effective_deg_per_step[:, DIRECTIONS.index(direction)]
     # A ratio fixed by the priors is uncorrelated with the backlash.
     if not fit.free[index] or np.ptp(ratio) == 0:
@@ -66,10 +67,10 @@ def _counters_direction(fit: JointFit, axis: Axis) -> Iterator[WeakDirection]:
     counters = sorted({getattr(fit.campaign.moves[move], f"{axis}_steps") for move in _used_moves(fit)})
     if not 2 <= len(counters) <= FEW_COUNTERS or not len(fit.information.place_mean):
         return
-    gears, count, physical = fit.arrays.gears, len(NAMES), np.asarray(fit.mode.physical)
+    gears, count, physical = fit.arrays.gears, len(fit.z), np.asarray(fit.mode.physical)
     places, errors, valid = gears.places, np.flatnonzero(~gears.of_play), np.asarray(gears.places.valid)
-    ratio = np.radians(physical[[INDEX[f"degrees_per_step.{a}"] for a in AXES]])
-    scales = scales_at(physical, np.asarray(fit.space.harmonic_period_deg))
+    ratio = np.radians(physical[RATIO_COLUMNS])
+    scales = scales_at(physical, np.asarray(fit.space.harmonic_period_deg), fit.space.mechanism)
     known = KnownPlaces(np.asarray(places.steps)[valid], np.asarray(places.on_tilt)[valid], ratio, scales)
     joint = with_places(fit.z, fit.covariance, fit.information).covariance
     # Errors that the priors fix have no column.
@@ -89,21 +90,24 @@ def _counters_direction(fit: JointFit, axis: Axis) -> Iterator[WeakDirection]:
     yield WeakDirection(too_few_counters(axis, counters, telling), names)
 
 
-def sum_directions(free: np.ndarray, physical: np.ndarray, weights: np.ndarray) -> tuple[WeakDirection, ...]:
+def sum_directions(
+    names: Sequence[str], free: np.ndarray, physical: np.ndarray, weights: np.ndarray
+) -> tuple[WeakDirection, ...]:
     """Name the scales of noise of which the data determine only sums of variances; none or one direction.
 
     A scale is one of them if its rank correlations with the others explain most of its variance.
 
     Args:
+        names: names of the parameters.
         free: whether a parameter is estimated, shape (p,).
         physical: draws of the parameters, shape (n, p).
         weights: their weights, shape (n,).
     """
-    scales = [name for name in names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale") if free[INDEX[name]]]
-    scales = [name for name in scales if np.ptp(physical[:, INDEX[name]]) > 0]
+    index = {name: names.index(name) for name in names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale")}
+    scales = [name for name, at in index.items() if free[at] and np.ptp(physical[:, at]) > 0]
     if len(scales) < 2:
         return ()
-    ranks = np.argsort(np.argsort(physical[:, [INDEX[name] for name in scales]], axis=0), axis=0)
+    ranks = np.argsort(np.argsort(physical[:, [index[name] for name in scales]], axis=0), axis=0)
     covariance = np.cov(ranks, rowvar=False, aweights=weights)
     correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     own_share = 1 / np.diag(np.linalg.inv(correlation))
@@ -133,17 +137,17 @@ SHIFTS = {
 
 def _shift_directions(fit: JointFit, axis: Axis) -> Iterator[WeakDirection]:
     """Gear parameters of an axis that cannot be separated from a shift of its zero."""
-    physical, senses = np.asarray(fit.draws.physical), SENSES[axis]
+    senses = SENSES[axis]
     negative, positive = (np.asarray(fit.draws.effective_deg_per_step)[:, DIRECTIONS.index(d)] for d in senses)
     quantities = (
         (f"the contrast of {' and '.join(senses)}", negative - positive, f"ratio_contrast_deg_per_step.{axis}"),
         (f"the {axis} ratio", 0.5 * (negative + positive), f"degrees_per_step.{axis}"),
-        (f"the {axis} backlash", physical[:, INDEX[f"backlash_deg.{axis}"]], f"backlash_deg.{axis}"),
+        (f"the {axis} backlash", fit.draws[f"backlash_deg.{axis}"], f"backlash_deg.{axis}"),
     )
     for block, (words, remedy) in SHIFTS.items():
         shift = f"{block}.{axis}"
-        for what, values, name in quantities if fit.free[INDEX[shift]] else ():
-            if scatters(values) and inseparable(together := _correlation(values, physical[:, INDEX[shift]])):
+        for what, values, name in quantities if fit.free[fit.names.index(shift)] else ():
+            if scatters(values) and inseparable(together := _correlation(values, fit.draws[shift])):
                 text = f"{what} and {words} are poorly separated (correlation {together:+.2f}): {remedy}"
                 yield WeakDirection(text, {name: 1.0, shift: together})
 
@@ -210,5 +214,5 @@ def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
 
 def poorly_known_stops(fit: JointFit) -> dict[str, int]:
     """Return directions whose stop sd is estimated from `few_stops`, with their number."""
-    few = few_stops(fit.campaign.moves, _used_moves(fit))
-    return {direction: count for direction, count in few.items() if fit.free[INDEX[f"stop_sd_deg.{direction}"]]}
+    few, free = few_stops(fit.campaign.moves, _used_moves(fit)), dict(zip(fit.names, fit.free, strict=True))
+    return {direction: count for direction, count in few.items() if free[f"stop_sd_deg.{direction}"]}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import textwrap
 from functools import partial
+from typing import Any
 
 from tvsbayes.calibration.calibration_file import (
     DIGITS,
@@ -45,7 +46,7 @@ def calibration_header(calibration: Calibration, origin: Origin | None = None, p
     if calibration.names != INPUT_NAMES:
         remedy = "take --export json, whose estimates are the terms of the head"
         raise InputError("usage", "the C header has the mirrors of a scanner, and this is a head", remedy=remedy)
-    none = dict.fromkeys(("steps", *_TABLES.values()), [0.0] * 4)
+    none: dict[str, Any] = dict.fromkeys(("steps", *_TABLES.values()), [0.0] * 4)
     none |= dict.fromkeys((f"beyond_{name}" for name in _TABLES.values()), 0.0)
     errors = gear_errors(calibration)
     return filled(

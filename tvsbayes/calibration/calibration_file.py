@@ -20,7 +20,7 @@ import numpy as np
 from tvsbayes.calibration.frames import EXTRINSICS_NAMES, NO_POSE
 from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration, input_names
 from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, shifts_at
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
@@ -65,7 +65,7 @@ def calibration_arrays(calibration: Calibration) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in {**arrays, **others}.items()}
 
 
-KNOWN_INPUTS = {each.named(INPUT_NAMES) for each in MECHANISMS.values()}
+KNOWN_INPUTS = {input_names(each) for each in MECHANISMS.values()}
 """Names of inputs that a stored calibration may have."""
 DIGITS = 15
 """Significant digits of any decimal number that a double holds: one more would print rounding errors."""

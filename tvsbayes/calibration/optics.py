@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
-from tvsbayes.instrument.chains import CHAINS
+from tvsbayes.instrument.chains import chain_of
 from tvsbayes.instrument.mechanisms import mechanism_of
 from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_ORDERS
 
@@ -111,11 +111,11 @@ def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: Module
     psi, beta, to_t = pan_deg * TO_RAD, tilt_deg * TO_RAD, (values["pan_zero_emission_deg"] - 90.0) * TO_RAD
 
     def block(name: str) -> Number | list[Number]:
-        names = BLOCKS.get(name, (name,))
+        names = BLOCKS[name]
         entries = [values[entry] * TO_RAD if "_deg" in name else values[entry] for entry in names]
         return entries if len(entries) > 1 else entries[0]
 
-    beam = CHAINS[mechanism_of(values).word].of(block).leaving_turned(psi, beta, to_t, m)
+    beam = chain_of(mechanism_of(values), block).leaving_turned(psi, beta, to_t, m)
     x, y, z = beam.origin_mm
     return Components((x, y + 0.5 * values["baseline_mm"], z), beam.direction)
 

@@ -38,17 +38,26 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, Axis, sides_of
 from tvsbayes.instrument.counter_limits import unseen
-from tvsbayes.instrument.mechanisms import mechanism_of
-from tvsbayes.instrument.parameters import OPTICS_NAMES, names_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism, mechanism_of
+from tvsbayes.instrument.parameters import names_of
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.statistics.predicted_readings import State
 
-INPUT_NAMES: tuple[str, ...] = (
-    *names_of("degrees_per_step", "backlash_deg", "harmonic_deg", "tilt_zero_deg"),
-    *OPTICS_NAMES,
-    *names_of("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
-)
-"""Inputs of a coordinate. Contrasts are not among them: they act by the travel, which is part of the state."""
+
+def input_names(mechanism: Mechanism) -> tuple[str, ...]:
+    """Names of the inputs of a coordinate, constants of the instrument included.
+
+    Contrasts are not among them: they act by the travel, which is part of the state.
+    """
+    return (
+        *names_of("degrees_per_step", "backlash_deg", "harmonic_deg"),
+        *(parameter.name for parameter in mechanism.path),
+        *names_of("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
+    )
+
+
+INPUT_NAMES = input_names(TWO_MIRROR)
+"""Inputs of a scanner; a head has as many."""
 NO_INPUTS: Values = {}
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
 """Noises of a look; those of stops include the scatter of the look, see `drawn_looks.noise_of_a_look`."""
@@ -472,7 +481,7 @@ class Calibration(Shown):
         return replace(
             steps,
             xyz_mm=point,
-            aperture_deg=None if "aperture_zero_deg" in mechanism_of(self.estimates).fixed else self.reading(point),
+            aperture_deg=self.reading(point) if mechanism_of(self.estimates).has_receiver else None,
             rounding_mm=float(np.linalg.norm(target.xyz_mm - point)),
             u95_mm=self.beam_u95_mm(counters, sides, reach),
         )

@@ -69,14 +69,14 @@ def compensate(
     """
     if (mechanism := _two_axis_mechanism(campaign)) is not None:
         # Counters of two axes follow from the whole calibration, which is the table.
-        default = "urdf" if mechanism.terms else "header"
+        default = "urdf" if mechanism.all_round else "header"
         if to != default:
-            kind = "a pan-tilt head" if mechanism.terms else "a scanner"
+            kind = "a pan-tilt head" if mechanism.all_round else "a scanner"
             message = f"compensate --to {escaped(to)} is for an axis, and {escaped(str(campaign), 200)} is {kind}"
-            counters = "; `tvsbayes steps-for` gives the counters of a direction" if mechanism.terms else ""
+            counters = "; `tvsbayes steps-for` gives the counters of a direction" if mechanism.all_round else ""
             remedy = f"its compensation is `tvsbayes compensate CAMPAIGN --to {default}`{counters}"
             raise InputError("usage", message, remedy=remedy)
-        if mechanism.terms:
+        if mechanism.all_round:
             from tvsbayes.cli.head_commands import compensate as compensate_head
 
             compensate_head(campaign, out, force, seed, as_json)
@@ -159,7 +159,7 @@ def verify(
 
     mechanism = _two_axis_mechanism(campaign)
     if mechanism is not _two_axis_mechanism(fresh):
-        kind = "an axis" if mechanism is None else "a head" if mechanism.terms else "a scanner"
+        kind = "an axis" if mechanism is None else "a head" if mechanism.all_round else "a scanner"
         message = f"{escaped(str(campaign), 200)} is of {kind}, {escaped(str(fresh), 200)} is not"
         raise InputError("usage", message, remedy="give fresh readings or looks of the same kind of machine")
     if distance_mm is not None and (mechanism is None or mechanism.sightings):

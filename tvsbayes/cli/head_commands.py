@@ -77,7 +77,7 @@ def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_pe
     kind = HEAD if spots == untouched else SIGHTING_HEAD
     ratios = {} if steps_per_turn is None else ratios_of(head, steps_per_turn)
     priors = {name: Prior(value, RATIO_U * value) for name, value in ratios.items()}
-    terms = {name: value for name, value in head.terms.items() if value and name in kind.documented}
+    terms = {name: value for name, value in head.terms.items() if value and name in kind.parameters}
     priors |= {name: Prior(value, kind.priors[name].u) for name, value in terms.items()}
     assumed = [
         f"pan is joint {escaped(head.names['pan'])}, tilt joint {escaped(head.names['tilt'])}; counter 0 is angle 0 "
@@ -293,7 +293,7 @@ def compensate(folder: Path, out: Path | None, force: bool, seed: int, as_json: 
     results, origin = StoredOrFitted(data, report_line), Origin.of(data)
     calibration, kind = accepted_calibration(data, results.stored), data.rig.mechanism
     terms = {f"{block}.{axis}" for axis in AXES for block in ("backlash_deg", "degrees_per_step")}
-    terms |= {term.name for term in kind.terms.values() if term.name in kind.documented}
+    terms |= {term.name for term in kind.path if term.name in kind.parameters}
     used = [k for k, name in enumerate(calibration.names) if name in terms and calibration.covariance[k, k] > 0]
     stated = data.header.get("urdf")
     made = f"made by tvsbayes {origin.tvsbayes}, {origin.exported}, of {escaped(origin.campaign)}"

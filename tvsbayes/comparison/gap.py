@@ -42,13 +42,13 @@ BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
 
 def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
     """Fix parameters at their ideal values: 0, or 1 for the focal scale; cameras as stated."""
-    from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
     from tvsbayes.model.compiled import placed
 
     value, u = np.array(space.value), np.array(space.u)
+    index = {name: number for number, name in enumerate(space.mechanism.rig_names)}
     for name in names:
-        if name in RIG_NAMES:
-            value[INDEX[name]], u[INDEX[name]] = float(name == "focal_scale"), 0.0
+        if name in index:
+            value[index[name]], u[index[name]] = float(name == "focal_scale"), 0.0
     space = replace(space, value=placed(value), u=placed(u))
     if "focal_scale" in names:
         space = replace(space, stereo_root=placed(np.zeros(space.stereo_root.shape)))
@@ -192,10 +192,9 @@ def camera_influence(fit: JointFit, values: np.ndarray) -> np.ndarray:
     The parameters are the focal scale and the stereo coordinates; the prior of coordinate j shifts the mode by S e_j.
     """
     from tvsbayes.assessment.headlines import gradients
-    from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 
     fisher = fit.information.fisher
-    cameras = [INDEX["focal_scale"], *range(len(RIG_NAMES), len(NAMES))]
+    cameras = [fit.names.index("focal_scale"), *range(fit.space.rig, len(fit.names))]
     return (gradients(fit, values) @ np.linalg.inv(fisher + np.eye(len(fisher))))[:, cameras]
 
 

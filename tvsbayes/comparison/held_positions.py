@@ -18,7 +18,6 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.comparison_record import HeldOutCounter, PositionHoldOut
@@ -96,7 +95,7 @@ def predicted_positions(fit_of_all: JointFit, taught: JointFit, left_out: LeftOu
     lin = linearised_at(taught.z, fit_of_all.space, fit_of_all.arrays)
     rows, axis = np.flatnonzero(left_out.out), AXES.index(left_out.axis)
     columns = np.concatenate([lin.by_coordinates(fit_of_all.held), lin.by_angles(rows)], axis=2)
-    information, count = stop_information(linear_spots(lin, fit_of_all.arrays, columns)), len(NAMES)
+    information, count = stop_information(linear_spots(lin, fit_of_all.arrays, columns)), len(fit_of_all.z)
     # Coordinates have priors, angles of the looks left out do not.
     precision = information.fisher + np.diag(np.arange(len(information.fisher)) < count)
     score = information.score(columns)

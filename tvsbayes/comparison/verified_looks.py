@@ -41,7 +41,6 @@ from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.homing import scatter_of_prior
 from tvsbayes.instrument.mechanisms import mechanism_of
-from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.model.parameter_space import physical_at
@@ -191,12 +190,13 @@ class SeenAngles:
         each = {k: np.linalg.inv(watched.departure(noise.z[k], angles=True).information) for k in set(places.tolist())}
         spots = watched.linear(noise.centre, angles=True)
         values = physical_at(noise.centre, watched.problem.space).value
+        index = watched.problem.space.mechanism.index
         visit = []
         for k, place in enumerate(watched.usable):
             slopes = spots.jacobian[place, :, -2 * watched.looks :][:, 2 * k : 2 * k + 2]
             stops = []
             for axis, side in zip(AXES, sides[k], strict=True):
-                ends = [float(values[INDEX[f"stop_sd_deg.{name}"]]) ** 2 for name in SIDES[axis]]
+                ends = [float(values[index[f"stop_sd_deg.{name}"]]) ** 2 for name in SIDES[axis]]
                 stops.append(ends[1] if side > 0 else ends[0] if side < 0 else 0.5 * sum(ends))
             visit.append(np.diag(np.linalg.inv(slopes.T @ slopes)) + stops)
         return cls(covariance @ centre.score, np.array([each[k] for k in places.tolist()]), np.ravel(visit))

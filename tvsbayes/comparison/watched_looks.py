@@ -25,8 +25,6 @@ from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.conditions import pause_s
 from tvsbayes.instrument.copies import refuse_same_looks
 from tvsbayes.instrument.homing import homed
-from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
-from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.watch_record import Watch
@@ -104,7 +102,7 @@ class WatchedLooks:
         self.joined = joined
         self.problem = Problem(joined, fit.table, used, np.asarray(fit.arrays.spots.weight)[: self.first])
         self.looks = int(used[self.first :].sum())
-        apply = fit.space.mechanism.documented.issuperset
+        apply = set(fit.space.mechanism.names).issuperset
         self.changes = next(each for each in (CHANGES, SIGHTED_CHANGES) if apply(n for c in each for n in c.names))
         self.dof = int(self.problem.dof[self.usable].sum())
 
@@ -123,22 +121,23 @@ class WatchedLooks:
 
         They are linearised in physical values, not in coordinates, since a change may shift a fixed parameter.
         """
-        at, rig = physical_at(z, self.problem.space), len(RIG_NAMES)
+        at, rig = physical_at(z, self.problem.space), self.problem.space.rig
         plain = replace(
             self.problem.space,
             value=placed(at.value[:rig]),
             u=placed(np.ones(rig)),
             kind=placed(np.zeros(rig, dtype=np.asarray(self.problem.space.kind).dtype)),
             stereo_mean=placed(at.value[rig:]),
-            stereo_root=placed(np.eye(len(NAMES) - rig)),
+            stereo_root=placed(np.eye(len(z) - rig)),
         )
-        lin = linearised_at(np.zeros(len(NAMES)), plain, self.problem.arrays)
+        lin = linearised_at(np.zeros(len(z)), plain, self.problem.arrays)
         physical = -np.asarray(lin.residual_jacobian)
         slope = np.where(self.problem.held, 0.0, physical @ at.slope)
         if angles:
             shifts = np.radians(1.0) * lin.by_angles(self.usable)
         else:
-            shifted = [COORDINATES[name] for change in self.changes for name in change.names]
+            index = self.problem.space.mechanism.index
+            shifted = [index[name] for change in self.changes for name in change.names]
             shifts = physical[:, :, shifted] * self._unit_sizes(at.value)
             shifts[: self.first] = 0.0
         return linear_spots(lin, self.problem.arrays, np.concatenate([slope, shifts], axis=2))
@@ -150,9 +149,10 @@ class WatchedLooks:
 
     def _unit_sizes(self, value: np.ndarray) -> np.ndarray:
         """Return physical values of a shift by one unit of the changes, shape (q,)."""
+        index = self.problem.space.mechanism.index
         return np.array(
             [
-                0.01 * value[COORDINATES[name]] if change.unit == "%" else np.radians(1.0) if "_rad" in name else 1.0
+                0.01 * value[index[name]] if change.unit == "%" else np.radians(1.0) if "_rad" in name else 1.0
                 for change in self.changes
                 for name in change.names
             ]

@@ -14,7 +14,8 @@ import numpy as np
 from tvsbayes.calibration.optics import Components, Ray, range_components, unit_vector
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import SENSES
-from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import Prior
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class SimpleCalibration:
 
 
 def simple_calibration(
-    priors: Mapping[str, Prior] = RIG_PRIORS, classic: ClassicResult | None = None
+    priors: Mapping[str, Prior] = TWO_MIRROR.priors, classic: ClassicResult | None = None
 ) -> SimpleCalibration:
     """Build the nominal calibration of stated priors, or with the classic estimator's ratios.
 

@@ -28,13 +28,13 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
-from tvsbayes.instrument.parameters import HOME_SD_NAMES, INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES
+from tvsbayes.instrument.parameters import HOME_SD_NAMES, TARGETS, ZERO_SHIFT_NAMES
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
-from tvsbayes.model.parameter_space import HOME_COLUMNS, ParameterSpace
+from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.stored_draws import StoredMode
 from tvsbayes.statistics.intervals import NORMAL_95
@@ -156,8 +156,9 @@ class JointFit(Shown):
 
     @cached_property
     def values(self) -> dict[str, float]:
-        """Return the values of the parameters at the mode by name."""
-        return dict(zip(self.names, np.asarray(self.mode.physical, dtype=float).tolist(), strict=True))
+        """Return the values of the parameters at the mode by name, and the constants of the instrument."""
+        own = zip(self.names, np.asarray(self.mode.physical, dtype=float).tolist(), strict=True)
+        return {**self.space.mechanism.constants, **dict(own)}
 
     @property
     def table(self) -> RigTable:
@@ -167,13 +168,14 @@ class JointFit(Shown):
     @property
     def held(self) -> np.ndarray:
         """Mark the parameters that the linearisation takes as known, shape (p,)."""
-        return held_by(self.free)
+        return held_by(self.names, self.free)
 
     @property
     def home_sd_by_prior(self) -> tuple[str, ...]:
         """Return the axes whose scatter of homings is that of the prior, since the campaign has one segment."""
-        open_u = np.where(self.free, 0.0, np.append(self.space.u, np.zeros(len(self.free) - len(RIG_NAMES))))
-        return tuple(axis for axis, u in zip(AXES, open_u[HOME_COLUMNS], strict=True) if u > 0)
+        columns = self.space.mechanism.columns("home_sd_deg")
+        by_prior = ~self.free[columns] & (np.asarray(self.space.u)[columns] > 0)
+        return tuple(axis for axis, kept in zip(AXES, by_prior, strict=True) if kept)
 
     @property
     def stored(self) -> StoredMode:
@@ -369,13 +371,14 @@ def restored(campaign: Campaign, stored: StoredMode) -> JointFit | None:
         The fit, with the Laplace draws of `fit` at its default seed; None where another version of tvsbayes used other
         parameter names.
     """
-    if stored.names != campaign.rig.mechanism.names or stored.prior.shape[1] != len(RIG_NAMES):
+    mechanism = campaign.rig.mechanism
+    if (own := stored.of(mechanism.names, mechanism.rig_names)) is None:
         return None
-    table = table_used(campaign.rig, *stored.prior)
+    table = table_used(campaign.rig, *own.prior)
     with jax.enable_x64(True):
-        sides: dict[str, str] = {axis: side for axis, side in zip(AXES, stored.sides, strict=True) if side}
-        problem = Problem(homed(campaign, sides), table, stored.valid > 0, stored.weight)
-        mode = Mode(stored.z, stored.covariance, -stored.log_density, ())
+        sides: dict[str, str] = {axis: side for axis, side in zip(AXES, own.sides, strict=True) if side}
+        problem = Problem(homed(campaign, sides), table, own.valid > 0, own.weight)
+        mode = Mode(own.z, own.covariance, -own.log_density, ())
         return replace(fit_at(campaign, problem, mode, 0), sides=sides)
 
 
@@ -403,14 +406,15 @@ def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformat
     return Gaussian(np.append(z, information.place_mean), np.block([[own, follows.T], [follows, lower]]))
 
 
-def _drawn(joint: Gaussian, free: Bool[np.ndarray, " parameters"], seed: int) -> np.ndarray:
+def _drawn(joint: Gaussian, problem: Problem, seed: int) -> np.ndarray:
     """Draw coordinates, then errors at places, shape (draws, p + e).
 
     Shifts of the zeros and scatters of homings that are not estimated keep their mean: the draws of the others then do
     not depend on them.
     """
     drawn = np.ones(len(joint.mean), dtype=bool)
-    drawn[[INDEX[name] for name in (*ZERO_SHIFT_NAMES, *HOME_SD_NAMES) if not free[INDEX[name]]]] = False
+    kept = np.isin(problem.table.mechanism.names, (*ZERO_SHIFT_NAMES, *HOME_SD_NAMES)) & ~problem.free
+    drawn[: len(kept)] = ~kept
     both = np.tile(joint.mean, (LAPLACE_DRAWS, 1))
     both[:, drawn] = laplace_draws(joint.mean[drawn], joint.covariance[np.ix_(drawn, drawn)], seed)
     return both
@@ -441,7 +445,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     suspect = used & (chi2_spots > special.chdtri(problem.dof, GATE_PROBABILITY))
     pose = np.asarray(lin.mirror_angles_rad[used].mean(axis=0))
     line, joint = _seen_line(campaign, problem, pose), with_places(mode.z, mode.covariance, information)
-    draws_z, draws_places = np.split(_drawn(joint, problem.free, seed), [len(NAMES)], axis=1)
+    draws_z, draws_places = np.split(_drawn(joint, problem, seed), [len(mode.z)], axis=1)
     gears = problem.arrays.gears
 
     def with_mode(z: np.ndarray, errors_rad: np.ndarray) -> Derived:
@@ -452,9 +456,9 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
 
     at_mode_and_draws = with_mode(draws_z, gears.at_places(draws_places @ np.asarray(lin.place_root).T))
     if prior_draws is None:
-        size = len(NAMES) + 2 * gears.filled
+        size = len(mode.z) + 2 * gears.filled
         prior = Gaussian(np.zeros(size), np.eye(size))
-        prior_z, normal = np.split(_drawn(prior, problem.free, seed + 1), [len(NAMES)], axis=1)
+        prior_z, normal = np.split(_drawn(prior, problem, seed + 1), [len(mode.z)], axis=1)
         prior_rad = np.asarray(prior_errors_at_places(prior_z, normal, problem.space, problem.arrays))
         prior_draws = jax.tree.map(lambda x: x[1:], with_mode(prior_z, prior_rad))
     reach = NORMAL_95 * np.sqrt(np.diag(mode.covariance))
@@ -463,7 +467,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
     # Where the pixel scale is fixed, chi-square contains the misfit.
     looks = max(float(np.sum(used * problem.dof)), 1.0)
-    misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
+    misfit = float(at_mode_and_draws["pixel_scale"][0]) * max(1.0, np.sqrt(chi2 / looks))
     if misfit > MISFIT_LIMIT:
         problems += (f"the {campaign.looks} miss the fitted beams by {misfit:.0f} times their stated uncertainty",)
     return JointFit(

@@ -32,11 +32,12 @@ from tvsbayes.estimators.kalman_filter import (
 )
 from tvsbayes.estimators.looks import WINDOW, Looks, looks_at, spot_angles
 from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToStates, noise_scales, spot_residuals
+from tvsbayes.instrument.mechanisms import RATIO_COLUMNS
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import BlockRoot, column_blocks
 from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, no_moves
-from tvsbayes.model.parameter_space import RATIO_COLUMNS, Model, ParameterSpace
+from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 POINTS_TOGETHER = 256
 """Points whose errors at places are eliminated together: many, since NumPy's calls cost more than small matrices; few
@@ -286,7 +287,8 @@ def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> Bl
     """
     ratio, on_tilt = np.radians(values[:, RATIO_COLUMNS]), np.asarray(gears.on_tilt)
     angle_rad = np.asarray(gears.places.steps)[gears.place] * ratio[:, on_tilt.astype(int)]
-    return column_blocks(scales_at(values, np.asarray(space.harmonic_period_deg)), angle_rad, on_tilt, gears.of_play)
+    scales = scales_at(values, np.asarray(space.harmonic_period_deg), space.mechanism)
+    return column_blocks(scales, angle_rad, on_tilt, gears.of_play)
 
 
 def prior_errors_at_places(

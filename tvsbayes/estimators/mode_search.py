@@ -6,6 +6,7 @@ weights. All computations use the coordinates of `model.parameter_space` (prior 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -25,9 +26,10 @@ from tvsbayes.estimators.linear_spots import (
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.conditions import unseen_shifts
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HOME_SD_NAMES, NAMES, NOISE_NAMES
+from tvsbayes.instrument.mechanisms import RATIO_COLUMNS
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HOME_SD_NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.parameter_space import RATIO_COLUMNS, ParameterSpace, free_mask, parameter_space, physical_at
+from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
 from tvsbayes.statistics.least_squares import Mode, Objective, neighbouring_mode, newton_mode
 
@@ -79,7 +81,8 @@ class LogVolume:
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """Evaluate at points (n, p), of which the scales are used, shape (n,)."""
-        free, rest = slice(len(NAMES)), slice(len(NAMES), None)
+        size = self.space.size
+        free, rest = slice(size), slice(size, None)
         if not self.products[rest].size:
             return np.zeros(len(z))
         values = self.space.values(z)
@@ -88,12 +91,12 @@ class LogVolume:
         inner = np.eye(root.size) + root.congruent(self.products[rest, rest])
         load = root.transposed_times(self.products[rest, free])
         information = self.products[free, free] - np.swapaxes(load, 1, 2) @ np.linalg.solve(inner, load)
-        return -0.5 * np.linalg.slogdet(np.eye(len(NAMES)) + information)[1]
+        return -0.5 * np.linalg.slogdet(np.eye(size) + information)[1]
 
 
-def held_by(free: Bool[np.ndarray, " parameters"]) -> Bool[np.ndarray, " parameters"]:
+def held_by(names: Sequence[str], free: Bool[np.ndarray, " parameters"]) -> Bool[np.ndarray, " parameters"]:
     """Mark the parameters that a linearisation takes as known: noise scales and those not estimated."""
-    return np.isin(NAMES, NOISE_NAMES) | ~free
+    return np.isin(names, NOISE_NAMES) | ~free
 
 
 def _curvatures(objective: Objective, z: np.ndarray, columns: np.ndarray, step: float) -> np.ndarray:
@@ -128,9 +131,10 @@ class Problem:
         # A single segment says nothing on the scatter of homings, which stays at its median.
         unseen += tuple(name for name, seen in zip(HOME_SD_NAMES, homed, strict=True) if not seen)
         self.free = free_mask(self.space, any(readings), unseen)
-        self.noise = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & self.free)
-        self.held = held_by(self.free)
-        self.repeated = np.isin(NAMES, GEAR_ERROR_NAMES) & self.free
+        names = table.mechanism.names
+        self.noise = np.flatnonzero(np.isin(names, NOISE_NAMES) & self.free)
+        self.held = held_by(names, self.free)
+        self.repeated = np.isin(names, GEAR_ERROR_NAMES) & self.free
 
     @property
     def dof(self) -> np.ndarray:
@@ -141,7 +145,7 @@ class Problem:
         """Start the compilation for later steps in another thread, while the first stage runs."""
 
         def work():
-            self.negative_log_density(np.zeros((1, len(NAMES))))
+            self.negative_log_density(np.zeros((1, self.space.size)))
 
         executor.submit(work)
 
@@ -196,7 +200,7 @@ class Problem:
         """Return the volume of geometry and cameras by scales of repeating errors, linearised at z."""
         gears, ratio = self.arrays.gears.without_padding(), physical_at(z, self.space).value[RATIO_COLUMNS]
         if not gears.columns:
-            return LogVolume(self.space, np.zeros((len(NAMES), len(NAMES))), gears, ratio)
+            return LogVolume(self.space, np.zeros((self.space.size, self.space.size)), gears, ratio)
         lin = self.linearised(z)
         linear = linear_spots(lin, self.arrays, lin.by_coordinates(self.held))
         information = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
@@ -216,7 +220,7 @@ class Problem:
 
         `job` must have the stages of `search_stages`.
         """
-        z, passes = np.zeros(len(NAMES)), len(ANNEALING) + 1 + (ROUNDS_EXPECTED if robust else 0)
+        z, passes = np.zeros(self.space.size), len(ANNEALING) + 1 + (ROUNDS_EXPECTED if robust else 0)
         job.begin(COMPILING)
         for number, inflation in enumerate(ANNEALING, 1):
             z = self.least_squares(z, inflation)
@@ -266,7 +270,7 @@ class Problem:
 
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Compute the information on the coordinates: Fisher's, and for the noise by differences."""
-        value = self.information(self.linearised(z)).fisher + np.eye(len(NAMES))
+        value = self.information(self.linearised(z)).fisher + np.eye(len(z))
         bent = _curvatures(self.negative_log_density, z, self.noise, NOISE_STEP)
         value[self.noise, self.noise] = np.maximum(1.0, bent)
         return value

@@ -15,7 +15,7 @@ from tvsbayes.estimators.annealed_stage import linearised_at
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, NOISE_NAMES
 
 STEP = 0.05
 """Step of central differences, in sds of the Laplace approximation; the weights correct for larger curvature."""
@@ -49,7 +49,7 @@ class MarginalScales:
 
     def __init__(self, fit: JointFit):
         self.fit = fit
-        self.columns = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & fit.free)
+        self.columns = np.flatnonzero(np.isin(fit.names, NOISE_NAMES) & fit.free)
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """Evaluate at points (n, p) that differ in their noise scales, shape (n,)."""
@@ -82,7 +82,7 @@ def noise_draws(fit: JointFit, count: int, seed: int) -> NoiseDraws:
     if not columns.size:
         return NoiseDraws(centre, centre[None], np.ones(1))
     # Scales of repeating errors are at their marginal mode already, by the search for the mode.
-    taken = np.setdiff1d(columns, [INDEX[name] for name in GEAR_ERROR_NAMES])
+    taken = columns[~np.isin(np.array(fit.names)[columns], GEAR_ERROR_NAMES)]
     root = np.linalg.cholesky(fit.covariance[np.ix_(taken, taken)])
     for _ in range(STEPS_TO_MODE if taken.size else 0):
         points = np.repeat(centre[None], 2 * taken.size, axis=0)

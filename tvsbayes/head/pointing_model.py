@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate, refusal
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
-from tvsbayes.instrument.chains import HeadOptics
-from tvsbayes.instrument.parameters import HEAD_TERMS
+from tvsbayes.instrument.chains import chain_of
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
+from tvsbayes.instrument.parameters import BLOCKS, TERMS
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sighted_deg, sightings_of, tangent_frames
 
 STEPS_MAX = 50
@@ -85,7 +87,13 @@ def _steps(campaign: Campaign, rows: Sequence[Sighting]) -> np.ndarray:
 def _off_deg(values: dict[str, float | complex], steps: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """Observed minus predicted on the sphere, shape (n, 2); complex where a value is."""
     pan, tilt = (np.radians(1.0) * values[name] * steps[:, k] for k, name in enumerate(RATIOS))
-    optics = HeadOptics.of(lambda name: values[name] * np.radians(1.0))
+    values = {**SIGHTING_HEAD.constants, **values}
+
+    def block(name: str) -> Any:
+        parts = [values[each] * np.radians(1.0) for each in BLOCKS[name]]
+        return parts if len(parts) > 1 else parts[0]
+
+    optics = chain_of(SIGHTING_HEAD, block)
     sight = optics.leaving(pan, tilt + np.radians(1.0) * values["elevation_zero_deg"], np).direction
     sighted = np.stack(np.broadcast_arrays(*sight), axis=1)
     across, above, along = (np.sum(frames[:, k] * sighted, axis=1) for k in range(3))
@@ -133,7 +141,7 @@ def pointing_model(campaign: Campaign) -> PointingModel:
         remedy = "`tvsbayes classic` of spots needs four-point experiments"
         raise refusal("no-sightings", file="spots.csv", found="spots", allowed=allowed, remedy=remedy)
     rows = sightings_of(ordered_spots(campaign))
-    terms = [term.name for term in HEAD_TERMS.values()]
+    terms = [term.name for term in TERMS if term.name in priors]
     values: dict[str, float | complex] = {name: priors[name].value for name in (*RATIOS, *terms)}
     unknown = tuple(n for n in values if priors[n].u > (RATIO_KNOWN * abs(priors[n].value) if n in RATIOS else 0.0))
     steps, angles = _steps(campaign, rows), sighted_deg(rows)

@@ -67,7 +67,7 @@ def adapted(keys: Keys, size: Size | None) -> tuple[Keys, str, str | None, list[
             values = read(keys.values, keys.file, size, notes)
     except (*_DAMAGE, configparser.Error, cv2.error) as error:
         raise refused("stereo-structure", keys.file, error=escaped(str(error), 100)) from error
-    return Keys(values, keys.file, keys.text), source, str(values.pop("unit", unit)), notes
+    return Keys(values, keys.file, keys.content), source, str(values.pop("unit", unit)), notes
 
 
 def _numbers(text: str) -> list[float]:

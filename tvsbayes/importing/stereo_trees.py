@@ -382,7 +382,7 @@ def entries_of(tables: tuple[Keys, ...]) -> Iterator[Entry]:
             yield from entries_of((*tables, keys.table(key)))
         elif isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
             for number, item in enumerate(value):
-                yield from entries_of((*tables, Keys(item, keys.file, keys.text, (*keys.path, key, str(number)))))
+                yield from entries_of((*tables, Keys(item, keys.file, keys.content, (*keys.path, key, str(number)))))
         elif isinstance(value, list):
             yield nothing
         elif isinstance(value, str):

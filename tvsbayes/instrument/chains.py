@@ -18,9 +18,8 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import NamedTuple
 
-from tvsbayes.instrument.mechanisms import HEAD, TWO_MIRROR
+from tvsbayes.instrument.mechanisms import HEAD, TWO_MIRROR, Mechanism
 from tvsbayes.instrument.mirrors import Materialise, Numbers, Optics, Ray, Turn, Vectors, unchanged
-from tvsbayes.instrument.parameters import HEAD_TERMS
 
 LEAST_ELEVATION = 1e-3
 """Sine of the elevation below which the cotangent is limited: a law in tan z does not hold near the horizon."""
@@ -40,14 +39,6 @@ class HeadOptics(NamedTuple):
     flexure_rad: Numbers
     azimuth_zero_rad: Numbers
     tangent_flexure_rad: Numbers
-
-    @classmethod
-    def of(cls, block: Callable[[str], Numbers]) -> HeadOptics:
-        """Build from `block`, which returns each term by its name in mm and rad; terms of two parts become pairs."""
-        terms: dict[str, tuple[Numbers, ...]] = {}
-        for term in list(HEAD_TERMS.values())[1:]:
-            terms[term.block] = (*terms.get(term.block, ()), block(term.name))
-        return cls(*(parts if len(parts) > 1 else parts[0] for parts in terms.values()))
 
     def leaving(
         self, pan_rad: Numbers, tilt_rad: Numbers, functions: ModuleType, materialise: Materialise = unchanged
@@ -98,3 +89,9 @@ type Chain = Optics | HeadOptics
 """What carries the beam: the laser over mirrors, or a line of sight on two axes."""
 CHAINS: dict[str, type[Optics] | type[HeadOptics]] = {TWO_MIRROR.word: Optics, HEAD.word: HeadOptics}
 """Chains by the word of a mechanism."""
+
+
+def chain_of(mechanism: Mechanism, block: Callable[[str], Numbers]) -> Chain:
+    """Build the chain of a mechanism from `block`, which returns the values of a block of parameters in mm and rad."""
+    kind = CHAINS[mechanism.word]
+    return kind(*(block(field.replace("_rad", "_deg")) for field in kind._fields))

@@ -1,37 +1,51 @@
-"""List of the instruments with two axes: mechanism of the beam, kind of observation, names of the geometry.
+"""List of the instruments with two axes: mechanism of the beam, kind of observation, parameters.
 
-Vectors of parameters have one layout (`parameters.NAMES`). A mechanism other than the scanner uses the coordinates of
-the mirrors for its own terms: the gears' coordinates, and every array, are the same.
+An instrument has its own parameters and no other's; they are the coordinates of its vectors, in their order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
+from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.parameters import (
-    HEAD_TERMS,
-    NAMES,
+    BLOCKS,
+    CAMERAS,
+    GEARS,
+    LOOKS,
+    MIRRORS,
     RECEIVER_NAMES,
     REGISTRY,
-    RIG_NAMES,
     STEREO_PARAMETER_NAMES,
+    TERMS,
     Parameter,
     Prior,
     names_of,
 )
+from tvsbayes.instrument.quantities import Quantities
+
+if TYPE_CHECKING:
+    import numpy as np
+
+RATIO_COLUMNS, CONTRAST_COLUMNS, BACKLASH_COLUMNS = (
+    [number for number, parameter in enumerate(GEARS) if parameter.block == block]
+    for block in ("degrees_per_step", "ratio_contrast_deg_per_step", "backlash_deg")
+)
+"""Coordinates of ratios, contrasts and plays, with which every instrument begins."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mechanism:
     """A kind of instrument.
 
     Attributes:
         key: its name in the program.
         word: its name in rig and campaign files.
-        terms: terms of its geometry, by the scanner's parameter whose coordinate they use.
-        fixed: values of parameters that do not apply to it; documents omit them.
+        path: parameters of the beam's path, the zero of the tilt axis first.
+        constants: values of what its model has and it lacks, such as a receiver; they are no parameters of it.
         own_priors: priors that replace the registry's.
         absent: derived quantities that it lacks.
         all_round: its axes turn all round; else the beam is aimed ahead only.
@@ -42,8 +56,8 @@ class Mechanism:
 
     key: str
     word: str
-    terms: Mapping[str, Parameter] = field(default_factory=dict)
-    fixed: Mapping[str, float] = field(default_factory=dict)
+    path: tuple[Parameter, ...] = MIRRORS
+    constants: Mapping[str, float] = field(default_factory=dict)
     own_priors: Mapping[str, Prior] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
     all_round: bool = False
@@ -55,58 +69,79 @@ class Mechanism:
         """Copying, also to another process, returns the entry of the list: mechanisms are compared by identity."""
         return mechanism_by_key, (self.key,)
 
+    @property
+    def declared(self) -> tuple[Parameter, ...]:
+        """Its parameters and constants of the rig, in the order in which true rigs are drawn."""
+        return (*GEARS, *self.path, *LOOKS)
+
     @cached_property
-    def parameters(self) -> dict[str, Parameter]:
-        """Every parameter by its name, in the order of the coordinates."""
-        return {(parameter := self.terms.get(name, REGISTRY[name])).name: parameter for name in NAMES}
+    def parameters(self) -> Quantities[Parameter]:
+        """Every parameter by its name, in the order of the coordinates: those of `[rig]`, then the cameras."""
+        return Quantities(*(each for each in (*self.declared, *CAMERAS) if each.name not in self.constants))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all coordinates."""
         return tuple(self.parameters)
 
-    def named(self, names: Iterable[str]) -> tuple[str, ...]:
-        """The mechanism's names for the scanner's coordinates of these names; other names are unchanged."""
-        return tuple(self.terms[name].name if name in self.terms else name for name in names)
-
     @cached_property
-    def tilt_zero(self) -> str:
-        """Name of the zero of the tilt axis."""
-        return self.named(("tilt_zero_deg",))[0]
-
-    @cached_property
-    def zeros(self) -> tuple[str, str]:
-        """Names of the parameters that shift the pan angle and the tilt angle as a whole."""
-        return "azimuth_zero_deg" if "azimuth_zero_deg" in self.names else "pan_zero_emission_deg", self.tilt_zero
-
-    @cached_property
-    def prior_groups(self) -> dict[str, list[int]]:
-        """Coordinates by cause of uncertainty, the stereo calibration first."""
-        columns = list(enumerate(self.parameters.values()))
-        groups: dict[str, list[int]] = {}
-        for column, parameter in (*columns[len(RIG_NAMES) :], *columns[: len(RIG_NAMES)]):
-            groups.setdefault(parameter.cause, []).append(column)
-        return groups
+    def index(self) -> dict[str, int]:
+        """Coordinates by name."""
+        return {name: number for number, name in enumerate(self.names)}
 
     @cached_property
     def rig_names(self) -> tuple[str, ...]:
         """Names of coordinates with a prior in `[rig]`, which come first."""
-        return self.names[: len(RIG_NAMES)]
+        return tuple(name for name, of in self.parameters.items() if of.place != "stereo")
+
+    def columns(self, *blocks: str) -> np.ndarray:
+        """Coordinates of the parameters of blocks that the instrument has, in the order of the arguments."""
+        import numpy as np
+
+        names = (name for block in blocks for name in BLOCKS[block])
+        return np.array([self.index[name] for name in names if name in self.index], dtype=int)
 
     @cached_property
-    def documented(self) -> frozenset[str]:
-        """Names allowed in files and documents."""
-        return frozenset(self.names) - frozenset(self.fixed)
+    def stop_columns(self) -> np.ndarray:
+        """Coordinates of the stop sds by axis and side, (right, left) and (down, up): shape (2, 2)."""
+        import numpy as np
+
+        return np.array([[self.index[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
+
+    @cached_property
+    def optics_names(self) -> tuple[str, ...]:
+        """Names of the geometry of the beam's path, without the zero of the tilt axis."""
+        return tuple(parameter.name for parameter in self.path[1:])
+
+    @cached_property
+    def has_receiver(self) -> bool:
+        """Whether a receiver may see its beam."""
+        return "aperture_zero_deg" in self.parameters
+
+    @cached_property
+    def tilt_zero(self) -> str:
+        """Name of the zero of the tilt axis."""
+        return self.path[0].name
+
+    @cached_property
+    def zeros(self) -> tuple[str, str]:
+        """Names of the parameters that shift the pan angle and the tilt angle as a whole."""
+        own = {parameter.name for parameter in self.path}
+        return "azimuth_zero_deg" if "azimuth_zero_deg" in own else "pan_zero_emission_deg", self.tilt_zero
+
+    @cached_property
+    def prior_groups(self) -> dict[str, list[int]]:
+        """Coordinates by cause of uncertainty, the stereo calibration first."""
+        columns, rig = list(enumerate(self.parameters.values())), len(self.rig_names)
+        groups: dict[str, list[int]] = {}
+        for column, parameter in (*columns[rig:], *columns[:rig]):
+            groups.setdefault(parameter.cause, []).append(column)
+        return groups
 
     @cached_property
     def priors(self) -> dict[str, Prior]:
-        """Default priors; parameters that do not apply are fixed."""
-
-        def prior(name: str) -> Prior:
-            stated = self.own_priors.get(name, self.parameters[name].prior)
-            return replace(stated, value=self.fixed[name], u=0.0) if name in self.fixed else stated
-
-        return {name: prior(name) for name in self.rig_names}
+        """Default priors of the parameters of `[rig]`."""
+        return {name: self.own_priors.get(name, REGISTRY[name].prior) for name in self.rig_names}
 
 
 _LASER = dict.fromkeys(("azimuth_zero_deg", "azimuth_axis_tilt_deg.north", "azimuth_axis_tilt_deg.east"), 0.0)
@@ -122,12 +157,12 @@ _SIGHT = {
 """A head with sightings has neither cameras nor lengths."""
 TWO_MIRROR = Mechanism("two-mirror", "two-mirror")
 HEAD = Mechanism(
-    "pan-tilt", "pan-tilt", HEAD_TERMS, _LASER | _RECEIVER, absent=("effective_mirror_offset_mm",), all_round=True
+    "pan-tilt", "pan-tilt", TERMS, _LASER | _RECEIVER, absent=("effective_mirror_offset_mm",), all_round=True
 )
 SIGHTING_HEAD = replace(
     HEAD,
     key="pan-tilt-sightings",
-    fixed=_SIGHT | _RECEIVER,
+    constants=_SIGHT | _RECEIVER,
     own_priors={"flexure_deg": Prior(0.0, 0.1)},
     sightings=True,
     noise="noise of sightings",

@@ -124,11 +124,6 @@ class Optics(NamedTuple):
     tilt_axis_skew_rad: Numbers
     tilt_axis_offset_mm: Numbers
 
-    @classmethod
-    def of(cls, block: Callable[[str], Numbers]) -> Optics:
-        """Build from `block`, which returns the values of a block of `instrument.parameters` in mm and rad."""
-        return cls(*(block(field.replace("_rad", "_deg")) for field in cls._fields))
-
     def leaving(
         self, pan_rad: Numbers, tilt_rad: Numbers, functions: ModuleType, materialise: Materialise = unchanged
     ) -> Ray:

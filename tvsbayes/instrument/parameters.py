@@ -1,4 +1,4 @@
-"""Registry of parameters: name, unit, prior, range and block of each, in the order of all vectors and files.
+"""Registry of parameters: name, unit, prior, range and block of each, in the order of vectors and files.
 
 Units are those of the names: degrees where a name says `deg`, radians where it says `rad`, mm, px; "1" has none.
 """
@@ -105,13 +105,16 @@ _SCALE, _REACH = (0.0, 0.0, 10.0), (0.1, 360.0, 5.0)
 _AMPLITUDES = tuple(f"{axis}.{number}" for axis in AXES for number in range(1, PERIODS_MAX + 1))
 _HARMONICS = tuple(f"{axis}.{order}.{part}" for axis in AXES for order in HARMONIC_ORDERS for part in ("cos", "sin"))
 _OF_GEARS = "the ratio of the gears"
-_PARAMETERS = (
+GEARS = (
     *_block("degrees_per_step", ("pan",), "deg/step", Prior(0.06, 0.01), _RATIO, _OF_GEARS, headline=True),
     *_block("degrees_per_step", ("tilt",), "deg/step", Prior(0.07, 0.01), _RATIO, _OF_GEARS, headline=True),
     *_block("ratio_contrast_deg_per_step", AXES, "deg/step", Prior(0.0, 2e-4), (-1.0, 1.0, 1.0),
             "the difference of the ratios of both directions"),
     *_block("backlash_deg", AXES, "deg", Prior(0.0, 0.5, "half-normal"), (0.0, 0.0, 45.0),
             "the backlash", "backlash {0}", headline=True, judged=True, target="backlash.{0}"),
+)  # fmt: skip
+"""Ratios and play, the first coordinates of every instrument."""
+MIRRORS = (
     *_block("tilt_zero_deg", (), "deg", Prior(0.0, 2.0), (-90.0, 90.0, 180.0), "the tilt mirror at counter 0"),
     *_block("mirror_offset_mm", (), "mm", Prior(30.0, 5.0), (-1000.0, 1000.0, 1000.0),
             "the mirror offset", "mirror offset L"),
@@ -121,6 +124,9 @@ _PARAMETERS = (
     *_block("laser_offset_mm", ("x", "y"), "mm", _SMALL, _LENGTH, "the laser's place"),
     *_block("tilt_axis_skew_deg", (), "deg", _SMALL, _ANGLE, "the skew of the tilt axis"),
     *_block("tilt_axis_offset_mm", ("x", "z"), "mm", _SMALL, _LENGTH, "the place of the tilt axis"),
+)  # fmt: skip
+"""The beam's path through the scanner, the zero of the tilt axis first."""
+LOOKS = (
     *_block("extrinsics.rotation_rad", _XYZ, "rad", Prior(0.0, 0.5), (-3.15, 3.15, 3.15),
             "the positioner's attitude", "positioner turned about {0}"),
     *_block("extrinsics.translation_mm", _XYZ, "mm", Prior(0.0, 100.0), (-1e5, 1e5, 1e5),
@@ -159,10 +165,12 @@ _PARAMETERS = (
             "the shift of the zero per kelvin", "zero per kelvin, {0}"),
     *_block("home_sd_deg", AXES, "deg", Prior(0.05, 1.0, "log-normal"), (1e-9, 10.0, 5.0),
             "the scatter of homings, sd", "homing scatter {0}", noise=True),
-    *_cameras(),
 )  # fmt: skip
+"""Pose, scatter of stops and looks, receiver, errors of the gears that repeat or vary, shifts of the zeros."""
+CAMERAS = _cameras()
+"""The stereo pair, the last coordinates of an instrument whose spots it sees."""
 _TURN, _TERM = Prior(0.0, 10.0), Prior(0.0, 0.5)
-_TERMS = (
+TERMS = (
     *_block("elevation_zero_deg", (), "deg", _TURN, (-360.0, 360.0, 360.0),
             "the elevation at counter 0", "elevation at counter 0"),
     *_block("elevation_axis_offset_mm", (), "mm", _SMALL, (-1000.0, 1000.0, 1000.0),
@@ -180,8 +188,9 @@ _TERMS = (
     *_block("tangent_flexure_deg", (), "deg", UNSTATED, _ANGLE,
             "the flexure with cot(elevation)", "flexure, cot(elevation)"),
 )  # fmt: skip
-"""Terms of a head, with TPOINT's names: elevation_zero IE, azimuth_zero -IA, azimuth_axis_tilt north AN and east -AW,
-axes_not_square NPAE, beam_not_square CA, flexure TF, tangent_flexure TX."""
+"""The line of sight of a head, the zero of the elevation axis first, with TPOINT's names: elevation_zero IE,
+azimuth_zero -IA, azimuth_axis_tilt north AN and east -AW, axes_not_square NPAE, beam_not_square CA, flexure TF,
+tangent_flexure TX."""
 _many = Quantity.many
 _LINES = (
     *_many("effective_deg_per_step", DIRECTIONS, unit="deg/step", words="the effective ratio", label="effective {0}",
@@ -198,16 +207,8 @@ _DERIVED = (
     *_many("play_variation_at_deg", (), unit="deg", words="the variation of play"),
 )  # fmt: skip
 
-REGISTRY = Quantities(*_PARAMETERS)
-"""Every parameter by its name, in the order of the coordinates, which stored draws and results keep."""
-NAMES: tuple[str, ...] = tuple(REGISTRY)
-_HEAD_SLOTS = NAMES[NAMES.index("tilt_zero_deg") : NAMES.index("tilt_axis_offset_mm.z") + 1]
-HEAD_TERMS: dict[str, Parameter] = dict(zip(_HEAD_SLOTS, _TERMS, strict=True))
-"""Geometry of a pan-tilt head, by the name of the scanner's parameter whose coordinate it takes (`mechanisms`)."""
-_OF_HEADS = {term.name: term for term in _TERMS}
-INDEX: dict[str, int] = {name: index for index, name in enumerate(NAMES)}
-COLUMNS: dict[str, int] = INDEX | {term.name: INDEX[name] for name, term in HEAD_TERMS.items()}
-"""Coordinates of parameters, including those of heads."""
+REGISTRY = Quantities(*GEARS, *MIRRORS, *TERMS, *LOOKS, *CAMERAS)
+"""Every parameter of an instrument with two axes by its name; which of them an instrument has: `mechanisms`."""
 BLOCKS = REGISTRY.blocks
 """Names by block; the parameters of a block are consecutive."""
 
@@ -217,10 +218,7 @@ def names_of(*blocks: str) -> tuple[str, ...]:
     return tuple(name for block in blocks for name in BLOCKS[block])
 
 
-RIG_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place != "stereo")
-"""Parameters with a prior in `[rig]`; they come first."""
-RIG_PRIORS: dict[str, Prior] = {name: REGISTRY[name].prior for name in RIG_NAMES}
-STEREO_PARAMETER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place == "stereo")
+STEREO_PARAMETER_NAMES: tuple[str, ...] = tuple(p.name for p in CAMERAS)
 """The 24 stereo parameters in the order of `parameter_covariance` of a stereo file."""
 HARMONIC_NAMES = names_of("harmonic_deg")
 """Transmission error by axis, order and phase."""
@@ -231,11 +229,8 @@ GEAR_ERROR_NAMES = names_of(
     "harmonic_amplitude_deg",
 )
 """Scales of the gears' errors that repeat by position, of play that varies and of zeros that drift."""
-OPTICS_NAMES = names_of(
-    *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
-    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
-)
-"""Geometry of the beam's path through the positioner; all but the first are zero in the nominal rig."""
+OPTICS_NAMES: tuple[str, ...] = tuple(p.name for p in MIRRORS[1:])
+"""Geometry of the beam's path through the scanner; all but the first are zero in the nominal rig."""
 LOOK_SCATTER_NAMES = names_of("look_scatter_deg")
 """Sds of the deviation of the beam's angle at a look from the angle of the axis."""
 CREEP_NAMES = names_of("creep_deg", "creep_minutes")
@@ -246,19 +241,14 @@ HOME_SD_NAMES = names_of("home_sd_deg")
 """Sds of the shift of a zero by a homing, by axis."""
 LATE_NAMES = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES, *HOME_SD_NAMES)
 """Parameters that earlier versions did not have: files omit them where they have their defaults."""
-NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
-RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
-QUANTITIES: Quantities[Quantity] = Quantities(*_LINES, *_PARAMETERS, *_TERMS, *_DERIVED)
+NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in LOOKS if p.noise)
+RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in LOOKS if p.receiver)
+QUANTITIES: Quantities[Quantity] = Quantities(*_LINES, *REGISTRY.values(), *_DERIVED)
 """Quantities of scanner and head: parameters and derived quantities. `HEADLINES` and `TARGETS` have this order."""
 HEADLINES = tuple(quantity for quantity in QUANTITIES.values() if quantity.headline)
 TARGETS = {quantity.target: quantity for quantity in HEADLINES if quantity.target}
 """Headlines that plans and studies may target, by their target names."""
 TARGET_ROWS = {target: row for row, target in enumerate(TARGETS)}
-
-
-def parameter_of(name: str) -> Parameter | None:
-    """The parameter of any mechanism with this name; None where there is none."""
-    return REGISTRY.get(name) or _OF_HEADS.get(name)
 
 
 def unit_of(name: str) -> str:

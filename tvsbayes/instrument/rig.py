@@ -25,10 +25,8 @@ from tvsbayes.instrument.parameters import (
     LATE_NAMES,
     PERIODS_MAX,
     REGISTRY,
-    RIG_PRIORS,
     Place,
     Prior,
-    parameter_of,
 )
 from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, read_stereo
 
@@ -66,7 +64,7 @@ class RigTable:
     def __post_init__(self) -> None:
         priors = {**self.mechanism.priors, **self.priors}
         for name in PERIODIC_NAMES:
-            if priors[name] == RIG_PRIORS[name] and not _has_period(name, self.harmonic_period_deg):
+            if priors[name] == REGISTRY[name].prior and not _has_period(name, self.harmonic_period_deg):
                 priors[name] = replace(priors[name], value=0.0, u=0.0)
         for axis in self.absolute:
             name = f"home_sd_deg.{axis}"
@@ -142,7 +140,7 @@ _OWN_KEYS = ("aperture_convention", "mechanism", "absolute", "prior")
 
 def _names_at(place: Place, mechanism: Mechanism) -> tuple[str, ...]:
     """Parameter names allowed in a table of a mechanism's file."""
-    return tuple(p.name for p in mechanism.parameters.values() if p.place == place and p.name in mechanism.documented)
+    return tuple(p.name for p in mechanism.parameters.values() if p.place == place)
 
 
 def _has_period(name: str, period_deg: Mapping[str, tuple[float, ...]]) -> bool:
@@ -190,7 +188,7 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     stem, _, last = name.partition(".")
     if name in _PERIOD_NAMES:
         return "it belongs in [rig] itself: tooth counts fix it, so it has no prior and no other truth"
-    parameter = parameter_of(name)
+    parameter = REGISTRY.get(name)
     if parameter is not None and parameter.place != "stereo":
         elsewhere = parameter.place == "rig.prior" and "backlash_deg.pan" not in allowed
         other = "it means nothing to this mechanism: leave it out, or correct `mechanism` in [rig]"
@@ -209,7 +207,7 @@ def _in_blocks(names: Iterable[str]) -> str:
     """Short list of names: one word for those of a block, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
     blocks: dict[str, list[list[str]]] = {}
     for name in names:
-        parameter = parameter_of(name)
+        parameter = REGISTRY.get(name)
         block = name.split(".")[0] if parameter is None else parameter.block
         blocks.setdefault(block, []).append(name.removeprefix(block).split(".")[1:])
     return ", ".join(
@@ -241,7 +239,7 @@ def _flat(table: Keys, names: tuple[str, ...], besides: tuple[str, ...] = ()) ->
 
 def _prior(keys: Keys, name: str) -> Prior:
     """A stated prior, checked."""
-    parameter, stated = parameter_of(name), keys.values[name]
+    parameter, stated = REGISTRY.get(name), keys.values[name]
     assert parameter is not None
     distribution = parameter.prior.distribution
     if distribution == "half-normal" and isinstance(stated, dict) and stated.get("value", 0) != 0:
@@ -311,7 +309,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
         if name in (f"home_sd_deg.{axis}" for axis in absolute):
             allowed = "no entry for an axis in `absolute`"
             raise refuse("absolute", allowed, "leave one of them out: no homing sets an absolute zero")
-    if convention in table and "aperture_zero_deg" not in mechanism.documented:
+    if convention in table and not mechanism.has_receiver:
         remedy = "leave it out: a head has no receiver"
         raise table.refuse(convention, "unknown-key", "no aperture", remedy, f"the name {convention}")
     azimuth = convention in table and table.word(convention, "in-plane", "azimuth") == "azimuth"
@@ -334,7 +332,7 @@ def rig_table_toml(table: RigTable) -> str:
         for name, axis in _PERIOD_NAMES.items()
         if stated.get(axis)
     }
-    has_aperture = "aperture_zero_deg" in kind.documented
+    has_aperture = kind.has_receiver
     own = {"aperture_convention": table.aperture_convention} if has_aperture else {"mechanism": kind.word}
     omitted = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
     omitted |= {*PERIODIC_NAMES, *(f"home_sd_deg.{axis}" for axis in table.absolute)}
@@ -473,7 +471,7 @@ def read_rig(path: Path) -> Rig:
     _check_limits(keys.table("positioner"), positioner)
     if stereo is not None:
         _check_pictures(keys.table("cameras"), cameras, stereo)
-    names = tuple(name for name in table.mechanism.rig_names if name in table.mechanism.documented)
+    names = table.mechanism.rig_names
     return Rig(
         table=table,
         stereo=stereo,

@@ -199,15 +199,13 @@ def no_stereo_pair() -> InputError:
 
 
 def stereo_parameters(stereo: Stereo | None) -> np.ndarray:
-    """The 24 parameters; of no pair those of an ideal one."""
-    ideal = np.zeros(24)
-    ideal[[0, 1, 9, 10]] = 1.0
-    return ideal if stereo is None else stereo.vector
+    """The 24 parameters; none of no pair."""
+    return np.zeros(0) if stereo is None else stereo.vector
 
 
 def stereo_covariance(stereo: Stereo | None) -> np.ndarray:
-    """The covariance (24, 24) of the 24 parameters; an ideal pair is exactly known."""
-    return np.zeros((24, 24)) if stereo is None else np.asarray(stereo.parameter_covariance, float)
+    """The covariance (24, 24) of the 24 parameters; (0, 0) of no pair."""
+    return np.zeros((0, 0)) if stereo is None else np.asarray(stereo.parameter_covariance, float)
 
 
 def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:

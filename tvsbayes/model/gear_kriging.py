@@ -12,16 +12,17 @@ from functools import cached_property
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, PERIODS_MAX
+from tvsbayes.instrument.mechanisms import Mechanism
+from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.model.gear_processes import GearScales, place_root
 
 
-def scales_at(physical: np.ndarray, harmonic_period_deg: np.ndarray) -> GearScales:
+def scales_at(physical: np.ndarray, harmonic_period_deg: np.ndarray, mechanism: Mechanism) -> GearScales:
     """Extract the gear scales from all parameter values, of one point (p,) or many (n, p); periods of shape (2, 3)."""
     leading = physical.shape[:-1]
 
     def block(name: str) -> np.ndarray:
-        return np.radians(physical[..., [INDEX[each] for each in BLOCKS[name]]])
+        return np.radians(physical[..., mechanism.columns(name)])
 
     return GearScales(
         error_rad=block("transmission_error_deg"),

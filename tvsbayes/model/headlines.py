@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.instrument.parameters import BLOCKS, COLUMNS, INDEX, QUANTITIES, TARGETS
+from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR
+from tvsbayes.instrument.parameters import BLOCKS, QUANTITIES, REGISTRY, TARGETS
 from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.gear_processes import Places, errors_at
@@ -125,7 +126,7 @@ _MODELLED_BLOCKS = tuple(block for block in FORMULAS if block not in COMBINED an
 MODELLED = {name: k for k, name in enumerate(name for block in _MODELLED_BLOCKS for name in QUANTITIES.blocks[block])}
 """Columns of quantities that are neither parameters nor follow from others."""
 DERIVED = tuple(
-    name for name, of in QUANTITIES.items() if name not in INDEX and (name in MODELLED or of.block in COMBINED)
+    name for name, of in QUANTITIES.items() if name not in REGISTRY and (name in MODELLED or of.block in COMBINED)
 )
 """All quantities with draws except parameters."""
 
@@ -134,7 +135,7 @@ class Derived(eqx.Module):
     """Quantities at points of parameter space by name, in the units of data/docs/conventions.md.
 
     Attributes:
-        physical: values of the parameters.
+        physical: values of the parameters of the instrument `key`.
         modelled: quantities of the model at the reference pose, by the columns `MODELLED`.
         jacobian: d(azimuth, elevation)/d(pan, tilt) there.
         place_errors_rad: transmission errors, then plays, at the places; empty where gears have no errors by position.
@@ -144,11 +145,15 @@ class Derived(eqx.Module):
     modelled: Float[Array | np.ndarray, "*draws modelled"]
     jacobian: Float[Array | np.ndarray, "*draws 2 2"]
     place_errors_rad: Float[Array | np.ndarray, "*draws errors"]
+    key: str = eqx.field(static=True, default=TWO_MIRROR.key)
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return a parameter or one of `DERIVED`, with the leading axes of the fields."""
-        if name in COLUMNS:
-            return np.asarray(self.physical)[..., COLUMNS[name]]
+        mechanism, physical = MECHANISMS[self.key], np.asarray(self.physical)
+        if name in mechanism.index:
+            return physical[..., mechanism.index[name]]
+        if name in mechanism.constants:
+            return np.full(physical.shape[:-1], mechanism.constants[name])
         if name in MODELLED:
             return np.asarray(self.modelled)[..., MODELLED[name]]
         quantity = QUANTITIES[name]
@@ -250,4 +255,4 @@ def derived_quantities(
     """
     given, values = np.asarray(place_errors_rad), space.values(z)
     modelled = _modelled(values, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
-    return Derived(values, np.asarray(modelled.modelled), np.asarray(modelled.jacobian), given)
+    return Derived(values, np.asarray(modelled.modelled), np.asarray(modelled.jacobian), given, space.key)

@@ -1,13 +1,13 @@
 """Coordinates with standard normal priors, and the model at a point of them.
 
-Every parameter has a coordinate z with prior N(0, 1) (`gears.priors`); the 24 stereo parameters are mean + root z with
-root root^T their full covariance. As u = 0 fixes a parameter whatever its z, one compiled function serves every choice
-of fixed parameters. Physical values have the units of their names.
+Every parameter of an instrument has a coordinate z with prior N(0, 1) (`gears.priors`); the stereo parameters are mean
++ root z with root root^T their full covariance. As u = 0 fixes a parameter whatever its z, one compiled function serves
+every choice of fixed parameters. Physical values have the units of their names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -19,20 +19,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.gears.priors import FARTHEST_SD, half_normal, half_normal_coordinate, half_normal_slope, values_at
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
-from tvsbayes.instrument.chains import CHAINS, Chain
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
+from tvsbayes.instrument.chains import Chain, chain_of
 from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, Mechanism
-from tvsbayes.instrument.parameters import (
-    BLOCKS,
-    COLUMNS,
-    HOME_SD_NAMES,
-    INDEX,
-    KINDS,
-    LOOK_SCATTER_NAMES,
-    PERIODS_MAX,
-    RECEIVER_NAMES,
-    RIG_NAMES,
-)
+from tvsbayes.instrument.parameters import BLOCKS, KINDS, PERIODS_MAX, RECEIVER_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, stereo_covariance, stereo_parameters
 from tvsbayes.model.compiled import placed
@@ -97,7 +87,7 @@ def _half_normal_along(
 
 
 class Point(eqx.Module):
-    """A point: coordinates, values in the units of `NAMES`, and d(value)/d(coordinate) of the rig's parameters."""
+    """A point: coordinates, values in the units of their names, and d(value)/d(coordinate) of the rig's parameters."""
 
     z: Float[Array | np.ndarray, " parameters"]
     values: Float[Array | np.ndarray, " parameters"]
@@ -114,8 +104,8 @@ class ParameterSpace(eqx.Module):
     value: Float[Array, " rig"]
     u: Float[Array, " rig"]
     kind: Int[Array, " rig"]
-    stereo_mean: Float[Array, "24"]
-    stereo_root: Float[Array, "24 24"]
+    stereo_mean: Float[Array, " cameras"]
+    stereo_root: Float[Array, "cameras cameras"]
     harmonic_period_deg: Float[Array, "2 3"]
     key: str = eqx.field(static=True, default=TWO_MIRROR.key)
 
@@ -124,8 +114,18 @@ class ParameterSpace(eqx.Module):
         """Return the mechanism whose parameters these are."""
         return MECHANISMS[self.key]
 
+    @property
+    def size(self) -> int:
+        """Return the number of coordinates."""
+        return len(self.mechanism.names)
+
+    @property
+    def rig(self) -> int:
+        """Return the number of coordinates with a prior in `[rig]`, which come first."""
+        return self.value.shape[-1]
+
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
-        """Convert coordinates to values in the units of `NAMES`."""
+        """Convert coordinates to values in the units of their names."""
         return _values(self, z, jnp, _half_normal)
 
     def values(self, z: Float[Array | np.ndarray, "*points parameters"]) -> np.ndarray:
@@ -149,13 +149,13 @@ class ParameterSpace(eqx.Module):
         return self.model_at(materialise(self.physical(z)))
 
     def model_at(self, physical: Float[Array, " parameters"]) -> Model:
-        """Compute the model at these values, in the units of `NAMES`."""
+        """Compute the model at these values, in the units of their names."""
         return model_of(physical, self.harmonic_period_deg, self.mechanism)
 
 
 def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: Callable[[Any], Any]) -> Any:
-    """Convert coordinates to values in the units of `NAMES`, by functions of JAX or NumPy."""
-    rig_z, stereo_z = z[..., : len(RIG_NAMES)], z[..., len(RIG_NAMES) :]
+    """Convert coordinates to values in the units of their names, by functions of JAX or NumPy."""
+    rig_z, stereo_z = z[..., : space.rig], z[..., space.rig :]
     half, log = (space.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
     rig = values_at(rig_z, space.value, space.u, half, log, functions, half_normal)
     return functions.concatenate([rig, space.stereo_mean + stereo_z @ space.stereo_root.T], axis=-1)
@@ -163,7 +163,7 @@ def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: C
 
 def _slopes(space: ParameterSpace, z: Any, values: Any, functions: ModuleType) -> Any:
     """Compute the slopes of the rig's part of `_values`, where every value has its own coordinate."""
-    rig_z, own = z[: len(RIG_NAMES)], values[: len(RIG_NAMES)]
+    rig_z, own = z[: space.rig], values[: space.rig]
     half, log = (space.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
     bent = half & (rig_z < FARTHEST_SD)
     at, reached = functions.where(bent, rig_z, 0.0), functions.where(bent & (space.u > 0), own, 0.0)
@@ -175,15 +175,6 @@ def _slopes(space: ParameterSpace, z: Any, values: Any, functions: ModuleType) -
 def scale_of(mechanism: Mechanism) -> np.ndarray:
     """Return the factors from the units of `NAMES` to rad and mm, shape (p,)."""
     return np.array([np.pi / 180 if p.unit.startswith("deg") else 1.0 for p in mechanism.parameters.values()])
-
-
-STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
-"""Coordinates of the stop sds by axis and side, (right, left) and (down, up): shape (2, 2)."""
-SCATTER_COLUMNS, RATIO_COLUMNS, DRIFT_COLUMNS, HOME_COLUMNS = (
-    np.array([INDEX[name] for name in names])
-    for names in (LOOK_SCATTER_NAMES, BLOCKS["degrees_per_step"], BLOCKS["drift_deg_per_root_hour"], HOME_SD_NAMES)
-)
-"""Coordinates by axis of the looks' scatter, of the mean ratios, of the zeros' drift and of their shift by a homing."""
 
 
 def _camera_columns(*parts: str) -> slice | np.ndarray:
@@ -201,7 +192,7 @@ def model_of(
     """Assemble the model (deg is converted to rad here only).
 
     Args:
-        physical: values in the units of `NAMES`.
+        physical: values in the units of their names.
         harmonic_period_deg: periods of the transmission error by axis, see `ParameterSpace`; the first of each axis is
             the period of `harmonic_deg`.
         mechanism: mechanism of these values.
@@ -213,8 +204,14 @@ def model_of(
     period_deg = jnp.asarray(harmonic_period_deg)
 
     def block(name: str):
-        first, *others = (COLUMNS[entry] for entry in BLOCKS.get(name, (name,)))
-        return values[first : first + 1 + len(others)] if others else values[first]
+        names = BLOCKS[name]
+        if names[0] in mechanism.constants:
+            unit = np.pi / 180 if "_deg" in name else 1.0
+            own = jnp.array([unit * mechanism.constants[each] for each in names])
+        else:
+            first = mechanism.index[names[0]]
+            own = values[first : first + len(names)]
+        return own[0] if names == (name,) else own
 
     intrinsics = jnp.stack([block("stereo.left"), block("stereo.right")])
     return Model(
@@ -229,8 +226,8 @@ def model_of(
             ),
             zero_shift=ZeroShift(block("creep_deg"), block("creep_minutes"), block("thermal_deg_per_K")),
         ),
-        optics=CHAINS[mechanism.word].of(block),
-        tilt_zero_rad=block("tilt_zero_deg"),
+        optics=chain_of(mechanism, block),
+        tilt_zero_rad=block(mechanism.tilt_zero),
         extrinsics=Extrinsics(block("extrinsics.rotation_rad"), block("extrinsics.translation_mm")),
         cameras=StereoCameras(
             focal_px=intrinsics[:, _camera_columns("fx", "fy")],
@@ -294,7 +291,7 @@ def _periods_deg(table: RigTable, axis: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Physical:
-    """Values in the units of `NAMES`, shape (p,), and d/d(coordinates), shape (p, p)."""
+    """Values in the units of their names, shape (p,), and d/d(coordinates), shape (p, p)."""
 
     value: np.ndarray
     slope: np.ndarray
@@ -304,19 +301,31 @@ def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
     """Compute values and slopes at a point (p,), in NumPy: compiling does not pay for one point."""
     point = space.known_point(z)
     slope = np.zeros((len(z), len(z)))
-    slope[: len(RIG_NAMES), : len(RIG_NAMES)] = np.diag(point.slopes)
-    slope[len(RIG_NAMES) :, len(RIG_NAMES) :] = np.asarray(space.stereo_root)
+    slope[: space.rig, : space.rig] = np.diag(point.slopes)
+    slope[space.rig :, space.rig :] = np.asarray(space.stereo_root)
     return Physical(np.asarray(point.values), slope)
 
 
+def named_at(z: np.ndarray, space: ParameterSpace, names: Sequence[str]) -> Physical:
+    """Compute `physical_at` of named parameters (k,), slopes (k, p); constants of the instrument do not vary."""
+    at, mechanism = physical_at(z, space), space.mechanism
+    value, slope = np.zeros(len(names)), np.zeros((len(names), len(z)))
+    for row, name in enumerate(names):
+        if (column := mechanism.index.get(name)) is None:
+            value[row] = mechanism.constants[name]
+        else:
+            value[row], slope[row] = at.value[column], at.slope[column]
+    return Physical(value, slope)
+
+
 def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:
-    """Compute coordinates of values in the units of `NAMES`, the inverse of `ParameterSpace.physical`; shapes (..., p).
+    """Compute coordinates (..., p) of values in the units of their names, the inverse of `ParameterSpace.physical`.
 
     Parameters fixed by their priors have coordinate 0, and so have directions in which the cameras are exactly known.
     Coordinates are clipped at 30.
     """
     value, u, kind = (np.asarray(x, dtype=float) for x in (space.value, space.u, space.kind))
-    true, cameras = np.split(np.asarray(physical, dtype=float), [len(RIG_NAMES)], axis=-1)
+    true, cameras = np.split(np.asarray(physical, dtype=float), [space.rig], axis=-1)
     safe = np.where(u > 0, u, 1.0)
     log = np.log(np.where(true > 0, true, 1.0) / np.where(value > 0, value, 1.0)) / safe
     z = np.where(kind == KINDS.index("log-normal"), log, (true - value) / safe)
@@ -331,7 +340,7 @@ def free_mask(
 ) -> Bool[np.ndarray, " parameters"]:
     """Mark estimated parameters: u > 0, the receiver's only with aperture readings, none `unseen`."""
     rig = np.asarray(space.u) > 0
-    for name in (*unseen, *(() if has_aperture else RECEIVER_NAMES)):
-        rig[INDEX[name]] = False
+    without = {*unseen, *(() if has_aperture else RECEIVER_NAMES)}
+    rig &= np.array([name not in without for name in space.mechanism.rig_names])
     stereo = np.abs(np.asarray(space.stereo_root)).sum(axis=1) > 0
     return np.concatenate([rig, stereo])

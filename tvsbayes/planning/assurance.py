@@ -12,24 +12,26 @@ from functools import lru_cache
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
+from tvsbayes.instrument.mechanisms import RATIO_COLUMNS, Mechanism
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.parameter_space import RATIO_COLUMNS, SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
+from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.drawn_rigs import Instruments
-from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, Knowledge
+from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.gear_places import GearPlaces
 from tvsbayes.planning.looks import LookArrays, LookPlan, Looks, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.progress import Advance, unshown
 from tvsbayes.statistics.streams import Stream, random_stream
 
-PIXEL_COLUMN = INDEX["pixel_scale"]
-SCALES = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
-"""Columns of the noise scales: stops by direction (right, left, down, up), pixels."""
 STOPS, PIXEL = slice(0, 4), 4
-"""Indices of `SCALES` by kind."""
+"""Indices of `scales_of` by kind."""
+
+
+def scales_of(mechanism: Mechanism) -> np.ndarray:
+    """Return the coordinates of the noise scales: stops by direction (right, left, down, up), pixels."""
+    return np.append(mechanism.stop_columns, mechanism.index["pixel_scale"])
 
 
 def judged_z(
@@ -55,18 +57,19 @@ def judged_z(
         picks: numbers of the looks taken, repeats allowed, shape (k,).
         covariance: covariance of coordinates and errors of gears after the looks, shape (n, p + e, p + e).
         knowledge: before the looks.
-        noise: standard normal numbers in the order of `SCALES`, shape (n, 5).
+        noise: standard normal numbers in the order of `scales_of`, shape (n, 5).
 
     Returns:
         Shape (n, p).
     """
     z, u = instruments.z.copy(), np.asarray(knowledge.space.u)
+    scales = scales_of(knowledge.space.mechanism)
     # A fit of the next instrument of a build has the priors of the rig file, wherever the plan expects it.
-    centre = knowledge.z if knowledge.after_data else np.zeros(PARAMETERS)
+    centre = knowledge.z if knowledge.after_data else np.zeros_like(knowledge.z)
     times_seen = seen.seen * np.bincount(picks, minlength=len(side))
     looks = np.maximum(times_seen.sum(axis=1), 1)
     rig_columns = np.ones(knowledge.size, dtype=bool)
-    rig_columns[:PARAMETERS] = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    rig_columns[: len(knowledge.z)] = ~knowledge.noise & (np.arange(len(knowledge.z)) < knowledge.space.rig)
     precision = np.diag(knowledge.precision)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     determined = np.sum(1 - variance[:, rig_columns] * precision[rig_columns], axis=1)
@@ -82,12 +85,12 @@ def judged_z(
     for axis in range(2):
         known = np.sum(seen.slope[..., axis] ** 2, axis=2)
         for index, sign in enumerate((-1, 1)):
-            column = STOP_COLUMNS[axis, index]
+            column = int(scales[STOPS][2 * axis + index])
             share = known * np.radians(instruments.physical[:, column, None]) ** 2
             share = share / (1 + share)
             stops = times_seen * (side[:, axis] == sign)
             estimate(column, 2 * np.sum(stops * share**2, axis=1), noise[:, STOPS][:, 2 * axis + index])
-    estimate(PIXEL_COLUMN, 2.0 * looks, noise[:, PIXEL])
+    estimate(int(scales[PIXEL]), 2.0 * looks, noise[:, PIXEL])
     return z
 
 
@@ -99,12 +102,12 @@ def instrument_gears(knowledge: Knowledge, physical: np.ndarray) -> GearPlaces:
 
     Args:
         knowledge: before the looks.
-        physical: the instrument's values in the units of `NAMES`, shape (p,).
+        physical: the instrument's values in the units of their names, shape (p,).
     """
     gears = knowledge.gears
     if knowledge.after_data or not gears.size:
         return gears
-    scales = scales_at(physical, np.asarray(knowledge.space.harmonic_period_deg))
+    scales = scales_at(physical, np.asarray(knowledge.space.harmonic_period_deg), knowledge.space.mechanism)
     return replace(gears, ratio_rad_per_step=np.radians(physical[RATIO_COLUMNS]), scales=scales)
 
 
@@ -162,7 +165,7 @@ class Assurance:
         # After data a fit's line goes through earlier and new looks, which the errors at places do not separate.
         before_data = not family.knowledge.after_data
         self._of_lines = before_data and target.point_mm is None and family.knowledge.gears.size > 0
-        self.noise = random_stream(seed, Stream.INSTRUMENT_SCALES).standard_normal((len(instruments), len(SCALES)))
+        self.noise = random_stream(seed, Stream.INSTRUMENT_SCALES).standard_normal((len(instruments), PIXEL + 1))
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
         self.looks = family.candidates.looks[self.distinct]
         self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
@@ -250,15 +253,16 @@ class Assurance:
         Rows and slope J are in units of pixel noise plus scatter of looks D: the scatter's part of I is J D J^T, the
         rest scales with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T) + J (D + S) J^T.
         """
-        u, true = np.asarray(self.family.knowledge.space.u)[SCALES], instruments.value[:, SCALES]
-        old_sd, new_sd = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))
+        scales = scales_of(instruments.common.mechanism)
+        u, true = np.asarray(self.family.knowledge.space.u)[scales], instruments.value[:, scales]
+        old_sd, new_sd = (true * np.exp(u * point[:, scales]) for point in (instruments.z, z))
         pixel = new_sd[:, PIXEL] / old_sd[:, PIXEL]
         sides = (self.looks.side > 0).astype(int)
 
         def of_angles(sd_deg: np.ndarray) -> np.ndarray:
             return (seen.slope * np.radians(sd_deg)[:, :, None] ** 2) @ np.swapaxes(seen.slope, -1, -2)
 
-        scatter = of_angles(instruments.physical[:, None, SCATTER_COLUMNS])
+        scatter = of_angles(instruments.physical[:, None, instruments.common.mechanism.columns("look_scatter_deg")])
         # The transform also rotates the rows; it is not only a scale.
         old_root, new_root = (
             p[:, None, None, None] ** 2 * (np.eye(4) - scatter)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import CounterLimits
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.mechanisms import BACKLASH_COLUMNS, RATIO_COLUMNS, Mechanism
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.instrument.protocols import UNSTATED_STEPS
-from tvsbayes.model.parameter_space import RATIO_COLUMNS, physical_at
+from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.planning.drawn_rigs import draws_of
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import LookArrays, Looks
@@ -53,26 +52,22 @@ def sheet_choices[Sheet](sheets: Sequence[Sheet], most: int) -> list[tuple[Sheet
     return [choice for size in range(1, most + 1) for choice in itertools.combinations(sheets, size)]
 
 
-BACKLASH_COLUMNS = [INDEX[f"backlash_deg.{axis}"] for axis in AXES]
 RUN_UP_STOPS = 4.0
 """Sds of a stop added to the play: the stop before the run-up deviates by more once in 30 000 runs."""
 RUN_UP_MARGIN = 1.5
 """Factor for the uncertainty of play and scatter: a longer run-up costs seconds, remaining play a look."""
 
 
-def run_up_steps(physical: np.ndarray, play_axes_deg: np.ndarray) -> np.ndarray:
+def run_up_steps(physical: np.ndarray, mechanism: Mechanism, play_axes_deg: np.ndarray) -> np.ndarray:
     """Compute the run-up (pan, tilt) that takes up a play and a few stop errors, with a margin.
 
     Args:
         physical: parameters in the units of their names, shape (p,): ratios and scatter of stops.
+        mechanism: whose parameters they are.
         play_axes_deg: play of (pan, tilt) to be taken up.
     """
-    result = []
-    for (axis, sides), play_deg in zip(SENSES.items(), play_axes_deg, strict=True):
-        scatter = max(physical[INDEX[f"stop_sd_deg.{side}"]] for side in sides)
-        ratio = abs(physical[INDEX[f"degrees_per_step.{axis}"]])
-        result.append(math.ceil(RUN_UP_MARGIN * (play_deg + RUN_UP_STOPS * scatter) / ratio))
-    return np.array(result)
+    reach_deg = play_axes_deg + RUN_UP_STOPS * physical[mechanism.stop_columns].max(axis=1)
+    return np.ceil(RUN_UP_MARGIN * reach_deg / np.abs(physical[RATIO_COLUMNS])).astype(int)
 
 
 def expected_run_up(knowledge: Knowledge) -> np.ndarray:
@@ -80,7 +75,7 @@ def expected_run_up(knowledge: Knowledge) -> np.ndarray:
     draws = draws_of(knowledge, 200, np.random.default_rng(17))
     physical = np.stack([physical_at(z, knowledge.space).value for z in draws])
     play_deg = np.quantile(physical[:, BACKLASH_COLUMNS], 0.99, axis=0)
-    return run_up_steps(np.median(physical, axis=0), play_deg)
+    return run_up_steps(np.median(physical, axis=0), knowledge.space.mechanism, play_deg)
 
 
 @dataclass(frozen=True)

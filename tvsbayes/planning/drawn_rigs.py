@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import INDEX, names_of
+from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.stereo_pair import stereo_parameters
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
-from tvsbayes.planning.expectation import PARAMETERS, Knowledge
+from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
 
@@ -30,7 +30,7 @@ class Instruments:
     Attributes:
         z: coordinates, shape (n, p).
         value: `value` of their spaces, shape (n, rig): parameters fixed by the priors are at their true values.
-        physical: values in the units of `NAMES`, shape (n, p).
+        physical: values in the units of their names, shape (n, p).
         common: the rest of their spaces.
     """
 
@@ -72,8 +72,9 @@ def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -
     """Draw coordinates of possible instruments, shape (count, p)."""
     if knowledge.like is not None:
         return _drawn_alike(knowledge, knowledge.like, count, generator).z
-    root = np.linalg.cholesky(knowledge.covariance[:PARAMETERS, :PARAMETERS])
-    return knowledge.z + generator.standard_normal((count, PARAMETERS)) @ root.T
+    size = len(knowledge.z)
+    root = np.linalg.cholesky(knowledge.covariance[:size, :size])
+    return knowledge.z + generator.standard_normal((count, size)) @ root.T
 
 
 def draw_instruments(knowledge: Knowledge, count: int, seed: int) -> Instruments:
@@ -97,17 +98,17 @@ def alike(knowledge: Knowledge, like: Knowledge) -> Knowledge:
     """
     found = np.asarray(physical_at(like.z, like.space).value)
     centre = np.array(physical_at(knowledge.z, knowledge.space).value)
-    build = [INDEX[name] for name in BUILD_NAMES]
+    build = np.isin(knowledge.space.mechanism.names, BUILD_NAMES)
     centre[build] = found[build]
     return replace(knowledge, z=coordinates_of(knowledge.space, centre), like=like)
 
 
 def _drawn_alike(knowledge: Knowledge, like: Knowledge, count: int, generator: np.random.Generator) -> Instruments:
     """Draw instruments whose build is drawn from the other's posterior, and the rest from `[truth]`."""
-    names = set(knowledge.rig.table.mechanism.rig_names).intersection(BUILD_NAMES)
+    mechanism = knowledge.rig.table.mechanism
     truths = []
     for z in draws_of(like, count, generator):
         found, truth = physical_at(z, like.space).value, draw_truth(knowledge.rig, generator)
-        build = {name: float(found[INDEX[name]]) for name in names}
+        build = {name: float(found[mechanism.index[name]]) for name in BUILD_NAMES if name in mechanism.index}
         truths.append(replace(truth, parameters=with_derived({**truth.parameters, **build})))
     return instruments_in(knowledge, truths)

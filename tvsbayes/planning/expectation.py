@@ -33,8 +33,9 @@ from tvsbayes.estimators.kalman_filter import filter_rows, kalman_update, no_bel
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
 from tvsbayes.instrument.campaign import Move
+from tvsbayes.instrument.mechanisms import RATIO_COLUMNS
 from tvsbayes.instrument.mirrors import Ray
-from tvsbayes.instrument.parameters import CREEP_NAMES, NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import CREEP_NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary
 from tvsbayes.instrument.plan import PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import Rig
@@ -42,14 +43,7 @@ from tvsbayes.instrument.stops import counters_made, redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import MoveArrays, mirror_angles, trace
-from tvsbayes.model.parameter_space import (
-    HOME_COLUMNS,
-    RATIO_COLUMNS,
-    Model,
-    ParameterSpace,
-    parameter_space,
-    physical_at,
-)
+from tvsbayes.model.parameter_space import Model, ParameterSpace, parameter_space, physical_at
 from tvsbayes.planning.gear_places import (
     NO_PLACES,
     FittedErrors,
@@ -58,7 +52,6 @@ from tvsbayes.planning.gear_places import (
     regular_places,
 )
 
-PARAMETERS = len(NAMES)
 KEPT_SD_DEG = 1e-7
 """Sd of a homing's shift of a zero that an absolute encoder keeps: next to none, but invertible."""
 SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
@@ -67,7 +60,7 @@ SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
 
 def home_variances_rad2(z: np.ndarray, space: ParameterSpace) -> np.ndarray:
     """Return the variances of the shift of (pan, tilt) by a homing at coordinates (p,), shape (2,)."""
-    return np.radians(np.maximum(physical_at(z, space).value[HOME_COLUMNS], KEPT_SD_DEG)) ** 2
+    return np.radians(np.maximum(physical_at(z, space).value[space.mechanism.columns("home_sd_deg")], KEPT_SD_DEG)) ** 2
 
 
 @dataclass(frozen=True)
@@ -119,6 +112,11 @@ class Knowledge:
         return tuple(sorted(self.rig.depths_mm, key=self.rig.depths_mm.__getitem__))
 
     @property
+    def noise(self) -> np.ndarray:
+        """Mark the coordinates that are scales of noise, shape (p,)."""
+        return np.isin(self.space.mechanism.names, NOISE_NAMES)
+
+    @property
     def gears_vary(self) -> bool:
         """Whether transmission error or play may differ from place to place."""
         return gears_vary(self.rig.table)
@@ -137,21 +135,23 @@ class Knowledge:
         """Add errors of gears at given places."""
         if self.errors_of_fit is not None:
             return replace(self, precision=np.linalg.inv(self.errors_of_fit.covariance_at(gears)), gears=gears)
-        precision = np.eye(PARAMETERS + gears.size)
-        precision[:PARAMETERS, :PARAMETERS] = self.precision[:PARAMETERS, :PARAMETERS]
+        size = len(self.z)
+        precision = np.eye(size + gears.size)
+        precision[:size, :size] = self.precision[:size, :size]
         return replace(self, precision=precision, gears=gears)
 
 
 def prior_knowledge(rig: Rig) -> Knowledge:
     """Return the knowledge before any data: the priors of the rig file."""
-    return Knowledge(rig, parameter_space(rig.table, rig.stereo), np.zeros(PARAMETERS), np.eye(PARAMETERS))
+    space = parameter_space(rig.table, rig.stereo)
+    return Knowledge(rig, space, np.zeros(space.size), np.eye(space.size))
 
 
 def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
     """Return the knowledge after a fit: its mode without creep, its Laplace covariance, and the rig file."""
     data_rig = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
     precision = np.linalg.inv(result.covariance)
-    z = np.where(np.isin(NAMES, CREEP_NAMES), 0.0, result.z)
+    z = np.where(np.isin(result.names, CREEP_NAMES), 0.0, result.z)
     errors, made = fitted_errors(result, result.covariance), counters_made(result.campaign.moves)
     return Knowledge(data_rig, result.space, z, precision, True, errors_of_fit=errors, made=made)
 
@@ -168,8 +168,9 @@ def fitted_errors(result: JointFit, covariance: np.ndarray) -> FittedErrors | No
     joint = with_places(result.z, covariance, result.information)
     gears, count = result.arrays.gears.without_padding(), int(np.sum(result.arrays.gears.places.valid))
     # Errors that the priors fix keep their unit variance, as coordinates do.
-    covariance = np.eye(PARAMETERS + 2 * count)
-    rows = np.concatenate([np.arange(PARAMETERS), PARAMETERS + gears.place + count * gears.of_play])
+    size = len(result.z)
+    covariance = np.eye(size + 2 * count)
+    rows = np.concatenate([np.arange(size), size + gears.place + count * gears.of_play])
     covariance[np.ix_(rows, rows)] = joint.covariance
     return FittedErrors(fit_places(result), covariance)
 
@@ -200,9 +201,6 @@ class Expectation(eqx.Module):
     variance: Float[Array | np.ndarray, "looks 6"]
     seen: Bool[Array | np.ndarray, " looks"]
     mirror_angles_rad: Float[Array | np.ndarray, "looks 2"]
-
-
-NOISE_COLUMNS = np.isin(NAMES, NOISE_NAMES)
 
 
 class _SheetPoints(eqx.Module):
@@ -272,7 +270,7 @@ def expect(
         arrays = eqx.tree_at(lambda a: a.spots.tangents, arrays, tangents_at(arrays.spots.triangulated_mm))
     spots = arrays.spots
     lin = linearise(space.point(z), space, arrays)
-    jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
+    jacobian = jnp.where(np.isin(space.mechanism.names, NOISE_NAMES), 0.0, -lin.residual_jacobian)
     jacobian = jnp.concatenate([jacobian, lin.slope @ turning], axis=2)
     columns = jnp.concatenate([jacobian, lin.slope], axis=2)
     inputs = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.zero_variance, spots)

@@ -13,7 +13,7 @@ from tvsbayes.errors import TvsError
 from tvsbayes.estimators.four_point import DirectionResult, classic, ratio_slopes, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, RIG_NAMES, names_of
+from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, names_of
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.drawn_rigs import Instruments
@@ -69,7 +69,7 @@ def _experiments(rig: Rig, sheets: tuple[str, str], physical: np.ndarray) -> _Ex
     """Simulate two of the paper's experiments in each direction; None where a direction lacks the second."""
     parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
     noise_free = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
-    stereo = rig.stereo_pair.with_vector(physical[len(RIG_NAMES) :])
+    stereo = rig.stereo_pair.with_vector(physical[len(rig.table.mechanism.rig_names) :])
     truth = Truth(with_derived({**parameters, **noise_free}), stereo)
     simulated = simulate(rig, four_point_protocol(2, targets=sheets), 0, truth)
     selection, pose = select_experiments(simulated.campaign), simulated.truth.reference_pose_deg

@@ -19,7 +19,7 @@ from scipy import linalg
 
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.parameters import KINDS, NAMES, TARGETS
+from tvsbayes.instrument.parameters import KINDS, TARGETS
 from tvsbayes.instrument.places import SPACING_DEG, interpolation
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.compiled import compiled, placed
@@ -153,9 +153,9 @@ def place_headlines(
         line = SeenLine(pose_rad, places, share)
 
         def values(point):
-            model = space.model(point[: len(NAMES)])
+            model = space.model(point[: len(z)])
             mirrors = beam_angles(model.optics, pose_rad[0], pose_rad[1])
-            slopes = line_deg_per_step(model, line, root @ point[len(NAMES) :], mirrors)
+            slopes = line_deg_per_step(model, line, root @ point[len(z) :], mirrors)
             return target_values(AtPose(model, mirrors, slopes))
 
         point = jnp.concatenate([z, jnp.zeros(len(root))])
@@ -173,7 +173,7 @@ def expected_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> G
     if not after_data:
         half_normal = np.asarray(space.kind) == KINDS.index("half-normal")
         physical[: len(half_normal)] = np.where(half_normal, np.asarray(space.u), physical[: len(half_normal)])
-    return scales_at(physical, np.asarray(space.harmonic_period_deg))
+    return scales_at(physical, np.asarray(space.harmonic_period_deg), space.mechanism)
 
 
 def windows_of(counters: np.ndarray, deg_per_step: float) -> list[np.ndarray]:
@@ -220,7 +220,8 @@ class FittedErrors:
 
     def covariance_at(self, places: GearPlaces) -> np.ndarray:
         """Compute the covariance of the coordinates and of the errors at other places."""
-        size, count = len(self.places.steps), len(NAMES)
+        size = len(self.places.steps)
+        count = len(self.covariance) - 2 * size
         scales = self.places.scales
         assert scales is not None, "a fit with places has scales"
         # Correlations do not depend on the scale of the errors; a zero scale of the play would divide by zero.

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR
-from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, describe_looks
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.planning.expectation import Knowledge
@@ -69,7 +68,7 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, a
     else:
         for name, columns in knowledge.rig.table.mechanism.prior_groups.items():
             parts[name] = float(np.sum(loading[columns] ** 2))
-        errors = np.split(loading[len(NAMES) :], 2)
+        errors = np.split(loading[len(knowledge.z) :], 2)
         parts |= {
             name: float(error @ error) for name, error in zip((TRANSMISSION_ERROR, PLAY_VARIATION), errors, strict=True)
         }
@@ -88,9 +87,10 @@ def _rounded_down(value: float) -> str:
 
 def _requirement(table: RigTable, columns: Sequence[int], share: float) -> str:
     """Write the stated u of a prior and the required one in words."""
-    if len(columns) == len(NAMES) - len(RIG_NAMES):
+    names, rig = table.mechanism.names, len(table.mechanism.rig_names)
+    if len(columns) == len(names) - rig:
         return f"the stereo calibration to {_rounded_down(100 * share)} % of its present uncertainty"
-    prior_u = {NAMES[c]: table.priors[NAMES[c]].u for c in columns if table.priors[NAMES[c]].u > 0}
+    prior_u = {names[c]: table.priors[names[c]].u for c in columns if table.priors[names[c]].u > 0}
     return " and ".join(f"u({name}) = {_rounded_down(share * u)} instead of {u:.2g}" for name, u in prior_u.items())
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.mechanisms import CONTRAST_COLUMNS
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, action_seconds
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.compiled import compiled, in_batches, placed
@@ -301,10 +301,6 @@ class LookArrays:
         return np.asarray(self._at_pairs(_in_images, z, value, self.IN_IMAGES))
 
 
-CONTRAST_COLUMNS = [INDEX["ratio_contrast_deg_per_step.pan"], INDEX["ratio_contrast_deg_per_step.tilt"]]
-CREEP_COLUMNS = [INDEX["creep_deg.pan"], INDEX["creep_deg.tilt"]]
-
-
 def information_of_looks(
     seen: Seen,
     picks: np.ndarray,
@@ -327,12 +323,14 @@ def information_of_looks(
     """
     looks, index, count = np.unique(picks, return_inverse=True, return_counts=True)
     # q = sum of k_dir dn = k n + (contrast / 2) x path: the contrast's column is the offset's, times the path.
-    factors, linked, axes = path * (np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360), CONTRAST_COLUMNS, [0, 1]
+    factors, linked = path * (np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360), [*CONTRAST_COLUMNS]
+    axes = [0, 1]
     if warm_minutes is not None:
         # Likewise the creep's column: the offset's times the completed share of the creep.
-        creep_share = -np.expm1(-warm_minutes / np.asarray(space.value)[INDEX["creep_minutes"]])
-        creep = creep_share[:, None] * (np.asarray(space.u)[CREEP_COLUMNS] * np.pi / 180)
-        factors, linked, axes = np.hstack([factors, creep]), [*CONTRAST_COLUMNS, *CREEP_COLUMNS], [0, 1, 0, 1]
+        creep_share = -np.expm1(-warm_minutes / np.asarray(space.value)[space.mechanism.index["creep_minutes"]])
+        creeps = space.mechanism.columns("creep_deg")
+        creep = creep_share[:, None] * (np.asarray(space.u)[creeps] * np.pi / 180)
+        factors, linked, axes = np.hstack([factors, creep]), [*CONTRAST_COLUMNS, *creeps], [0, 1, 0, 1]
     sums, squares = np.zeros((len(looks), len(linked))), np.zeros((len(looks), len(linked), len(linked)))
     np.add.at(sums, index, factors)
     np.add.at(squares, index, factors[:, :, None] * factors[:, None, :])

@@ -16,7 +16,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
-from tvsbayes.instrument.parameters import INDEX, TARGET_ROWS
+from tvsbayes.instrument.parameters import TARGET_ROWS
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, too_few_counters
 from tvsbayes.instrument.plan import PlanStep, continued, describe_looks, run_plan
 from tvsbayes.instrument.rig import Rig
@@ -227,8 +227,8 @@ def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:
 def _few_stops(knowledge: Knowledge, plan: Judgement) -> list[str]:
     """Describe directions with too few stops for their scatter in a sentence."""
     counts = few_stops(plan.information.moves, plan.information.seen_moves)
-    free = np.asarray(knowledge.space.u) > 0
-    counts_text = ", ".join(f"{name} {count}" for name, count in counts.items() if free[INDEX[f"stop_sd_deg.{name}"]])
+    free, index = np.asarray(knowledge.space.u) > 0, knowledge.space.mechanism.index
+    counts_text = ", ".join(f"{name} {count}" for name, count in counts.items() if free[index[f"stop_sd_deg.{name}"]])
     return [f"few stops ({counts_text}): too few to estimate their scatter; add stops"] if counts_text else []
 
 

@@ -13,12 +13,13 @@ from functools import cached_property
 
 import numpy as np
 
+from tvsbayes.instrument.mechanisms import CONTRAST_COLUMNS
 from tvsbayes.instrument.parameters import TARGET_ROWS
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanLog, PlanStep, continued, plan_minutes
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates, sheet_choices
 from tvsbayes.planning.expectation import Knowledge
-from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookPlan, Seen, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.looks import LookPlan, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.progress import Advance, unshown
 

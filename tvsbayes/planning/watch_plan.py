@@ -31,15 +31,15 @@ from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Look, ordered_spots, pixels_of
 from tvsbayes.instrument.homing import homed
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.mechanisms import BACKLASH_COLUMNS, CONTRAST_COLUMNS
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_minutes, run_plan
 from tvsbayes.instrument.rig import COSTS_S, Rig
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import counters_made, rests_of
-from tvsbayes.model.parameter_space import STOP_COLUMNS, physical_at
-from tvsbayes.planning.candidates import BACKLASH_COLUMNS, counter_range, have_room, run_up_steps, sheet_choices
+from tvsbayes.model.parameter_space import physical_at
+from tvsbayes.planning.candidates import counter_range, have_room, run_up_steps, sheet_choices
 from tvsbayes.planning.expectation import home_variances_rad2
-from tvsbayes.planning.looks import CONTRAST_COLUMNS, run_up_start
+from tvsbayes.planning.looks import run_up_start
 from tvsbayes.planning.search import smallest_design
 from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
 from tvsbayes.statistics.streams import Stream, random_stream
@@ -148,7 +148,7 @@ class WatchDesigns:
         """Compute the run-up (pan, tilt) that takes up the play by the fit, steps; none of an axis that never moves."""
         physical = physical_at(self.z, self.fit.space).value
         moves = [len({getattr(move, f"{axis}_steps") for move in self.campaign.moves}) > 1 for axis in AXES]
-        return np.where(moves, run_up_steps(physical, physical[BACKLASH_COLUMNS]), 0)
+        return np.where(moves, run_up_steps(physical, self.fit.space.mechanism, physical[BACKLASH_COLUMNS]), 0)
 
     @cached_property
     def _limits(self) -> np.ndarray:
@@ -164,7 +164,7 @@ class WatchDesigns:
     def _prepare(self, linear: LinearSpots, first: int, places: list[int]) -> None:
         """Compute the information of the first session and of every candidate (its row), stop errors integrated out."""
         spelled = linear.spelled_out(linear.places)
-        shifts = slice(len(NAMES), len(NAMES) + columns_of(self.changes)[-1].stop)
+        shifts = slice(len(self.z), len(self.z) + columns_of(self.changes)[-1].stop)
         fisher = stop_information(rows_of(spelled, slice(first))).fisher
         keep = np.r_[: shifts.start, shifts.stop : shifts.stop + linear.places.shape[2]]
         self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
@@ -189,7 +189,8 @@ class WatchDesigns:
 
     def _stop_variance(self, candidate: Candidate) -> np.ndarray:
         physical = physical_at(self.z, self.fit.space).value
-        columns = [STOP_COLUMNS[axis, int(side > 0)] for axis, side in enumerate(candidate.side)]
+        stops = self.fit.space.mechanism.stop_columns
+        columns = [stops[axis, int(side > 0)] for axis, side in enumerate(candidate.side)]
         return np.radians([physical[column] for column in columns]) ** 2
 
     def information(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:

@@ -18,14 +18,14 @@ import xarray as xr
 from tvsbayes.files.packages import version_of
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
-from tvsbayes.instrument.mechanisms import Mechanism
+from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     BLOCKS,
     HARMONIC_NAMES,
     QUANTITIES,
-    RIG_NAMES,
     STEREO_PARAMETER_NAMES,
+    TERMS,
 )
 from tvsbayes.model.headlines import DERIVED, Derived
 from tvsbayes.posterior.chain import fingerprint
@@ -65,9 +65,7 @@ def _of_block(block: str, names: tuple[str, ...]) -> Variable:
     return Variable(names, next(dim for dim, of_dim in COORDS.items() if of_dim == labels))
 
 
-_RIG_BLOCKS = sorted(
-    (block for block, names in BLOCKS.items() if names[0] in RIG_NAMES), key=lambda b: len(BLOCKS[b]) > 1
-)
+_RIG_BLOCKS = sorted({parameter.block: None for parameter in TWO_MIRROR.declared}, key=lambda b: len(BLOCKS[b]) > 1)
 _DERIVED = {block: tuple(n for n in names if n in DERIVED) for block, names in QUANTITIES.blocks.items()}
 VARIABLES: dict[str, Variable] = {
     **{block: _of_block(block, names) for block, names in _DERIVED.items() if names},
@@ -80,8 +78,10 @@ VARIABLES: dict[str, Variable] = {
 
 def variables_of(mechanism: Mechanism) -> dict[str, Variable]:
     """Return the variables of posterior.nc for a mechanism; each term of a head's geometry is one."""
-    shared = {name: spec for name, spec in VARIABLES.items() if mechanism.named(spec.names) == spec.names}
-    return shared | {term.name.replace(".", "_"): Variable((term.name,)) for term in mechanism.terms.values()}
+    own = {*mechanism.names, *derived_names(mechanism)}
+    shared = {name: spec for name, spec in VARIABLES.items() if spec.names[0] in own}
+    terms = [name for name in mechanism.names if mechanism.parameters[name] in TERMS]
+    return shared | {name.replace(".", "_"): Variable((name,)) for name in terms}
 
 
 def _variables(

@@ -19,7 +19,7 @@ from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.inference.summaries import Propagated, carried, propagated, reweighted
 from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS
 from tvsbayes.instrument.mechanisms import Mechanism
-from tvsbayes.instrument.parameters import HEADLINES, INDEX
+from tvsbayes.instrument.parameters import HEADLINES
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import DERIVED, Derived, derived_quantities
@@ -46,8 +46,7 @@ class Draws(Mapping[str, np.ndarray]):
 
     def __init__(self, draws: Derived, mechanism: Mechanism):
         self.derived = draws
-        documented = (name for name in mechanism.names if name in mechanism.documented)
-        self.names = (*documented, *derived_names(mechanism))
+        self.names = (*mechanism.names, *derived_names(mechanism))
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the draws of one quantity."""
@@ -67,8 +66,9 @@ class Draws(Mapping[str, np.ndarray]):
 def headline_names(fit: JointFit) -> tuple[str, ...]:
     """Return the names of the headlines in `Draws` that the campaign moved and priors do not fix."""
     moved, derived = set(legs_of(fit.campaign.moves)), derived_names(fit.space.mechanism)
+    index = fit.space.mechanism.index
     names = [quantity.name for quantity in HEADLINES if quantity.applies(moved)]
-    return tuple(name for name in names if (fit.free[INDEX[name]] if name in INDEX else name in derived))
+    return tuple(name for name in names if (fit.free[index[name]] if name in index else name in derived))
 
 
 @dataclass(frozen=True, repr=False)

@@ -21,13 +21,8 @@ from tvsbayes.estimators.kalman_filter import STATES, Belief, FilterRows, kalman
 from tvsbayes.estimators.likelihood import filter_input
 from tvsbayes.estimators.looks import WINDOW, observe_with_stop_errors
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
-from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.parameter_space import (
-    DRIFT_COLUMNS,
-    HOME_COLUMNS,
-    SCATTER_COLUMNS,
-    STOP_COLUMNS,
     ParameterSpace,
 )
 from tvsbayes.posterior.draws import Posterior
@@ -269,19 +264,19 @@ def looks_again(
     Gears repeat their errors at places (draws, e). Stop errors, home offsets, drifts, positions in the play, scatter of
     looks and pixel noise are drawn again; ranges are as observed.
     """
-    count = len(ordered_spots(fit.campaign))
+    count, mechanism = len(ordered_spots(fit.campaign)), fit.space.mechanism
     arrays = jax.tree.map(lambda of_spot: np.asarray(of_spot)[:count], fit.arrays.spots)
-    sd_rad = np.radians(physical[:, STOP_COLUMNS])
+    sd_rad = np.radians(physical[:, mechanism.stop_columns])
     variance = np.sum(arrays.redraw_mix[None] * sd_rad[:, None] ** 2, axis=3)
     fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
     rows = np.arange(count)[:, None]
     error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
-    home_rad = np.radians(physical[:, None, HOME_COLUMNS])
+    home_rad = np.radians(physical[:, None, mechanism.columns("home_sd_deg")])
     home = np.sqrt(arrays.homed) * home_rad * generator.standard_normal((len(z), count, 2))
     segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(count), 0))
     # Row at which the zero of each axis was set last, for all draws.
     zero = np.maximum.accumulate(np.where(arrays.new_zero, rows, 0), axis=0)[None]
-    drift_rad = np.radians(physical[:, DRIFT_COLUMNS])
+    drift_rad = np.radians(physical[:, mechanism.columns("drift_deg_per_root_hour")])
     walked = drift_rad[:, None] * np.sqrt(arrays.hours) * generator.standard_normal(home.shape)
     total = np.cumsum(walked, axis=1)
     # The zero drifts as a random walk from its homing on.
@@ -290,8 +285,9 @@ def looks_again(
     # The position in the play is Gaussian after an unknown approach, as in the filter.
     place = generator.standard_normal(home.shape)[:, segment]
     error = error + fit.linearised.play_sd_rad * place
-    pixel_scale = physical[:, INDEX["pixel_scale"]].reshape(-1, 1, 1)
+    pixel_scale = physical[:, mechanism.index["pixel_scale"]].reshape(-1, 1, 1)
     root = np.linalg.inv(arrays.whitening)
     noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal((len(z), count, 4)))
-    error = error + np.radians(physical[:, None, SCATTER_COLUMNS]) * generator.standard_normal(error.shape)
+    scatter_rad = np.radians(physical[:, None, mechanism.columns("look_scatter_deg")])
+    error = error + scatter_rad * generator.standard_normal(error.shape)
     return looks(fit, z, error) + pixel_scale * noise

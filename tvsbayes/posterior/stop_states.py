@@ -15,7 +15,6 @@ import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots
-from tvsbayes.model.parameter_space import HOME_COLUMNS, STOP_COLUMNS
 
 
 @dataclass(frozen=True)
@@ -59,9 +58,9 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     """Expand the filter's six states: one column for each new draw of a state."""
     spots, states = linear.load.shape[0], linear.load.shape[2]
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
-    physical = np.asarray(fit.mode.physical)
-    variance_of, homed = np.radians(physical[STOP_COLUMNS]) ** 2, np.asarray(fit.arrays.spots.homed)
-    of_homing = np.diag(np.radians(physical[HOME_COLUMNS]) ** 2)
+    physical, mechanism = np.asarray(fit.mode.physical), fit.space.mechanism
+    variance_of, homed = np.radians(physical[mechanism.stop_columns]) ** 2, np.asarray(fit.arrays.spots.homed)
+    of_homing = np.diag(np.radians(physical[mechanism.columns("home_sd_deg")]) ** 2)
     times = []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])

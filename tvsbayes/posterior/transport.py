@@ -21,35 +21,24 @@ from scipy import linalg
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import residuals
 from tvsbayes.estimators.linear_spots import linear_spots
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
+from tvsbayes.instrument.mechanisms import RATIO_COLUMNS, Mechanism
+from tvsbayes.instrument.parameters import BLOCKS, KINDS, NOISE_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import BlockRoot, column_blocks
-from tvsbayes.model.parameter_space import (
-    DRIFT_COLUMNS,
-    FARTHEST_SD,
-    HOME_COLUMNS,
-    RATIO_COLUMNS,
-    SCATTER_COLUMNS,
-    STOP_COLUMNS,
-    half_normal,
-    half_normal_slope,
-)
+from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal, half_normal_slope
 from tvsbayes.posterior.linear_campaign import Conditional, Creep, LinearCampaign
 from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.plays import Cut, HalfNormal
 from tvsbayes.posterior.stop_states import Elimination, StopStates, stop_states
 
-GEAR_SCALES = np.array(
-    [
-        INDEX[name]
-        for name in names_of(
-            *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "harmonic_amplitude_deg")
-        )
-    ]
+GEAR_SCALES = (
+    "transmission_error_deg",
+    "transmission_error_length_deg",
+    "play_variation_deg",
+    "harmonic_amplitude_deg",
 )
-"""Coordinates on which the covariance of the errors at places depends."""
-CREEP_COLUMNS = np.array([INDEX[name] for name in names_of("creep_deg")])
+"""Blocks of parameters on which the covariance of the errors at places depends."""
 WALK_STEPS = 128
 """Largest number of steps of a drift between two homings; it is linear within each."""
 WALK_INFORMATION = 1.0
@@ -71,7 +60,7 @@ the play makes a kink in the residuals, whose second difference grows as the ste
 SCALE_NAMES = (*NOISE_NAMES, *BLOCKS["creep_minutes"])
 """Coordinates on which all others are conditioned: noise scales, and the time constant of a creep, in which the spots
 are strongly nonlinear."""
-HEAVY_NAMES = (*SCALE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm")
+HEAVY_NAMES = (*SCALE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y")
 """Coordinates whose tails are heavier than normal: those that few stops determine (a walker did not move for 155 steps
 at 3.7 sd of a stop sd), and the tilt of the frames with the mirrors' offset. Each is always proposed from a table and a
 t of its own."""
@@ -141,6 +130,7 @@ class Transport:
     """The map w -> z; its Jacobian is |det root| exp(`Mapped.log_jacobian`).
 
     Attributes:
+        mechanism: the instrument.
         mode: z at w = 0, shape (p,).
         physical: values of the parameters there, in the units of their names, shape (p,).
         free: sampled columns of z, (d,): noise scales, then all others, the widest conditional sd first.
@@ -161,6 +151,7 @@ class Transport:
         period_deg: periods of the gears' errors, shape (2, 3).
     """
 
+    mechanism: Mechanism
     mode: np.ndarray
     physical: np.ndarray
     free: np.ndarray
@@ -186,7 +177,7 @@ class Transport:
     @property
     def heavy(self) -> np.ndarray:
         """Mark the coordinates of `HEAVY_NAMES`, shape (d,)."""
-        return np.isin(np.array(NAMES)[self.free], HEAVY_NAMES)
+        return np.isin(np.array(self.mechanism.names)[self.free], (*HEAVY_NAMES, self.mechanism.optics_names[0]))
 
     @property
     def coupled(self) -> np.ndarray:
@@ -194,7 +185,7 @@ class Transport:
 
         They are wide: where several of them are far out together, the proposal fits the target badly.
         """
-        return np.isin(np.array(NAMES)[self.free], OPTICS_NAMES)
+        return np.isin(np.array(self.mechanism.names)[self.free], self.mechanism.optics_names)
 
     def noise_of(self, *columns: int) -> np.ndarray:
         """Mark with 1 the noise coordinate that is each of some columns (k,) of z, shape (k, q)."""
@@ -203,17 +194,17 @@ class Transport:
     @cached_property
     def pixels(self) -> np.ndarray:
         """Mark with 1 the noise coordinate that scales all pixels, shape (q,)."""
-        return self.noise_of(INDEX["pixel_scale"])[0]
+        return self.noise_of(self.mechanism.index["pixel_scale"])[0]
 
     @cached_property
     def creep_noise(self) -> np.ndarray:
         """Mark with 1 the noise coordinate that is the time constant of a creep, shape (q,)."""
-        return self.noise_of(INDEX["creep_minutes"])[0]
+        return self.noise_of(self.mechanism.index["creep_minutes"])[0]
 
     @cached_property
     def plays(self) -> tuple[int, ...]:
         """Return the positions in y, without noise coordinates, of backlashes that are not narrow."""
-        wide = np.array(NAMES)[self.free[self.noise : self.dimension - self.narrow]]
+        wide = np.array(self.mechanism.names)[self.free[self.noise : self.dimension - self.narrow]]
         return tuple(np.flatnonzero(np.isin(wide, BLOCKS["backlash_deg"])))
 
     def _play_at_mode(self, place: int) -> HalfNormal:
@@ -260,10 +251,12 @@ class Transport:
 
     def _place_roots(self, log_scale: np.ndarray) -> BlockRoot:
         """Compute factors of the covariance of errors at places, then of drift terms, at ln of noise scales (n, q)."""
-        values = np.zeros((len(log_scale), len(NAMES)))
-        values[:, GEAR_SCALES] = self.physical[GEAR_SCALES] * np.exp(log_scale @ self.noise_of(*GEAR_SCALES).T)
-        errors = column_blocks(scales_at(values, self.period_deg), self.angle_rad, self.on_tilt, self.of_play)
-        drift = np.radians(self.physical[DRIFT_COLUMNS]) * np.exp(log_scale @ self.noise_of(*DRIFT_COLUMNS).T)
+        mechanism, values = self.mechanism, np.zeros((len(log_scale), len(self.physical)))
+        scales, drifts = mechanism.columns(*GEAR_SCALES), mechanism.columns("drift_deg_per_root_hour")
+        values[:, scales] = self.physical[scales] * np.exp(log_scale @ self.noise_of(*scales).T)
+        gears = scales_at(values, self.period_deg, mechanism)
+        errors = column_blocks(gears, self.angle_rad, self.on_tilt, self.of_play)
+        drift = np.radians(self.physical[drifts]) * np.exp(log_scale @ self.noise_of(*drifts).T)
         terms = (drift @ self.drift_axis.T)[..., None] * np.eye(len(self.drift_axis))
         return BlockRoot((*errors.blocks, terms))
 
@@ -277,7 +270,8 @@ class Transport:
         weight = np.exp(-2 * log_scale @ self.pixels)
         places, count = linear.places.shape[1], linear.columns.shape[1]
         later = None if linear.creep is None else linear.creep.later(log_scale @ self.creep_noise)
-        inner = linear.looks.inner(weight[:, None] * np.exp(2 * log_scale @ self.noise_of(*SCATTER_COLUMNS).T))
+        scatter = self.noise_of(*self.mechanism.columns("look_scatter_deg"))
+        inner = linear.looks.inner(weight[:, None] * np.exp(2 * log_scale @ scatter.T))
         products = linear.at(inner, later)
         variance = linear.constant + np.exp(2 * log_scale) @ linear.by_noise.T
         elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance), products.of_states)
@@ -440,10 +434,11 @@ def walks(fit: JointFit, stops: StopStates) -> Walks:
     spots = jax.tree.map(lambda x: np.asarray(x)[: len(slope)], fit.arrays.spots)
     sd = np.sqrt(stops.variance.sum(axis=1) + stops.constant)[None]
     of_stops = Elimination.of(stops, sd, stops.gram[stops.overlapping][None])
-    above = fit.z[DRIFT_COLUMNS] + np.sqrt(np.diag(fit.covariance)[DRIFT_COLUMNS])
-    scale = np.radians(half_normal(above) * np.asarray(fit.space.u)[DRIFT_COLUMNS])
+    drifts = fit.space.mechanism.columns("drift_deg_per_root_hour")
+    above = fit.z[drifts] + np.sqrt(np.diag(fit.covariance)[drifts])
+    scale = np.radians(half_normal(above) * np.asarray(fit.space.u)[drifts])
     columns, axes = [np.empty((slope.size // 2, 0))], [np.empty((0, 2))]
-    for axis in np.flatnonzero(fit.free[DRIFT_COLUMNS]):
+    for axis in np.flatnonzero(fit.free[drifts]):
         begins = np.flatnonzero(spots.new_zero[:, axis])
         for begin, end in zip(begins, [*begins[1:], len(slope)], strict=True):
             hours = np.cumsum(spots.hours[begin:end, axis])
@@ -470,12 +465,12 @@ def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Cre
         errors: number of columns of errors at places and drifts, before those of y.
         looks: noise of all looks.
     """
-    minutes = INDEX["creep_minutes"]
+    minutes, creeps = fit.space.mechanism.index["creep_minutes"], fit.space.mechanism.columns("creep_deg")
     if not fit.free[minutes]:
         return None
     physical, moves = np.asarray(fit.mode.physical), np.asarray(fit.arrays.spots.move_index)[: len(looks.load)]
-    unit_rad = np.radians(np.asarray(fit.space.u)[CREEP_COLUMNS])
-    at_mode = -np.radians(physical[CREEP_COLUMNS])
+    unit_rad = np.radians(np.asarray(fit.space.u)[creeps])
+    at_mode = -np.radians(physical[creeps])
     rows = np.column_stack([np.zeros((2, errors)), unit_rad[:, None] * by_y[:, ::-1], at_mode])
     rows /= looks.unit_rad[:, None]
     return Creep(np.asarray(fit.arrays.moves.warm_minutes)[moves], float(physical[minutes]), looks, rows)
@@ -483,16 +478,17 @@ def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Cre
 
 def look_noise(fit: JointFit) -> LookNoise:
     """Build the noise of a fit's looks, up to a scatter that its prior allows."""
-    slope, held = np.asarray(fit.linearised.slope), ~fit.free[SCATTER_COLUMNS]
-    variance_rad2 = np.radians(np.asarray(fit.mode.physical)[SCATTER_COLUMNS]) ** 2
-    at = np.where(held, FAR_SD, fit.z[SCATTER_COLUMNS])
+    columns = fit.space.mechanism.columns("look_scatter_deg")
+    slope, held = np.asarray(fit.linearised.slope), ~fit.free[columns]
+    variance_rad2 = np.radians(np.asarray(fit.mode.physical)[columns]) ** 2
+    at = np.where(held, FAR_SD, fit.z[columns])
     most = FAR_PIXELS * (half_normal(np.array(FAR_SD)) / half_normal(at)) ** 2
     return LookNoise.of(slope, np.asarray(fit.arrays.spots.weight)[: len(slope)], variance_rad2, most)
 
 
 def transport(fit: JointFit) -> Transport:
     """Build the map at the mode of a converged fit."""
-    by_noise = np.isin(NAMES, SCALE_NAMES)
+    by_noise = np.isin(fit.names, SCALE_NAMES)
     others = np.flatnonzero(fit.free & ~by_noise)
     covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
     order = by_width(covariance)
@@ -533,7 +529,8 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
         wide: lower triangular factor of their covariance, shape (g, g).
     """
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
-    names, physical = np.array(NAMES), np.asarray(fit.mode.physical)
+    mechanism, physical = fit.space.mechanism, np.asarray(fit.mode.physical)
+    names = np.array(fit.names)
     free = np.flatnonzero(fit.free)
     scales = np.isin(names[free], SCALE_NAMES)
     # The scatter of looks comes first: given it, the other scales are nearly independent.
@@ -542,11 +539,12 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
     stops, looks = stop_states(fit, linear), look_noise(fit)
     drifts = walks(fit, stops)
-    by_noise = np.append(STOP_COLUMNS, HOME_COLUMNS)[:, None] == noise
+    by_noise = np.append(mechanism.stop_columns, mechanism.columns("home_sd_deg"))[:, None] == noise
     gears = fit.arrays.gears.without_padding()
     columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, gears.columns)
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
     ratio = np.radians(physical[RATIO_COLUMNS])
+    creeps = others == mechanism.columns("creep_deg")[:, None]
     spots = len(linear.residual)
 
     def misfit(z: np.ndarray) -> np.ndarray:
@@ -556,6 +554,7 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     for place in np.flatnonzero(np.isin(names[others], BLOCKS["backlash_deg"])):
         precision[place] = HalfNormal(float(fit.z[others[place]])).precision
     return Transport(
+        mechanism=mechanism,
         mode=fit.z,
         physical=physical,
         free=np.concatenate([noise, others]),
@@ -574,7 +573,7 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
             places=np.column_stack([columns, drifts.columns]),
             prior=(wide.T * precision) @ wide,
             looks=looks,
-            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, gears.columns + len(drifts.axis), looks),
+            creep=creep(fit, creeps @ wide, gears.columns + len(drifts.axis), looks),
         ),
         residuals=misfit,
         bend=np.zeros((len(others), 0, 0)),

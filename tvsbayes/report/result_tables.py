@@ -14,7 +14,7 @@ from tvsbayes.display import concise
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.experiments import name_of
-from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
+from tvsbayes.instrument.parameters import HEADLINES, QUANTITIES, TERMS, names_of
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.tables import (
     TableView,
@@ -35,7 +35,7 @@ KEY_PARAMETERS = (
     *names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale"),
 )
 """Parameters of the last table of a fit."""
-HEAD_PARAMETERS = tuple(term.name for term in HEAD_TERMS.values())
+HEAD_PARAMETERS = tuple(term.name for term in TERMS)
 """The terms of a head, which follow them."""
 MORE_PARAMETERS = names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm", "home_sd_deg")
 """Parameters of the table of details."""

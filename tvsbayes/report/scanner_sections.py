@@ -15,7 +15,7 @@ from tvsbayes.display import concise
 from tvsbayes.estimators.four_point import ClassicResult, Experiment
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.experiments import name_of
-from tvsbayes.instrument.parameters import parameter_of
+from tvsbayes.instrument.parameters import REGISTRY
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.document import FigureView, Section, labelled, sentence
@@ -416,7 +416,7 @@ def _pairs(tables: Sequence[BudgetTable]) -> list[list[BudgetTable]]:
 def _source_text(row: BudgetRow) -> str:
     """The source of a row in words, with the unit of its u; standardised effects are in sds."""
     words = source_in_words(row.quantity)
-    standardised = row.unit == "1" and parameter_of(row.quantity.removeprefix("prior of ")) is None
+    standardised = row.unit == "1" and row.quantity.removeprefix("prior of ") not in REGISTRY
     unit = "in sds" if standardised else row.unit.removesuffix("1")
     return words if row.u is None or not unit or words.endswith(f", {unit}") else f"{words}, {unit}"
 
@@ -477,7 +477,7 @@ def _gap_note(budget: BudgetTable, result: Estimate | None) -> str:
     low, high = result.interval95
     half = 0.5 * (high - low)
     linear_low, linear_high = budget.estimate - budget.expanded, budget.estimate + budget.expanded
-    parameter = parameter_of(budget.quantity)
+    parameter = REGISTRY.get(budget.quantity)
     never_below = parameter is not None and parameter.prior.distribution == "half-normal"
     note = ", which extends below 0, where no value is possible" * (never_below and linear_low < 0 <= low)
     rounding = 10.0 ** (math.floor(math.log10(half)) - 1) if half > 0 else 0.0

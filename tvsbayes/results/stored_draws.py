@@ -5,8 +5,8 @@ Draws in the units of the names, ratios in deg/step, pose in rad; mode and covar
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from tvsbayes.calibration.calibration_file import calibration_arrays
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.homing import ANYWHERE
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.results.store import damaged_draws, write_fit
 
 if TYPE_CHECKING:
@@ -43,6 +44,18 @@ class StoredMode:
     valid: np.ndarray
     weight: np.ndarray
     sides: tuple[str, ...] = ("", "")
+
+    def of(self, names: Sequence[str], rig_names: Sequence[str]) -> StoredMode | None:
+        """The mode of these parameters alone, those with a prior in `[rig]`; None where the file lacks one.
+
+        Heads of 0.3.0 and before also stored what they lack, fixed and so independent of all others.
+        """
+        own = {name: row for row, name in enumerate(self.names)}
+        if not set(names) <= set(own) or len(self.names) - self.prior.shape[1] not in (0, len(STEREO_PARAMETER_NAMES)):
+            return None
+        rows, rig = [own[name] for name in names], [own[name] for name in rig_names]
+        covariance = self.covariance[np.ix_(rows, rows)]
+        return replace(self, names=tuple(names), z=self.z[rows], covariance=covariance, prior=self.prior[:, rig])
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.files.packages import own_version
 from tvsbayes.gears.priors import half_normal_sd, half_normal_slope
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.mechanisms import BACKLASH_COLUMNS
 from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
 from tvsbayes.model.headlines import Derived
-from tvsbayes.planning.candidates import BACKLASH_COLUMNS
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import Knowledge, fit_places, fitted_errors, information_of, prior_knowledge
 from tvsbayes.planning.gear_places import NO_PLACES, expected_scales

@@ -17,13 +17,12 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
 from tvsbayes.instrument.axes import AXES, SENSES, SIDES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.mechanisms import MECHANISMS
+from tvsbayes.instrument.mechanisms import Mechanism, mechanism_of
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     LATE_NAMES,
     REGISTRY,
-    RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
 )
@@ -95,7 +94,7 @@ class Truth(WithStereo):
     def as_json(self, campaign: Campaign) -> dict[str, Any]:
         """Return the document of truth.json for a campaign of this rig, with effective ratios if it has looks."""
         mechanism = campaign.rig.mechanism
-        constants, stereo = mechanism.fixed, self.stereo
+        constants, stereo = mechanism.constants, self.stereo
         cameras = {} if stereo is None else dict(zip(STEREO_PARAMETER_NAMES, stereo.vector.tolist(), strict=True))
         document: dict[str, Any] = {
             "format": TRUTH_FORMAT,
@@ -134,11 +133,9 @@ class Truth(WithStereo):
         """Rebuild from truth.json; image size and covariance come from the campaign's `stated` stereo."""
         pose, known = document["reference_pose_deg"], document["stereo"]
         # Older files without errors of gears, scatter of looks and shifts of zeros have none of them.
-        perfect = {name: RIG_PRIORS[name].value for name in (*GEAR_ERROR_NAMES, *LATE_NAMES)}
+        perfect = {name: REGISTRY[name].prior.value for name in (*GEAR_ERROR_NAMES, *LATE_NAMES)}
         parameters = {name: float(value) for name, value in document["parameters"].items()}
-        heads = [each for each in MECHANISMS.values() if any(term.name in parameters for term in each.terms.values())]
-        constants = {name: head.fixed[name] for head in heads for name in head.fixed.keys() - {*STEREO_PARAMETER_NAMES}}
-        parameters = {**perfect, **constants, **parameters}
+        parameters = {**perfect, **_constants(mechanism_of(parameters)), **parameters}
         side, tables = document.get("homing_side"), document.get("gear_error")
         return cls(
             parameters=parameters,
@@ -152,6 +149,11 @@ class Truth(WithStereo):
             gear_errors=PERFECT if tables is None else _tabulated(tables, parameters),
             note=str(document["note"]),
         )
+
+
+def _constants(mechanism: Mechanism) -> dict[str, float]:
+    """Return the constants of an instrument but for cameras."""
+    return {name: value for name, value in mechanism.constants.items() if name not in STEREO_PARAMETER_NAMES}
 
 
 def _tabulated(tables: Mapping[str, Mapping[str, Sequence[float]]], parameters: Mapping[str, float]) -> GearErrors:
@@ -203,12 +205,12 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     (gears,) = rng.spawn(1)
 
     def drawn(names: Iterable[str], stream: np.random.Generator) -> dict[str, float]:
-        return {name: _draw(rig.truth.get(name, rig.table.priors[name]), stream) for name in names}
+        return {name: _draw(rig.truth.get(name, priors[name]), stream) for name in names}
 
-    rig_names = rig.table.mechanism.rig_names
-
+    constants = _constants(rig.table.mechanism)
+    priors = rig.table.priors | {name: Prior(value, 0.0) for name, value in constants.items()}
     late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
-    parameters = drawn((n for n in rig_names if n not in late), rng)
+    parameters = drawn((each.name for each in rig.table.mechanism.declared if each.name not in late), rng)
     # By eigenvectors, since fixed parameters give a semi-definite covariance, for which Cholesky fails.
     cameras, covariance = stereo_parameters(rig.stereo), stereo_covariance(rig.stereo)
     variances, vectors = np.linalg.eigh(covariance)

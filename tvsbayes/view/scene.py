@@ -26,7 +26,7 @@ from tvsbayes.instrument.campaign import (
     read_campaign,
     stereo_spots,
 )
-from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
+from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.pipeline import StoredOrFitted, Tell, compile_for, no_output
@@ -196,8 +196,8 @@ def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
         return None
     if fitted is None:
         arrays = campaign_arrays(campaign)
-        turned = np.zeros((int(arrays.count), 2))
-        return laser_ways(np.zeros(len(NAMES)), turned, parameter_space(campaign.rig, campaign.stereo), arrays)
+        turned, space = np.zeros((int(arrays.count), 2)), parameter_space(campaign.rig, campaign.stereo)
+        return laser_ways(np.zeros(space.size), turned, space, arrays)
     fit = fitted.fit
     turned = turned_by(fit.arrays, np.asarray(fit.mode.place_errors_rad)[None])[0]
     return laser_ways(fit.z, turned, fit.space, fit.arrays)
@@ -271,7 +271,7 @@ def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow
     """Parameters of the record, headlines first; else the stated priors."""
     if fitted is None:
         stated = campaign.rig.priors
-        return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES)
+        return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in stated)
     named = fitted.record.summary.named.items()
     return tuple(ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction) for name, e in named)
 
