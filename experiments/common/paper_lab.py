@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import datetime
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tvsbayes.instrument.campaign import CAMERAS, Campaign, frame_name
+from tvsbayes.instrument.campaign import CAMERAS, Campaign, frame_name, read_campaign
 from tvsbayes.instrument.experiments import experiments_of
 
 BEGUN = datetime.datetime(2025, 7, 24, 9, 0, 0)
@@ -109,3 +110,14 @@ def write_lab(lab: Lab, campaign: Campaign, frames: Path, folder: Path) -> dict[
     with (folder / "book.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([[*lab.columns, *["Direction"] * lab.direction], *rows])
     return names
+
+
+def misplaced(names: Mapping[int, tuple[str, str]], pictures: Path, mine: Path) -> int:
+    """Number of pictures in `frames/` that are not those of their look; looks are numbered by the rows of the book."""
+    looks = sorted(read_campaign(mine).spots, key=lambda spot: (spot.move, spot.spot))
+    wrong = 2 * abs(len(looks) - len(names))
+    for look, own in zip(looks, (names[spot] for spot in sorted(names)), strict=False):
+        for side, name in zip(CAMERAS, own, strict=True):
+            file = mine / frame_name(look.spot, side)
+            wrong += not file.is_file() or file.read_bytes() != (pictures / name).read_bytes()
+    return wrong

@@ -3,20 +3,18 @@
     python -m experiments.real.two_fields > experiments/real/two_fields.md
 
 Real beams (data/real/spots): what alternates between their rows, gain and place. The same with their odd rows moved on
-purpose. Pictures of the twin, which read all rows at once: how many are widened. And what looking costs.
+purpose. Pictures of the twin, which read all rows at once: how many are widened.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
-from experiments.common.clock import timed
 from experiments.common.command_line import print_only
 from experiments.real.beams import BEAMS, deviations, parts_of
-from tvsbayes.cameras.spot_fit import Centre, centre_of, fit_spot, measured_noise, widened
+from tvsbayes.cameras.spot_fit import Centre, centre_of, measured_noise, widened
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.cameras.spot_window import Patch, patch_around
 from tvsbayes.files.images import in_grey_levels, read_image
@@ -25,7 +23,6 @@ from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
 MOVED_PX = (0.05, 0.1, 0.2, 0.5, 2.0)
 SPOTS = 1000
 SIZES_PX, PEAKS_DN, CONTRASTS = (2.0, 2.5, 4.0, 8.0), (60.0, 200.0, 500.0), (0.0, 0.4)
-TIMED = 60
 TEXT = """Written by `python -m experiments.real.two_fields`. Real beams (`data/real/spots`): by how much the odd rows
 are brighter; centre of odd less that of even rows (u, v); the same in sds as the two halves state them, each by its own
 pixels; in sds of what the stated uncertainty of the whole leads to (twice u, white noise); u of v of the whole. Then
@@ -101,7 +98,7 @@ def real_rows() -> None:
 
 
 def twin_row() -> None:
-    """How many of the twin's pictures are widened, and the time of looking."""
+    """How many of the twin's pictures are widened."""
     rng, widened_spots, good, chi2 = np.random.default_rng(22), 0, 0, []
     for number in range(SPOTS):
         sd, peak = rng.choice(SIZES_PX), rng.choice(PEAKS_DN)
@@ -135,37 +132,12 @@ def mono_picture(mark: Footprint, contrast: float, seed: int) -> np.ndarray:
     return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def costs() -> None:
-    """CPU time of looking at alternate lines beside that of finding and fitting a spot in a whole picture."""
-    mark = Footprint(np.array([640.3, 360.8]), 2.5**2 * np.eye(2), 200.0)
-    noise = SpotNoise(Sensor().gain_dn_per_electron, 0.4)
-    pictures = [render_spot(mark, 1280, 720, Scene(), Sensor(), (24, k, 0)) for k in range(4)]
-    files = [cv2.imencode(".png", picture)[1] for picture in pictures]
-    patches = [patch for picture in pictures if not isinstance(patch := patch_around(picture), str)]
-    fits = [fitted for patch in patches if (fitted := fit_spot(patch, noise)) is not None]
-
-    def whole() -> None:
-        for number in range(TIMED):
-            widened([bare(cv2.imdecode(files[number % len(files)], cv2.IMREAD_UNCHANGED), noise)])
-
-    def looking() -> None:
-        for number in range(TIMED):
-            # Anew, without its cached gains.
-            fitted = replace(fits[number % len(fits)])
-            widened([Centre("ok", fitted.centre_px, np.eye(2), lines_px=fitted.shift_of_lines())])
-
-    all_s, own_s = (min(timed(job)[1]["cpu_s"] for _ in range(3)) / TIMED for job in (whole, looking))
-    print(f"\nA picture of 1280 x 720 px, a spot of 2.5 px: {1e3 * all_s:.1f} ms of CPU decoded, found and fitted,")
-    print(f"{1e3 * own_s:.2f} ms of them ({100 * own_s / all_s:.1f} %) for alternate lines.")
-
-
 def main() -> None:
     print_only(__doc__)
     print("# Pictures read in two fields\n")
     print(TEXT)
     real_rows()
     twin_row()
-    costs()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How fast, how exact and how large is tvsbayes beside its peers?
 
-    taskset -c 0 python -m experiments.speed.benchmarks run --parts posterior spots stereo     # the compared code
+    taskset -c 0 python -m experiments.speed.benchmarks run --parts spots stereo     # the compared code
     python -m experiments.speed.benchmarks run --parts commands scaling                # as users start them
     python -m experiments.speed.benchmarks table > experiments/speed/benchmarks.md
 
@@ -141,18 +141,6 @@ PARTS = {
         "size; Laplace only. The first fit holds the compilation, which the shape of a campaign decides.",
         {"reading_s": ("read, s", ".3g"), "first_s": ("first fit, s", ".3g"), "warm_s": ("warm fit, s", ".3g"),
          "rss_mib": ("peak memory, MiB", ".0f")}, tuple(f"{n} spots" for n in SIZES), scaling, repeats=1),
-    "posterior": Part("Sampling the posterior", "60 spots of the mounted rig, both axes moved between any two. Worst "
-        "bulk effective draws of all free parameters over the process' CPU seconds, compilation apart. `tvsbayes` is "
-        "`sample` from the fit until its own limits are met; tier 1 alone ends before the chain, its effective draws "
-        f"are those of the means. NUTS ({peers.CHAINS} chains in step, {peers.WARMUP} + {peers.DRAWS} draws each) "
-        "samples Laplace-whitened coordinates, sheared as in `sampler/nuts_reference.py`; its seconds hold transport "
-        f"and warm-up. To an interval: until the worst parameter has {peers.TRUSTED} effective draws, or ours has met "
-        "its limits, which ask for more.",
-        {"ess": ("worst bulk ESS", ".0f"), "rhat": ("worst R-hat", ".4f"), "cpu_s": ("CPU s", ".3g"),
-         "rate": ("ESS per CPU s", ".3g"), "trusted_s": ("to an interval, CPU s", ".3g"),
-         "sampling_rate": ("of the draws alone", ".3g"), "leapfrogs": ("leapfrogs a draw", ".3g"),
-         "divergences": ("divergences", ".0f"), "compile_s": ("compilation, CPU s", ".3g")},
-        (OURS, peers.FIRST_TIER, peers.NUTS), peers.samplers, "rate", 3),
     "spots": Part("Spot centres", "Rendered frames of 48 looks, 1280 x 720 px PNG. Error of one coordinate against the "
         "twin's true centre. From file to centre on one thread; ours hold safe reading, learning the noise, a "
         "covariance and the epipolar check. photutils has no finder for one laser spot: it is given our window around "

@@ -15,64 +15,10 @@ import numpy as np
 
 from experiments.common.against_truth import rms
 from experiments.common.clock import timed
-from experiments.common.rigs import dense_plan, mounted_rig, pixels_of, small_plan
+from experiments.common.rigs import mounted_rig, pixels_of, small_plan
 
 Work = Callable[[int], Mapping[str, object]]
 OURS = "tvsbayes"
-
-
-CHAINS, WARMUP, DRAWS, TRUSTED = 4, 250, 500, 400
-"""Of NUTS; effective draws that four chains need before an interval is trusted (Vehtari et al., 10.1214/20-BA1221)."""
-FIRST_TIER, NUTS = "tvsbayes, tier 1 alone", "NumPyro NUTS, sheared"
-
-
-def samplers(_: Path) -> Mapping[str, Work]:
-    import jax
-    import jax.numpy as jnp
-    from arviz_stats.base import array_stats
-
-    from experiments.common.reference_samplers import AXES, Setting, build_transport, nuts, potential_of
-    from tvsbayes.estimators.joint_fit import fit
-    from tvsbayes.model.compilation_cache import use_compilation_cache
-    from tvsbayes.posterior.sampling import sample
-    from tvsbayes.results.tiers import CHAIN
-    from tvsbayes.statistics.weighted_draws import weighted_summary
-    from tvsbayes.twin.simulated_campaign import simulate
-
-    use_compilation_cache()
-    jax.config.update("jax_enable_x64", True)
-    joint = fit(simulate(mounted_rig(), dense_plan(("d1", "d3")), seed=1).campaign)
-    free = np.flatnonzero(joint.free)
-
-    def worst(z: np.ndarray) -> dict[str, float]:
-        ess, rhat = array_stats.ess(z, method="bulk", **AXES), array_stats.rhat(z, **AXES)
-        return {"ess": float(np.min(ess)), "rhat": float(np.max(rhat))}
-
-    def ours(tier: str, seed: int) -> Mapping[str, object]:
-        posterior, cost = timed(lambda: sample(joint, tier, seed=seed, max_minutes=30.0))
-        if tier == CHAIN:
-            figures = worst(posterior.z[..., free])
-        else:
-            summary = weighted_summary(posterior.z[0][:, free], posterior.weights[0])
-            figures = {"ess": float(np.min(summary.ess_mean))}
-        rate = figures["ess"] / cost["cpu_s"]
-        return {**cost, **figures, "converged": posterior.converged, "rate": rate, "trusted_s": cost["cpu_s"]}
-
-    def hamiltonian(seed: int) -> Mapping[str, object]:
-        route, built = timed(lambda: build_transport(joint))
-        z_of, potential = potential_of(joint, route)
-        run = nuts(potential, route.index.size, Setting(CHAINS, WARMUP, DRAWS, seed))
-        flat = jnp.asarray(run.draws.reshape(-1, run.draws.shape[-1]))
-        z = np.asarray(jax.jit(jax.vmap(z_of))(flat)).reshape(*run.draws.shape[:2], -1)
-        figures, before_s = worst(z[..., free]), built["cpu_s"] + run.warmup_s
-        row = {**figures, "cpu_s": before_s + run.sampling_s, "compile_s": run.compile_s, "leapfrogs": run.leapfrogs}
-        row |= {"rate": figures["ess"] / row["cpu_s"], "sampling_rate": figures["ess"] / run.sampling_s}
-        row["trusted_s"] = before_s + run.sampling_s * TRUSTED / figures["ess"]
-        return row | {"divergences": run.divergences}
-
-    works = {OURS: partial(ours, CHAIN), FIRST_TIER: partial(ours, "importance"), NUTS: hamiltonian}
-    ours("importance", 0)
-    return works
 
 
 BRIGHT = 0.2

@@ -9,8 +9,7 @@ import pytest
 from support.commands import MOUNTED, assert_error
 from support.drawn_pictures import drawn
 
-from experiments.common.paper_lab import LABS, keys_of, write_lab
-from experiments.paper.lab import misplaced
+from experiments.common.paper_lab import LABS, keys_of, misplaced, write_lab
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import CAMERAS, frame_name, read_campaign
