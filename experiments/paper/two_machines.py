@@ -6,23 +6,19 @@ the plans are the paper's, each experiment from a homing at its start. deg/step,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from experiments.common.rigs import PAPER_NOISE, mounted_rig, numbered, paper_values
-from experiments.common.worth import searched_family
+from experiments.common.rigs import PAPER_NOISE, numbered, paper_values
 from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.instrument.protocols import RUN_UP_STEPS, grid_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
-from tvsbayes.planning.expectation import prior_knowledge
-from tvsbayes.planning.search import Scope
 from tvsbayes.twin.physics import mirror_chain, project
 from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
 
@@ -35,43 +31,19 @@ STEPS, STARTS = 200, {"left": (0, 0), "right": (200, 0), "up": (100, -100), "dow
 """Counters of pan and tilt at which the experiments of a direction start."""
 
 
-def four_point_plan(
-    repeats: int = 24, steps: Sequence[int] = (200,), other_side: Sequence[bool] = (False,)
-) -> tuple[PlanStep, ...]:
-    """The paper's experiments, each from a homing at its start; `other_side` starts have a run-up against it."""
+def four_point_plan(repeats: int = 24) -> tuple[PlanStep, ...]:
+    """The paper's experiments, each from a homing at its start."""
     orders: list[tuple] = []
     for direction, (name, sign) in DIRECTION_SIGNS.items():
-        start, axis = STARTS[direction], AXES.index(name)
-        home_sign = (-1, 1)[axis]
+        start = STARTS[direction]
+        end = list(start)
+        end[AXES.index(name)] += sign * STEPS
         for repeat in range(repeats):
             number = DIRECTIONS.index(direction) * repeats + repeat
-            end, beyond = list(start), list(start)
-            end[axis] += sign * steps[repeat % len(steps)]
-            # Arriving by a move against the homing's last one.
-            beyond[axis] += home_sign * RUN_UP_STEPS
-            orders += [("home", *start), ("place", None, None, "d1")]
-            if other_side[repeat % len(other_side)]:
-                orders += [("move", *beyond), ("move", *start)]
             looks = [("look", None, None, None, number, point) for point in (1, 2, 3, 4)]
-            there, back = (("place", None, None, sheet) for sheet in ("d2", "d1"))
-            orders += [looks[0], there, looks[1], ("move", *end), looks[2], back, looks[3]]
+            near, far = (("place", None, None, sheet) for sheet in ("d1", "d2"))
+            orders += [("home", *start), near, looks[0], far, looks[1], ("move", *end), looks[2], near, looks[3]]
     return numbered(orders)
-
-
-def plan_of(name: str) -> tuple[PlanStep, ...]:
-    """Plan of a campaign; the planned one is what the planner takes for 16 experiments' worth of looks."""
-    if name.startswith("paper"):
-        return four_point_plan()
-    if name == "mixed":
-        return four_point_plan(12, steps=(100, 200), other_side=(False, False, True, True))
-    if name == "planned":
-        return searched_family(prior_knowledge(mounted_rig()), scope=Scope(largest=16)).arranged(16).steps
-    orders = []
-    for step in grid_protocol():
-        orders.append(step)
-        if step.action == "place":
-            orders.append(PlanStep(0, "home", 0, 0))
-    return tuple(replace(step, step=number) for number, step in enumerate(orders))
 
 
 def classic_without_noise(parameters: Mapping[str, float], stated: Stereo, true_stereo: Stereo) -> dict[str, float]:

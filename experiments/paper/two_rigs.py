@@ -10,23 +10,18 @@ drawing, each solved so that the classic estimator reads Table 1's means without
 * "literal": four ratios, no play; turned so that the tilt experiments happen at azimuth 0, where a tilt is read as it
   is. Such gears drift away (no toothed gear can be so over long travel): homed before every experiment.
 
-Both run the same plans, with the stop errors of the paper twin (which give the Table's sds) and 0.05 px. The nominal
-rig is declared, without knowledge of the mounting, with N(0, 0.005 deg/step) for the contrasts: the default 2e-4
-excludes literal ratios beforehand. Three models are fitted: gears with play and one ratio per axis; ratios per
-direction without play; both. log10 of the Bayes factor = difference of the Laplace evidences of the first two. It is
-called separated beyond 100 to 1, called the other rig with more than 20 to 1 against the truth. Effective ratios are
-those of the model with both, by Laplace with all homing hypotheses weighed. Campaigns:
-
-* paper, as published: |N| = 200, 24 in each direction, every experiment from a homing at its start counters, ended on
-  the right and on the upper side, and the sides NOT recorded;
-* paper, sides recorded; mixed: 12 in each direction, |N| = 100 and 200 in turn, every second start reached from the
-  other side of its homing;
-* grid: the shipped grid, homed once per sheet; planned: 64 looks by the planner for the worst effective ratio.
+Both run the paper's plan as published, |N| = 200, 24 in each direction, every experiment from a homing at its start
+counters, ended on the right and on the upper side, and the sides NOT recorded; with the stop errors of the paper twin
+(which give the Table's sds) and 0.05 px. The nominal rig is declared, without knowledge of the mounting, with
+N(0, 0.005 deg/step) for the contrasts: the default 2e-4 excludes literal ratios beforehand. Three models are fitted:
+gears with play and one ratio per axis; ratios per direction without play; both. log10 of the Bayes factor = difference
+of the Laplace evidences of the first two. It is called separated beyond 100 to 1, called the other rig with more than
+20 to 1 against the truth. Effective ratios are those of the model with both, by Laplace with all homing hypotheses
+weighed.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 
@@ -34,9 +29,9 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import study
+from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, paper_values, unseen
-from experiments.common.rows import output
-from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
+from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, four_point_plan, solved
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.files.disk import shipped_data
@@ -45,14 +40,13 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
+from tvsbayes.instrument.plan import run_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth
 
-PLANNED = output(__file__, "two_rigs_planned.csv")
-CAMPAIGNS = ("paper, as published", "paper, sides recorded", "mixed", "grid", "planned")
 MODELS = {"play": ModelChoice(per_axis=True), "ratios": ModelChoice(no_backlash=True), "both": ModelChoice()}
 CONTRAST_U = 0.005
 """Prior sd of left - right and up - down, deg/step: twice what Table 1 shows for pan."""
@@ -88,21 +82,22 @@ def effective_ratios(joint: JointFit) -> dict[str, list[float]]:
     return {d: [e.value, e.sd, *e.interval95] for d, e in rows.items() if e is not None}
 
 
-def one_row(task: tuple[str, str, int]) -> dict[str, object]:
-    """Simulate one campaign of one machine and fit the three models."""
+def read_by(rig: Rig, kind: str, seed: int, truth: Truth) -> Campaign:
+    """The paper's campaign; other noise for every machine, or the two-sample tests would compare twins."""
+    noise = 10_000 + 100 * seed + 10 * RIGS.index(kind)
+    return simulate(rig, four_point_plan(), noise, truth, spot_sd_px=SPOT_SD_PX, home_approach=HOME_SIDES).campaign
+
+
+def one_row(task: tuple[str, int]) -> dict[str, object]:
+    """Simulate the campaign of one machine and fit the three models."""
     use_compilation_cache()
-    kind, name, seed = task
+    kind, seed = task
     start = time.process_time()
     truth = solved(kind, mounted_rig(), seed)
     declared = wide(read_rig(shipped_data() / "rigs" / "nominal" / "rig.toml"))
-    plan = read_plan(PLANNED) if name == "planned" else plan_of(name)
-    # Other noise for every machine and campaign, or the two-sample tests would compare twins.
-    noise = 10_000 + 100 * seed + 10 * RIGS.index(kind) + CAMPAIGNS.index(name)
-    campaign = simulate(declared, plan, noise, truth, spot_sd_px=SPOT_SD_PX, home_approach=HOME_SIDES).campaign
-    row: dict[str, object] = {"kind": kind, "campaign": name, "seed": seed, "unseen": unseen(campaign)}
-    if name == "paper, as published":
-        campaign = forget_sides(campaign)
-    row["models"] = {}
+    campaign = read_by(declared, kind, seed, truth)
+    row: dict[str, object] = {"kind": kind, "seed": seed, "unseen": unseen(campaign), "models": {}}
+    campaign = forget_sides(campaign)
     for model, choice in MODELS.items():
         try:
             result = fit(campaign, model=choice)
@@ -122,15 +117,6 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
         row["models"][model] = entry
     row |= {"truth": {n: v for n, v in truth.parameters.items() if "step" in n}}
     return {**row, "effective": truth.effective_deg_per_step(campaign), "cpu_s": time.process_time() - start}
-
-
-def tasks(of: argparse.Namespace) -> list[tuple[str, str, int]]:
-    """Every machine, every campaign, every seed; the planned looks are there before workers ask for them."""
-    use_compilation_cache()
-    PLANNED.parent.mkdir(parents=True, exist_ok=True)
-    if not PLANNED.exists():
-        write_plan(plan_of("planned"), PLANNED)
-    return [(kind, name, seed) for seed in range(of.n) for name in CAMPAIGNS for kind in RIGS]
 
 
 def weight_log10(row) -> float | None:
@@ -162,17 +148,12 @@ def classic_part() -> None:
         for kind in RIGS:
             truth = solved(kind, rig, seed)
             ratios[kind].append([truth.parameters[f"degrees_per_step.{d}"] for d in DIRECTIONS])
-            noise = 10_000 + 100 * seed + 10 * RIGS.index(kind)
-            plan = plan_of("paper, as published")
-            campaign = simulate(rig, plan, noise, truth, spot_sd_px=SPOT_SD_PX, home_approach=HOME_SIDES).campaign
-            for direction, values in classic_readings(campaign).items():
+            for direction, values in classic_readings(read_by(rig, kind, seed, truth)).items():
                 readings.setdefault((kind, direction), []).append(values)
     print("## The classic estimator\n")
     print(f"{CLASSIC_SEEDS} drawings, 24 experiments per direction each; deg/step; range of the true gear ratios.\n")
-    print(
-        "| direction | paper: mean, sd | lost motion: mean, sd | literal: mean, sd | true ratios, lost motion ", end=""
-    )
-    print("| true ratios, literal | Welch p < 0.05 |\n|" + "---|" * 7)
+    titles = "direction | paper: mean, sd | lost motion: mean, sd | literal: mean, sd | true ratios, lost motion"
+    print(heading(titles, "true ratios, literal | Welch p < 0.05"))
     every = []
     for k, name in enumerate(DIRECTIONS):
         cells = [f"{paper[name][1]:.6f}, {paper[name][2]:.6f}"]
@@ -203,37 +184,27 @@ def table(rows: list[dict]) -> None:
     print(f"Told apart: the evidence is beyond {10**TOLD_LOG10:.0f} to 1 for the true one of play and literal ratios;")
     print("misled: for the wrong one. Contrast and backlash (medians over the seeds, sd of the model with both) in")
     print("1e-3 deg/step and deg; z of the contrast: largest of pan and tilt, |contrast| / sd, median.\n")
-    print(
-        "| campaign | truth | seeds | converged | told apart | undecided | misled | 20 to 1 against the truth ", end=""
-    )
-    print("| log10 factor: median (range) | effective ratios in their 95 % intervals ", end="")
-    print("| contrast pan | contrast tilt | z | backlash pan | backlash tilt | tilt over pan ratio |\n|" + "---|" * 16)
-    for name in CAMPAIGNS:
-        for kind in RIGS:
-            chosen = [r for r in rows if r["campaign"] == name and r["kind"] == kind]
-            if not chosen:
-                continue
-            weights = [w for w in map(weight_log10, chosen) if w is not None]
-            right = np.array(weights) * (1 if kind == "lost motion" else -1)
-            sure, misled = int(np.sum(right > TOLD_LOG10)), int(np.sum(right < -TOLD_LOG10))
-            cells = [f"{sure}", f"{len(weights) - sure - misled}", f"{misled}", f"{np.sum(right < -AGAINST_LOG10)}"]
-            cells.append(f"{np.median(weights):+.0f} ({min(weights):+.0f} to {max(weights):+.0f})" if weights else "-")
-            both = [r["models"]["both"] for r in chosen if r["models"]["both"]["converged"]]
-            stated = [(row, row["models"]["both"].get("effective", {})) for row in chosen]
-            held = [low <= row["effective"][d] <= high for row, of in stated for d, (_, _, low, high) in of.items()]
-            cells.append(f"{sum(held)} of {len(held)}")
-            if both:
-                at = {n: np.median([b[n][:2] for b in both], axis=0) for n in QUANTITIES}
-                z = np.median([max(abs(b[n][0]) / b[n][1] for n in QUANTITIES[:2]) for b in both])
-                cells += [f"{1e3 * at[n][0]:+.2f} +- {1e3 * at[n][1]:.2f}" for n in QUANTITIES[:2]] + [f"{z:.1f}"]
-                cells += [f"{at[n][0]:.3f} +- {at[n][1]:.3f}" for n in QUANTITIES[2:]]
-                ratio = np.median([b["tilt over pan"] for b in both], axis=0)
-                cells.append(f"{ratio[0]:.3f} +- {ratio[1]:.3f}")
-            else:
-                cells += ["-"] * 6
-            print(f"| {name} | {kind} | {len(chosen)} | {len(weights)} | {' | '.join(cells)} |")
+    titles = "truth | seeds | converged | told apart | undecided | misled | 20 to 1 against the truth"
+    titles += " | log10 factor: median (range) | effective ratios in their 95 % intervals"
+    print(heading(titles, "contrast pan | contrast tilt | z | backlash pan | backlash tilt | tilt over pan ratio"))
+    for kind in RIGS:
+        chosen = [row for row in rows if row["kind"] == kind]
+        weights = [w for w in map(weight_log10, chosen) if w is not None]
+        right = np.array(weights) * (1 if kind == "lost motion" else -1)
+        sure, misled = int(np.sum(right > TOLD_LOG10)), int(np.sum(right < -TOLD_LOG10))
+        cells = [sure, len(weights) - sure - misled, misled, np.sum(right < -AGAINST_LOG10)]
+        cells.append(f"{np.median(weights):+.0f} ({min(weights):+.0f} to {max(weights):+.0f})")
+        both = [row["models"]["both"] for row in chosen if row["models"]["both"]["converged"]]
+        stated = [(row, row["models"]["both"].get("effective", {})) for row in chosen]
+        held = [low <= row["effective"][d] <= high for row, of in stated for d, (_, _, low, high) in of.items()]
+        at = {n: np.median([b[n][:2] for b in both], axis=0) for n in (*QUANTITIES, "tilt over pan")}
+        z = np.median([max(abs(b[n][0]) / b[n][1] for n in QUANTITIES[:2]) for b in both])
+        cells += [f"{sum(held)} of {len(held)}"]
+        cells += [f"{1e3 * at[n][0]:+.2f} +- {1e3 * at[n][1]:.2f}" for n in QUANTITIES[:2]] + [f"{z:.1f}"]
+        cells += [f"{at[n][0]:.3f} +- {at[n][1]:.3f}" for n in (*QUANTITIES[2:], "tilt over pan")]
+        print(line(kind, len(chosen), len(weights), *cells))
     print(f"\n{NOTES}")
 
 
 if __name__ == "__main__":
-    study(__file__, __doc__, one_row, ("kind", "campaign", "seed"), tasks, table, 8)
+    study(__file__, __doc__, one_row, ("kind", "seed"), RIGS, table, 8)

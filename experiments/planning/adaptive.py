@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.command_line import study
+from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
 from tvsbayes.acquisition import session
 from tvsbayes.acquisition.journal import read_journal
@@ -183,31 +184,24 @@ def share(hits: int, count: int) -> str:
 
 
 def table(rows: list[dict]) -> None:
-    groups: dict[tuple[str, str], list[dict]] = {}
-    for name in (ADAPTIVE, *FIXED):
-        for row in rows:
-            if row["plan"] == name:
-                label = "`--adapt`" if name == ADAPTIVE else f"{name}.csv"
-                groups.setdefault((label, "posterior" if "importance" in row else "Laplace"), []).append(row)
+    runs = {name: [row for row in rows if row["plan"] == name] for name in (ADAPTIVE, *FIXED)}
+    label = {ADAPTIVE: "`--adapt`", **{name: f"{name}.csv" for name in FIXED}}
     print("# Looks chosen while measuring, against fixed plans\n")
     print("Written by `python -m experiments.planning.adaptive table`; what was done stands in the script.\n")
-    print(f"Rigs drawn anew, target u(worst) <= {TARGET:g} deg/step by the sampled posterior (importance sampling); by")
-    print("Laplace alone, which ends a run earlier, where it says so.\n")
-    print("| plan | ended by | rigs | target met | minutes, median (10 to 90 %) | looks, median |\n|" + "---|" * 6)
-    for (name, stop), runs in groups.items():
-        middle, low, high = np.quantile([o["minutes"] for o in runs], [0.5, 0.1, 0.9])
-        spread, looks = f"{middle:.1f} ({low:.1f} to {high:.1f})", np.median([o["looks"] for o in runs])
-        print(f"| {name} | {stop} | {len(runs)} | {sum(o['met'] for o in runs)} | {spread} | {looks:.0f} |")
+    print(f"Rigs drawn anew, target u(worst) <= {TARGET:g} deg/step by the sampled posterior (importance sampling).\n")
+    print(heading("plan | rigs | target met | minutes, median (10 to 90 %) | looks, median"))
+    for name, of in runs.items():
+        middle, low, high = np.quantile([row["minutes"] for row in of], [0.5, 0.1, 0.9])
+        spread, looks = f"{middle:.1f} ({low:.1f} to {high:.1f})", np.median([row["looks"] for row in of])
+        print(line(label[name], len(of), sum(row["met"] for row in of), spread, f"{looks:.0f}"))
     print("\nFinal 95 % intervals with the truth in them; in brackets 95 % of the counts. The four directions of a rig")
     print("are no independent trials, left and right least of all: beside them rigs on which all four hold (81 % if")
     print("they were independent, 95 % if they were one).\n")
-    print("| plan | ended by | intervals | of directions | of rigs, all four | rms z |\n|" + "---|" * 6)
-    for (name, stop), runs in groups.items():
-        for tier in ("importance", "laplace"):
-            if tier in runs[0]:
-                word = "posterior" if tier == "importance" else "Laplace"
-                print(f"| {name} | {stop} | {word} | {' | '.join(coverage([o[tier] for o in runs]))} |")
-    confirmed_part([row for row in rows if row["plan"] == ADAPTIVE])
+    print(heading("plan | intervals | of directions | of rigs, all four | rms z"))
+    for name, of in runs.items():
+        for tier, word in (("importance", "posterior"), ("laplace", "Laplace")):
+            print(line(label[name], word, *coverage([row[tier] for row in of])))
+    confirmed_part(runs[ADAPTIVE])
 
 
 def coverage(rows: list[dict]) -> list[str]:

@@ -22,7 +22,6 @@ from msgspec import structs
 from experiments.common.command_line import print_only
 from experiments.common.page import heading
 from experiments.common.rigs import mounted_rig
-from experiments.common.worth import UNREACHED, searched_family
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.model.compilation_cache import use_compilation_cache
@@ -35,6 +34,8 @@ from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, 
 
 REPEATS = (2, 4, 8, 16, 24)
 TARGET = parse_target(DEFAULT_TARGET)
+UNREACHED = 1e-9
+"""A limit that no plan keeps: the search goes on to its largest design."""
 TURN = {"pan_min_steps": -100, "pan_max_steps": 7000, "tilt_min_steps": -130, "tilt_max_steps": 130}
 """Limits that allow a full turn of pan: 6000 steps at 0.06 deg/step."""
 
@@ -128,7 +129,11 @@ def main() -> None:
     print_only(__doc__)
     use_compilation_cache()
     knowledge = prior_knowledge(mounted_rig())
-    family = searched_family(knowledge)
+    pool = candidates(knowledge)
+    looks = LookArrays(pool.looks, knowledge, False).at(knowledge.z, knowledge.space)
+    target, pose = structs.replace(TARGET, limit=UNREACHED), looks.mirror_angles_rad.mean(axis=0)
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
+    family = design_family(DesignProblem(knowledge, pool, looks, target, at), None)
     plans = {"paper": [paper_protocol(n) for n in REPEATS], "mixed": [mixed_protocol(n) for n in REPEATS]}
     plans |= {"grid": [grid_protocol()], "planned": [family.arranged(n).steps for n in LADDER]}
     sessions = {name: [session(knowledge, steps) for steps in of] for name, of in plans.items()}

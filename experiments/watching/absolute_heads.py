@@ -16,10 +16,7 @@ from __future__ import annotations
 
 import datetime
 import json
-import os
-import resource
 import subprocess
-import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass
@@ -29,7 +26,9 @@ import numpy as np
 from scipy.stats import binom
 
 from experiments.common.command_line import study
-from experiments.common.rows import ROOT, commit, commits_of
+from experiments.common.commands import IMPORTS, PROGRAM, measured
+from experiments.common.page import table
+from experiments.common.rows import commit, commits_of
 from tvsbayes.errors import TvsError
 from tvsbayes.studies.executors import SINGLE_THREADED
 
@@ -42,18 +41,12 @@ NIGHTS_APART = datetime.timedelta(hours=24)
 U_DEG = 0.0005
 MOVED_U = 10.0
 PAN_DEG, TILT_DEG = (-120.0, 120.0), (15.0, 75.0)
-IMPORTS = "import jax, optimistix, scipy.stats"
-
-
-def matern52(distance: np.ndarray, length: float) -> np.ndarray:
-    """Correlation of a twice differentiable process."""
-    scaled = np.sqrt(5.0) * np.abs(distance) / length
-    return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
 
 
 def process(rng: np.random.Generator, at: np.ndarray, sd: float, length: float) -> np.ndarray:
-    """A drawn process at angles (n,), deg."""
-    near = matern52(at[:, None] - at, length) + 1e-9 * np.eye(len(at))
+    """A drawn process at angles (n,), deg, twice differentiable: Matern's 5/2."""
+    scaled = np.sqrt(5.0) * np.abs(at[:, None] - at) / length
+    near = (1 + scaled + scaled**2 / 3) * np.exp(-scaled) + 1e-9 * np.eye(len(at))
     return sd * np.linalg.cholesky(near) @ rng.standard_normal(len(at))
 
 
@@ -155,28 +148,16 @@ def drawn_nights(kind: tuple[str, str], seed: int) -> tuple[Night, list[Night], 
     return each[0], each[1:], known
 
 
-def tvsbayes(cwd: Path, *words: str) -> tuple[float, subprocess.CompletedProcess]:
-    """CPU seconds of a command of the package, and what it left."""
-    return cpu_s(cwd, "-m", "tvsbayes", *words)
-
-
-def cpu_s(cwd: Path, *words: str) -> tuple[float, subprocess.CompletedProcess]:
-    """CPU seconds of Python with these arguments, and what it left."""
-    environment = {**os.environ, **SINGLE_THREADED, "PYTHONPATH": str(ROOT)}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, *words]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, env=environment)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done
+def ran(cwd: Path, *command: str) -> tuple[str, float]:
+    """What a command prints, and its CPU seconds; on one thread."""
+    printed, cost = measured(command, cwd=cwd, variables=SINGLE_THREADED)
+    return printed, cost["cpu_s"]
 
 
 def imported(cwd: Path, name: str, table: str, encoder: str, start: datetime.datetime) -> None:
     """Make a campaign of a night's table, dated."""
     (cwd / f"{name}.csv").write_text(table)
-    words = ("import", f"{name}.csv", "--sightings", "--to", name, "--encoders", encoder, "--yes")
-    _, done = tvsbayes(cwd, *words)
-    if done.returncode:
-        raise RuntimeError(done.stderr)
+    ran(cwd, *PROGRAM, "import", f"{name}.csv", "--sightings", "--to", name, "--encoders", encoder, "--yes")
     campaign = cwd / name / "campaign.toml"
     first, *others = campaign.read_text().splitlines()
     campaign.write_text("\n".join([first, f"created = {start.isoformat()}", *others, ""]))
@@ -195,12 +176,13 @@ def one_head(task: tuple[str, str, int]) -> dict[str, object]:
         imported(cwd, "night", campaign.table(), encoder, FIRST_NIGHT)
         for k, night in enumerate(later):
             imported(cwd, f"next{k}", night.table(), encoder, next_night)
-        imports, _ = cpu_s(cwd, "-c", IMPORTS)
-        taken, done = tvsbayes(cwd, "fit", "night", "--quick", "--json")
-        row |= {"imports": taken / imports, "import_s": imports, "answer": "none"}
-        if done.returncode:
-            return row | {"problem": done.stderr[-300:]}
-        fitted = json.loads(done.stdout)
+        _, imports = ran(cwd, *IMPORTS)
+        try:
+            printed, taken = ran(cwd, *PROGRAM, "fit", "night", "--quick", "--json")
+        except subprocess.CalledProcessError as error:
+            return row | {"answer": "none", "problem": error.stderr[-300:]}
+        row |= {"imports": taken / imports, "import_s": imports}
+        fitted = json.loads(printed)
         zero = fitted["parameters"]["elevation_zero_deg"]["sd"]
         row |= {"answer": fitted["answer"], "u_zero_deg": zero}
         imported(cwd, "moved", later[0].table(MOVED_U * zero), encoder, next_night)
@@ -245,46 +227,39 @@ TEXT = """# Heads with absolute encoders
 
 Made by `python -m experiments.watching.absolute_heads`. Heads drawn by NumPy alone: encoders on the axes (`output`) or
 before the gears (`motor`), 40 to 100 stars, each at angles of its own, sides of approach recorded or not. `fit --quick`
-on them; the next night, a day later, is 40 stars. CPU in imports of JAX, optimistix and scipy.stats."""
+on them; the next night, a day later, is 40 stars. CPU in imports of JAX, optimistix and scipy.stats.
+"""
 
 
-def table(rows: list[dict]) -> None:
+def page(rows: list[dict]) -> None:
     """Answers and cost by kind, then promises and alarms."""
     print(TEXT)
-    print("\n| encoders | sides | heads | accepted | rough | other | median imports | largest |")
-    print("|---|---|---|---|---|---|---|---|")
-    for kind in (*KINDS, None):
-        own = [row for row in rows if kind in (None, (row["encoder"], row["sides"]))]
-        if not own:
-            continue
-        count = Counter(row["answer"] for row in own)
-        imports = [row["imports"] for row in own]
-        others = len(own) - count["accepted"] - count["rough"]
-        name = "**all** | " if kind is None else " | ".join(kind)
-        print(f"| {name} | {len(own)} | {count['accepted']} | {count['rough']} | {others}", end=" | ")
-        print(f"{np.median(imports):.0f} | {max(imports):.0f} |")
-    kept = [row for row in rows if "inside" in row]
-    seen = [row for row in rows if "next_verdict" in row]
-    print("\nPromise of the next night over the actual 95 % of errors, of eight drawn nights and of one alone:")
-    print("\n| the zero | heads | errors within | promise over actual, median | largest | over one night's | BROKEN |")
-    print("|---|---|---|---|---|---|---|")
+    lines = []
+    for kind in (*KINDS, ("**all**", "")):
+        if own := [row for row in rows if not kind[1] or kind == (row["encoder"], row["sides"])]:
+            count, cost = Counter(row["answer"] for row in own), [row["imports"] for row in own if "imports" in row]
+            named = count["accepted"], count["rough"], len(own) - count["accepted"] - count["rough"]
+            lines.append((*kind, len(own), *named, f"{np.median(cost):.0f}", f"{max(cost):.0f}"))
+    titles = ("encoders", "sides", "heads", "accepted", "rough", "other", "median imports", "largest")
+    print(table(titles, lines))
+    print("\nPromise of the next night over the actual 95 % of errors, of eight drawn nights and of one alone:\n")
+    lines = []
     for use, *_ in USES:
-        own = [row for row in kept if row["use"] == use]
-        if not own:
-            continue
-        ratio = np.array([row["promised95_deg"] / row["error95_deg"] for row in own])
-        once = np.array([row["promised95_deg"] / np.array(row["night95_deg"]) for row in own])
-        inside = 100 * np.mean([row["inside"] for row in own])
-        print(f"| {use} | {len(own)} | {inside:.1f} % | {np.median(ratio):.2f} | {ratio.max():.2f}", end=" | ")
-        print(f"{np.median(once):.2f} | {sum(row['verify'] == 'BROKEN' for row in own)} |")
-    if seen:
-        alarms = sum(row["next_verdict"] == "MOVED" for row in seen)
+        if own := [row for row in rows if "inside" in row and row["use"] == use]:
+            ratio = np.array([row["promised95_deg"] / row["error95_deg"] for row in own])
+            once = np.array([row["promised95_deg"] / np.array(row["night95_deg"]) for row in own])
+            shown = f"{100 * np.mean([row['inside'] for row in own]):.1f} %", f"{np.median(ratio):.2f}"
+            ends = f"{ratio.max():.2f}", f"{np.median(once):.2f}", sum(row["verify"] == "BROKEN" for row in own)
+            lines.append((use, len(own), *shown, *ends))
+    titles = ("the zero", "heads", "errors within", "promise over actual, median", "largest", "over one night's")
+    print(table((*titles, "BROKEN"), lines))
+    if seen := [row for row in rows if "next_verdict" in row]:
+        alarms, found = (sum(row[f"{day}_verdict"] == "MOVED" for row in seen) for day in ("next", "moved"))
         most = binom.isf(0.001, len(seen), 0.01)
-        found = sum(row["moved_verdict"] == "MOVED" for row in seen)
         print(f"\n`watch`, {len(seen)} heads: {alarms} false alarms (at 1 % at most {most:.0f} in 99.9 %); an", end=" ")
         print(f"elevation zero moved by {MOVED_U:g} u is MOVED in {found}.")
     print(f"\nCommit {commits_of(rows)}.")
 
 
 if __name__ == "__main__":
-    study(__file__, __doc__, one_head, ("encoder", "sides", "seed"), KINDS, table, 10)
+    study(__file__, __doc__, one_head, ("encoder", "sides", "seed"), KINDS, page, 10)
