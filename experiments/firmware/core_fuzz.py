@@ -16,7 +16,6 @@ import tempfile
 from pathlib import Path
 
 from experiments.common.command_line import act, parser
-from experiments.common.of_tests import module_of_tests
 from experiments.common.rows import commit
 from tvsbayes.positioner import firmware_folder
 
@@ -36,10 +35,9 @@ def run(arguments: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "fuzz"
         sanitizers = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-        include = f"-I{firmware_folder() / 'tvs_positioner'}"
-        command = ["g++", "-std=c++17", "-O1", "-g", "-Wall", "-Wextra", *sanitizers, include]
-        sources = module_of_tests("support.emulated_board").core_sources()
-        subprocess.run([*command, str(SOURCE), *map(str, sources), "-o", str(program)], check=True)
+        core = firmware_folder() / "tvs_positioner"
+        command = ["g++", "-std=c++17", "-O1", "-g", "-Wall", "-Wextra", *sanitizers, f"-I{core}", SOURCE]
+        subprocess.run([*command, *sorted(core.glob("tvs_*.cpp")), "-o", program], check=True)
         limits = [str(program), str(arguments.seed), str(arguments.seconds)]
         result = subprocess.run(limits, capture_output=True, text=True, check=False)
     print("# Fuzz of the firmware's core\n")

@@ -133,7 +133,7 @@ def main() -> None:
     looks = LookArrays(pool.looks, knowledge, False).at(knowledge.z, knowledge.space)
     target, pose = structs.replace(TARGET, limit=UNREACHED), looks.mirror_angles_rad.mean(axis=0)
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
-    family = design_family(DesignProblem(knowledge, pool, looks, target, at), None)
+    family = design_family(DesignProblem(knowledge, pool, looks, target, at))
     plans = {"paper": [paper_protocol(n) for n in REPEATS], "mixed": [mixed_protocol(n) for n in REPEATS]}
     plans |= {"grid": [grid_protocol()], "planned": [family.arranged(n).steps for n in LADDER]}
     sessions = {name: [session(knowledge, steps) for steps in of] for name, of in plans.items()}
