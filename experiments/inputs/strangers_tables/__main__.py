@@ -76,16 +76,12 @@ def page(seeds: range) -> None:
     every = sum(counts.values(), Counter())
     clear = sum((count for (_, answer), count in counts.items() if answer == "right"), Counter())
     print("# Tables of strangers\n\n`python -m experiments.inputs.strangers_tables`\n")
+    found = every["right"] + every["guessed"] + every["asked"]
     print(
-        f"{every.total()} drawn tables, {seeds[0]} to {seeds[-1]}: {every['wrong']} wrong in silence. Of the", end=" "
+        f"{every.total()} drawn tables, {seeds[0]} to {seeds[-1]}: {every['wrong']} wrong in silence. Of "
+        f"{clear.total()} that state reading, unit and order {share(clear['right'], clear.total())} are right without "
+        f"an option. {found} are right at once, or by a command that the question prints.\n{EXPLAINED}"
     )
-    print(
-        f"{clear.total()} that state reading,\nunit and order {share(clear['right'], clear.total())} are right", end=" "
-    )
-    print(
-        f"without an option. {every['right'] + every['guessed'] + every['asked']} are\nright at once, or by a command"
-    )
-    print(f"that the question prints.\n{EXPLAINED}")
     rows = [(k, a, c.total(), *(c[word] or "" for word in WORDS)) for (k, a), c in sorted(counts.items())]
     print(table(("kind", "careful", "drawn", *WORDS), rows))
     if unlisted:
