@@ -11,8 +11,3 @@ def timed[Result](work: Callable[[], Result]) -> tuple[Result, dict[str, float]]
     wall, cpu = time.perf_counter(), time.process_time()
     result = work()
     return result, {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
-
-
-def seconds(work: Callable[[], object], repeats: int = 1) -> float:
-    """Wall clock of the fastest of several calls."""
-    return min(timed(work)[1]["wall_s"] for _ in range(repeats))

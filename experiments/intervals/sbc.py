@@ -2,12 +2,11 @@
 
     python -m experiments.intervals.sbc run --n 1000 --cores 0 1       # CPU seconds a rig: see sbc.md; resumable
     python -m experiments.intervals.sbc run --variants "few stops" "prior x3" "camera dropped" --n 50 --cores 0 1
-    python -m experiments.intervals.sbc run --tier emcee --n 200 --cores 0 1
     python -m experiments.intervals.sbc table > experiments/intervals/sbc.md     # also writes sbc.png
 
 Every simulation draws a rig from the priors of `data/rigs/mounted` (seed i), runs the 60 spots of
-`rigs.dense_plan`, fits, samples, and ranks the truth among 255 draws that weigh the same: resampled by their weights,
-or evenly spaced in the chain (Talts et al., arXiv:1804.06788). Ranked are all free parameters, the effective ratios
+`rigs.dense_plan`, fits, samples by importance, and ranks the truth among 255 draws resampled by their weights
+(Talts et al., arXiv:1804.06788). Ranked are all free parameters, the effective ratios
 and mirror offset, and the joint log-likelihood and log-posterior of the true model, which see what single parameters
 hide (Modrak et al., doi 10.1214/23-BA1404). `table` turns ranks into PIT = (rank + U) / 256 with seeded U and tests
 their ECDF with the simultaneous band of Sailynoja et al. (doi 10.1007/s11222-022-10090-6). Quantity by quantity its p
@@ -17,7 +16,7 @@ which draws are proposed (from those of `few stops`, where noise scales are leas
 calibration taken three times too wide, and the right camera's centres taken as a thousand times worse than they are.
 `few stops` is clean too: 48 spots, twelve stops in every direction, where the Laplace interval of the backlash is too
 short. Whether draws are accepted depends on the data and not on the truth behind them, so the ranks of the others must
-be uniform all the same; a tier that refuses more than `FAILURES` of them fails the study.
+be uniform all the same; more than `FAILURES` refused ones fail the study.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ from tvsbayes.report.drawing import BLUE
 from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate
 
-KEYS, PICTURE = ("tier", "variant", "seed"), Path(__file__).with_suffix(".png")
+KEYS, PICTURE = ("variant", "seed"), Path(__file__).with_suffix(".png")
 SHEETS, WIDER, WORSE, MAX_MINUTES = ("d1", "d2"), 3.0, 1000.0, 8.0
 CLEAN, FEW, PRIOR, CAMERA = "clean", "few stops", "prior x3", "camera dropped"
 SHRUNK, JACOBIAN = f"sd x {SHRINK}", "Jacobian dropped"
@@ -111,9 +110,9 @@ def faulty(campaign, variant: str):
     return campaign
 
 
-def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
+def one_simulation(task: tuple[str, int]) -> dict[str, object]:
     """Simulate, fit, sample, rank; whatever fails is recorded as a failure."""
-    tier, variant, seed = task
+    variant, seed = task
     use_compilation_cache()
     simulated = simulate(creeping_rig(), small_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
     row: dict = {**dict(zip(KEYS, task, strict=True)), "converged": False, "problems": []}
@@ -121,7 +120,7 @@ def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
     try:
         result = fit(faulty(simulated.campaign, variant))
         row["problems"] = list(result.problems)
-        posterior = sample(result, tier=tier, seed=seed, max_minutes=MAX_MINUTES)
+        posterior = sample(result, tier=TIERS[0], seed=seed, max_minutes=MAX_MINUTES)
         row |= {"converged": bool(posterior.converged), "problems": list(posterior.convergence.missing)}
         run = posterior.convergence.importance
         row |= {"cpu_s": time.process_time() - start, "draws": run.draws, "effective_share": run.effective_share}
@@ -132,7 +131,7 @@ def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
             mean, centre_rad = np.tensordot(posterior.weights, posterior.z, axes=2), posterior.centre.place_errors_rad
             nearer_rad = centre_rad + SHRINK * (errors_rad - centre_rad)
             row[SHRUNK] = ranks(simulated, result, mean + SHRINK * (chosen - mean), nearer_rad)
-        if variant == FEW and tier == TIERS[0]:
+        if variant == FEW:
             wrong = without_jacobian(posterior)
             row[JACOBIAN] = ranks(simulated, result, wrong.coordinates(DRAWS), wrong.thinned(DRAWS).place_errors_rad)
     except Exception as error:
@@ -214,7 +213,7 @@ def design_row(title: str, chosen: Sequence[dict], judged: int, p: Mapping[str, 
 
 def clean_part(band: Band, pit: Mapping[str, np.ndarray], p: Mapping[str, float]) -> None:
     """Every quantity of the clean simulations, the two densities first, then by p."""
-    print(f"### Clean, all quantities: {band.n} simulations\n")
+    print(f"## Clean, all quantities: {band.n} simulations\n")
     print(heading("quantity | mean PIT | sd of PIT x sqrt 12 | p of the band | p of sum z^2"))
     for name in [*DENSITIES, *sorted((n for n in p if n not in DENSITIES), key=p.__getitem__)]:
         total = stats.chi2(band.n).cdf(np.sum(stats.norm.ppf(pit[name]) ** 2))
@@ -223,9 +222,8 @@ def clean_part(band: Band, pit: Mapping[str, np.ndarray], p: Mapping[str, float]
     print()
 
 
-def tier_part(title: str, rows: Sequence[dict], pictured: bool) -> None:
-    """Every design of one tier with two simulations or more that have ranks."""
-    print(f"## {title}\n")
+def designs(rows: Sequence[dict]) -> None:
+    """Every design with two simulations or more that have ranks."""
     titles = "draws | simulations | not accepted | quantities | criterion p | least p, of | p log-likelihood"
     print(heading(titles, "p log-posterior | quantities failing | verdict | wanted"))
     of, clean = {v: [r for r in rows if r["variant"] == v] for v in VARIANTS}, None
@@ -255,8 +253,7 @@ def tier_part(title: str, rows: Sequence[dict], pictured: bool) -> None:
     if clean:
         band, pit, p = clean
         worst = sorted((n for n in p if n not in DENSITIES), key=p.__getitem__)[:4]
-        if pictured:
-            picture(band, pit, [*DENSITIES, *worst], ALPHA / len(p))
+        picture(band, pit, [*DENSITIES, *worst], ALPHA / len(p))
         clean_part(band, pit, p)
 
 
@@ -266,13 +263,9 @@ def table(rows: list[dict]) -> None:
     print(title_and_figure(__file__, title, PICTURE, words))
     print("Written by `python -m experiments.intervals.sbc table` after `run`; rig i has seed i. 60 spots of the")
     print("mounted rig (48 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n")
-    for tier, title in zip(TIERS, ("Tier 1, importance sampling", "Tier 2, emcee"), strict=True):
-        if mine := [row for row in rows if row["tier"] == tier]:
-            tier_part(title, mine, tier == TIERS[0])
+    designs(rows)
 
 
 if __name__ == "__main__":
     options = {"--variants": {"nargs": "+", "default": [CLEAN], "choices": VARIANTS}}
-    options["--tier"] = {"default": TIERS[0], "choices": TIERS}
-    tasks = lambda of: [(of.tier, *task) for task in by_seed(of.variants, of.n)]  # noqa: E731
-    study(__file__, __doc__, one_simulation, KEYS, tasks, table, 1000, options)
+    study(__file__, __doc__, one_simulation, KEYS, lambda of: by_seed(of.variants, of.n), table, 1000, options)

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from importlib.metadata import version
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 
@@ -81,10 +80,6 @@ def hamiltonian(joint: JointFit, setting: Setting) -> tuple[Run, dict[str, dict[
     transport, cost = timed(lambda: build_transport(joint))
     size = transport.index.size
     print(f"{size} free coordinates, {len(transport.stiff)} sheared, transport {cost['wall_s']:.1f} s")
-    for w in np.random.default_rng(setting.seed).standard_normal((3, size)):
-        sign, log_volume = np.linalg.slogdet(np.asarray(jax.jacfwd(transport.y_of_w)(jnp.asarray(w))))
-        print(f"log |dy/dw| = {log_volume:.1e}, sign {sign:.0f}")
-
     z_of, potential = potential_of(joint, transport)
     run = nuts(potential, size, setting)
     return run, {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()}

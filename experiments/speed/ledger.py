@@ -21,7 +21,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from experiments.common.command_line import act, parser
-from experiments.common.commands import IMPORTS, PROGRAM, measured, said
+from experiments.common.commands import IMPORTS, PROGRAM, measured
 from experiments.common.page import heading, line
 from experiments.common.rows import ROOT, append_row, cpu_model, read_rows, state
 
@@ -79,7 +79,7 @@ def write_axis(folder: Path) -> None:
     (template / "readings.csv").write_text("reading,move,value,u,status\n")
     header = ('format = "tvsbayes-axis/1"', 'unit = "deg"', "[axis]", "per_command = { value = 0.01, u = 0.001 }", "")
     (template / "campaign.toml").write_text("\n".join(header))
-    said("simulate", template, folder / "axis", "--seed", 1)
+    measured([*PROGRAM, "simulate", template, folder / "axis", "--seed", 1])
 
 
 def study(module: str, number: int) -> list[dict]:
