@@ -40,6 +40,11 @@ def against(
     return {"pit": float(weights @ (values < true)), "z": float(z), "contraction": float(contraction)}
 
 
+def scored(draws: np.ndarray, true: float) -> dict[str, float]:
+    """Draws (n,) that weigh the same, of a quantity without a prior to compare with."""
+    return against(draws, np.full(draws.shape, 1 / draws.size), true, np.inf)
+
+
 def judged(found: Any, truth: Any, campaign: Any, names: Sequence[str] = ()) -> dict[str, dict[str, float]]:
     """Headlines and named parameters of a fit, its centre the mode, or of a posterior, its centre the mean."""
     from tvsbayes.posterior.draws import Draws, Posterior, headline_names

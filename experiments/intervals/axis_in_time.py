@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.common.against_truth import NOTE, against, table
+from experiments.common.against_truth import NOTE, scored, table
 from experiments.common.command_line import study
 from experiments.common.drawn_axes import drive
 from experiments.common.page import heading, line
@@ -53,10 +53,6 @@ def template(protocol: str, seed: int) -> AxisCampaign:
         for k, (c, t) in enumerate(zip(commands, degC, strict=True))
     )
     return AxisCampaign("deg", moves, (), stated, periods=periods)
-
-
-def scored(draws: np.ndarray, true: float) -> dict[str, float]:
-    return against(draws, np.full(draws.shape, 1 / draws.size), true, np.inf)
 
 
 def one_axis(task: tuple[str, int]) -> dict[str, object]:

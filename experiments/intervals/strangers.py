@@ -166,20 +166,6 @@ def classes(rows: Sequence[dict]) -> None:
     print()
 
 
-def cost_of_unrecorded_homings(rows: Sequence[dict]) -> None:
-    """CPU time without recorded homings over that with them, at equal numbers of looks."""
-    timed = [row for row in rows if "cpu_s" in row]
-    looks, cpu, unrecorded = np.array(
-        [(np.log(row["looks"]), np.log(row["cpu_s"]), not row["homing_recorded"]) for row in timed]
-    ).T
-    design = np.stack([np.ones(len(timed)), looks - looks.mean(), unrecorded], axis=1)
-    solution, (square,), *_ = np.linalg.lstsq(design, cpu)
-    sd = np.sqrt(np.linalg.inv(design.T @ design)[2, 2] * square / (len(timed) - 3))
-    low, middle, high = np.exp(solution[2] + np.array([-2, 0, 2]) * sd)
-    print("Benches without recorded homings have other numbers of looks. Least squares of ln CPU on ln looks and on")
-    print(f"whether homings were recorded: without, {middle:.2f} times the CPU time ({low:.2f} to {high:.2f}, 2 sd).\n")
-
-
 def tasks(of: argparse.Namespace) -> list[tuple]:
     """Drawn benches, or those of a folder."""
     if of.folder is None:
@@ -196,7 +182,6 @@ def page(rows: list[dict]) -> None:
         print(f"## {len(mine)} {'drawn benches' if folder is None else f'benches of {Path(folder).name}'}\n")
         classes(mine)
         if folder is None and len(mine) > FEW:
-            cost_of_unrecorded_homings(mine)
             print("These benches differ from what the prior expects: both directions have one ratio, so that the true")
             print("contrast is 0, and a play varies by at most 0.02 deg. Where the prior decides, intervals are wider")
             print("than they need.\n")

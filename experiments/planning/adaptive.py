@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.against_truth import rms
 from experiments.common.command_line import study
 from experiments.common.page import heading, line
 from experiments.common.rigs import mounted_rig, shipped_plan
@@ -209,9 +210,8 @@ def coverage(rows: list[dict]) -> list[str]:
     z = [np.array(each["z"]) for each in rows]
     held = [np.array(each.get("held", np.abs(err) <= NORMAL_95)) for each, err in zip(rows, z, strict=True)]
     directions = np.concatenate(held)
-    rms = np.sqrt(np.mean(np.concatenate(z) ** 2))
     whole = sum(bool(err.all()) for err in held)
-    return [share(int(directions.sum()), len(directions)), share(whole, len(held)), f"{rms:.2f}"]
+    return [share(int(directions.sum()), len(directions)), share(whole, len(held)), f"{rms(np.concatenate(z)):.2f}"]
 
 
 def confirmed_part(rows: list[dict]) -> None:

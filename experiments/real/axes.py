@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.against_truth import NOTE, against, rms, table
+from experiments.common.against_truth import NOTE, rms, scored, table
 from experiments.common.command_line import study
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.page import heading, line
@@ -65,12 +65,9 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     campaign = drawn.campaign
     kept = tuple(r for r in campaign.readings if abs(campaign.moves[r.move].command) <= 2000)
     fit = fit_axis(AxisCampaign("deg", campaign.moves, kept, campaign.stated), tier="importance", seed=seed)
-    row: dict = {"protocol": protocol, "seed": seed, "problems": list(fit.missing), "quantities": {}}
-    for name in ("per_command", "backlash"):
-        draws = fit.draws[name]
-        weights = np.full(draws.shape, 1 / draws.size)
-        row["quantities"][name] = against(draws, weights, drawn.truth.parameters[name], np.inf)
-    return row
+    true = drawn.truth.parameters
+    quantities = {name: scored(fit.draws[name], true[name]) for name in ("per_command", "backlash")}
+    return {"protocol": protocol, "seed": seed, "problems": list(fit.missing), "quantities": quantities}
 
 
 def folders(arguments: argparse.Namespace) -> None:

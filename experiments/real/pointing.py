@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.common.against_truth import rms as spread
 from experiments.common.command_line import act, parser
 from experiments.common.page import heading
 from experiments.common.rows import append_row, output, read_rows
@@ -144,7 +145,7 @@ def table(_: argparse.Namespace) -> None:
     print(TEXT)
     for row in rows:
         held = row["left_out"]
-        rms, (low, high) = float(np.sqrt(np.mean(np.square(held["z"])))), rms_bounds(len(held["z"]))
+        rms, (low, high) = spread(held["z"]), rms_bounds(len(held["z"]))
         print(f"\n## `{row['file']}`, {row['stars']} stars\n\n{heading('term | least squares | exact | joint')}")
         for name in TERMS:
             cells = (f"{row[kind][name][0]:.2f} ({row[kind][name][1]:.2f})" for kind in ("least", "classic", "joint"))

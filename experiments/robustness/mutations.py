@@ -104,11 +104,6 @@ TEXT = f"""# Mutants that no test sees
 Written by `python -m experiments.robustness.mutations table`: the latest run of each module. mutmut changes one
 operator, number, argument or word at a time, and runs the tests that reach the function.
 
-The mathematics are `model` (2202 mutants), `estimators` (5653), `posterior` (5269), `single_axis` (6993) and
-`statistics` (1440), counted on 25 November 2026. A mutant of a module without JAX costs 0.1 to 0.2 CPU seconds where
-its tests are fast: `statistics` and `single_axis` are 20 to 140 CPU minutes, by how many of their mutants need a fit. A
-mutant that JAX has to compile costs 3 to 30 CPU seconds: some 2000 CPU minutes for the other three, an estimate.
-
 Survivors of these sorts are left: an order of equal numbers (`kind="stable"`), a bound met with probability zero
 (`>` for `>=`), a type or a default that NumPy has anyway, a constant that cancels, a guard against rounding.
 

@@ -121,7 +121,6 @@ def main() -> None:
     command.add_argument("twin", choices=("paper", "grid"))
     command.add_argument("--warmup", type=int, default=500)
     command.add_argument("--draws", type=int, default=1500, help="per chain")
-    command.add_argument("--limit", type=float, default=np.inf, help="seconds after which drawing ends")
     command.add_argument("--seed", type=int, default=20261121)
     options = command.parse_args()
 
@@ -130,7 +129,7 @@ def main() -> None:
     use_compilation_cache()
     # What the tests ask importance sampling about; gears that repeat their errors are `agreement.py`'s.
     joint = fit(campaign, model=ModelChoice(perfect_gears=True))
-    setting = Setting(CHAINS, options.warmup, options.draws, options.seed, options.limit)
+    setting = Setting(CHAINS, options.warmup, options.draws, options.seed)
     run, rows = hamiltonian(joint, setting)
     worst = min(rows, key=lambda name: rows[name]["ess_bulk"])
     ess = rows[worst]["ess_bulk"]

@@ -62,11 +62,9 @@ def page(seeds: range) -> None:
     counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     reasons: dict[tuple[str, str], list[int]] = defaultdict(list)
     questions: Counter[tuple[str, str]] = Counter()
-    unlisted: list[int] = []
     for seed in seeds:
         drawn, verdict = judged(seed)
         counts[drawn.kind, drawn.truth.answer][verdict.word] += 1
-        unlisted += [seed] * bool(verdict.unlisted)
         if verdict.word in ("wrong", "crash"):
             reasons[f"{verdict.word}: {verdict.why}", drawn.kind].append(seed)
             OUTPUT.mkdir(parents=True, exist_ok=True)
@@ -84,8 +82,6 @@ def page(seeds: range) -> None:
     )
     rows = [(k, a, c.total(), *(c[word] or "" for word in WORDS)) for (k, a), c in sorted(counts.items())]
     print(table(("kind", "careful", "drawn", *WORDS), rows))
-    if unlisted:
-        print(f"\n{len(unlisted)} tables have columns that no line of `import` names: {unlisted[:12]}.")
     print("\n## What was asked\n")
     print(table(("question", "kind", "tables"), [(*key, n) for key, n in questions.most_common()]))
     if reasons:

@@ -46,8 +46,6 @@ class Verdict(NamedTuple):
     """right, guessed, asked, wrong, unanswered, refused, crash."""
     why: str = ""
     question: str = ""
-    unlisted: tuple[str, ...] = ()
-    """Columns that are named nowhere in the document of `import`."""
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -159,18 +157,12 @@ def times(truth: Truth, pairs: Sequence[tuple[Reading, Reading]]) -> str:
 
 
 def walk(document: Any) -> Iterator[str]:
-    """Command lines in a refusal: under keys of that name, else in backticks of its sentences."""
-    if isinstance(document, dict):
-        for key, value in document.items():
-            if key in ("command", "commands"):
-                yield from [value] if isinstance(value, str) else [v for v in value or () if isinstance(v, str)]
-            else:
-                yield from walk(value)
-    elif isinstance(document, list):
-        for value in document:
+    """Command lines in a refusal: by themselves, or in backticks of its sentences."""
+    if isinstance(document, dict | list):
+        for value in document.values() if isinstance(document, dict) else document:
             yield from walk(value)
     elif isinstance(document, str):
-        yield from (text for text in re.findall(r"`([^`]+)`", document) if text.startswith("tvsbayes "))
+        yield from [document] if document.startswith("tvsbayes ") else re.findall(r"`(tvsbayes [^`]+)`", document)
 
 
 def answers(error: dict[str, Any]) -> list[list[str]]:
@@ -225,9 +217,7 @@ def judge(drawn: Drawn, folder: Path) -> Verdict:
             return Verdict("wrong", why)
         if drawn.truth.meant:
             return Verdict("wrong", "a unit that nobody knows is replaced in silence")
-        named = " ".join(json.dumps(document, ensure_ascii=False).replace("\\n", " ").replace('\\"', '"').split())
-        unlisted = tuple(name for name in drawn.file.heads if " ".join(name.split()) not in named)
-        return Verdict("guessed" if drawn.truth.answer == "ask" else "right", unlisted=unlisted)
+        return Verdict("guessed" if drawn.truth.answer == "ask" else "right")
     error = document.get("error", {})
     has, right = answered(error, out, drawn.truth)
     return Verdict("asked" if right else "unanswered" if has else "refused", question=str(error.get("code")))

@@ -252,11 +252,10 @@ class Sheet:
 
 
 class File(NamedTuple):
-    """A file to import; `heads` are the names of its columns where they stand on one line."""
+    """A file to import."""
 
     name: str
     data: bytes
-    heads: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """For people to look at; a workbook is none."""
@@ -291,8 +290,7 @@ def text_file(by: Stranger, sheet: Sheet) -> File:
     writer = csv.writer(stream, delimiter=separator, lineterminator="\n", quoting=quoting)
     empty = [""] * int(by.rng.integers(1, 4)) * by.chance(0.03)
     writer.writerows([*sheet.heads, *([number(cell, point, form) for cell in row] + empty for row in sheet.rows)])
-    heads = tuple(sheet.heads[0]) if len(sheet.heads) == 1 else ()
-    return File(f"log.{by.pick(('csv', 'csv', 'txt', 'dat'))}", encoded(by, stream.getvalue()), heads)
+    return File(f"log.{by.pick(('csv', 'csv', 'txt', 'dat'))}", encoded(by, stream.getvalue()))
 
 
 def encoded(by: Stranger, text: str) -> bytes:
@@ -325,7 +323,7 @@ def workbook(by: Stranger, sheet: Sheet) -> File:
     if by.chance(0.2):
         book.create_sheet("Sheet2")
     book.save(stream)
-    return File("log.xlsx", stream.getvalue(), tuple(sheet.heads[0]) if len(sheet.heads) == 1 else ())
+    return File("log.xlsx", stream.getvalue())
 
 
 def markdown(by: Stranger, sheet: Sheet) -> File:
@@ -337,9 +335,7 @@ def markdown(by: Stranger, sheet: Sheet) -> File:
     above = "# Measurements\n\nTable 1, first day.\n\n" * by.chance(0.4) + "".join(
         f"{line}\n\n" for line in sheet.above
     )
-    return File(
-        "report.md", encoded(by, above + "".join(f"{left}{' | '.join(of)}{right}\n" for of in lines)), tuple(names)
-    )
+    return File("report.md", encoded(by, above + "".join(f"{left}{' | '.join(of)}{right}\n" for of in lines)))
 
 
 def with_index(by: Stranger, sheet: Sheet) -> None:
