@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,14 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, case):
     path = folder / "file"
     path.write_bytes(data)
     imported(path, folder)
+
+
+def test_a_number_whose_square_is_no_float_is_no_warning(tmp_path):
+    """Warnings are errors in tests."""
+    whole = FILES["counts_wrap/log.csv"].decode()
+    path = tmp_path / "log.csv"
+    path.write_text(re.sub(r"(?m)^\d+,", "1e308,", whole, count=1))
+    imported(path, tmp_path)
 
 
 BEYOND = "9" * 400

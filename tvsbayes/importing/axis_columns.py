@@ -455,6 +455,8 @@ def follows(command: Column, column: Column) -> bool:
     c, v = _in_both(command, column)
     if len(np.unique(c)) < 3 or np.ptp(v) == 0:
         return False
+    # Squares of a damaged number, 1e308, are no floats.
+    c, v = (values / np.abs(values).max() for values in (c, v))
     if np.corrcoef(c, v)[0, 1] ** 2 >= FOLLOWS_R2:
         return True
     dc, dv = np.diff(c), np.diff(v)
