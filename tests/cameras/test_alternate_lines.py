@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.drawn_spots import oval, picture, small_pair
+from support.drawn_spots import small_pair
 from support.written_rows import move_row, spot_row
 
 from tvsbayes.cameras.detection import detect
-from tvsbayes.cameras.spot_fit import LINES_EXCESS_MIN, Centre, centre_of, find_spot, widened
+from tvsbayes.cameras.spot_fit import LINES_EXCESS_MIN, Centre, find_spot, widened
 from tvsbayes.cameras.spot_noise import SpotNoise
-from tvsbayes.cameras.spot_window import patch_around
-from tvsbayes.files.images import in_grey_levels, png_bytes
+from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
 from tvsbayes.report.command_text import detection_text
-from tvsbayes.twin.spot_pictures import Footprint, Scene
 
 PLACE = np.array([150.3, 110.8])
 GAIN_DN = 0.04
@@ -60,17 +58,6 @@ def test_a_gain_of_the_odd_rows_causes_no_shift(sd):
         chi2.append(shift @ np.linalg.solve(4 * spot.covariance_px2, shift))
     # 60 degrees of freedom: mean 2, its standard uncertainty 0.37; four of them.
     assert 0.5 < np.mean(chi2) < 3.5
-
-
-def test_good_pictures_are_unchanged():
-    """Forty pictures of the twin, half of them with speckle: the same covariance to the bit."""
-    rng = np.random.default_rng(5)
-    for number in range(40):
-        mark = Footprint(PLACE + rng.uniform(-1, 1, 2), oval(rng, 2.5), 200.0)
-        frame = picture(mark, scene=Scene(speckle_contrast=0.4 * (number % 2)))
-        noise = SpotNoise(GAIN_DN, 0.4 * (number % 2))
-        without = centre_of(patch_around(in_grey_levels(frame)), noise)
-        assert (find_spot(frame, noise).covariance_px2 == without.covariance_px2).all()
 
 
 def spots_of(shifts: np.ndarray, covariance: np.ndarray) -> list[Centre]:

@@ -82,22 +82,6 @@ def test_cameras_of_two_picture_sizes(tmp_path, proportion):
         assert missed_px(of_pair(view), pose) < 2 * FOUND_PX
 
 
-def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):
-    write_pair(tmp_path, "1", pictures(POSES[0]))
-    cv2.imwrite(str(tmp_path / "left2.png"), pictures(POSES[1])[0])
-    cv2.imwrite(str(tmp_path / "RIGHT3.PNG"), np.full(SIZE[::-1], 90, np.uint8))
-    cv2.imwrite(str(tmp_path / "left_small.png"), np.zeros((30, 40), np.uint8))
-    cv2.imwrite(str(tmp_path / "leaf.png"), np.zeros((100, 400), np.uint8))
-    (tmp_path / "left_notes.txt").write_text("no picture")
-    (tmp_path / "right.yml").write_text("%YAML:1.0")
-    (tmp_path / ".left9.png").write_bytes(b"hidden")
-    views = find_views(tmp_path, BOARD)
-    assert [(v.name, v.left is None, v.right is None) for v in views.views] == [("1", False, False), ("2", False, True)]
-    assert views.unpaired == ("left2.png", "RIGHT3.PNG")
-    assert views.without_board == ("RIGHT3.PNG",)
-    assert (views.other_size, views.unnamed) == (("left_small.png",), ("leaf.png",))
-
-
 @pytest.mark.parametrize("swap", (False, True))
 def test_wide_frames_are_split(tmp_path, six, six_views, swap):
     for view in six_views.views[:2]:
@@ -149,25 +133,6 @@ def test_mirrored_corner_orders_are_corrected(monkeypatch):
     np.testing.assert_array_equal(boards.find_corners(grey, BOARD)[0], straight)
 
 
-def test_colours_decide_for_an_inverted_camera(tmp_path):
-    """The right picture turned by 180 degrees: direction alone would pair the wrong corners."""
-    left, right = pictures(POSES[0])
-    write_pair(tmp_path, "1", [left, right[::-1, ::-1]])
-    view = find_views(tmp_path, BOARD).views[0]
-    assert missed_px(np.hstack([view.left, np.array(SIZE) - 1 - view.right]), POSES[0]) < FOUND_PX
-
-
-def test_other_finder_is_used_and_reported(six, monkeypatch, tmp_path):
-    write_pair(tmp_path, "1", pictures(POSES[0]))
-    monkeypatch.setattr(boards, "_find_classic", lambda grey, board: None)
-    views = find_views(tmp_path, BOARD)
-    assert views.by_fallback == ("left1.png", "right1.png")
-    assert missed_px(of_pair(views.views[0]), POSES[0]) < FOUND_PX
-    direct = find_views(tmp_path, BOARD, finder="sector")
-    assert direct.by_fallback == ()
-    np.testing.assert_array_equal(direct.views[0].left, views.views[0].left)
-
-
 @pytest.mark.parametrize("share", [0.5, 0.2])
 def test_large_pictures_are_searched_in_a_smaller_copy(monkeypatch, share):
     """The size of the copy is no whole part of the picture's; corners are refined in the picture itself."""
@@ -208,30 +173,12 @@ def test_hostile_pictures_are_refused_by_name(tmp_path, kind):
         find_views(folder, BOARD)
 
 
-@pytest.mark.parametrize("kind", ("garbage", "damaged"))
-def test_all_pictures_that_cannot_be_used_are_named_at_once(tmp_path, kind):
-    """By their headers or by what the decoder says: two of four pictures."""
-    for name, pose in (("1", POSES[0]), ("2", POSES[1])):
-        write_pair(tmp_path, name, pictures(pose))
-    for name in ("left1.png", "right2.png"):
-        data = (tmp_path / name).read_bytes()
-        (tmp_path / name).write_bytes(b"?" + data[1:] if kind == "garbage" else damaged(data))
-    with pytest.raises(InputError, match=r"left1.png: found .*; likewise right2.png$"):
-        find_views(tmp_path, BOARD)
-
-
 def test_a_folder_without_pictures_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(NothingToEstimate, match="no checkerboard picture"):
         find_views(tmp_path, BOARD)
     with pytest.raises(InputError, match="nowhere"):
         find_views(tmp_path / "nowhere", BOARD)
-
-
-@pytest.mark.parametrize("text", ("9", "9x", "x6", "9x6x2", "2x9", "9x101", "-9x6", "nine x six", "٩x٦"))
-def test_impossible_boards_are_refused(text):
-    with pytest.raises(InputError, match="--board"):
-        Board.named(text, 25.0)
 
 
 def test_board_is_parsed_and_has_its_measures():
@@ -267,18 +214,6 @@ def test_the_size_of_a_board_is_detected(greys):
     assert (
         f"{size[0]}x{size[1]} inner corners are seen in 2 of 2" in reason and f"--board {size[0]}x{size[1]}?" in remedy
     )
-
-
-def test_the_size_of_a_board_is_searched_in_a_smaller_copy(greys, monkeypatch):
-    """At 20 million pixels a search by sectors takes gigabytes."""
-    sizes, search = [], boards.cv2.findChessboardCornersSBWithMeta
-    monkeypatch.setattr(
-        boards.cv2,
-        "findChessboardCornersSBWithMeta",
-        lambda grey, *more: sizes.append(grey.size) or search(grey, *more),
-    )
-    monkeypatch.setattr(boards, "SECTOR_PIXELS_MAX", greys[0].size // 2)
-    assert inner_corners(greys[0]) is not None and sizes[0] <= greys[0].size // 2
 
 
 @pytest.mark.parametrize(

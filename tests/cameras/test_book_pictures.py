@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from support.drawn_pictures import SIZE, drawn
 
@@ -86,33 +84,6 @@ def test_names_without_pictures_are_listed_and_a_wrong_folder_refused(tmp_path):
     assert sorted(booked.left_over) == ["left/exp01_P1_R.png", "up/exp02_P2_L.png"]
     with pytest.raises(InputError, match="no name of a picture among 14"):
         pictures_of_book(rows("{way}/E{n}_{p}.png"), tmp_path, "book.csv")
-
-
-def test_wide_pictures_hold_both(tmp_path):
-    """One file a look, in folders of directions with up: no word of a camera."""
-    lab(tmp_path, "{way}/exp{n}_P{p}.png", size=(6, 16), sides="L")
-    booked = pictures_of_book(rows("exp{n}_P{p}"), tmp_path, "book.csv")
-    assert len(booked.pictures) == 8 and booked.image_sizes["right"] == (8, 6)
-    assert booked.pictures[7].pictures[0].sides == ("left", "right")
-
-
-def test_moves_to_the_other_side_than_names_say_are_counted(tmp_path):
-    """A counter of the other sign: the name of the picture decides, and the contradiction is told."""
-    lab(tmp_path)
-    turned = [replace(row, moved="right") if row.moved == "left" else row for row in rows("{way}/exp{n:02d}_P{p}")]
-    booked = pictures_of_book(turned, tmp_path, "book.csv")
-    assert booked.turned == {"right": 4} and len(booked.pictures) == 8
-    stated = [replace(row, direction="left") for row in turned[:4]]
-    assert pictures_of_book(stated, tmp_path, "book.csv").turned == {"right": 4}
-
-
-def test_a_camera_word_is_no_direction_of_a_name(tmp_path):
-    """Of left/exp1_left.png and up/exp1_left.png that of the move up is meant."""
-    for way in WAYS:
-        drawn(tmp_path / way, "exp1_left.png", "exp1_right.png")
-    for cells in (("exp1_left.png",), ("exp1",), ("exp1_left", "exp1_right")):
-        booked = pictures_of_book([BookRow(0, 2, cells, "", "up")], tmp_path, "book.csv")
-        assert names_of(booked, tmp_path) == {0: ["up/exp1_left.png", "up/exp1_right.png"]}
 
 
 def test_pictures_of_two_sizes_are_refused_by_name(tmp_path):

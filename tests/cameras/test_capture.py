@@ -108,16 +108,6 @@ def test_both_of_two_devices_are_flushed():
     assert image.left.shape == image.right.shape == (HEIGHT, WIDTH, 3)
 
 
-def test_side_by_side_is_split_in_the_middle():
-    clock = VirtualClock()
-    capture = FakeCapture(clock)
-    both = np.zeros((HEIGHT, 2 * WIDTH, 3), np.uint8)
-    both[:, :WIDTH], both[:, WIDTH:] = 10, 200
-    capture.retrieve = lambda: (True, both)
-    image = OpenCVCamera([capture], WIDTH, HEIGHT, clock=clock).grab()
-    assert (image.left == 10).all() and (image.right == 200).all()
-
-
 @pytest.mark.parametrize("shape", ((HEIGHT, 2 * WIDTH), (HEIGHT, 2 * WIDTH, 1), (HEIGHT, 2 * WIDTH, 3)))
 def test_deep_and_monochrome_pictures_are_kept(shape):
     """16 bits stay 16 bits; one channel becomes three alike."""

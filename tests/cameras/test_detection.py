@@ -19,7 +19,6 @@ from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import Campaign, read_campaign, spots_bytes, write_campaign
 from tvsbayes.instrument.stereo_pair import scaled_px, write_stereo
-from tvsbayes.report.command_text import detection_text
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
 
@@ -193,26 +192,6 @@ def test_deep_frames_are_detected_with_all_their_bits(tmp_path, monkeypatch):
         assert deep.su_left_px == pytest.approx(eight.su_left_px, rel=0.1)
 
 
-def test_a_beam_s_own_skew_is_no_noise(tmp_path):
-    """Every spot has the same second maximum in its flank: learned as shape; one look without it is misshapen."""
-    folder = Folder(tmp_path / "c", looks=16, sd=3.0)
-    rng = np.random.default_rng(6)
-    for look in range(16):
-        for camera, side in enumerate(("left", "right")):
-            centre = folder.true_px[look, 2 * camera : 2 * camera + 2]
-            marks = [Footprint(centre, 9.0 * np.eye(2), 150.0)]
-            if (look, side) != (7, "left"):
-                marks.append(Footprint(centre + np.array([4.0, 0.0]), 4.0 * np.eye(2), 70.0))
-            light = sum(
-                render_spot(mark, WIDTH, HEIGHT, Scene(speckle_contrast=0.0), Sensor(), (look, camera, k)) / 1.0
-                for k, mark in enumerate(marks)
-            )
-            folder.put(look, side, np.clip(light + rng.normal(0, 0.1, light.shape), 0, 255).astype(np.uint8))
-    detection = detect(read_campaign(folder.path))
-    assert detection.statuses == {"ok": 15, "misshapen left": 1}
-    assert all(noise.speckle_contrast < 0.1 and max(np.abs(noise.skew)) > 0.01 for noise in detection.noise.values())
-
-
 def test_the_paper_s_contour_has_larger_errors_and_sds(speckled, found_speckled):
     contour = detect(read_campaign(speckled.path), "contour")
     errors, stated = speckled.errors(contour)
@@ -257,16 +236,6 @@ def test_pictures_that_are_mixed_up_are_said(tmp_path):
     assert found.as_json()["warnings"] == [warning]
 
 
-def test_an_uncertain_calibration_widens_the_epipolar_tolerance(plain):
-    loose = replace(plain.stereo, parameter_covariance=plain.stereo.parameter_covariance * 1e4)
-    covariances = np.broadcast_to(np.diag(np.full(4, 0.05**2)), (LOOKS, 4, 4))
-    assert not epipolar_refused(plain.true_px + np.array([0, 3.0, 0, 0]), covariances, loose).any()
-
-
-def test_the_number_of_threads_changes_nothing(plain, plain_detection):
-    assert detect(read_campaign(plain.path), workers=1).campaign.spots == plain_detection.campaign.spots
-
-
 def test_detection_in_place_keeps_rows_and_other_columns(tmp_path, capsys):
     folder = Folder(tmp_path / "c", looks=5, contrast=0.4)
     before = read_campaign(folder.path)
@@ -300,14 +269,6 @@ def test_detection_in_place_keeps_rows_and_other_columns(tmp_path, capsys):
     assert "no-spot right" in capsys.readouterr().out
 
 
-def test_the_table_names_every_status(found_speckled):
-    text = detection_text(
-        replace(found_speckled, missing=3, kept=2, statuses={"ok": 9, "border left, no-spot right": 1})
-    )
-    for word in ("ok", "border left", "undetected", "refused by hand", "contrast"):
-        assert word in text
-
-
 HOSTILE = {
     "link": lambda frame: frame.symlink_to(frame.rename(frame.parents[2] / "outside.png")),
     "damaged": lambda frame: frame.write_bytes(frame.read_bytes()[:-20] + bytes(20)),
@@ -327,20 +288,6 @@ def test_hostile_frames_are_refused_and_nothing_is_written(kind, tmp_path):
         assert caught.value.file == "000010_right.png"
     assert run(["detect", str(folder.path)]) == 2
     assert (folder.path / "spots.csv").read_bytes() == before
-
-
-def test_all_damaged_frames_are_named_at_once(tmp_path):
-    """Ten of twelve: the first in full, five by name, the rest by number."""
-    folder = Folder(tmp_path / "c", looks=6)
-    looks = [f"{spot.spot:06d}" for spot in read_campaign(folder.path).spots]
-    names = [f"{look}_{side}.png" for look in looks for side in ("left", "right")][2:]
-    for name in names:
-        (folder.path / "frames" / name).write_bytes(b"no picture")
-    message = f"{names[0]}: found .*; likewise {', '.join(names[1:6])} and 4 more$"
-    for method in ("fit", "contour"):
-        with pytest.raises(InputError, match=message) as caught:
-            detect(read_campaign(folder.path), method)
-        assert caught.value.file == names[0] and names[6] not in str(caught.value)
 
 
 def test_a_refusal_of_another_path_is_passed_on(tmp_path):

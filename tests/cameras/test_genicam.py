@@ -160,14 +160,6 @@ def test_pictures_are_triggered_after_the_request():
     assert maker.reset_done and all(a.destroyed for a in maker.acquirers)
 
 
-def test_twelve_bits_are_kept():
-    camera = opened(Maker(), pixel_format="Mono12")
-    pair = camera.grab()
-    picture = pair.left
-    assert picture.dtype == np.uint16 and picture[0, 5].tolist() == [5 + 1] * 3 and pair.white == 4095
-    assert camera.settings().values["left.bits"] == 12.0
-
-
 def test_colour_has_the_channel_order_of_opencv():
     picture = opened(Maker(), pixel_format="RGB8").grab().left
     assert picture[0, 0].tolist() == [3, 2, 1]

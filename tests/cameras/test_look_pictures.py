@@ -13,21 +13,6 @@ from tvsbayes.errors import InputError, Question
 from tvsbayes.files.images import png_bytes, read_image
 
 
-def test_the_number_in_the_name_is_the_move(tmp_path):
-    """Of several numbers the one that distinguishes most looks; the rest of the name is the sheet."""
-    drawn(tmp_path, *pairs("_d1_000", "_d1_007", "_d2_007", "_d1_012"))
-    matched = pair_looks(views_of(tmp_path).views, range(20))
-    assert matched.matching == "number"
-    assert [(s.spot, s.move, s.target, s.status) for s in matched.spots] == [
-        (0, 0, "d1", "undetected"),
-        (1, 7, "d1", "undetected"),
-        (2, 7, "d2", "undetected"),
-        (3, 12, "d1", "undetected"),
-    ]
-    assert matched.pictures[2].name == "_d2_007"
-    assert matched.without == tuple(move for move in range(20) if move not in (0, 7, 12))
-
-
 def test_names_without_a_fitting_number_count_in_order(tmp_path):
     """1, 2 ... 10 for moves 0 to 9: names sort by number."""
     drawn(tmp_path, *pairs(*map(str, range(1, 11))))
@@ -40,14 +25,6 @@ def test_names_without_a_fitting_number_count_in_order(tmp_path):
     for moves, matching in ((9, None), (10, "number"), (12, "order")):
         with pytest.raises(InputError, match="number of its row"):
             pair_looks(views, range(moves), matching=matching)
-
-
-def test_without_moves_every_number_is_a_move(tmp_path):
-    drawn(tmp_path, *pairs("_5", "_7_a", "_7_b", "_12"))
-    matched = pair_looks(views_of(tmp_path).views, None)
-    assert [s.move for s in matched.spots] == [5, 7, 7, 12] and matched.renumbered is None
-    assert [s.target for s in matched.spots] == ["", "a", "b", ""]
-    assert matched.without == tuple(move for move in range(12) if move not in (5, 7))
 
 
 def test_numbers_too_sparse_for_moves_are_renumbered_and_reported(tmp_path):
@@ -89,20 +66,6 @@ def test_numbers_of_something_else_are_no_moves(tmp_path, names, counted):
         with pytest.raises(Question, match=f"numbers of {counted} in the names"):
             pair_looks(views, moves)
     assert [spot.move for spot in pair_looks(views, None, matching="order").spots] == [0, 1, 2]
-
-
-def test_pictures_of_no_look_are_left_out_and_named(tmp_path):
-    """Dark frames, backgrounds and the board, by words in their names or folders."""
-    drawn(tmp_path, *pairs("_00_on", "_00_off", "_01_on", "_01_off", "_background"))
-    found = views_of(tmp_path)
-    assert [view.numbers for view in found.views] == [[0], [1]]
-    assert [name for name in found.without_spot if "left" in name] == [
-        *("left_00_off.png", "left_01_off.png", "left_background.png"),
-    ]
-    boards = tmp_path / "boards"
-    boards.mkdir()
-    drawn(boards, *pairs("_calib_1", "_calib_2"))
-    assert len(views_of(boards).views) == 2 and not views_of(boards).without_spot
 
 
 def test_rows_without_pictures_take_their_own(tmp_path):
@@ -169,9 +132,3 @@ def test_a_png_is_copied_as_it_is_and_a_jpeg_decoded(tmp_path):
     assert (frames / "000000_left.png").read_bytes() == (tmp_path / "mixed" / "left1.png").read_bytes()
     right = read_image(tmp_path / "mixed" / "right1.jpg")
     np.testing.assert_array_equal(read_image(frames / "000000_right.png"), right)
-
-
-def test_a_narrow_picture_among_wide_ones_is_reported(tmp_path):
-    drawn(tmp_path / "wide", "look_0.png", "look_1.png", size=(6, 16))
-    drawn(tmp_path / "wide", "room.png")
-    assert views_of(tmp_path / "wide").unnamed == ("room.png",)

@@ -65,15 +65,6 @@ def test_frames_are_read_continuously_and_the_newest_is_returned():
     assert inner.released
 
 
-def test_a_stream_that_ends_is_reopened_once_per_run():
-    streams = [Stream(5), Stream(3), Stream()]
-    opened = iter(streams)
-    stream = NetworkStream(lambda: next(opened))
-    assert streams[2].many.wait(WAIT_S)
-    assert stream.grab() and stream.reopened == 2 and streams[0].released and streams[1].released
-    stream.release()
-
-
 def _gone():
     raise DeviceFault("camera", "gone", remedy="plug it in")
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.drawn_spots import HEIGHT, WIDTH, oval, picture
 
-from tvsbayes.cameras.detection import REASONS
 from tvsbayes.cameras.spot_fit import find_spot
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.cameras.spot_window import CLIPPED_DN, patch_around
@@ -66,28 +65,6 @@ REFUSED = {
 @pytest.mark.parametrize("reason", REFUSED)
 def test_every_refusal_has_its_name(reason):
     assert find_spot(REFUSED[reason]()).status == reason
-
-
-def test_all_reasons_are_tested():
-    """`epipolar` below; `unfitted` has no picture of its own."""
-    assert set(REASONS) - set(REFUSED) == {"epipolar", "unfitted"}
-
-
-def test_a_window_in_the_corner_does_not_shift_a_spot():
-    """The centre is that of the dark picture to a quarter of its sd: the background is estimated from other pixels."""
-    frame = picture(Footprint(HERE, SMALL, 180.0))
-    dark, lit = (find_spot(image, SpotNoise(0.04, 0)) for image in (frame, window(frame)))
-    assert dark.status == lit.status == "ok"
-    assert np.abs(lit.centre_px - dark.centre_px).max() < 0.25 * np.sqrt(dark.covariance_px2.max())
-
-
-def test_a_weak_second_reflection_and_a_gradient_are_harmless():
-    steep = Scene(speckle_contrast=0.0, ambient_dn=60.0, ambient_gradient_dn=100.0)
-    spot = find_spot(
-        picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 25.0), scene=steep), SpotNoise(0.04, 0)
-    )
-    assert spot.status == "ok"
-    assert np.abs(spot.centre_px - HERE).max() < 5 * np.sqrt(spot.covariance_px2.max())
 
 
 def test_a_clipped_core_is_normal_and_a_larger_one_widens_the_sd():
@@ -153,13 +130,6 @@ def test_pixels_of_a_wide_beam_give_its_uncertainty(white):
     # Four times the pixels each way; the whole has the centre of its parts.
     assert np.sqrt(np.mean(variances) / np.trace(whole.covariance_px2) * 2) == pytest.approx(4, rel=0.3)
     assert np.abs(whole.centre_px - np.mean(centres, axis=0)).max() < 0.05
-
-
-def test_a_beam_far_from_its_shape_is_refused():
-    """Half of it cut off by an edge is no shape of a beam."""
-    cut = beam(np.random.default_rng(1), 255)
-    cut[:, 240:] = np.minimum(cut[:, 240:], 3)
-    assert find_spot(cut).status != "ok"
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (4, 40), (7, 9), (8, 8)])

@@ -476,16 +476,6 @@ def test_command_does_not_replace_files(ask, tmp_path, there):
     assert [path.name for path in tmp_path.iterdir()] == [there] and (tmp_path / there).read_text() == "kept"
 
 
-def test_command_warns_of_an_implausible_import(ask, capsys, tmp_path):
-    mounted = read_stereo(MOUNTED / "stereo.json")
-    swapped = replace(mounted, R=mounted.R.T, T=-mounted.R.T @ mounted.T)
-    (tmp_path / "swapped.json").write_bytes(stereo_bytes(swapped))
-    code, document = ask("--import", tmp_path / "swapped.json")
-    assert code == 0 and [w for w in document["warnings"] if "swapped" in w] == document["warnings"] != []
-    assert run(["stereo", "--import", str(tmp_path / "swapped.json")]) == 0
-    assert "warning: the second camera stands" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("falls", [0, 1, RESTARTS_MAX, RESTARTS_MAX + 1])
 def test_the_accepted_end_was_repeated(monkeypatch, falls):
     """Every descent ends lower than the one before: the last end is compared with another one."""

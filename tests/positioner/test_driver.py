@@ -32,21 +32,6 @@ def homed(device: SimulatedDevice, settings=None) -> SerialPositioner:
     return positioner
 
 
-def test_a_session_from_connection_to_close():
-    device = simulated()
-    positioner = connected(device)
-    assert positioner.identity["fw"] == "1.1.0" and positioner.repeats == 0
-    report = positioner.home()
-    assert not report.known and (report.state.pan_steps, report.state.tilt_steps) == (-60, -40)
-    state = positioner.move_to(200, -15)
-    assert (state.pan_steps, state.tilt_steps) == (200, -15) == tuple(device.mechanics.true_steps)
-    assert positioner.laser(True).laser_on and device.mechanics.laser_on
-    assert positioner.move_to(200, -15).pan_steps == 200, "a move of no steps is done at once"
-    positioner.close()
-    assert not device.mechanics.laser_on
-    positioner.close()
-
-
 def test_a_laser_left_on_is_off_in_motion():
     device = simulated()
     positioner = homed(device)
@@ -91,20 +76,6 @@ def test_motion_stopped_from_outside_is_no_arrival():
     with pytest.raises(DeviceFault) as caught:
         positioner.move_to(50, 0)
     assert caught.value.code == "stopped" and device.mechanics.true_steps[0] == 50
-
-
-@pytest.mark.parametrize(("order", "compared"), [(None, True), ("ABORT", False)])
-def test_homing_after_an_alarm_compares_nothing(order, compared):
-    """The device stayed on; the counters of one in alarm say nothing, and its report of (0, 0) neither."""
-    device = simulated()
-    first = connected(device)
-    assert not first.home().compared
-    if order:
-        device.model.receive(request(4_000_000_000, order), device.clock.now_us)
-    device.mechanics.true_steps[0] -= 4
-    report = connected(device).home()
-    assert not report.known and report.compared is compared
-    assert report.deviation_steps == ((4, 0) if compared else (0, 0))
 
 
 def test_close_darkens_though_another_program_has_counted_on():
@@ -168,15 +139,6 @@ def test_an_identity_without_a_sequence_is_refused(last):
     assert caught.value.code == "firmware"
 
 
-def test_port_that_cannot_be_opened():
-    def gone():
-        raise OSError(2, "No such file or directory")
-
-    with pytest.raises(DeviceFault) as caught:
-        SerialPositioner(gone, {}, VirtualClock())
-    assert caught.value.code == "port" and "No such file" in caught.value.message
-
-
 class Plug:
     """A line that can be pulled: every call fails until it is plugged in again."""
 
@@ -210,30 +172,6 @@ def plugged_in() -> tuple[SimulatedDevice, Plug, SerialPositioner]:
     positioner = SerialPositioner(plug.open, SETTINGS, device.clock)
     positioner.home()
     return device, plug, positioner
-
-
-@pytest.mark.parametrize("reset", [False, True])
-def test_unplugged_and_plugged_in_again(reset):
-    device, plug, positioner = plugged_in()
-    positioner.laser(True)
-    plug.pulled_until_us = device.clock.now_us + 5_000_000
-    if reset:
-        device.power_on()
-        with pytest.raises(PositionLost):
-            positioner.move_to(50, 0)
-    else:
-        assert positioner.move_to(50, 0).pan_steps == 50 == device.mechanics.true_steps[0]
-    assert not device.mechanics.laser_on, "the watchdog of the device saw to it meanwhile"
-
-
-def test_unplugged_for_good_is_reported_in_time():
-    device, plug, positioner = plugged_in()
-    plug.pulled_until_us = 10**12
-    start = device.clock.monotonic()
-    with pytest.raises(DeviceFault) as caught:
-        positioner.move_to(50, 0)
-    assert caught.value.code == "unplugged" and device.clock.monotonic() - start < 15
-    positioner.close()
 
 
 def test_another_program_meanwhile_is_noticed():

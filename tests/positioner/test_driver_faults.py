@@ -281,12 +281,6 @@ def bench(kinds, steps, seeds) -> tuple[Counter, list[str]]:
     return outcomes, wrong
 
 
-def test_without_a_fault_everything_is_done():
-    run = session("none", 0, 0)
-    assert (run.outcome, run.logged, run.wrong) == ("done", 3, [])
-    assert len(KINDS) >= 15 and len(set(KINDS)) == len(KINDS)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_fault_makes_a_move_count_that_was_not_reached(kind):
     steps = range(1 + sum(map(ord, kind)) % 11, REQUESTS + 1, 11)

@@ -16,30 +16,6 @@ from tvsbayes.positioner.protocol import SETTINGS, parse_answer, request
 FIRMWARE = firmware_folder()
 
 
-def test_repeated_request_is_answered_from_the_cache_and_not_executed_again():
-    bench = Bench().homed()
-    first = request(5, "MA", 100, 20)
-    bench.device.receive(first, bench.now_us)
-    reply = bench.sent[-1]
-    bench.pass_time(5)
-    assert bench.board.true_steps == [100, 20]
-    bench.device.receive(first, bench.now_us)
-    assert bench.sent[-1] == reply, "the cached reply, though the state has changed since"
-    assert bench.ask(6, "?").state.done_sequence == 5
-
-
-def test_lower_sequences_and_reused_ones_are_refused():
-    bench = Bench().homed()
-    bench.ask(5, "MA", 10, 0)
-    bench.pass_time(5)
-    assert bench.ask(5, "MA", 30, 0).error == "seq"
-    assert bench.ask(4, "MA", 30, 0).error == "seq"
-    assert bench.ask(0, "MA", 30, 0).error == "seq"
-    bench.pass_time(5)
-    assert bench.board.true_steps == [10, 0]
-    assert bench.ask(0, "ID").extra == {"fw": "1.1.0", "proto": "2", "q": "5"}
-
-
 def test_moves_need_homing_stay_inside_the_limits_and_never_overlap():
     bench = Bench()
     assert bench.ask(1, "MA", 1, 1).error == "unhomed"
@@ -77,18 +53,6 @@ def test_ramp_obeys_speed_and_acceleration_and_ends_slowly():
         speed = min((200**2 + 2 * amax * n) ** 0.5, vmax)
         assert gap == pytest.approx(1e6 / speed, rel=1 / 200, abs=1)
     assert gaps == gaps[::-1]
-
-
-def test_stop_slows_down_and_keeps_the_counters():
-    bench = Bench().homed()
-    bench.ask(5, "MA", 800, 0)
-    bench.pass_time(0.5)
-    bench.ask(6, "STOP")
-    bench.pass_time(5)
-    state = bench.ask(7, "?").state
-    assert (state.status, state.last_error) == ("idle", "stop")
-    assert state.done_sequence == 3, "a stopped motion is never done"
-    assert 0 < state.pan_steps < 800 and state.pan_steps == bench.board.true_steps[0] == state.pan_target_steps
 
 
 def test_abort_and_limit_switch_end_in_alarm_with_the_laser_off():

@@ -36,11 +36,6 @@ def homed(settings: dict[int, float] | None = None, **changes) -> tuple[GrblBoar
     return board, positioner
 
 
-def test_slow_ramps_are_waited_for():
-    """Full speed of 100 mm/s at 5 mm/s^2 takes 20 s, and as long to stop."""
-    assert connected(GrblBoard({120: 5.0}))._board.ramps_s == 40.0
-
-
 def test_messages_of_a_board():
     status = parse_status("<Idle|MPos:5.529,-0.560,7.000|FS:0,0|WCO:0.000,1.551,5.664|Pn:XZ>")
     assert status is not None and (status.state, status.position_mm, status.pins) == ("Idle", (5.529, -0.56), "XZ")
@@ -144,18 +139,6 @@ def check_fault(positioner: GrblPositioner, board: GrblBoard, order: tuple, code
     return caught.value
 
 
-def test_an_alarm_is_left_by_homing():
-    board, positioner = homed()
-    board.limit_steps = 300
-    with pytest.raises(DeviceFault, match="hard limit"):
-        positioner.move_to(900, 0)
-    with pytest.raises(DeviceFault, match="before homing"):
-        positioner.move_to(0, 0)
-    board.limit_steps = 10**9
-    positioner.home()
-    assert positioner.move_to(10, 10).pan_steps == 10
-
-
 def test_an_interrupted_order_does_not_answer_the_next():
     """Ctrl-C between an order and its ok, then laser off: that ok is not taken for this one's."""
     board, positioner = homed()
@@ -184,13 +167,6 @@ def test_a_board_that_is_set_otherwise_is_refused_by_its_setting(settings, colum
     with pytest.raises(InputError) as caught:
         connected(GrblBoard(settings))
     assert caught.value.column == column and f"{column}=..." in caught.value.remedy
-
-
-def test_laser_mode_is_no_matter_of_a_coolant_output():
-    board, positioner = homed({32: 1}, laser="M8")
-    assert positioner.laser(True).laser_on and board.laser_on
-    positioner.close()
-    assert not board.laser_on
 
 
 def test_light_without_a_watchdog_has_to_be_accepted():

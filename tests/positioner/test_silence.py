@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import random
 
 import pytest
-from support.pseudo_terminal import needs_pseudo_terminals
 
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.firmware_model import Mechanics
-from tvsbayes.positioner.protocol import SEQUENCE_MAX, crc16, request
-from tvsbayes.positioner.serial_port import serial_opener
-from tvsbayes.positioner.silence import explained
+from tvsbayes.positioner.protocol import SEQUENCE_MAX, request
 
 GREETING = b"\r\nGrbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n"
 UNREADABLE = bytes(random.Random(3).choice((0x00, 0x80, 0xF8, 0xFE, 0x1C, 0x66)) for _ in range(40))
@@ -89,26 +85,3 @@ def test_a_used_up_sequence_is_named():
     assert caught.value.code == "sequence" and "plug it in again" in caught.value.remedy
     device.power_on()
     SerialPositioner(lambda: ModelLink(device), {}, device.clock).close()
-
-
-@needs_pseudo_terminals
-def test_a_port_that_another_program_holds_is_named():
-    import fcntl
-
-    master, slave = os.openpty()
-    other = os.open(os.ttyname(slave), os.O_RDWR | os.O_NOCTTY)
-    fcntl.flock(other, fcntl.LOCK_EX)
-    try:
-        with pytest.raises(DeviceFault, match="held by another program") as caught:
-            SerialPositioner(serial_opener(os.ttyname(slave), 115_200), {}, VirtualClock())
-        assert caught.value.code == "port-busy" and "close the other program" in caught.value.remedy
-    finally:
-        for descriptor in (other, slave, master):
-            os.close(descriptor)
-
-
-def test_a_message_for_another_program_is_no_wrong_speed():
-    """Noise that begins like text is one."""
-    body = b"<7 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none"
-    assert explained(body + b"*%04X\n" % crc16(body)).cause == "nak"
-    assert explained(b"ab" + UNREADABLE).cause == "unreadable"

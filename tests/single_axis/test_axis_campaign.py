@@ -58,12 +58,6 @@ def test_limits_and_assumed_moves_are_kept_and_no_estimate_depends_on_the_limits
     assert read_axis(tmp_path / "b").range_allowed == (-2300.0, 2000.0)
 
 
-def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):
-    axis = read_axis(folder(tmp_path / "a", "\ufeff" + TOML, MOVES.replace("\n", "\r\n")))
-    assert axis.moves[1].command == 10.5
-    assert [(r.value, r.u, r.status) for r in axis.readings] == [(0.1, 0.01, "ok"), (None, 0.0, "lost")]
-
-
 @pytest.mark.parametrize(
     ("change", "file", "line", "column", "code"),
     [
@@ -145,17 +139,6 @@ def test_temperatures_start_at_absolute_zero(tmp_path):
     assert read_axis(folder(tmp_path / "a", moves=moves.format(-273.15))).moves[0].temperature_degC == -273.15
     with pytest.raises(InputError, match=r"temperature_degC.*-273\.15"):
         read_axis(folder(tmp_path / "b", moves=moves.format(-300)))
-
-
-def test_an_absolute_encoder_is_read_written_and_hashed(tmp_path):
-    plain = read_axis(folder(tmp_path / "a"))
-    kept = read_axis(folder(tmp_path / "b", TOML + "[axis]\nabsolute = true\n"))
-    assert kept.absolute and not plain.absolute
-    assert axis_hashes(kept)["axis"] != axis_hashes(plain)["axis"]
-    write_axis(kept, tmp_path / "c")
-    assert read_axis(tmp_path / "c").absolute
-    off = read_axis(folder(tmp_path / "d", TOML + "[axis]\nabsolute = false\n"))
-    assert axis_hashes(off) == axis_hashes(plain)
 
 
 @pytest.mark.parametrize(

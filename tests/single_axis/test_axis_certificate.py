@@ -115,12 +115,6 @@ def test_what_allows_no_certificate_is_refused(results):
     assert refusal(lambda: root(results, parties=Parties(country="Mexico"))).code == "country"
 
 
-def test_signed_or_not_is_said_and_equal_inputs_give_equal_bytes(results):
-    both = [axis_certificate(results, issued=DAY, parties=Parties(), report=REPORT, signed=s) for s in (False, True)]
-    assert both[0].replace(b"Signature>false<", b"Signature>true<") == both[1]
-    assert both[0] == axis_certificate(results, issued=DAY, parties=Parties(), report=REPORT)
-
-
 def test_tables_of_the_header_are_read_and_checked(results, tmp_path):
     write_axis(results.fit.campaign, tmp_path / "a")
     assert read_axis(tmp_path / "a").header == HEADER

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.axes import campaign, drawn, random_moves, runs
+from support.axes import drawn, random_moves, runs
 
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_doubts import axis_warnings, data_doubts
@@ -46,16 +46,6 @@ def test_moves_beyond_the_stated_limits_are_doubted_unless_an_import_added_them(
     assert not [doubt for doubt in doubts(replace(axis, moves=added)) if "limits" in doubt]
 
 
-def test_a_segment_counted_in_other_steps_is_named():
-    whole = logged()
-    mixed = replace(
-        whole, moves=tuple(replace(m, command=m.command / 16) if m.segment == 2 else m for m in whole.moves)
-    )
-    [doubt] = [text for text in doubts(mixed) if text.startswith("segment")]
-    assert doubt.startswith("segment 2 ") and "16 times" in doubt and "moves.csv" in doubt and "(0.012499)" in doubt
-    assert doubts(whole) == []
-
-
 @pytest.mark.parametrize("value", [16 * RATIO, -RATIO])
 def test_a_wrong_stated_ratio_is_named(value):
     [doubt] = doubts(logged(per_command=AxisPrior(value, 0.001)))
@@ -76,20 +66,6 @@ def test_outliers_are_named_and_their_neighbours_not(stated):
         move = whole.readings[at].move
         assert text.startswith(f"reading {at} (move {move}, command {whole.moves[move].command:g}) ")
         assert "readings.csv" in text and "1.5" in text and "status" in text
-
-
-def test_a_single_outlier_is_named_among_stops_read_once():
-    """By a line through the other stops; a stop within the play is not assessed."""
-    moves = [AxisMove(k, 0, 60.0 * k, c, "" if k else "forward") for k, c in enumerate([*range(6), *range(4, -1, -1)])]
-    stands = [250.0 * m.command - (6.0 if k > 5 else 0.0) + (-1) ** k for k, m in enumerate(moves)]
-    log = campaign(moves, stands)
-    assert data_doubts(log, rows_of(log)) == []
-    wild = campaign(moves, [v + 200.0 * (k == 8) for k, v in enumerate(stands)])
-    [doubt] = data_doubts(wild, rows_of(wild))
-    assert doubt.startswith("reading 8 (move 8, command 2) lies +2") and "readings.csv" in doubt and "status" in doubt
-    loose = [250.0 * m.command - (300.0 if k > 6 else 50.0 if k == 6 else 0.0) for k, m in enumerate(moves)]
-    held = campaign(moves, loose)
-    assert data_doubts(held, rows_of(held)) == []
 
 
 @pytest.mark.parametrize("seed", range(8))

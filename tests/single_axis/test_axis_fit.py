@@ -12,7 +12,7 @@ from tvsbayes.inference import ensemble
 from tvsbayes.inference.chain import run_of
 from tvsbayes.inference.importance import weighted_run
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE, RUNS
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
+from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_density import AxisDensity, find_mode
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -88,15 +88,6 @@ def test_another_tier_is_an_entry_of_runs(monkeypatch):
     np.testing.assert_array_equal(one.draws["backlash"], other.draws["backlash"])
 
 
-def test_nothing_left_to_sample():
-    moves = runs(2)
-    fixed = campaign(moves, [0.01 * m.command + 0.002 * (k % 3) for k, m in enumerate(moves)], **FIRST_EDITION)
-    for way in ({"tier": "emcee"}, {"tier": "importance"}, {"sampled": False}):
-        fit = fit_axis(fixed, **way)
-        assert fit.free == () and fit.error is None
-        assert summarise_axis(fit).per_command["forward"].value == pytest.approx(0.01, rel=1e-3)
-
-
 def test_play_swallows_short_legs():
     """Backlash of five legs, stops inside it."""
     commands = [*range(0, 12), *range(12, 0, -1), *range(0, 12)]
@@ -141,15 +132,6 @@ def test_readings_without_a_density_are_not_converged(scales):
     assert "no density" in fit.error.message and not summarise_axis(fit).converged
 
 
-def test_undetermined_quantities_are_named():
-    moves = [AxisMove(k, 0, 60.0 * k, 100.0 * k, "" if k else "forward") for k in range(4)]
-    summary = summarise_axis(fit_axis(campaign(moves, [0.0, 1.0, 2.1, 3.0]), tier="importance"))
-    text = " ".join(summary.weak_directions)
-    assert "one side" in text and "4 positions" in text and "twice" in text
-    assert summary.parameters["backlash"].contraction == pytest.approx(0.0, abs=0.15)
-    assert summary.classic.backlash is None and summary.classic.iso230 is None
-
-
 def test_a_reversal_of_the_wrong_sign_is_reported():
     moves = runs(3)
     side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
@@ -158,14 +140,6 @@ def test_a_reversal_of_the_wrong_sign_is_reported():
     summary = summarise_axis(fit_axis(campaign(moves, values), sampled=False))
     assert summary.parameters["backlash"].value == pytest.approx(-0.2, abs=0.05)
     assert any("negative" in text for text in summary.warnings)
-
-
-@pytest.mark.parametrize("name, value", [("per_command", 0.01), ("ratio_contrast", 2e-6)])
-def test_a_constant_is_held(name, value):
-    axis = drawn(2, None, **{name: AxisPrior(value, 0.0)}).campaign
-    fit = fit_axis(AxisCampaign("deg", axis.moves, axis.readings, axis.stated), sampled=False)
-    # Rounding of a variance that is zero.
-    np.testing.assert_allclose(fit.draws[name], value, atol=1e-10)
 
 
 def test_places_read_one_after_the_other_are_weak():

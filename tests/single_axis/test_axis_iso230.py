@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from statistics import mean, stdev
 
@@ -13,7 +12,7 @@ from support.published_iso230 import PUBLISHED, vector_runs
 
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
-from tvsbayes.single_axis.classic_line import classic_axis, position_runs, target_runs
+from tvsbayes.single_axis.classic_line import classic_axis
 
 type Table = dict[float, list[float]]
 ROUNDING = 1e-9
@@ -137,29 +136,3 @@ def figures(commands: list[float], values: list[float]) -> dict[str, float | Non
     moves = [AxisMove(k, 0, 60.0 * k, c, "" if k else "unknown") for k, c in enumerate(commands)]
     data = campaign(moves, values)
     return classic_axis(rows_of(AxisCampaign("mm", data.moves, data.readings, command_unit="mm"))).iso230
-
-
-def test_one_run_a_side_has_no_repeatability():
-    one = figures([-5, 0, 10, 20, 25, 20, 10, 0], [-5, 0.0, 10.1, 20.0, 25, 20.2, 10.2, 0.2])
-    missing = {name for name, value in one.items() if value is None}
-    assert missing == {name for name in one if name.startswith(("repeatability", "accuracy"))}
-    assert one["reversal"] == pytest.approx(0.2) and one["systematic"] == pytest.approx(0.2)
-
-
-def test_one_side_alone_has_its_own_figures():
-    side = figures([-5, 0, 10, -5, 0, 10, -5, 0, 10], [-5, 0.0, 10.1, -5, 0.2, 10.1, -5, 0.1, 10.4])
-    assert side["repeatability_forward"] == pytest.approx(4 * math.sqrt(0.03))
-    assert {name for name, value in side.items() if value is not None} == {
-        *("repeatability_forward", "systematic_forward", "accuracy_forward")
-    }
-
-
-def test_runs_that_were_not_made_are_nan():
-    rows = drifting(1.0)
-    left_out = np.zeros(len(rows.value), dtype=bool)
-    left_out[np.flatnonzero((rows.command == 50.0) & (rows.side > 0))[0]] = True
-    deviations = position_runs(rows.without(left_out), rows.without(left_out).value)
-    assert deviations.position.tolist() == [0.0, 50.0, 100.0]
-    assert np.isnan(deviations.forward).sum() == 1 and not np.isnan(deviations.backward).any()
-    assert deviations.rows[0].shape == (3, 3) and (deviations.rows[0] == -1).sum() == 1
-    assert target_runs(rows).runs.forward.shape == (3, 3)

@@ -15,9 +15,6 @@ from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import (
-    CURVE_DRAWS,
-    deviation_strata,
-    drawn_deviations,
     keep_fit,
     results_for,
     summarise_axis,
@@ -70,18 +67,6 @@ def test_results_that_modelled_less_are_fitted_again(kept, copied, monkeypatch):
     monkeypatch.setattr("tvsbayes.single_axis.axis_record.fit_axis", lambda *_, **__: fit)
     assert results_for(read_axis(copied), notify=messages.append).fit is fit
     assert messages == ["results/ are of a version with another model of the axis: fitting first (weighted draws) ..."]
-
-
-def test_strata_have_the_band_of_all_draws(kept):
-    """The band of a page against draws of every equally weighted draw of the scales."""
-    fit = kept[1]
-    commands = fit.rows.positions
-    every = drawn_deviations(fit, commands, np.random.default_rng(1))
-    sd = every.std(axis=0)
-    ends, expected = (np.percentile(values, [2.5, 97.5], axis=0) for values in (deviation_strata(fit, commands), every))
-    # Standard error of an end by n draws is sqrt(0.025 0.975 / n) / 0.058 sd of a normal law.
-    allowed = 5 * sum(np.sqrt(0.025 * 0.975 / n) / 0.058 for n in (len(every), CURVE_DRAWS))
-    assert np.abs((ends - expected) / sd).max() < allowed < 1.1
 
 
 @pytest.mark.parametrize(

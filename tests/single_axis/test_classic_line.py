@@ -9,7 +9,7 @@ from support.axes import campaign, runs
 from tvsbayes.report.axis_document import classic_text
 from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
-from tvsbayes.single_axis.classic_line import classic_axis, fit_line
+from tvsbayes.single_axis.classic_line import classic_axis
 
 
 def rows_with(seed: int, places: tuple[float, ...] = (0.0, 500.0, 1400.0), cycles: int = 3) -> AxisRows:
@@ -46,14 +46,3 @@ def test_as_many_stops_as_unknowns_leave_u_and_scatter_open():
     assert line.u_per_command is line.u_backlash is line.residual_sd is None
     text = classic_text(line, "deg")
     assert text.startswith("1 deg per command\nbacklash 0.1 deg\n") and "not determined" in text
-
-
-def test_rows_of_one_side_give_zero_reversal():
-    rows = rows_with(2)
-    forward = fit_line(rows, rows.side > 0)
-    slope, offset = np.polyfit((rows.command - rows.command.mean())[rows.side > 0], rows.value[rows.side > 0], 1)
-    np.testing.assert_allclose(forward.solution, [offset, slope, 0.0], rtol=1e-9, atol=1e-12)
-    assert not forward.covariance[2].any() and np.all(np.diag(forward.covariance)[:2] > 0)
-    moves = [AxisMove(k, 0, 0.0, c, "" if k else "forward") for k, c in enumerate((0.0, 1.0, 2.0, 4.0))]
-    alone = classic_axis(rows_of(campaign(moves, [0.0, 1.1, 1.9, 4.0])))
-    assert alone.backlash is alone.u_backlash is None

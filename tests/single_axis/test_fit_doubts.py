@@ -13,7 +13,7 @@ from tvsbayes.report.axis_document import axis_fit_text
 from tvsbayes.results.estimates import Estimate, Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
-from tvsbayes.single_axis.axis_record import AxisSummary, PositionDeviation, summarise_axis
+from tvsbayes.single_axis.axis_record import AxisSummary, summarise_axis
 from tvsbayes.single_axis.fit_doubts import RULES, WithoutProcesses, doubts_of
 from tvsbayes.single_axis.waves import WavePeriods
 from tvsbayes.statistics.intervals import WithSd
@@ -39,39 +39,6 @@ def names(summary: AxisSummary, without: WithoutProcesses | None = None) -> list
 
 def changed(summary: AxisSummary, **parameters: Estimate) -> AxisSummary:
     return structs.replace(summary, parameters={**summary.parameters, **parameters})
-
-
-def test_a_clean_axis_raises_no_doubt(clean):
-    assert clean.doubts == () and names(clean) == []
-
-
-def test_the_scatter_of_readings_far_below_their_u_is_doubted(clean):
-    """0.2 is the limit; a scale that the readings do not inform says nothing."""
-    wide = changed(clean, reading_scale=estimate(0.08, 0.01))
-    [doubt] = doubts_of(wide)
-    assert doubt.name == "stated u" and not doubt.usable and "0.08 of their stated u" in doubt.text
-    assert names(changed(clean, reading_scale=estimate(0.25, 0.01))) == []
-    unknown = structs.replace(estimate(0.08, 0.01), contraction=0.0)
-    assert names(changed(clean, reading_scale=unknown)) == []
-
-
-def test_a_play_that_varies_by_more_than_itself_is_doubted(clean):
-    """A play is never negative; a variation that may be small is none."""
-    assert names(changed(clean, play_variation=estimate(0.25, 0.05))) == ["play by position"]
-    assert names(changed(clean, play_variation=estimate(0.25, 0.12))) == []
-    assert names(changed(clean, play_variation=estimate(0.15, 0.01))) == []
-    no_play = structs.replace(clean, effective_backlash=estimate(0.01, 0.01))
-    assert names(changed(no_play, play_variation=estimate(0.25, 0.05))) == []
-
-
-def test_an_error_larger_than_the_play_is_doubted_of_angles_alone(clean):
-    """The lead of a screw may err by more than the play of its nut."""
-    large = structs.replace(clean, deviations=(PositionDeviation(500.0, -0.6, 0.02, (-0.64, -0.56)),))
-    [doubt] = doubts_of(large)
-    assert doubt.name == "error by position" and doubt.usable and "0.600(20) deg at command 500" in doubt.text
-    assert names(structs.replace(large, unit="mm")) == []
-    small = structs.replace(clean, deviations=(PositionDeviation(500.0, -0.45, 0.02, (-0.49, -0.41)),))
-    assert names(small) == []
 
 
 def test_a_wave_on_an_error_as_large_and_as_short_is_doubted(clean):

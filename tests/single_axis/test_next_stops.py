@@ -12,12 +12,11 @@ from support.axes import campaign, drawn, runs
 
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.single_axis.axis_campaign import AxisStop, Reading, read_axis
-from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
+from tvsbayes.single_axis.axis_campaign import AxisStop, read_axis
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import SIDES, reversal_of, rows_of
-from tvsbayes.single_axis.next_stops import NextStop, _run_up_start, _with_stop, plan_next
+from tvsbayes.single_axis.next_stops import _run_up_start, _with_stop, plan_next
 from tvsbayes.twin.simulated_axis import draw_axis, simulate_axis
 
 
@@ -75,17 +74,6 @@ def test_a_plan_stays_within_stated_limits_wherever_the_axis_was(fitted):
     assert all(command == round(command) for command in commands)
 
 
-@pytest.mark.parametrize("target", ["per_command", "effective_per_command", "backlash"])
-def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
-    """The u given the scales is smaller because means differ between draws. Places between the rows change neither."""
-    functionals = headline_functionals(fitted.model, fitted.w)[[HEADLINE_DRAWS.index(target)]]
-    mean, sd = fitted.linear.mean_of(functionals), fitted.linear.sd_of(functionals)
-    u_fit = np.sqrt(np.mean(sd**2))
-    plan = plan_next(fitted, target, count=1)
-    assert plan.u_now == pytest.approx(np.hypot(u_fit, mean.std()), rel=1e-6)
-    assert plan.u_now > 1.001 * u_fit and plan.next[0].u < plan.u_now
-
-
 @pytest.mark.thorough
 def test_stops_lower_a_play_that_is_sampled_and_none_that_is_held():
     """The play is no linear quantity where moves may be shorter than it."""
@@ -101,12 +89,6 @@ def test_stops_lower_a_play_that_is_sampled_and_none_that_is_held():
         plan_next(held, "backlash", count=1)
 
 
-def test_actions_print_all_digits_of_commands():
-    """Microsteps of a long axis reach millions."""
-    stop = NextStop(1234567.0, "forward", 1111111.0, 1.0, 0.1, 0.1)
-    assert stop.actions == ["move 1111111", "move 1234567", "read"]
-
-
 def test_a_plan_keeps_its_time(fitted):
     assert plan_next(fitted, minutes=2.0).minutes <= 2.0
     with pytest.raises(InputError):
@@ -120,18 +102,6 @@ def turned():
     side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
     values = [m.command - 0.2 * s + 0.003 * (k % 3) for k, (m, s) in enumerate(zip(moves, side, strict=True))]
     return campaign(moves, values, u=0.002)
-
-
-def test_a_stop_to_be_read_is_no_jump_by_a_turn(turned):
-    plan = plan_next(fit_axis(turned, sampled=False), count=1)
-    assert plan.next[0].gain > 0
-
-
-def test_an_unusable_last_reading_does_not_change_the_gains(turned):
-    lost = Reading(len(turned.readings), len(turned.moves) - 1, None, 0.0, "no light")
-    fit = fit_axis(replace(turned, readings=(*turned.readings, lost)), sampled=False)
-    plan, whole = plan_next(fit, count=1), plan_next(fit_axis(turned, sampled=False), count=1)
-    assert plan == whole and plan.next[0].gain > 0
 
 
 @pytest.mark.parametrize("direction", ["forward", "backward"])

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.special import ndtri
-from support.axes import drawn, runs
 from support.compensated import driven, results, to_and_fro, true_axis
 
 from tvsbayes.single_axis.axis_campaign import AxisMove
-from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_rows import rows_of
-from tvsbayes.single_axis.predicted_stops import DRAWS, PredictedAxis, longest_use
+from tvsbayes.single_axis.predicted_stops import PredictedAxis, longest_use
 from tvsbayes.statistics.predicted_readings import State, Use
 
 
@@ -44,16 +41,6 @@ def test_draws_have_the_moments_of_the_mixture_and_its_density():
     flat = 1e4 * np.ones((4, 4))
     shifts = prediction.log_density(mean, flat) - prediction.log_density(mean + 1.0, flat)
     assert shifts == pytest.approx(0.0, abs=1e-3)
-
-
-def test_the_scatter_of_homings_is_spread_evenly():
-    """Its draws are those of the fit at even ranks; those of the prior where one homing was read."""
-    known, once = results().fit, fit_axis(drawn(1, runs(2)).campaign, tier="importance")
-    prior, at = once.model.priors["home_sd"], (np.arange(DRAWS) + 0.5) / DRAWS
-    of_prior = prior.value * np.exp(prior.u * ndtri(at))
-    of_fit = np.sort(known.draws["home_sd"])[(at * len(known.w)).astype(int)]
-    for fit, even in ((known, of_fit), (once, of_prior)):
-        np.testing.assert_allclose(np.sort(PredictedAxis(fit).scales["home_sd"]), even, rtol=1e-9)
 
 
 def test_time_and_travel_since_homing_are_those_of_the_longest_segment():

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import datetime
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.axes import OFF, drawn, random_moves, runs
+from support.axes import drawn, random_moves, runs
 from support.refusals import refusal
 
 from tvsbayes.files.documents import StatedValue
@@ -18,7 +17,6 @@ from tvsbayes.single_axis.axis_campaign import (
     Reading,
     Reference,
     axis_bytes,
-    axis_hashes,
     read_axis,
     write_axis,
 )
@@ -82,14 +80,6 @@ def test_the_scale_of_the_reference_is_in_line_figures_and_budget(reference):
     assert accuracy.u == u["accuracy"] and accuracy.estimate == figures["accuracy"]
 
 
-def test_a_quantity_that_is_stated_exactly_has_no_budget():
-    """As of an absolute encoder on the axis, which sees no play."""
-    exact = dict.fromkeys(("backlash", "play_variation", "ratio_contrast"), OFF)
-    campaigns = [drawn(5, runs(2), **stated).campaign for stated in ({}, exact)]
-    free, fixed = ({budget.quantity for budget in summary_of(campaign).budgets} for campaign in campaigns)
-    assert free - fixed == {"effective_backlash"}
-
-
 def test_budgets_sum_to_the_stated_u():
     summary = summary_of(screw(Reference(u_per_unit=1e-6), u=3e-4))
     named = {budget.quantity: budget for budget in summary.budgets}
@@ -142,22 +132,6 @@ def test_the_expansion_of_the_reference_corrects_and_has_a_u():
     assert classic_axis(after).per_command == pytest.approx(classic_axis(before).per_command * (1 + 4.8e-5), rel=1e-9)
 
 
-STATED = Reference(2e-4, 1e-6, StatedValue(8e-6, 1e-6), "common", "K-17", datetime.date(2027, 1, 15))
-
-
-def test_a_folder_states_the_reference(tmp_path):
-    campaign = warm(screw(STATED), 21.0)
-    write_axis(campaign, tmp_path / "a")
-    assert read_axis(tmp_path / "a").reference == STATED
-    known = axis_hashes(campaign)
-    for other, same in (
-        (replace(STATED, u=1e-4), False),
-        (replace(STATED, u_is="independent"), False),
-        (replace(STATED, certificate="other", valid_until=None), True),
-    ):
-        assert (axis_hashes(replace(campaign, reference=other)) == known) is same
-
-
 @pytest.mark.parametrize(
     ("entry", "code"),
     [
@@ -187,14 +161,6 @@ def test_import_says_that_an_expanded_uncertainty_is_common(ask, tmp_path):
         campaign = read_axis(out)
         assert campaign.reference.common is common and campaign.command_unit == "mm"
         assert campaign.readings[-1].u == pytest.approx((5.0 if not common else 2.5) * 1e-3)
-
-
-def test_moves_of_a_drive_keep_the_reference():
-    moves = (AxisMove(0, 0, 0.0, 0.0, "forward"),)
-    readings = tuple(Reading(k, 0, 1.001 * k, 0.01, time_s=float(k)) for k in range(50))
-    campaign = AxisCampaign("arcsec", moves, readings, header={"rate": 1.0}, reference=Reference(u_per_unit=1e-3))
-    rows = rows_of(campaign)
-    assert rows.reference.shape == (len(rows.value), 1)
 
 
 def test_positions_hold_the_u_of_the_reference_and_its_own_readings_do_not():

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.axes import campaign, drawn, random_moves, runs
+from support.axes import drawn, runs
 
 from tvsbayes.single_axis import axis_density
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_density import find_mode
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.axis_periods import WaveSample, separate_periods, strong_harmonics
+from tvsbayes.single_axis.axis_periods import WaveSample, strong_harmonics
 from tvsbayes.single_axis.axis_record import summarise_axis
 from tvsbayes.single_axis.period_search import APART_MIN, period_grid
 from tvsbayes.single_axis.waves import (
@@ -194,22 +194,6 @@ def test_a_stated_period_of_position():
     assert estimate.period.value == 8.0 and estimate.period.sd == 0.0
     assert estimate.amplitude.interval95[0] < 0.12 < estimate.amplitude.interval95[1]
     assert estimate.phase_deg.interval95[0] < np.degrees(2.0) < estimate.phase_deg.interval95[1]
-
-
-def test_without_times_or_periods_the_coordinates_are_unchanged():
-    """Without times there is no creep, without periods no wave."""
-    moves = [replace(move, time_s=0.0) for move in random_moves(1)]
-    axis = campaign(moves, [0.01 * m.command for m in moves], 0.001)
-    model = model_of(axis)
-    assert model.shifts == () and model.coordinates.waves == ()
-    assert not {"creep_minutes", "seeing_s", "drift_per_root_hour"} & set(model.coordinates.names)
-
-
-def test_separate_periods_are_named():
-    period = np.concatenate([np.full(70, 3.7), np.full(30, 12.4)])
-    groups = separate_periods(period)
-    assert [(group.mean, group.share) for group in groups] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
-    assert groups[1].between == (12.4, 12.4)
 
 
 def test_periods_of_the_grid_differ_by_more_than_rounding():

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import ast
-import json
-from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
-
 import cv2
 import numpy as np
 import pytest
-from scipy import stats
 from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12, VECTOR
 
-from experiments.intervals import strange_bench, strange_optics, strangers
+from experiments.intervals import strangers
 from experiments.intervals.strange_bench import Bench, bench, true_values
 from experiments.intervals.strange_optics import Gear, Head, turn
-from tvsbayes import pipeline
 from tvsbayes.instrument.stereo_pair import parse_stereo
 
 SEED, BENCHES = 7, 6
@@ -60,18 +52,6 @@ def test_the_beam_of_the_published_vector(printed):
     assert np.abs(np.array(jacobian) / 2e-3 - [[1.0070677, 0.0038895], [-0.0025873, 0.9977070]]).max() <= LAST_7 * 1.01
     point = origin + 250.0 * ahead
     assert np.abs(turn("z", 1.0) @ point + [0, 100, 0] - [250.365237, 119.492704, 18.238043]).max() <= LAST_6 * 1.01
-
-
-def test_no_module_of_the_benches_is_the_package():
-    for module in (strange_optics, strange_bench):
-        tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
-        names = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-        names |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-        assert {name.split(".")[0] for name in names} <= {"__future__", *_standard(), "numpy", "cv2", "experiments"}
-
-
-def _standard() -> set[str]:
-    return {"collections", "csv", "dataclasses", "json", "pathlib", "statistics"}
 
 
 def test_cameras_project_as_opencv_does(drawn):
@@ -130,34 +110,6 @@ def test_play_of_the_published_sequence():
     np.testing.assert_allclose(angles, [-0.15, 11.85, 0.15, 0.15, 0.15, 5.91], atol=1e-12)
 
 
-def test_a_stop_error_stays_while_its_axis_stands_and_a_look_error_does_not():
-    counters, first = np.repeat([0, 50, 0], 200), np.arange(600) == 0
-    rng = np.random.default_rng(5)
-    kept = replace(perfect(0.06), stop_sd_deg=0.03).driven(counters, first, np.zeros(600), 1, rng)
-    assert {len(set(part)) for part in np.split(kept, 3)} == {1} and kept[0] != kept[-1]
-    scattered = replace(perfect(0.06), look_sd_deg=0.02).driven(counters, first, np.zeros(600), 1, rng)
-    # Standard error of an sd of 600: 3 %; five of them.
-    assert np.std(scattered - 0.06 * counters) == pytest.approx(0.02, rel=0.15)
-
-
-def test_benches_follow_from_seed_and_number(drawn, tmp_path):
-    again = bench(SEED, 2)
-    drawn[2].write(tmp_path / "a")
-    again.write(tmp_path / "b")
-    names = ("looks.csv", "rig_stereo.yml", "truth.json")
-    assert all((tmp_path / "a" / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in names)
-    assert len({json.dumps(one.truth) for one in [*drawn, bench(SEED + 1, 2)]}) == BENCHES + 1
-
-
-def test_a_calibration_errs_as_its_corners_do(drawn):
-    """OpenCV's parameters lie near the truth and not on it."""
-    for one in drawn:
-        off = one.calibration.matrices["M1"][0, 0] / one.rig.left.focal_px[0] - 1
-        assert 0 < abs(off) < 0.01
-        angle = cv2.Rodrigues(one.calibration.matrices["R"] @ one.rig.right.rotation.T)[0]
-        assert 0 < np.linalg.norm(angle) < 0.03
-
-
 def test_commands_take_a_bench_as_its_owner_has_it(drawn, tmp_path):
     one = next(b for b in drawn if not b.traits.covariance)
     one.write(tmp_path / "bench")
@@ -166,46 +118,3 @@ def test_commands_take_a_bench_as_its_owner_has_it(drawn, tmp_path):
     assert sum(",ok" in line for line in spots) == one.both.sum() == strangers.looks_seen(tmp_path / "bench/looks.csv")
     pair = parse_stereo((tmp_path / "campaign" / "stereo.json").read_bytes(), "stereo.json")
     assert pair.assumed and np.allclose(pair.T, one.calibration.matrices["T"].ravel())
-
-
-ENTRY = {"value": 1.0, "sd": 0.5, "interval95": [0.0, 2.0], "contraction": 0.9}
-
-
-def test_headlines_stand_beside_their_truths(monkeypatch):
-    """Draws to either side of each truth: another truth lies outside of both."""
-    expected = {
-        f"{strangers.RATIO}.left": 0.06,
-        f"{strangers.RATIO}.right": 0.06,
-        f"{strangers.RATIO}.up": 0.07,
-        f"{strangers.CONTRAST}.pan": 0.0,
-        "backlash_deg.pan": 0.1,
-        "effective_mirror_offset_mm": 30.0,
-    }
-    draws = {name: np.array([value - 1e-3, value + 1e-3]) for name, value in expected.items()}
-    loaded = SimpleNamespace(weights=np.full(2, 0.5), by_name=draws)
-    monkeypatch.setattr(pipeline, "load_posterior", lambda folder, anyway: loaded)
-    document = {
-        strangers.RATIO: dict.fromkeys(("left", "right", "up"), ENTRY) | {"down": None},
-        strangers.CONTRAST: {"pan": ENTRY, "tilt": None},
-        "parameters": {"backlash_deg.pan": ENTRY, "effective_mirror_offset_mm": ENTRY},
-    }
-    truth = {strangers.RATIO: {"pan": 0.06, "tilt": 0.07}, "backlash_deg": {"pan": 0.1, "tilt": 0.2}}
-    headlines = strangers.headlines_of(document, truth | {"mirror_offset_mm": 30.0}, Path())
-    assert {name: e["pit"] for name, e in headlines.items()} == dict.fromkeys(expected, 0.5)
-    assert {name for name, e in headlines.items() if not e["held"]} == {"effective_mirror_offset_mm"}
-
-
-def test_a_skewed_posterior_is_judged_by_the_probability_below_the_truth(monkeypatch):
-    """Of right posteriors of any shape the transform is normal: here exponential ones, by weighted draws."""
-    rng = np.random.default_rng(4)
-    draws = rng.uniform(0, 12, 4000)
-    weights = np.exp(-draws) / np.exp(-draws).sum()
-    loaded = SimpleNamespace(weights=weights, by_name={"backlash_deg.pan": draws})
-    monkeypatch.setattr(pipeline, "load_posterior", lambda folder, anyway: loaded)
-    truths, z = rng.exponential(size=400), []
-    for truth in truths:
-        true = {strangers.RATIO: {"pan": 0.06, "tilt": 0.07}, "backlash_deg": {"pan": truth, "tilt": truth}}
-        document = {"parameters": {"backlash_deg.pan": ENTRY}}
-        found = strangers.headlines_of(document, true | {"mirror_offset_mm": 30.0}, Path())
-        z.append(found["backlash_deg.pan"]["z"])
-    assert stats.kstest(z, "norm").pvalue > 1e-3 > stats.kstest(1 - truths, "norm").pvalue

@@ -161,13 +161,6 @@ def test_connection_without_a_request_is_closed(live, monkeypatch):
             assert slow.recv(1) == b""
 
 
-def test_connections_leave_most_descriptors_to_the_run(monkeypatch):
-    resource = pytest.importorskip("resource")
-    for soft, most in ((1024, 64), (96, 24), (4, 2), (resource.RLIM_INFINITY, 64)):
-        monkeypatch.setattr(resource, "getrlimit", lambda kind, soft=soft: (soft, soft))
-        assert connections_max() == most
-
-
 def test_without_the_extra_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "tornado", None)
     with pytest.raises(InputError) as refused:

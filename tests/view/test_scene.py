@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
 from dataclasses import replace
@@ -14,7 +13,7 @@ from support.viewed_twin import UNDETECTED
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import ordered_spots, read_campaign, with_pixels
 from tvsbayes.instrument.parameters import names_of
-from tvsbayes.view.page import KINDS, document
+from tvsbayes.view.page import document
 from tvsbayes.view.scene import NOT_FITTED, NOT_OF_THESE, Looked, look_at, scene, stored_campaign
 
 
@@ -78,18 +77,6 @@ def test_stops_stand_at_their_looks(stored, shown):
         assert {looks.direction[row][column] for row in np.flatnonzero(rows)} == {stop.direction}
 
 
-def test_parameters_and_correlations_are_those_of_the_record(stored, shown):
-    record = stored.fitted.record
-    rows = {row.name: row for row in shown.parameters}
-    assert rows["mirror_offset_mm"].value == record.summary.parameters["mirror_offset_mm"].value
-    assert rows["effective_deg_per_step.left"].unit == "deg/step"
-    assert not [name for name in shown.correlated if name.startswith("stereo.")]
-    np.testing.assert_allclose(np.diag(shown.correlation), 1.0, atol=1e-12)
-    a, b = (record.covariance.names.index(name) for name in shown.correlated[:2])
-    matrix = np.asarray(record.covariance.matrix)
-    assert shown.correlation[0, 1] == pytest.approx(matrix[a, b] / np.sqrt(matrix[a, a] * matrix[b, b]))
-
-
 def test_folder_without_results_shows_the_stated_rig(viewed):
     looked = look_at(viewed.bare)
     (shown,) = looked.scenes
@@ -127,25 +114,6 @@ def test_campaign_without_a_usable_spot(viewed):
     assert np.isnan(shown.origin_mm).all() and shown.sheets == () and len(shown.cameras) == 2
     page = json.loads(document(Looked((shown,))))
     assert page["scenes"][0]["rig"]["origin_mm"] is None
-
-
-def unpacked(sent) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(sent["base64"]), sent["type"]).reshape(sent["shape"])
-
-
-def test_document_carries_every_column(shown):
-    page = json.loads(document(Looked((shown,))))
-    (one,) = page["scenes"]
-    assert page["changes"] is None and one["fitted"] is True
-    looks = one["looks"]
-    assert {sent["type"] for sent in looks.values() if isinstance(sent, dict)} == set(KINDS.values())
-    np.testing.assert_array_equal(unpacked(looks["spot"]), shown.looks.spot)
-    # Single precision of 1000 px.
-    np.testing.assert_allclose(unpacked(looks["pixels_px"]), shown.looks.pixels_px, rtol=1e-7)
-    np.testing.assert_allclose(
-        unpacked(looks["residual_px"]), shown.looks.pixels_px - shown.looks.predicted_px, rtol=1e-6, atol=1e-9
-    )
-    assert looks["status"] == list(shown.looks.status)
 
 
 @pytest.mark.thorough
