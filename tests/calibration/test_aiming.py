@@ -18,7 +18,6 @@ from support.bent_rig import (
 from support.refusals import refusal
 
 from tvsbayes.assessment.fitted_calibration import CLEARED_PROBABILITY, _overshoot_steps
-from tvsbayes.calibration.optics import unit_vector
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.twin import physics
@@ -48,21 +47,6 @@ def test_steps_for_a_point_come_back_to_it(either):
             half_mm += max(np.linalg.norm(m - (m @ ray.direction) * ray.direction) for m in moved)
         assert steps.rounding_mm <= half_mm * 1.001
         assert steps.rounding_deg is None and steps.u95_deg is None
-
-
-def test_steps_for_a_direction(bent):
-    for azimuth, elevation in ((0.0, 0.0), (25.0, -12.0), (-40.0, 30.0)):
-        steps = bent.steps_for(azimuth_deg=azimuth, elevation_deg=elevation)
-        d = steps.ray.direction
-        gone = [math.degrees(math.atan2(d[1], d[0])) - azimuth, math.degrees(math.asin(d[2])) - elevation]
-        # Half a step of 0.0621 and 0.0704 deg, and 5 % for the crosstalk of a bent rig at 30 deg of elevation.
-        assert abs(gone[0]) < 0.05 * 0.0704 + 0.5 * 0.0621 * 1.05
-        assert abs(gone[1]) < 0.05 * 0.0621 + 0.5 * 0.0704 * 1.05
-        wanted = unit_vector(azimuth, elevation)
-        # The cosine loses half of the digits.
-        assert steps.rounding_deg == pytest.approx(math.degrees(math.acos(min(1.0, wanted @ d))), abs=1e-5)
-        assert steps.xyz_mm is None and steps.aperture_deg is None and steps.u95_mm is None
-        assert steps.u95_deg.shape == (2,)
 
 
 def test_half_widths_of_the_beam_are_the_draws(bent):

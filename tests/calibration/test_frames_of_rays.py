@@ -10,11 +10,10 @@ from support.bent_rig import AXES, BENT, ROUNDING, ROUNDING_MM, TWIN_SIDE, calib
 
 from tvsbayes.calibration.drawn_looks import drawn
 from tvsbayes.calibration.frames import EXTRINSICS_NAMES, P_INPUTS
-from tvsbayes.calibration.optics import beam_components
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import sides_of
 from tvsbayes.instrument.stereo_pair import rotation_matrix
-from tvsbayes.twin.physics import Sheet, light_on_sheet, mirror_chain
+from tvsbayes.twin.physics import Sheet, light_on_sheet
 
 STEPS, APPROACH = (200.0, -120.0), ("left", "down")
 POSE = np.array([0.05, -0.12, 0.4, 12.0, 85.0, -40.0])
@@ -35,14 +34,6 @@ def angles_rad(values):
         twin_angle_deg(values, axis, n, TWIN_SIDE[side]) for axis, n, side in zip(AXES, STEPS, APPROACH, strict=True)
     ]
     return np.radians(angles)
-
-
-def test_frame_p_is_where_the_mirrors_stand(placed):
-    ray = placed.ray(*STEPS, APPROACH, frame="P")
-    origin, direction = mirror_chain(*angles_rad(placed.estimates), placed.estimates)
-    np.testing.assert_allclose(ray.origin_mm, origin, atol=ROUNDING_MM)
-    np.testing.assert_allclose(ray.direction, direction, atol=ROUNDING)
-    assert ray.frame == "P" and ray.covariance is None
 
 
 def test_frame_s_is_where_the_twins_light_goes(placed):
@@ -88,17 +79,6 @@ def test_covariance_is_that_of_the_draws(placed, frame):
     np.testing.assert_allclose(ray_sd, sd, rtol=0.03)
     np.testing.assert_allclose(covariance / np.outer(ray_sd, ray_sd), expected / np.outer(sd, sd), atol=0.03)
     np.testing.assert_allclose(ray.covariance, ray.covariance.T, atol=1e-9)
-
-
-def test_what_p_does_not_know_is_not_in_it(placed):
-    """C0 and baseline place T, not P."""
-    sharper = replace(placed, covariance=placed.covariance.copy())
-    rows = [list(placed.estimates).index(name) for name in P_INPUTS]
-    sharper.covariance[rows] = sharper.covariance[:, rows] = 0.0
-    for frame, same in (("T", False), ("P", True)):
-        both = [each.ray(*STEPS, frame=frame, covariance=True).covariance for each in (placed, sharper)]
-        assert np.allclose(*both, rtol=1e-9) == same
-    assert beam_components(BENT | dict(P_INPUTS), 0.0, 0.0).origin[1] != beam_components(BENT, 0.0, 0.0).origin[1]
 
 
 def test_frames_that_there_are_not(placed, bent):

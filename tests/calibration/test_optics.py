@@ -28,20 +28,6 @@ def test_transmission_error_is_that_of_wheel_or_pinion(wobbling):
     assert abs(gap[0] - gap[1]) > 1e-4, "the wheel's error differs between the sides"
 
 
-@pytest.mark.parametrize("azimuth", [False, True])
-def test_one_beam_has_the_range_that_it_has_among_many(azimuth):
-    """Beams from all around: also those that meet only the other nappe of the aperture's cone."""
-    rng = np.random.default_rng(1)
-    origin = rng.normal(size=(3, 100)) * 60 + np.array([[0.0], [100.0], [0.0]])
-    direction, angle_deg = rng.normal(size=(3, 100)), rng.uniform(1, 179, 100)
-    ranges = range_components(tuple(origin), tuple(direction), 200.0, angle_deg, azimuth)
-    assert 20 < np.sum(ranges > 0) < 80 and not np.isfinite(ranges).all()
-    for k in range(100):
-        beam = tuple(origin[:, k].tolist()), tuple(direction[:, k].tolist())
-        single = range_components(*beam, 200.0, angle_deg[k], azimuth, math)
-        assert single == pytest.approx(ranges[k], rel=1e3 * ROUNDING, nan_ok=True)
-
-
 def test_ratio_of_the_beam_is_the_twins():
     """Against the twin's own optics, whose slope is differentiated elsewhere."""
     pose = (7.0, 4.0)
@@ -128,30 +114,3 @@ def test_conventions_differ_by_the_documented_share():
         assert one[[0, 2]] == pytest.approx(in_plane, abs=0.05)
         assert two[[0, 2]] == pytest.approx(azimuth, abs=0.05)
     assert one[0] / two[0] - 1 == pytest.approx(-0.034, abs=0.0005)
-
-
-def level_beam(C_deg: float) -> np.ndarray:
-    return np.array([math.sin(math.radians(C_deg)), -math.cos(math.radians(C_deg)), 0.0])
-
-
-@pytest.mark.parametrize("azimuth", [False, True])
-def test_beams_without_a_point_do_not_meet(azimuth):
-    origin = np.array([0.0, A_MM / 2, 0.0])
-    cases = {
-        "diverging": (origin, level_beam(85.0), 96.0),
-        "parallel to a micro-degree": (origin, level_beam(80.0), 100.000001),
-        "away from the aperture": (origin, level_beam(150.0), 60.0),
-        "far behind the aperture's side": (origin, level_beam(120.0), 120.0),
-    }
-    for name, case in cases.items():
-        assert not met(*(np.array([part]) for part in case), azimuth)[2][0], name
-    near = met(origin[None], level_beam(85.0)[None], [94.9], azimuth)
-    assert near[2][0] and near[0][0, 0] > 1e4, "the point before it diverges is far and exists"
-
-
-def test_a_point_behind_the_scanner_is_no_azimuth():
-    """A beam that runs back meets the azimuth's line only on the far side of the aperture."""
-    origin = np.array([[0.0, A_MM / 2, 0.0]])
-    back = level_beam(60.0) * [-1.0, 1.0, 1.0]
-    assert not met(origin, back[None], [120.0], True)[2][0]
-    assert not met(origin, back[None], [60.0], True)[2][0]

@@ -6,7 +6,6 @@ import base64
 import datetime
 import hashlib
 import json
-import math
 import re
 import shutil
 import subprocess
@@ -16,29 +15,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from msgspec import structs
-from support.reported_twin import PLANNED, Nodes, evidence_of, first_words, report_html, stored, words
-from support.small_results import estimate
+from support.reported_twin import Nodes, evidence_of, first_words, report_html, words
 
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import Outlier
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.axes import DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.pipeline import load_calibration
-from tvsbayes.report.document import Document, Issue, Section, Verdict
-from tvsbayes.report.page import BROWSERS, page_html, print_to_pdf, prose, replace_page, typeset
-from tvsbayes.report.scanner_document import _cells, answer_table, report_document, step_sizes
-from tvsbayes.report.scanner_sections import _parameters
+from tvsbayes.report.document import Issue
+from tvsbayes.report.page import BROWSERS, replace_page, typeset
+from tvsbayes.report.scanner_document import answer_table
 from tvsbayes.report.tables import (
-    TableView,
     cause_in_words,
     chance_text,
     name_in_words,
     sentence_in_words,
-    sentences,
     share_in_words,
     source_in_words,
 )
@@ -157,31 +152,6 @@ def test_the_first_page_has_results_and_customer(page, evidence, no_pictures):
         assert "Error of classic there" in first and "of the variance" in first
 
 
-def test_millimetres_without_aperture_readings_state_their_source(evidence, no_pictures):
-    """All calibrations share what is stated of the aperture: they are compared by their beams alone."""
-    assert words(report_html(evidence)).count(sentences("sections")["no_aperture"]) == 1
-    first, *others = evidence.campaign.spots
-    read = replace(evidence.campaign, spots=(replace(first, aperture_deg=70.0), *others))
-    assert sentences("sections")["no_aperture"] not in words(report_html(replace(evidence, campaign=read)))
-
-
-def test_a_step_is_given_in_millimetres(evidence, no_pictures):
-    """Degrees per step times the range, with both directions of an axis."""
-    (sentence,) = step_sizes(evidence)
-    for axis, (one, other) in SENSES.items():
-        ratios = [evidence.fit.summary.effective[side].value for side in (one, other)]
-        mm = float(re.search(rf"(\S+)\(\d[\d.]*\) mm in {axis}", sentence)[1])
-        assert mm == pytest.approx(evidence.range_mm * math.radians(sum(ratios) / 2), rel=1e-2)
-    assert sentence in words(report_html(evidence))
-
-
-def test_a_long_cell_wraps_and_is_not_cut(evidence, no_pictures):
-    """The versions of a dozen programs are wider than any screen."""
-    long = re.findall(r'<td class="long">([^<]*)</td>', report_html(evidence).decode())
-    assert any("numpy" in cell and "jax" in cell for cell in long)
-    assert "td.long { white-space: normal;" in (shipped_data() / "report" / "report.css").read_text(encoding="utf-8")
-
-
 def test_warnings_of_check_are_on_the_first_page(evidence, no_pictures):
     """The page outlives the terminal: an interrupted run is not usable without a word of it."""
     doubted = replace(evidence, criteria=(), doubts=("whether steps were lost in segment 0 is not known",))
@@ -204,13 +174,6 @@ def test_equal_ratios_share_a_row(evidence):
         assert {len(row) for row in shown.rows} == {len(shown.columns)}
     apart = [row[0] for row in answer_table(alike, evidence.classic).rows]
     assert apart[:2] == ["left, deg/step", "right, deg/step"]
-
-
-def test_the_half_width_of_an_asymmetric_interval_is_left_out():
-    """0.24 - 0.40 would be a negative play."""
-    play = structs.replace(estimate(0.24, 0.21), interval95=(0.016, 0.810))
-    assert _cells(play) == ["0.24(21)", "[0.02, 0.81]", ""]
-    assert _cells(estimate(0.5, 0.01))[2] == "0.020"
 
 
 def test_causes_and_parameters_are_called_by_words():
@@ -236,23 +199,6 @@ def test_causes_and_parameters_are_called_by_words():
     )
 
 
-@pytest.mark.thorough
-def test_no_two_reports_have_one_number(evidence, no_pictures):
-    """Another laboratory, customer, day, limit or operator is another report; the same one has the same number."""
-    day = datetime.date(2026, 1, 15)
-    campaign = replace(evidence.campaign, header={**evidence.campaign.header, "operator": "A. B."})
-    pages = [
-        *(report_document(evidence, issue) for issue in (Issue(day), Issue(day, "A"), Issue(day, "", "A"))),
-        report_document(evidence, Issue(datetime.date(2026, 1, 16))),
-        report_document(replace(evidence, criteria=()), Issue(day)),
-        report_document(replace(evidence, campaign=campaign), Issue(day)),
-    ]
-    numbers = [each.number for each in pages]
-    assert len(set(numbers)) == len(numbers) and report_document(evidence, Issue(day)).number == numbers[0]
-    for each in pages:
-        assert page_html(each).decode().count(each.number) == 4  # title, head, foot of printed pages, end
-
-
 def test_files_of_an_earlier_page_are_removed(tmp_path):
     """A PDF or certificate of an older page is removed; files beside a page of another program are kept."""
     ours, newer = b'<meta name="generator" content="tvsbayes 1">old', b'<meta name="generator" content="tvsbayes 1">new'
@@ -274,22 +220,6 @@ def test_files_of_an_earlier_page_are_removed(tmp_path):
     assert (tmp_path / "results" / "report.html").read_bytes() == newer
     with pytest.raises(InputError):
         replace_page(tmp_path / "missing" / "mine.html", newer, tmp_path / "missing" / "mine.html")
-
-
-def test_commands_are_code_and_campaign_text_is_not():
-    assert prose("Do `tvsbayes fit -5`, u <= 2") == "Do <code>tvsbayes fit -5</code>, u \u2264 2"
-    assert prose("`<b>` and -1") == "<code>&lt;b&gt;</code> and \u22121"
-    assert prose("a ` alone <i>") == "a ` alone &lt;i&gt;"
-
-
-def test_no_paragraph_is_repeated_and_details_are_folded(page):
-    html = page.decode()
-    texts = [re.sub(r"<.*?>", "", part) for part in re.findall(r"<(?:p|li)\b.*?</(?:p|li)>", html, flags=re.DOTALL)]
-    long = [text for text in texts if len(text) > 60]
-    assert len(long) > 15 and len(long) == len(set(long))
-    nodes = Nodes(page)
-    assert len(nodes.of("details")) == len(nodes.of("section")) > 8
-    assert sum("open" in each for each in nodes.of("details")) == 1
 
 
 @pytest.mark.parametrize(
@@ -339,16 +269,6 @@ def test_axes_are_assessed_with_the_fitted_contrast(reported, evidence):
         assert abs(table.predicted["accuracy_deg"].median - untold["accuracy_deg"].median) > 1e-6
 
 
-@pytest.mark.thorough
-def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
-    spots = tuple(replace(s, experiment=None, point=None) for s in evidence.campaign.spots)
-    plain = replace(evidence, classic=None, campaign=replace(evidence.campaign, spots=spots))
-    text = words(report_html(plain))
-    assert "Classic: not applicable" in text and "no complete four-point experiment" in text
-    first = text.split("Contents")[0]
-    assert "0.06" in first and "classic value(u)" not in first
-
-
 def test_without_limit_no_verdict_and_without_convergence_no_results(evidence, no_pictures):
     assert "No limit was stated" in words(report_html(replace(evidence, criteria=())))
     astray = structs.replace(evidence.fit.summary, converged=False, problems=("the mode was not reached",))
@@ -393,22 +313,6 @@ def test_hostile_text_is_escaped(reported, page, shift, tmp_path, no_pictures):
     assert not any(name.startswith("on") for _, attributes in nodes.elements for name in attributes)
     text = "".join(nodes.text)
     assert all(text.count(payload) >= 2 for payload in payloads)
-
-
-def test_next_experiments_are_those_of_the_plan(reported, evidence, no_pictures):
-    with stored(reported, {"plan.json": {"inputs": evidence.fit.provenance.inputs, **PLANNED}}):
-        planned = evidence_of(reported).planned
-    text = report_html(replace(evidence, planned=planned)).decode()
-    for wanted in ("u(left) \u2264 2e-4", "0.00031 deg/step", "focal scale to 0.1 %", "Go on measuring"):
-        assert wanted in text
-    row = text.split("sheet d9, &lt;b&gt;four&lt;/b&gt; looks")[-1].split("</tr>")[0]
-    assert [cell in row for cell in ("2.5", "1.2e-05", "4.8e-06")] == [True] * 3
-
-
-def test_the_points_budget_is_shown_by_parameter_too(evidence, page):
-    shares = [row.share for row in evidence.point.rows]
-    assert sum(shares) == pytest.approx(1.0) and evidence.point.quantity[0] in "xyz"
-    assert f"1000 mm away: {evidence.point.quantity}" in page.decode()
 
 
 def luminance(colour: str) -> float:
@@ -465,48 +369,3 @@ def test_chromium_renders_the_page_without_overflow_or_error(reported, tmp_path,
     assert layout["cut"] == 0, "the table of the answer scrolls sideways"
     assert layout["images"] == len(Nodes((tmp_path / "report.html").read_bytes()).of("img"))
     assert "CONSOLE" not in done.stderr
-
-
-@pytest.mark.thorough
-def test_the_printed_report_has_at_most_eight_pages_none_empty(reported, tmp_path):
-    """Folded sections are open in print: a page of nothing but folded headings would be one or two."""
-    if not any(map(shutil.which, BROWSERS)):
-        pytest.skip("no Chromium or Chrome on the path (Debian's package: chromium)")
-    shutil.copy(reported / "results" / "report.html", tmp_path / "report.html")
-    printed = print_to_pdf(tmp_path / "report.html").read_bytes()
-    pages = len(re.findall(rb"/Type\s*/Page\b(?!s)", printed))
-    assert 5 <= pages <= 8
-    # Chromium writes each page's marks as one stream; an empty page has only its footer, some 500 bytes.
-    streams = [len(part) for part in re.findall(rb"stream\r?\n(.*?)endstream", printed, flags=re.DOTALL)]
-    assert sum(length > 2000 for length in streams) >= pages
-
-
-@pytest.mark.thorough
-def test_no_heading_ends_a_printed_page(tmp_path):
-    """A heading with a single line below it is as lost as one alone; sections of many lengths meet every foot."""
-    reader = shutil.which("pdftotext")
-    if reader is None or not any(map(shutil.which, BROWSERS)):
-        pytest.skip("no Chromium or Chrome, or no pdftotext, on the path (Debian's packages: chromium, poppler-utils)")
-    table = [TableView("caption", ["a", "b"], [["cell", str(row)] for row in range(size)]) for size in range(5, 30)]
-    sections = [Section(f"heading {k}", [f"line {k}"], tables=[one]) for k, one in enumerate(table)]
-    sections += [Section(f"heading {k}", [f"line {k}"]) for k in range(len(sections), 100)]
-    about = TableView("about", [], [["measured", "today"]])
-    words = {"results": "R", "name": "n", "verdict": Verdict("v", "met"), "traceable": "t", "number": "N"}
-    none = {"answer": None, "picture": None, "steps": [], "warnings": []}
-    document = Document(**words, **none, about=about, versions={"tvsbayes": "0"}, sections=sections)
-    (tmp_path / "report.html").write_bytes(page_html(document))
-    done = subprocess.run([reader, "-layout", print_to_pdf(tmp_path / "report.html"), "-"], capture_output=True)
-    pages = [[line.strip() for line in text.split("\n") if line.strip()] for text in done.stdout.decode().split("\f")]
-    # The last line of each is its footer; of a section without a table one line is all that there is.
-    feet = [lines[-3:-1] for lines in pages if lines]
-    numbers = [[re.fullmatch(r"[0-9]+ heading ([0-9]+)", line) for line in foot] for foot in feet]
-    assert len(feet) > 8 and not any(last for _, last in numbers)
-    assert not [before[1] for before, _ in numbers if before and int(before[1]) < len(table)]
-    assert any(line.startswith("line ") for _, line in feet)
-
-
-def test_the_table_of_parameters_repeats_no_ratio(reported):
-    """Ratios by direction are results of their own: all four or none belong there."""
-    names = {row[-1] for row in _parameters(evidence_of(reported)).rows}
-    assert {"degrees_per_step.pan", "degrees_per_step.tilt"} < names
-    assert not names & {f"degrees_per_step.{direction}" for direction in DIRECTIONS}

@@ -117,25 +117,6 @@ def test_play_varies_and_is_never_negative(mounted_rig):
     assert right == pytest.approx(60 * k + play[0] / 2, abs=1e-12)
 
 
-def test_errors_are_functions_of_the_position_alone(mounted_rig):
-    """A counter come back to from the same side is at the same angle; another seed of the run changes none of it."""
-    rig = geared(mounted_rig, drift_deg_per_root_hour=0.0)
-    truth = one_ratio(quiet(draw_truth(rig, np.random.default_rng(8))))
-    one, two = (simulate(rig, sweep((100, 200, 60, 100, 200)), seed, truth).truth for seed in (1, 2))
-    angles = np.array(one.mirror_angles_deg)
-    assert angles[1] == pytest.approx(angles[4], abs=1e-12)
-    assert angles[2] == pytest.approx(angles[5], abs=1e-12)
-    assert one.mirror_angles_deg == two.mirror_angles_deg
-    smooth = simulate(rig, sweep((100, 200, 60, 100, 200)), 1, replace(truth, gear_errors=PERFECT)).truth
-    k = truth.parameters["degrees_per_step.pan"]
-    errors = truth.gear_errors["pan"]
-    place = k * np.array([0.0, 100.0, 200.0, 60.0, 100.0, 200.0])
-    side = np.array([1, 1, 1, -1, 1, 1])
-    expected = errors.error_deg(place) - side * errors.play_deg(place) / 2
-    turned = angles[:, 0] - np.array(smooth.mirror_angles_deg)[:, 0]
-    assert turned == pytest.approx(expected, abs=1e-12) and np.ptp(expected) > 0.01
-
-
 def test_drift_grows_with_the_root_of_time_and_restarts_at_a_homing():
     """400 walks of four hours, homed after two: variance scale^2 x hours since the homing."""
     time_s = 900.0 * np.arange(17)

@@ -6,7 +6,6 @@ Degrees, mm and pixels by suffix. Nothing here imports an estimator's model.
 from __future__ import annotations
 
 import datetime
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,6 @@ from support.commands import steps
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.instrument.parameters import (
-    STEREO_PARAMETER_NAMES,
     names_of,
 )
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
@@ -24,12 +22,11 @@ from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import rotation_matrix, triangulate
 from tvsbayes.twin.physics import (
-    local_deg_per_step,
     mirror_chain,
     project,
 )
 from tvsbayes.twin.simulated_campaign import simulate
-from tvsbayes.twin.true_rig import Truth, draw_truth
+from tvsbayes.twin.true_rig import draw_truth
 
 
 @pytest.fixture
@@ -82,17 +79,6 @@ def test_homings_are_as_the_rig_states(rig):
     assert not drift[::2, 1].any() and drift[2::2, 0].all()
 
 
-def test_homing_ends_on_the_side_that_it_states(fixed):
-    """Reached left or up a mirror lags by half the play, reached right or down it leads by as much."""
-    truth = draw_truth(fixed, np.random.default_rng(0))
-    known = {f"stop_sd_deg.{d}": 0.0 for d in DIRECTION_SIGNS}
-    known |= {"backlash_deg.pan": 1.0, "backlash_deg.tilt": 0.6, "tilt_zero_deg": 0.25}
-    truth = replace(truth, parameters=truth.parameters | known)
-    for sides, angles_deg in ((("left", "up"), (-0.5, -0.05)), (("right", "down"), (0.5, 0.55))):
-        homed = simulate(fixed, steps(("home", 0, 0)), 1, truth, home_approach=sides).truth
-        assert homed.mirror_angles_deg[0] == pytest.approx(angles_deg, abs=1e-12)
-
-
 def test_unknown_approach_is_uniform_in_the_band(fixed):
     """Mirror angles after homing with unknown approach fill the band of width b around mid-play."""
     truth = draw_truth(fixed, np.random.default_rng(0))
@@ -141,21 +127,6 @@ def test_draws_follow_their_distributions(rig):
     assert np.mean(fx) == pytest.approx(value, abs=four_se * sd) and np.std(fx) == pytest.approx(sd, rel=four_se)
 
 
-def test_truth_round_trip(rig):
-    """truth.json returns the same truth, with the effective values it implies."""
-    run = simulate(rig, small_plan(), 4)
-    truth = run.truth
-    document = json.loads(json.dumps(truth.as_json(run.campaign), allow_nan=False))
-    again = Truth.from_json(document, rig.stereo)
-    assert again.parameters == truth.parameters and again.mirror_angles_deg == truth.mirror_angles_deg
-    # The rotation goes through its matrix once: rounding only.
-    assert np.abs(again.stereo.vector - truth.stereo.vector).max() < 1e-12
-    assert set(document["stereo"]) == set(STEREO_PARAMETER_NAMES)
-    assert document["local_deg_per_step"] == local_deg_per_step(truth.parameters, truth.reference_pose_deg)
-    assert document["effective_deg_per_step"] == truth.effective_deg_per_step(run.campaign)
-    assert again.effective_deg_per_step(run.campaign) == pytest.approx(document["effective_deg_per_step"], rel=1e-12)
-
-
 def test_looks_scatter_also_where_an_axis_stands(fixed):
     """Of one beam looked at 400 times, by 0.05 deg of pan alone, then of tilt; nothing else changes."""
     count = 400
@@ -180,20 +151,6 @@ def test_true_transmission_error_needs_its_period(rig):
     wobbling = replace(truth, parameters={**truth.parameters, "harmonic_deg.pan.1.sin": 0.1})
     with pytest.raises(InputError, match=r"harmonic_deg\.pan\.1\.sin has no period"):
         simulate(rig, small_plan(), 8, wobbling)
-
-
-def test_streams_are_independent(fixed):
-    """Aperture readings change no pixel; a truth given changes no other draw; nor does the spot noise."""
-    plan = small_plan()
-    fixed = replace(fixed, stereo=replace(fixed.stereo, parameter_covariance=np.zeros((24, 24))))
-    without, with_readings = simulate(fixed, plan, 8), simulate(fixed, plan, 8, aperture=True)
-    stripped = tuple(replace(spot, aperture_deg=None) for spot in with_readings.campaign.spots)
-    assert stripped == without.campaign.spots
-    assert all(spot.aperture_deg is not None for spot in with_readings.campaign.spots if spot.status == "ok")
-    truth = draw_truth(fixed, np.random.default_rng(1))
-    assert simulate(fixed, plan, 8, truth).campaign.spots == without.campaign.spots, "u = 0: any draw is the same rig"
-    noisier = simulate(fixed, plan, 8, truth, spot_sd_px=0.16)
-    assert noisier.truth.stop_errors_deg == without.truth.stop_errors_deg
 
 
 def test_spots_lie_on_beam_and_sheet(fixed):
@@ -247,15 +204,6 @@ def test_aperture_reads_the_spot_with_its_zero(fixed, convention: str):
     assert np.std(error, ddof=1) == pytest.approx(0.02, rel=4 * 0.12)
 
 
-def test_every_placement_is_a_new_one(fixed):
-    """The same target placed twice is not at the same depth."""
-    plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("look",), ("place", "d1"), ("look",))
-    spots = simulate(fixed, plan, 6, spot_sd_px=1e-9).campaign.spots
-    disparity = [spot.u_left_px - spot.u_right_px for spot in spots]
-    # 1 mm of depth at 175 mm is f B / Z^2 = 2.2 px of disparity; noise is 1e-9 px.
-    assert abs(disparity[0] - disparity[1]) < 1e-7 and abs(disparity[2] - disparity[0]) > 0.01
-
-
 def test_pixel_noise_is_stated_sd_times_pixel_scale(fixed):
     """400 looks at one resting spot: the spread in each coordinate, in four standard errors."""
     truth = draw_truth(fixed, np.random.default_rng(0))
@@ -288,14 +236,6 @@ def test_plan_errors_teach(rig):
     assert caught.value.allowed == "d1, d2, d3"
     with pytest.raises(InputError, match="before a target"):
         simulate(rig, steps(("home", 0, 0), ("look",)), 1)
-
-
-def test_time_advances_by_the_rigs_costs(rig):
-    """time_s is the sum of the costs of what came before."""
-    rig = replace(rig, costs_s={"placement_s": 11.0, "move_s": 2.0, "look_s": 3.0})
-    times = [move.time_s for move in simulate(rig, small_plan(), 1).campaign.moves]
-    # home place look | move look | move look look | move look place | move look | home look | move
-    assert times == [0.0, 16.0, 21.0, 29.0, 45.0, 50.0, 55.0]
 
 
 ROUNDING_DEG = 1e-12

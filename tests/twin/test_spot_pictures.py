@@ -26,7 +26,6 @@ from tvsbayes.twin.spot_pictures import (
     expose,
     footprint,
     render_spot,
-    render_spots,
     speckle,
     spot_irradiance,
 )
@@ -147,28 +146,6 @@ def test_opencv_finds_the_corners_where_the_optics_put_them(mounted_rig):
         # cornerSubPix scatters by 0.05 px on these pictures; its mean over 54 corners is 0.01 px.
         assert np.abs(error).max() < 0.3
         assert np.abs(error.mean(axis=0)).max() < 0.04
-
-
-def test_the_same_seed_gives_the_same_picture_and_another_another(twin):
-    cameras = cameras_of(twin.truth.stereo)
-    light = twin.light.of(5)
-    one, two = (render_spots(cameras, light, Scene(), Sensor(), 1, 5) for _ in range(2))
-    assert np.array_equal(one.left, two.left)
-    assert np.array_equal(one.right, two.right)
-    for seed, spot in ((2, 5), (1, 6)):
-        other = render_spots(cameras, light, Scene(), Sensor(), seed, spot)
-        assert not np.array_equal(one.left, other.left)
-
-
-def test_frames_of_one_look_share_speckle_and_not_noise():
-    spot = Footprint(np.array([60.3, 50.7]), 9.0 * np.eye(2), 150.0)
-    pictures = [
-        render_spot(spot, 120, 100, Scene(speckle_contrast=0.5), Sensor(), (1, 2, 0), frame).astype(float)
-        for frame in (0, 1)
-    ]
-    core = np.s_[45:56, 55:66]
-    difference, spread = np.std(pictures[0][core] - pictures[1][core]), np.std(pictures[0][core])
-    assert 0 < difference < spread / 3
 
 
 def test_the_two_cameras_see_independent_speckle(mounted_rig):

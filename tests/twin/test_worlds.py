@@ -10,7 +10,7 @@ import pytest
 from experiments.common.rigs import shipped_plan
 from experiments.common.worlds import PERIOD_DEG, STEP_AT_DEG, WARM_UP_HOURS, WORLDS, campaign_of
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, Prior
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -45,16 +45,3 @@ def test_a_world_errs_by_its_size_and_leaves_all_else(mounted_rig, world):
             parts = np.linalg.lstsq(np.column_stack([wave.real, wave.imag]), error, rcond=None)[0]
             assert np.hypot(*parts) == pytest.approx(0.1, abs=1e-9)
             assert error == pytest.approx(parts[0] * wave.real + parts[1] * wave.imag, abs=1e-12)
-
-
-def test_worlds_repeat_by_seed_and_replace_what_the_rig_would_draw(mounted_rig):
-    plan = shipped_plan("mixed")
-    drawn = {"transmission_error_deg.pan": Prior(0.0, 0.3, "half-normal")}
-    rig = replace(mounted_rig, truth={**mounted_rig.truth, **drawn})
-    one, two, other = (campaign_of(rig, plan, "pinion", 0.05, seed) for seed in (4, 4, 5))
-    assert one.campaign.spots == two.campaign.spots
-    assert one.truth.parameters["transmission_error_deg.pan"] == 0.0
-    at = np.linspace(0.0, 12.0, 5)
-    assert np.abs(one.truth.gear_errors["pan"].error_deg(at)).max() <= 0.05
-    apart = one.truth.gear_errors["pan"].error_deg(at) - other.truth.gear_errors["pan"].error_deg(at)
-    assert np.abs(apart).max() > 1e-3, "another phase"
