@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import chain
 
@@ -27,10 +26,8 @@ from tvsbayes.cameras.boards import Board, View
 from tvsbayes.cameras.bundle_adjustment import bundle_adjustment
 from tvsbayes.cameras.calibration_export import exported
 from tvsbayes.cameras.imported_calibration import read_calibration
-from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
-from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.stereo_pair import Stereo, read_stereo, rotation_matrix, rotation_vector, stereo_bytes
+from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_vector, stereo_bytes
 from tvsbayes.report.fit_text import assumed_stereo
 from tvsbayes.results.metrology_tables import BudgetRow, BudgetTable
 
@@ -211,30 +208,6 @@ def test_cameras_without_a_common_field_are_refused(mounted):
         with_assumed_covariance(away, Provenance(), Provenance())
     with pytest.raises(InputError, match="calibrate no pair"):
         calibration_covariance(mounted, Board(3, 3, 25.0), 0, 0.2)
-
-
-def test_command_takes_the_stated_uncertainties(mounted, tmp_path, capsys):
-    named = [part for path in written(tmp_path, exported(mounted, "opencv")) for part in ("--import", str(path))]
-    facts = ["--rms-px", "0.21", "--views", "20", "--board", "9x6", "--pitch-mm", "25", "--joint"]
-    assert run(["stereo", *named, *facts, "-o", str(tmp_path / "stereo.json"), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["assumed"] and document["assumed_from"] == (
-        "RMS 0.21 px (stated), 20 views (stated), a board of 9x6 corners (stated), squares of 25 mm (stated), "
-        "all in one adjustment"
-    )
-    stereo = read_stereo(tmp_path / "stereo.json")
-    assert stereo.assumed_from == document["assumed_from"] and stereo.rms_px == 0.21
-    # The shipped pair's own sds, of 20 views at another noise, within twice the stated factor of a guess.
-    assert run(["stereo", "--import", str(tmp_path / "stereo.json"), "--u-rotation-mrad", "1", "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
-    assert abs(again["parameters"]["stereo.rotation_rad.y"]["sd"] - 1e-3) < 1e-12
-    for options in (["--rms-px", "0"], ["--views", "0"], ["--u-baseline-mm", "-1"], ["--board", "9"]):
-        assert run(["stereo", *named, *options, "--json"]) == 2
-        assert json.loads(capsys.readouterr().out)["error"]["remedy"]
-    path = shipped_data() / "rigs" / "mounted" / "stereo.json"
-    assert run(["stereo", "--import", str(path), "--rms-px", "0.2", "--json"]) == 2
-    assert "its own covariance" in json.loads(capsys.readouterr().out)["error"]["message"]
-    assert run(["stereo", str(tmp_path), "--board", "9x6", "--pitch-mm", "25", "--rms-px", "0.2", "--json"]) == 2
 
 
 def test_a_fit_states_its_share_of_the_variance(mounted):

@@ -13,8 +13,6 @@ from support.commands import (
     PAPER_TWIN,
     assert_error,
     no_constant,
-    steps,
-    two_sheets,
     with_spots,
 )
 from support.fit_documents import problems, shipped_schema
@@ -157,65 +155,12 @@ def test_unreliable_weights_fall_back_to_laplace_with_a_warning(ask, say, grid_f
     assert "\nverdict: usable with care: the posterior could not be sampled" in text
 
 
-@pytest.mark.thorough
-def test_fit_without_backlash_and_with_harmonics(ask, grid_campaign, grid_folder, tmp_path):
-    code, document = ask("fit", grid_folder, "--no-sample", "--harmonics")
-    assert code == 2 and "harmonic_period_deg.pan" in document["error"]["remedy"]
-    table = replace(grid_campaign.rig, harmonic_period_deg={"tilt": (360.0,)})
-    write_campaign(replace(grid_campaign, rig=table), tmp_path / "wheel")
-    code, document = ask("fit", tmp_path / "wheel", "--no-sample", "--harmonics", "--no-backlash")
-    assert code == 0
-    parameters = document["parameters"]
-    assert {name for name in parameters if name.startswith("harmonic_deg")} == {
-        f"harmonic_deg.tilt.{order}.{part}" for order in (1, 2) for part in ("cos", "sin")
-    }
-    assert parameters["backlash_deg.pan"]["value"] == parameters["backlash_deg.tilt"]["sd"] == 0.0
-
-
-@pytest.mark.thorough
-def test_robust_fit_names_the_spot_it_leaves_out(ask, grid_campaign, tmp_path):
-    spots = list(grid_campaign.spots)
-    # 40 stated sds.
-    spots[9] = replace(spots[9], v_left_px=spots[9].v_left_px + 40 * spots[9].sv_left_px)
-    write_campaign(replace(grid_campaign, spots=tuple(spots)), tmp_path / "odd")
-    code, document = ask("fit", tmp_path / "odd", "--no-sample", "--robust")
-    assert code == 0
-    assert document["excluded_spots"] == [spots[9].spot]
-
-
-@pytest.mark.thorough
-def test_a_direction_never_moved_is_null_and_one_side_is_weak(ask, say, mounted_rig, tmp_path):
-    plan = two_sheets((80, 0), (80, 40), (160, 40), (160, 80))
-    write_campaign(simulate(mounted_rig, plan, seed=5).campaign, tmp_path / "one way")
-    code, document = ask("fit", tmp_path / "one way", "--no-sample")
-    assert code == 0
-    effective = document["effective_deg_per_step"]
-    assert effective["right"] is effective["down"] is None
-    assert effective["left"]["contraction"] > 0.9
-    texts = [weak["text"] for weak in document["weak_directions"]]
-    assert [text for text in texts if "pan ratio and pan backlash" in text and "from one side" in text]
-    assert "never moved" in say("fit", tmp_path / "one way", "--no-sample")[1]
-
-
 def test_too_few_spots_are_nothing_to_estimate(ask, grid_campaign, tmp_path):
     write_campaign(replace(grid_campaign, spots=grid_campaign.spots[:7]), tmp_path / "few")
     code, document = ask("fit", tmp_path / "few", "--no-sample")
     assert code == 3
     assert_error(document, "too-few-spots")
     assert not (tmp_path / "few" / "results").exists()
-
-
-@pytest.mark.thorough
-def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
-    """Both axes move, but only after the last look."""
-    looks = [("place", "d1"), *[("look",)] * 5, ("place", "d2"), *[("look",)] * 5]
-    plan = steps(("home", 0, 0), *looks, ("move", 100, 50), ("move", 0, 0))
-    write_campaign(simulate(mounted_rig, plan, seed=6).campaign, tmp_path / "still")
-    code, document = ask("fit", tmp_path / "still", "--no-sample")
-    assert code == 3
-    assert_error(document, "uninformed")
-    # The document is written and states the source of the values.
-    assert all(e["contraction"] < 0.1 for e in document["effective_deg_per_step"].values())
 
 
 @pytest.mark.thorough
@@ -305,23 +250,6 @@ def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatc
     code, _, log = say("fit", grid_folder, "--no-sample")
     assert code == 4
     assert "NOT CONVERGED: it went astray" in log
-
-
-@pytest.mark.thorough
-def test_held_out_counters_of_a_scanner_are_predicted(ask, say, grid_folder, monkeypatch):
-    """Three counters of pan; two of tilt are too few. No experiments are needed, nothing is stored."""
-    monkeypatch.setattr("tvsbayes.comparison.held_positions.refit", lambda fit_of_all, *_: fit_of_all)
-    code, document = ask("compare", grid_folder, "--by", "positions")
-    assert code == 0 and document["kind"] == "positions left out" and document["unit"] == "deg"
-    held = document["hold_out"]
-    assert {(p["axis"], p["position"]) for p in held["positions"]} == {("pan", 0), ("pan", 100), ("pan", 200)}
-    assert held["rms_z"] < 3 and held["warnings"] == [
-        "tilt is seen at 2 counters: with one left out no line is determined"
-    ]
-    code, text, _ = say("compare", grid_folder, "--by", "positions")
-    assert code == 0 and "RMS z" in text and "predicted" in text
-    code, refused = ask("compare", grid_folder, "--by", "weeks")
-    assert code == 2 and "positions" in json.dumps(refused)
 
 
 def test_without_experiments_compare_fits_nothing(ask, grid_folder, monkeypatch):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 from pathlib import Path
 
 from tvsbayes.acquisition.replanning import Ahead, Proposal
@@ -23,11 +22,6 @@ def two_directions(folder: Path, looks: int) -> Estimate:
         raise ArithmeticError("not converged")
     u = 0.012 / rows_of(folder)
     return Estimate(looks, {"left": 0.06, "right": 0.06}, {"left": u, "right": u})
-
-
-def endless(folder: Path, looks: int) -> Estimate:
-    threading.Event().wait()
-    raise AssertionError
 
 
 def waiting(folder: Path, looks: int) -> Estimate:
