@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments.common.rigs import mounted_rig
-from experiments.paper.table1 import paper_values
-from experiments.paper.two_machines import HOME_SIDES, NOISE, RIGS, classic_readings, four_point_plan, solved
+from experiments.common.rigs import PAPER_NOISE, mounted_rig, paper_values
+from experiments.paper.two_rigs import HOME_SIDES, RIGS, classic_readings, four_point_plan, solved
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -19,7 +18,7 @@ def test_both_rigs_agree_with_table_1(kind):
     """Solved by a shortcut on nominal sheets; here the whole twin runs, gears with play included, without noise."""
     rig = mounted_rig()
     truth = solved(kind, rig, 0)
-    still = {name: 0.0 for name in NOISE}
+    still = {name: 0.0 for name in PAPER_NOISE}
     truth = replace(truth, parameters={**truth.parameters, **still})
     campaign = simulate(rig, four_point_plan(4), 3, truth, home_approach=HOME_SIDES).campaign
     table = paper_values()
