@@ -7,8 +7,7 @@ Rig i is drawn from `data/rigs/mounted` with seed i, every prior quantity as `tv
 measures four-point experiments of |N| = 100 and 200 (64 looks), twice with the same stops and sheets: `centroids` are
 drawn by the twin, `frames` are rendered, written, read and detected by the method `fit`. Both are fitted (joint,
 Laplace); what differs between the two is what detection adds. Drawn centroids have the stated noise times the drawn
-pixel_scale; in frames the truth of pixel_scale is the rms of (found - true) / stated of that campaign. The paper's
-whole protocol from pictures is `paper/lab.py`.
+pixel_scale; in frames the truth of pixel_scale is the rms of (found - true) / stated of that campaign.
 """
 
 from __future__ import annotations
