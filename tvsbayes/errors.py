@@ -162,6 +162,11 @@ INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
+def plural(count: int, noun: str) -> str:
+    """A count with its noun."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 def escaped(text: str, limit: int = 60) -> str:
     """Make text from a file fit to print: escape characters that are not printable, cut long text."""
     cut = text if len(text) <= limit else text[:limit] + "..."

@@ -17,7 +17,7 @@ import numpy as np
 
 from tvsbayes.cameras.boards import Board
 from tvsbayes.cameras.bundle_adjustment import projected
-from tvsbayes.errors import InputError, refusal
+from tvsbayes.errors import InputError, plural, refusal
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_vector
 
@@ -139,7 +139,7 @@ def calibration_covariance(
     coordinates = 4 * board.corners * views
     dof = coordinates - 24 - 6 * views
     if views < 1 or dof < 1:
-        found = f"{views} view{'s' * (views != 1)} of {board.corners} corners"
+        found = f"{plural(views, 'view')} of {board.corners} corners"
         remedy = "give --views and --board as they were"
         raise InputError("usage", f"{found} calibrate no pair of cameras", found=found, remedy=remedy)
     sigma_px = rms_px * math.sqrt(coordinates / (2 * dof))

@@ -14,7 +14,7 @@ from tvsbayes.cli.app import Json, finish, finite, missing_options, option_of, r
 from tvsbayes.cli.begin_commands import stated_globs
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
+from tvsbayes.errors import DeviceFault, InputError, escaped, plural, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import make_folder, require_writable, write_atomically
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
@@ -307,7 +307,7 @@ def doctor(
     faults = [c for c in checks if c.status == "fault"]
     error = None
     if faults:
-        message = f"{len(faults)} fault{'s' * (len(faults) > 1)}: {', '.join(c.name for c in faults)}"
+        message = f"{plural(len(faults), 'fault')}: {', '.join(c.name for c in faults)}"
         error = DeviceFault("doctor", message, remedy=faults[0].remedy)
     finish({"checks": plain(checks)}, "\n".join(lines), as_json, error)
 

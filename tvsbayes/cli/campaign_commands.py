@@ -10,7 +10,7 @@ from typer import Argument, Option
 from tvsbayes.cli.app import CampaignFolder, Json, Seed, check_order, finish, finite, is_part, report_line
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, escaped, typed
+from tvsbayes.errors import InputError, escaped, plural, typed
 from tvsbayes.files.disk import output_place, require_writable, shipped_data, write_atomically, write_folder
 from tvsbayes.instrument.axes import DIRECTIONS, HOME_APPROACH
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
@@ -183,7 +183,7 @@ def check(
 
     document = _contents(path, plan_file)
     warnings, has_images = document["warnings"], not (path / SIGHTINGS.file).is_file()
-    summary = f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}"
+    summary = f"{escaped(str(path), 200)}: readable, {plural(len(warnings), 'warning')}"
     finish(document, f"{check_text(document, has_images)}\n{summary}", as_json)
 
 

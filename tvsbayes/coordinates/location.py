@@ -23,7 +23,7 @@ from tvsbayes.calibration.pointing import (
     Calibration,
 )
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import InputError, require_kind
+from tvsbayes.errors import InputError, plural, require_kind
 from tvsbayes.instrument.axes import HOME_APPROACH, sides_of
 from tvsbayes.progress import Job, Show
 from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
@@ -75,7 +75,7 @@ class Locations(Shown):
             note = f"refused: {error.code}" if error is not None else "EXTRAPOLATED" if self.extrapolated[k] else ""
             numbers = [None] * 6 if error is not None else [*self.xyz_mm[k].tolist(), *self.u95_mm[k].tolist()]
             rows.append((k, *numbers, note))
-        points = f"{len(self.refused)} point{'s' * (len(self.refused) != 1)}"
+        points = f"{plural(len(self.refused), 'point')}"
         title = f"Locations of {points}, frame T, {self.draws} draws ({self.estimator})"
         return View(title, (*columns, "note"), rows)
 

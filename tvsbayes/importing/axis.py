@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tvsbayes.errors import escaped
+from tvsbayes.errors import escaped, plural
 from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.axis_columns import FIELDS, axis_columns
 from tvsbayes.importing.axis_units import (
@@ -136,7 +136,7 @@ def axis_rows(table: ForeignTable, wishes: Wishes, folder_unit: str | None = Non
     cells.assumed.extend(said)
     unread = sum(v is None and means(s, "good") for v, s in zip(values, cells.text("status"), strict=True))
     if unread:
-        cells.assumed.append(f"status: {unread} row{'s' * (unread > 1)} called good without a reading: moves alone")
+        cells.assumed.append(f"status: {plural(unread, 'row')} called good without a reading: moves alone")
     if "u" not in cells:
         cells.assumed.append("u: none, so that the scatter of stops covers the readings' own")
     readings, wrapped = unwrapped(moves, readings, folder_unit or unit, wishes.counts_per_turn)
@@ -291,10 +291,10 @@ def _moves_of(
         move_of_row.append(len(moves) - 1)
     said = []
     if again:
-        rows = f"{again} row{'s' * (again > 1)}"
+        rows = f"{plural(again, 'row')}"
         said.append(f"{rows} at the command before: read at that stop again, without a move")
     if inserted:
-        added, name = f"{inserted} move{'s' * (inserted > 1)} added", cells.shown("approach")
+        added, name = f"{plural(inserted, 'move')} added", cells.shown("approach")
         where = f"where column {name} states another side than the row before gives"
         said.append(f"{added}, {reach:.6g} past the stop, {where}; --column approach= takes sides from the order only")
     if "approach" not in cells:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tvsbayes.errors import InputError, Question, escaped
+from tvsbayes.errors import InputError, Question, escaped, plural
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.table import ForeignTable
 from tvsbayes.importing.words import HOUR_ANGLE, Unit, means, name_of, parse_unit, place_of, unit_named, words_of
@@ -273,7 +273,7 @@ def homings_of(cells: FieldCells, *, silent: bool = False) -> list[bool]:
     homings = [False, *changes]
     if not silent:
         count, how = sum(homings), "at each 1" if are_marks else "where it changes"
-        said = f"segment: {count} homing{'s' * (count != 1)} after the first row"
+        said = f"segment: {plural(count, 'homing')} after the first row"
         cells.assumed.append(f"{said}, by column {cells.shown('segment')} {how}")
     return homings
 
@@ -284,7 +284,7 @@ def say_left_out(cells: FieldCells, statuses: Sequence[str], noun: str) -> None:
     counts = Counter(escaped(text, 24) for text in statuses if text.strip() and not means(text, "good"))
     words = ", ".join(f"{text} {count}" for text, count in counts.most_common(WORDS_SHOWN))
     if count := counts.total():
-        rows, more = f"{count} {noun}{'s' * (count != 1)}", " ..." * (len(counts) > WORDS_SHOWN)
+        rows, more = plural(count, noun), " ..." * (len(counts) > WORDS_SHOWN)
         cells.assumed.append(f"status: {rows} left out by column {cells.shown('status')}: {words}{more}")
 
 

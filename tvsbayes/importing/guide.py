@@ -19,7 +19,7 @@ from itertools import pairwise
 from statistics import median
 from typing import Any, NamedTuple
 
-from tvsbayes.errors import Candidate, escaped
+from tvsbayes.errors import Candidate, escaped, plural
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import asked, refused
 from tvsbayes.importing.axis import AxisRows
@@ -380,17 +380,13 @@ def _check_known(run: GuideRun, known: Mapping[str, Any], file: str) -> None:
         raise asked("large-pulses", file, line=run.line, pulse=known["pulse_arcsec_per_s"], most=most)
 
 
-def _several(count: int, name: str) -> str:
-    return f"{count} {name}{'s' * (count != 1)}"
-
-
 def _notes(run: GuideRun, used: int, stretches: int) -> tuple[str, ...]:
     """Numbers of frames used and left out, and further remarks on a run, in words."""
     counts, frames = run.counts, run.frames
     out = [f"{sum(f.settling for f in frames)} while settling", f"{len(run.rows) - len(frames)} dropped"]
-    out += [_several(n, name) for name in ("damaged row", "calibration step") if (n := counts[name])]
+    out += [plural(n, name) for name in ("damaged row", "calibration step") if (n := counts[name])]
     out += [f"{n} {name}" for name, n in counts.items() if name.startswith("rows of")]
-    breaks = [_several(counts["dither"], "dither")] + [_several(counts["pause"], "pause")] * (counts["pause"] > 0)
+    breaks = [plural(counts["dither"], "dither")] + [plural(counts["pause"], "pause")] * (counts["pause"] > 0)
     own = f"{stretches} stretch{'es' * (stretches != 1)} with a zero of its own{' each' * (stretches > 1)}"
     step_s = median([b.time_s - a.time_s for a, b in pairwise(frames)] or [0.0])
     pulses_ms, limit_ms = [abs(frame.pulse_ms) for frame in frames], run.header.get("pulse_max_ms", 0.0)
@@ -401,8 +397,8 @@ def _notes(run: GuideRun, used: int, stretches: int) -> tuple[str, ...]:
         "the log does not say that the run ended: it may be cut off": not counts["end"],
         f"{long_pulses} pulses last longer than the {step_s:.2g} s between frames and act in part later": long_pulses,
         f"{at_limit} pulses at their limit of {limit_ms:g} ms": at_limit,
-        f"{_several(counts['saturated'], 'frame')} with a saturated star, used": counts["saturated"],
-        f"{_several(counts['change'], 'change')} of the RA algorithm during the run": counts["change"],
+        f"{plural(counts['saturated'], 'frame')} with a saturated star, used": counts["saturated"],
+        f"{plural(counts['change'], 'change')} of the RA algorithm during the run": counts["change"],
     }
     return tuple(remark for remark, is_so in remarks.items() if is_so)
 

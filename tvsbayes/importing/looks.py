@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tvsbayes.errors import InputError, escaped
+from tvsbayes.errors import InputError, escaped, plural
 from tvsbayes.files.csv_kind import ID_MAX
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.importing.asking import listed, refused
@@ -493,7 +493,7 @@ def _centres(cells: FieldCells) -> dict[str, list[float | None]]:
                 pixels[u][row] = pixels[v][row] = None
                 empty.add(row)
     if empty:
-        count = f"{len(empty)} look{'s' * (len(empty) > 1)}"
+        count = f"{plural(len(empty), 'look')}"
         cells.assumed.append(f"centres: none in {count} whose two pixels of a camera are one number, as -1 or 0")
     return pixels
 
@@ -523,7 +523,7 @@ def _four_point(cells: FieldCells, assumed: list[str], book: bool) -> dict[str, 
     rows = list(zip(*(numbered.whole(name, *limits[name], optional=True) for name in FOUR_POINT), strict=True))
     half = sum((experiment is None) != (point is None) for experiment, point in rows)
     if half:
-        assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with only one of them, which is left out")
+        assumed.append(f"experiment, point: {plural(half, 'row')} with only one of them, which is left out")
     whole = [(None, None) if None in row else row for row in rows]
     return {name: list(column) for name, column in zip(FOUR_POINT, zip(*whole, strict=True), strict=True)}
 

@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from tvsbayes.errors import escaped
+from tvsbayes.errors import escaped, plural
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX, NUMBER
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.importing.asking import refused
@@ -186,7 +186,7 @@ def paired_rows(text: str, file: str) -> Rows | None:
     damaged |= orphans | ({*others} - {*before})
     notes = ['lines of "name: value"']
     if n := len(before):
-        notes.append(f"{n} line{'s' * (n > 1)} before the first row left out")
+        notes.append(f"{plural(n, 'line')} before the first row left out")
     if damaged:
         named = ", ".join(map(str, sorted(damaged)[:NAMED_MAX])) + " ..." * (len(damaged) > NAMED_MAX)
         s, them = ("", "it") if len(damaged) == 1 else ("s", "them")

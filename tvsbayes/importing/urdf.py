@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from tvsbayes.errors import InputError, closest, escaped, listed, refusal, shown
+from tvsbayes.errors import InputError, closest, escaped, listed, plural, refusal, shown
 from tvsbayes.files.csv_table import NUMBER
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Tag:
             return np.array(default)
         words = text.split()
         if len(words) != len(default) or not all(NUMBER.fullmatch(w) and abs(float(w)) <= NUMBER_MAX for w in words):
-            allowed = f"{len(default)} finite number{'s' * (len(default) > 1)} up to {NUMBER_MAX:g}"
+            allowed = f"{plural(len(default), 'finite number')} up to {NUMBER_MAX:g}"
             raise tag.refuse(f"{part} {attribute} {shown(text)}", allowed, "correct the numbers of the joint")
         return np.array(words, float)
 

@@ -14,6 +14,7 @@ from msgspec import structs
 
 from tvsbayes.calibration.optics import beam_angle_deg, beam_deg_per_step, output_deg
 from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.errors import plural
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
 from tvsbayes.metrology.simulated_cycles import (
@@ -84,7 +85,7 @@ def _with_own_stops(table: AxisPositioning, readings: StopReadings, wanted: int)
     }
     usable = {n: pair for n, pair in runs.items() if min(map(len, pair)) >= RUNS_MIN}
     if len(usable) < TARGETS_MIN:
-        counters = f"{len(usable)} counter{'s' * (len(usable) != 1)}"
+        counters = f"{plural(len(usable), 'counter')}"
         reason = (
             f"{counters} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
             f"are needed, ISO 230-2 asks for {wanted} with {RUNS} runs"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.errors import InputError
+from tvsbayes.errors import InputError, plural
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
@@ -210,7 +210,7 @@ def _fault(
     if remedy is None:
         return PlanFault(axis, f"{text}; up to {ADDED_LOOKS_MAX} more looks do not change that on this rig")
     looks, after = sum(s.action == "look" for s in remedy.addition), remedy.after.u(axis)
-    looks_text = f"{looks} more look{'s' * (looks != 1)}, {describe_looks(knowledge.rig, remedy.addition, steps)}"
+    looks_text = f"{plural(looks, 'more look')}, {describe_looks(knowledge.rig, remedy.addition, steps)}"
     text += f"; smallest addition: {looks_text}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
     return PlanFault(axis, text, actions_of(remedy.addition), after)
 

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.errors import InputError, NotConverged, plural
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign
@@ -263,7 +263,7 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
     notes = []
     sides = {d: looks.side[:, AXES.index(axis)] == sign for d, (axis, sign) in DIRECTION_SIGNS.items()}
     for direction, stops in too_few({d: int(np.sum(reached)) for d, reached in sides.items()}).items():
-        reached = f"only {stops} stop{'s' * (stops != 1)} {direction}"
+        reached = f"only {plural(stops, 'stop')} {direction}"
         remedy = "plan u(worst), which asks for every direction"
         if target.quantity == "worst":
             remedy = f"look more often: {FEW_STOPS} stops determine their scatter"

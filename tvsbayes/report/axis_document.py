@@ -14,7 +14,7 @@ import numpy as np
 from tvsbayes.compensation.periodic_error import LIKELY as TABLE_LIKELY
 from tvsbayes.compensation.verification import compensation_in
 from tvsbayes.display import concise
-from tvsbayes.errors import NothingToEstimate, escaped, typed
+from tvsbayes.errors import NothingToEstimate, escaped, plural, typed
 from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.metrology.conformity import Criterion, Tolerance
@@ -44,7 +44,6 @@ from tvsbayes.report.tables import (
     interval_text,
     optional,
     percent,
-    plural,
     sentences,
     table,
     three_digits,

@@ -12,7 +12,7 @@ from msgspec import UNSET
 
 from tvsbayes.calibration.pointing import Steps
 from tvsbayes.display import concise
-from tvsbayes.errors import escaped
+from tvsbayes.errors import escaped, plural
 from tvsbayes.instrument.homing import scatter_of_prior
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.report.document import Part, labelled, terminal
@@ -22,7 +22,6 @@ from tvsbayes.report.tables import (
     made_by,
     name_in_words,
     optional,
-    plural,
     sentences,
     table,
     text_width,

@@ -75,11 +75,6 @@ def signed(value: float, sd: float) -> str:
     return text if text.startswith("-") else f"+{text}"
 
 
-def plural(count: int, noun: str) -> str:
-    """A count with its noun."""
-    return f"{count} {noun}{'s' * (count != 1)}"
-
-
 def percent(probability: float) -> str:
     """A probability from draws, never printed as 0 or 100 %."""
     return "> 99.9 %" if probability > 0.999 else "< 0.1 %" if probability < 0.001 else f"{100 * probability:.1f} %"
