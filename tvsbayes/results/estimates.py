@@ -108,6 +108,15 @@ class Estimate(Measured, frozen=True, forbid_unknown_fields=True):
         return self.contraction is not None and self.contraction >= CONTRACTION_LIMIT
 
 
+def estimates_view(title: str, named: Mapping[str, Estimate]) -> View:
+    """Estimates by name, each with the share of its prior variance that the data removed."""
+    rows = [
+        (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
+        for name, e in named.items()
+    ]
+    return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "set by the data, %"), rows)
+
+
 def varies_beyond(variation: Estimate | None, play: Estimate | None) -> bool:
     """Whether a play that is there varies by more than itself, so that it would be negative at some positions.
 
@@ -373,12 +382,7 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
         if self.validation is not None and not self.validation.passed:
             title += f"; VALIDATION FAILED: {self.validation.cause}"
             title += f", u times {self.validation.inflation:.2f}" * self.validation.widens
-        rows = [
-            (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
-            for name, e in self.named.items()
-            if not name.startswith("stereo.")
-        ]
-        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "set by the data, %"), rows)
+        return estimates_view(title, {name: e for name, e in self.named.items() if not name.startswith("stereo.")})
 
     @property
     def named(self) -> dict[str, Estimate]:

@@ -9,7 +9,7 @@ from msgspec import Meta, field
 
 from tvsbayes.display import Shown, View
 from tvsbayes.results.convergence import MonteCarloError
-from tvsbayes.results.estimates import Estimate, PeriodEstimate
+from tvsbayes.results.estimates import Estimate, PeriodEstimate, estimates_view
 from tvsbayes.results.fit_record import Provenance, Sha256
 from tvsbayes.results.metrology_tables import BudgetTable
 from tvsbayes.results.records import AnswerKind, Count, EstimatorName, NotNegative, Record, Tier, schema_of
@@ -116,13 +116,8 @@ class AxisSummary(Shown, Record, frozen=True):
         estimates = {f"per_command.{side}": e for side, e in self.per_command.items()}
         estimates |= {f"effective_per_command.{side}": e for side, e in self.effective_per_command.items()}
         estimates |= {name: e for name, e in self.parameters.items() if name != "per_command"}
-        rows = [
-            (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
-            for name, e in estimates.items()
-        ]
         state = "converged" if self.converged else "NOT CONVERGED"
-        title = f"AxisSummary in {self.unit}, {self.estimator}, {state}"
-        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "set by the data, %"), rows)
+        return estimates_view(f"AxisSummary in {self.unit}, {self.estimator}, {state}", estimates)
 
 
 class AxisInputs(Record, frozen=True):
