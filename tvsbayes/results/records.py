@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import msgspec
 import numpy as np
@@ -26,9 +26,6 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.results.tiers import TIERS
-
-if TYPE_CHECKING:
-    from jsonschema import Draft202012Validator
 
 type NotNegative = Annotated[float, Meta(ge=0)]
 type Positive = Annotated[float, Meta(gt=0)]
@@ -195,24 +192,16 @@ def _record_schema(kind: type[Record]) -> dict[str, Any]:
     return schema_of(kind)
 
 
-def _validator(schema: Mapping[str, Any]) -> Draft202012Validator:
-    from jsonschema import Draft202012Validator
-
-    return Draft202012Validator(schema)
-
-
-class _Problem(NamedTuple):
-    """A place in a document, as keys and list indices, and what is allowed there."""
-
-    place: Sequence[str | int]
-    allowed: str
+type _Problem = tuple[Sequence[str | int], str]
+"""A place in a document, as keys and list indices, and what is allowed there."""
 
 
 def _schema_problem(values: object, schema: Mapping[str, Any]) -> _Problem | None:
     """The place that most likely violates the schema."""
+    from jsonschema import Draft202012Validator
     from jsonschema.exceptions import best_match
 
-    error = best_match(islice(_validator(schema).iter_errors(values), SCHEMA_PROBLEMS))
+    error = best_match(islice(Draft202012Validator(schema).iter_errors(values), SCHEMA_PROBLEMS))
     if error is None:
         return None
     place, rule = list(error.absolute_path), error.validator_value
@@ -221,28 +210,28 @@ def _schema_problem(values: object, schema: Mapping[str, Any]) -> _Problem | Non
         place.append(error.instance)
     match error.validator:
         case "required":
-            return _Problem([*place, next(name for name in rule if name not in error.instance)], "this key")
+            return [*place, next(name for name in rule if name not in error.instance)], "this key"
         case "additionalProperties":
             known = error.schema.get("properties", {})
-            return _Problem([*place, next(name for name in error.instance if name not in known)], "no such key")
+            return [*place, next(name for name in error.instance if name not in known)], "no such key"
         case "type":
-            return _Problem(place, rule if isinstance(rule, str) else " or ".join(rule))
+            return place, rule if isinstance(rule, str) else " or ".join(rule)
         case "const":
-            return _Problem(place, shown(rule))
+            return place, shown(rule)
         case "enum":
-            return _Problem(place, " or ".join(map(shown, rule)))
+            return place, " or ".join(map(shown, rule))
         case other:
-            return _Problem(place, f"{other} {shown(rule)}")
+            return place, f"{other} {shown(rule)}"
 
 
 def _unfit_value(value: object, place: tuple[str, ...] = ()) -> _Problem | None:
     """The place of a text that cannot be printed or of a number that is not finite."""
     if isinstance(value, str):
         if len(value) > TEXT_CHARS_MAX or not all(c.isprintable() or c in "\n\t" for c in value):
-            return _Problem(place, "printable text")
+            return place, "printable text"
     elif isinstance(value, float):
         if not math.isfinite(value):
-            return _Problem(place, "a finite number")
+            return place, "a finite number"
     elif isinstance(value, dict):
         return next(filter(None, (_unfit_value(inner, (*place, key)) for key, inner in value.items())), None)
     elif isinstance(value, list):
