@@ -18,7 +18,6 @@ from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
-from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.twin.true_rig import read_truth
@@ -151,38 +150,3 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     assert "synthetic" not in read_campaign(tmp_path / "c").header
     (start,) = events(tmp_path / "c", "start")
     assert start["device"]["fw"] == "1.1.0" and "cameras" in start
-
-
-@pytest.mark.thorough
-@needs_pseudo_terminals
-def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
-    """As after a reboot: the board comes back as ttyACM1, the camera at another address, and both are logged."""
-    instrument, lines = Instrument(small_rig, 7), []
-    instrument.place("d1", 0)
-    looks = [0]
-
-    def failing_once(lit, dark):
-        looks[0] += 1
-        if looks[0] == 2:
-            raise DeviceFault("no-frame", "the camera has gone", remedy="plug it in")
-        return centroids(lit, dark)
-
-    def go(resume):
-        with (
-            streamed(cameras_before(instrument)) as address,
-            served(instrument.device, 1_000_000) as port,
-        ):
-            # Another name of the same line, should the system give the same one twice.
-            name = tmp_path / f"tty{resume:d}"
-            name.symlink_to(port)
-            table = {"port": str(name), "settle_s": 0.0}
-            rig = replace(small_rig, positioner=table, cameras={"source": address, "spot_sd_px": 0.08})
-            options = {"terminal": Terminal(lines.append, ask=lambda question: ""), "detector": failing_once}
-            return acquire(rig, TWO_LOOKS, tmp_path / "c", resume=resume, laser_class="3B", **options)
-
-    with pytest.raises(DeviceFault, match="has gone"):
-        go(False)
-    assert go(True).reason == "done"
-    changed = [line for line in lines if line.endswith(": logged")]
-    assert [line.split(" was ")[0] for line in changed] == ["[cameras] source", "[positioner] port"], lines
-    assert 'tty0" and is ' in changed[1] and verify(tmp_path / "c").stopped == "done"

@@ -91,6 +91,7 @@ def test_thinned_study_confirms_the_covariance():
     assert abs(noise / CORNER_SD_PX - 1) < 4 / np.sqrt(2 * dof)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("off_mm", (0.0, 0.2))
 def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
     """Corners displaced alike in all pictures: the residuals give the size, and parameters err by the stated sds."""
@@ -116,6 +117,7 @@ def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
     assert (alone > high) == (off_mm > 0)
 
 
+@pytest.mark.thorough
 def test_errors_that_corners_share_are_in_the_covariance():
     """Half of the variance shared over 2.5 squares: independent corners would claim a third of the true sds."""
     rows = [calibrate(("shared", seed), VIEWS) for seed in range(2)]
@@ -320,6 +322,7 @@ def test_doubtful_view_is_named_and_left_out_on_request(views, without_the_sixth
     np.testing.assert_allclose(robust.stereo.vector, without_the_sixth.stereo.vector, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_views_of_one_camera_are_used_for_that_camera(views, calibration):
     half = [view if k % 2 else replace(view, right=None) for k, view in enumerate(views)]
     result = calibrate_stereo(half, BOARD, SIZE)
