@@ -339,30 +339,18 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
     if not moved.any():
         what = "no axis was seen at two counters: nothing can have been aimed by the calibration"
         raise NothingToEstimate("no-correction", what, remedy="look before and after moves, then fit again")
-    axes = [
-        _axis_stops(campaign, calibration, k, run_up[k])
-        if moved[k]
-        else _AxisStops([VerifyStop(float(calibration.range_steps[k, 0]), 1)], 0.0)
-        for k in range(2)
-    ]
-    count = max(LOOKS_MIN, *(len(axis.stops) for axis in axes))
+    still = [VerifyStop(float(steps), 1) for steps in calibration.range_steps[:, 0]]
+    planned = [_axis_stops(campaign, calibration, k, run_up[k]) if moved[k] else ([still[k]], 0.0) for k in range(2)]
+    count = max(LOOKS_MIN, *(len(stops) for stops, _ in planned))
     # The axis that needs fewer stops repeats them: every look measures both axes.
-    pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)
+    pan, tilt = ([stops[i % len(stops)] for i in range(count)] for stops, _ in planned)
     stops = tuple(AimedStop(int(p.command), int(t.command), p.side, t.side) for p, t in zip(pan, tilt, strict=True))
-    reached = max(axis.reached for axis in axes)
+    reached = max(distance for _, distance in planned)
     return AimPlan(stops, (run_up[0], run_up[1]), reached >= IDENTIFIED, float(np.sqrt(reached)))
 
 
-@dataclass(frozen=True)
-class _AxisStops:
-    """Counters and sides of one axis, and the squared distance of the nearest hypothesis by these stops."""
-
-    stops: list[VerifyStop]
-    reached: float
-
-
-def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: int) -> _AxisStops:
-    """Choose the stops of one axis, the other in the middle of its range."""
+def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: int) -> tuple[list[VerifyStop], float]:
+    """Choose the stops of one axis, the other in the middle of its range, and the squared distance by them."""
     low, high = calibration.range_steps[k]
     least, most = counters_made(campaign.moves)[AXES[k]]
     if high - low > 4 * run_up:
@@ -395,7 +383,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
         [world[reach] for world in worlds], common[np.ix_(reach, reach)], noise[reach], np.repeat(spread, 2)[reach]
     )
     chosen = [i for i, count in zip(reach.tolist(), visits.visits, strict=True) for _ in range(int(count))]
-    return _AxisStops([VerifyStop(float(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
+    return [VerifyStop(float(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached
 
 
 def _remarks(fit: JointFit, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ from tvsbayes.metrology.traceability import (
     Traceability,
     performed,
     plain_text,
-    stated_in,
+    stated_value,
 )
 from tvsbayes.results.fit_record import Provenance
 
@@ -284,15 +284,15 @@ def certificate_xml(content: Content, campaign: Measured, title: str, identifier
         statements=common_statements(content, issue.parties, synthetic=synthetic, performance=when),
         used=" ".join(("method", "software", *(each.identifier for each in content.equipment))),
         conditions={
-            refers: Quantity(name, stated(header, "environment", key, unit))
+            refers: Quantity(name, stated(campaign, "environment", key, unit))
             for refers, (key, name, unit) in CONDITIONS.items()
         },
     )
 
 
-def stated(header: Mapping[str, object], table: str, key: str, unit: str) -> Real | None:
+def stated(campaign: Measured, table: str, key: str, unit: str) -> Real | None:
     """A quantity of a table of `campaign.toml`; None where it is not stated."""
-    found = stated_in(header, table, key)
+    found = stated_value(campaign, table, key)
     return None if found is None else dcc_real(unit, found.value, found.u)
 
 

@@ -131,7 +131,7 @@ def dcc_bytes(
     kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
     where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     board = str(header_table(campaign, "traceability").get("board_certificate", NOT_STATED))
-    pitch = stated(campaign.header, "traceability", "pitch_mm", MM)
+    pitch = stated(campaign, "traceability", "pitch_mm", MM)
     pitches = [] if pitch is None else [Quantity("pitch", pitch)]
     content = Content(
         item="stepper-driven two-mirror laser positioner",

@@ -71,16 +71,10 @@ def header_table(campaign: Measured, name: str) -> dict[str, object]:
     return table if isinstance(table, dict) else {}
 
 
-def stated_in(header: Mapping[str, object], name: str, key: str) -> StatedValue | None:
-    """Return a quantity of such a table of a header."""
-    table = header.get(name)
-    entry = table.get(key) if isinstance(table, dict) else None
-    return entry if isinstance(entry, StatedValue) else None
-
-
 def stated_value(campaign: Measured, name: str, key: str) -> StatedValue | None:
     """Return a quantity of such a table."""
-    return stated_in(campaign.header, name, key)
+    entry = header_table(campaign, name).get(key)
+    return entry if isinstance(entry, StatedValue) else None
 
 
 UNITS = {"degC": "degC", "percent": "%", "mm": "mm"}
