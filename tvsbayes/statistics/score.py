@@ -52,8 +52,9 @@ class Score:
 
     def given(self, rows: np.ndarray | slice, inverse: np.ndarray) -> Score:
         """What is left where some unknowns are fitted, of which the inverse information is given, priors included."""
-        load = self.information[:, rows] @ inverse
-        return Score(self.value - load @ self.value[rows], self.information - load @ self.information[rows])
+        cross = self.information[rows]
+        followed = inverse @ cross
+        return Score(self.value - followed.T @ self.value[rows], self.information - cross.T @ followed)
 
     def at(self, rows: np.ndarray | slice) -> Score:
         """That of some unknowns."""
