@@ -5,8 +5,6 @@ It uses a finished `JointFit`, and a `Posterior` if given; nothing is fitted aga
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import numpy as np
 from msgspec import structs
@@ -24,6 +22,7 @@ from tvsbayes.assessment.weaknesses import (
 )
 from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, ratio_slopes, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.inference.summaries import Propagated
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
@@ -70,30 +69,25 @@ def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws:
     return Estimate(float(value), sd, (float(low), float(high)), prior_sd, contraction)
 
 
-class LaplaceDraws(NamedTuple):
-    """Draws of the Laplace approximations under all fitted homing hypotheses; weights (n,) of sum 1."""
+def draws_of_ways(fit: JointFit) -> tuple[Derived, np.ndarray]:
+    """Concatenate the Laplace draws of all fitted homing hypotheses; their weights (n,) of sum 1.
 
-    draws: Derived
-    weights: np.ndarray
-
-
-def draws_of_ways(fit: JointFit) -> LaplaceDraws:
-    """Concatenate the draws of all homing hypotheses; those of the fit alone where the sides were recorded."""
+    Those of the fit alone where the sides were recorded.
+    """
     parts = [(way.probability, way.fit.draws) for way in fit.mixture if way.fit is not None]
     counts = [len(part.physical) for _, part in parts]
     weights = np.concatenate([np.full(n, p / n) for n, (p, _) in zip(counts, parts, strict=True)])
-    draws = jax.tree.map(lambda *each: np.concatenate(each), *(part for _, part in parts))
-    return LaplaceDraws(draws, weights / weights.sum())
+    return jax.tree.map(lambda *each: np.concatenate(each), *(part for _, part in parts)), weights / weights.sum()
 
 
 def equal_laplace_draws(fit: JointFit) -> Derived:
     """Resample `draws_of_ways` with equal weights, as many as the fit has; its own draws if there is one way."""
     if len(fit.mixture) == 1:
         return fit.draws
-    weighted, count = draws_of_ways(fit), len(fit.draws.physical)
+    draws, weights = draws_of_ways(fit)
     # Without the permutation the first draws would be of one way only.
-    places = np.random.default_rng(MIXING_SEED).permutation(systematic(weighted.weights, count, 0.5))
-    return jax.tree.map(lambda x: x[places], weighted.draws)
+    places = np.random.default_rng(MIXING_SEED).permutation(systematic(weights, len(fit.draws.physical), 0.5))
+    return jax.tree.map(lambda x: x[places], draws)
 
 
 class _Source:
@@ -141,22 +135,17 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
     fit = source.fit
     low, high = fit.ends95
     has_readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) > 0))
-    estimates = {}
+    absent = _absent(fit) | (set() if has_readings else set(RECEIVER_NAMES))
+    estimates = {name: source.estimate(name) for name in fit.names if name not in absent}
+    if source.posterior is not None or len(fit.mixture) > 1:
+        return estimates
     for index, name in enumerate(fit.names):
-        if name in RECEIVER_NAMES and not has_readings:
-            continue
-        if name in _absent(fit):
-            continue
-        estimate = source.estimate(name)
-        if source.posterior is not None or len(fit.mixture) > 1:
-            estimates[name] = estimate
-            continue
-        if index >= fit.space.rig:
+        if (estimate := estimates.get(name)) is not None:
             # Stereo parameters mix coordinates linearly.
-            ends = (estimate.value - NORMAL_95 * estimate.sd, estimate.value + NORMAL_95 * estimate.sd)
-        else:
-            ends = (float(low[index]), float(high[index]))
-        estimates[name] = structs.replace(estimate, interval95=ends)
+            half = NORMAL_95 * estimate.sd
+            exact = (estimate.value - half, estimate.value + half)
+            ends = (float(low[index]), float(high[index])) if index < fit.space.rig else exact
+            estimates[name] = structs.replace(estimate, interval95=ends)
     return estimates
 
 
@@ -216,16 +205,16 @@ def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint
         pose = np.degrees(posterior.fit.reference_pose_rad)
         pose[axis] = angle
         pan, tilt = pose.tolist()
-        estimates = posterior.local_deg_per_step(pan, tilt)
-        ratios = {
-            direction: Measured(
-                float(estimates.mean[k]), float(estimates.sd[k]), tuple(estimates.interval95[:, k].tolist())
-            )
-            for k, direction in enumerate(DIRECTIONS)
-            if direction in moved
-        }
-        points.append(CurvePoint(pan, tilt, **ratios))
+        ratios = zip(DIRECTIONS, _measured(posterior.local_deg_per_step(pan, tilt)), strict=True)
+        moving = {direction: Measured(*ratio) for direction, ratio in ratios if direction in moved}
+        points.append(CurvePoint(pan, tilt, **moving))
     return tuple(points)
+
+
+def _measured(estimates: Propagated) -> list[tuple[float, float, tuple[float, float]]]:
+    """Mean, sd and interval of each quantity."""
+    rows = np.column_stack([estimates.mean, estimates.sd, *estimates.interval95]).tolist()
+    return [(mean, sd, (low, high)) for mean, sd, low, high in rows]
 
 
 def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]:
@@ -233,11 +222,8 @@ def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]
     used = sorted(set(legs_of(posterior.fit.campaign.moves)[direction]))
     chosen = np.unique(np.linspace(0, len(used) - 1, min(CURVE_POINTS, len(used))).astype(int))
     steps = [used[i] for i in chosen]
-    motion = posterior.lost_motion_deg(direction, np.array(steps))
-    return tuple(
-        LostMotion(n, float(motion.mean[k]), float(motion.sd[k]), tuple(motion.interval95[:, k].tolist()))
-        for k, n in enumerate(steps)
-    )
+    motion = _measured(posterior.lost_motion_deg(direction, np.array(steps)))
+    return tuple(LostMotion(n, *each) for n, each in zip(steps, motion, strict=True))
 
 
 def seen_range(fit: JointFit) -> dict[str, tuple[int, int]]:
