@@ -98,15 +98,6 @@ def test_write_refuses_campaigns_that_read_refuses(tmp_path):
         assert not (tmp_path / name).exists()
 
 
-def test_truth_frames_results_and_other_files_are_not_read(tmp_path):
-    write_campaign(small_campaign(), tmp_path / "c")
-    (tmp_path / "c" / "truth.json").write_bytes(b"\xff no JSON at all")
-    (tmp_path / "c" / "frames").mkdir()
-    (tmp_path / "c" / "results").mkdir()
-    (tmp_path / "c" / "holiday.jpg").write_bytes(b"\0")
-    assert_same(small_campaign(), read_campaign(tmp_path / "c"))
-
-
 def test_bom_crlf_order_of_rows_and_columns(tmp_path):
     write_campaign(small_campaign(), tmp_path / "c")
     for path in (tmp_path / "c").iterdir():

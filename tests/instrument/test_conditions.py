@@ -99,13 +99,6 @@ def test_below_absolute_zero_is_refused(degC):
         parse_moves(data.replace(b"-273.15", degC.encode()))
 
 
-def test_the_temperature_column_round_trips_where_present():
-    moves = moves_at([0.0, 7.0], [21.5, None])
-    moves[0] = replace(moves[0], pan_approach="left", tilt_approach="up")
-    assert list(parse_moves(MOVES.content(moves))) == moves
-    assert b"temperature" not in MOVES.content([replace(m, temperature_degC=None) for m in moves])
-
-
 def test_shifts_determined_by_the_moves():
     warm, both = moves_at([0.0, 7.0]), moves_at([0.0, 7.0], [20.0, 21.0])
     still = {**TWO_MIRROR.priors, **dict.fromkeys(names_of("creep_deg"), Prior(0.0, 0.0))}

@@ -88,11 +88,6 @@ def test_one_key_twice_is_refused(tmp_path, experiments, line, column, words):
     assert (caught.value.line, caught.value.column) == (line, column)
 
 
-def test_looks_that_wait_may_repeat_a_point(tmp_path):
-    write_campaign(booked((1, 200, 0), (1, -200, 0), status="too dim"), tmp_path / "c")
-    assert len(read_campaign(tmp_path / "c").spots) == 8
-
-
 def test_a_plan_keeps_the_numbers_of_each_direction(tmp_path):
     plan = PlanBuilder()
     plan.home()

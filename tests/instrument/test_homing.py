@@ -6,7 +6,7 @@ from support.small_campaign import small_campaign
 from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.homing import ANYWHERE, has_play, homed, unrecorded
+from tvsbayes.instrument.homing import ANYWHERE, homed, unrecorded
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.rig import RigTable
 
@@ -18,12 +18,6 @@ def moves(*first: tuple[str, str]) -> tuple[Move, ...]:
         rows.append(move_row(2 * segment, segment, 0.0, 0, 0, pan, tilt))
         rows.append(move_row(2 * segment + 1, segment, 0.0, 100, 0))
     return tuple(rows)
-
-
-def test_an_axis_is_unrecorded_only_if_every_homing_is():
-    assert unrecorded(moves(("unknown", "up"), ("unknown", "up")), RigTable()) == ("pan",)
-    assert unrecorded(moves(("unknown", "unknown"), ("left", "unknown")), RigTable()) == ("tilt",)
-    assert unrecorded(moves(("left", "up")), RigTable()) == ()
 
 
 def test_no_way_of_homing_is_weighed_of_an_absolute_encoder_or_without_play():
@@ -40,10 +34,3 @@ def test_only_unknown_approaches_are_replaced():
     assert [m.pan_approach for m in rows] == ["right", "", "left", ""]
     assert [m.tilt_approach for m in rows] == ["up", "", "unknown", ""]
     assert homed(campaign, {"pan": ANYWHERE}) is campaign
-
-
-def test_an_axis_without_play_has_no_side():
-    exact, some = Prior(0.0, 0.0, "half-normal"), Prior(0.0, 0.1, "half-normal")
-    names = ("backlash_deg.pan", "play_variation_deg.pan")
-    assert not has_play(dict.fromkeys(names, exact), "pan")
-    assert all(has_play(dict.fromkeys(names, exact) | {name: some}, "pan") for name in names)

@@ -13,12 +13,9 @@ from support.printed_vector import VECTOR
 from tvsbayes.instrument.chains import chain_of
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.mirrors import (
-    Mirror,
     Optics,
-    Ray,
     Vectors,
     beam_path,
-    reflected,
 )
 from tvsbayes.instrument.parameters import BLOCKS, OPTICS_NAMES
 from tvsbayes.twin.physics import mirror_chain
@@ -40,33 +37,11 @@ def optics() -> Optics:
     return chain_of(TWO_MIRROR, block)
 
 
-def vectors(seed: int, count: int = 50) -> Vectors:
-    return Vectors.of(np.random.default_rng(seed).standard_normal((3, count)))
-
-
-def unit_vectors(seed: int, count: int = 50) -> Vectors:
-    drawn = vectors(seed, count)
-    return drawn * (1 / np.sqrt(drawn.dot(drawn)))
-
-
 def test_products_of_vectors():
     first, second = np.random.default_rng(3).standard_normal((2, 3, 5, 7))
     one, other = Vectors.of(first), Vectors.of(second)
     np.testing.assert_allclose(one.dot(other), np.sum(first * second, axis=0), atol=10 * ROUNDING)
     np.testing.assert_allclose(one.cross(other).stacked(), np.cross(first, second, axis=0), atol=10 * ROUNDING)
-
-
-def test_any_number_of_mirrors_in_sequence():
-    """Three at right angles send every ray back along its direction, and each ray starts in its mirror's plane."""
-    axes = np.eye(3)
-    corner = [Mirror(Vectors(0.0, 0.0, 0.0), Vectors(*axis)) for axis in axes]
-    ray = Ray(vectors(13), unit_vectors(14))
-    rays = reflected(ray, corner)
-    assert len(rays) == 3
-    for mirror, left in zip(corner, rays, strict=True):
-        np.testing.assert_allclose(left.origin_mm.dot(mirror.normal), 0.0, atol=1e3 * ROUNDING)
-    np.testing.assert_allclose(rays[-1].direction, ray.direction * -1.0, atol=ROUNDING)
-    assert reflected(ray, []) == ()
 
 
 def test_the_chain_is_the_twins():

@@ -25,22 +25,6 @@ from tvsbayes.instrument.places import (
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.statistics.gaussian_process import matern52
 
-ROUNDING = 1e-11
-
-
-@pytest.mark.parametrize("count", [4, 5, 13, 24])
-def test_interpolation_is_exact_for_cubics(count):
-    rng = np.random.default_rng(1)
-    nodes = np.linspace(-310.0, 420.0, count)
-    counters = np.concatenate([rng.uniform(-310.0, 420.0, 50), nodes])
-    share = interpolation(counters, nodes)
-    np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=ROUNDING)
-    assert np.all(np.count_nonzero(share, axis=1) <= 4)
-    cubic = np.polynomial.Polynomial(rng.standard_normal(4), domain=[-310.0, 420.0])
-    np.testing.assert_allclose(share @ cubic(nodes), cubic(counters), atol=ROUNDING)
-    # A node has weight 1 at itself.
-    np.testing.assert_allclose(interpolation(nodes, nodes), np.eye(count), atol=ROUNDING)
-
 
 @pytest.mark.parametrize(
     ("degrees", "count"), [(5.0, OWN_PLACES_MAX), (16 * SPACING_DEG - 0.01, 17), (400.0, PLACES_MAX)]

@@ -8,7 +8,7 @@ import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.own_outputs import require_own
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep, continued, read_plan, run_plan, write_plan
+from tvsbayes.instrument.plan import PlanStep, continued, read_plan, run_plan, write_plan
 
 PLAN = (
     PlanStep(0, "home", 0, 0),
@@ -19,14 +19,6 @@ PLAN = (
     PlanStep(5, "home", -100, 20),
     PlanStep(6, "look", experiment=0, point=2),
 )
-
-
-def test_plan_round_trip(tmp_path):
-    write_plan(PLAN, tmp_path / "plan.csv")
-    assert read_plan(tmp_path / "plan.csv") == PLAN
-    text = (tmp_path / "plan.csv").read_text().replace("0,home,0,0,", "0,home,,,")
-    (tmp_path / "plan.csv").write_text(text)
-    assert read_plan(tmp_path / "plan.csv") == PLAN  # home counters default to 0
 
 
 def test_a_plan_states_its_target_in_the_first_row(tmp_path):
@@ -105,18 +97,6 @@ def test_actions_of_a_plan_have_their_effect(mounted_rig):
         run_plan((PlanStep(0, "place", target="d9"),), mounted_rig)
     with pytest.raises(InputError, match="before a target is placed"):
         run_plan((PlanStep(0, "look"),), mounted_rig)
-
-
-def test_a_built_plan_has_no_repeated_move():
-    plan = PlanBuilder()
-    plan.home()
-    plan.move(pan=10)
-    plan.move(pan=10)
-    plan.reach("tilt", -5, 1, 40)
-    assert [(s.action, s.pan_steps, s.tilt_steps) for s in plan.steps] == [
-        *(("home", 0, 0), ("move", 10, 0), ("move", 10, -45), ("move", 10, -5))
-    ]
-    assert plan.at == (10, -5)
 
 
 def test_a_plan_does_not_place_the_present_sheet_again():

@@ -6,28 +6,8 @@ import numpy as np
 import pytest
 
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
-from tvsbayes.instrument.plan import PlanStep, read_plan, write_plan
-from tvsbayes.instrument.protocols import PROTOCOLS, RUN_UP_STEPS, four_point_protocol, grid_protocol
-
-
-def _approach_signs(plan: tuple[PlanStep, ...]) -> dict[str, set[bool]]:
-    """Direction -> whether its starts were reached along the experiment (cleared), as the set of cases."""
-    history: list[tuple[int, int]] = []
-    arrived: dict[int, int] = {}
-    cases: dict[str, set[bool]] = {}
-    for step in plan:
-        if step.action in ("home", "move"):
-            history.append((step.pan_steps, step.tilt_steps))
-        elif step.action == "look" and step.point == 1:
-            arrived[step.experiment] = len(history) - 1
-        elif step.action == "look" and step.point == 3:
-            start = arrived[step.experiment]
-            delta = np.subtract(history[start + 1], history[start])
-            axis = int(np.flatnonzero(delta)[0])
-            before = next(h for h in reversed(history[:start]) if h[axis] != history[start][axis])
-            direction = [["right", "left"], ["down", "up"]][axis][int(delta[axis] > 0)]
-            cases.setdefault(direction, set()).add((history[start][axis] - before[axis]) * delta[axis] > 0)
-    return cases
+from tvsbayes.instrument.plan import read_plan, write_plan
+from tvsbayes.instrument.protocols import PROTOCOLS, RUN_UP_STEPS, grid_protocol
 
 
 @pytest.mark.parametrize("name", ["paper", "mixed", "paper_twin"])
@@ -53,16 +33,6 @@ def test_four_point_plans(name: str):
         assert len(mine) == 24, direction
         sizes = (100, 200) if name == "mixed" else (200,)
         assert [abs(s) for s in mine] == list(sizes) * (24 // len(sizes))
-
-
-def test_approaches_of_the_protocols():
-    """Reversed or cleared as requested; right and up cleared in the twin's plan; both kinds in the mixed one."""
-    for how in ("reversed", "cleared"):
-        plan = four_point_protocol(repeats=3, approaches=dict.fromkeys(DIRECTION_SIGNS, (how,)))
-        assert _approach_signs(plan) == {name: {how == "cleared"} for name in DIRECTION_SIGNS}
-    twin = _approach_signs(PROTOCOLS["paper_twin"]())
-    assert twin == {"left": {False}, "right": {True}, "up": {True}, "down": {False}}
-    assert _approach_signs(PROTOCOLS["mixed"]()) == {name: {True, False} for name in DIRECTION_SIGNS}
 
 
 def test_grid_sees_every_pose_from_both_sides():

@@ -12,37 +12,13 @@ from support.small_campaign import small_stereo
 from tvsbayes.errors import InputError
 from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
-from tvsbayes.instrument.parameters import AMPLITUDE_NAMES, HARMONIC_NAMES, HOME_SD_NAMES, Prior
+from tvsbayes.instrument.parameters import AMPLITUDE_NAMES, HARMONIC_NAMES, Prior
 from tvsbayes.instrument.rig import PERIODIC_NAMES, RigTable, parse_rig_table, read_rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import write_stereo
 
 
 def rig_table(text: str) -> RigTable:
     return parse_rig_table(parse_toml(text.encode(), "rig.toml").table("rig"))
-
-
-def test_rig_table_defaults_and_both_spellings():
-    assert rig_table("") == RigTable()
-    quoted = rig_table('[rig.prior]\n"degrees_per_step.pan" = { value = 0.05, u = 0.02 }\n')
-    dotted = rig_table("[rig.prior]\ndegrees_per_step.pan = { value = 0.05, u = 0.02 }\n")
-    table = rig_table("[rig.prior.degrees_per_step.pan]\nvalue = 0.05\nu = 0.02\n")
-    assert quoted == dotted == table
-    assert quoted.priors["degrees_per_step.pan"] == Prior(0.05, 0.02)
-    deep = rig_table("[rig.prior]\nextrinsics.rotation_rad.z = { value = 1, u = 0 }\n")
-    assert deep.priors["extrinsics.rotation_rad.z"] == Prior(1.0, 0.0)
-
-
-def test_any_parameter_may_stand_in_the_priors():
-    """Also one that belongs in [rig]."""
-    one = rig_table("[rig]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
-    other = rig_table("[rig.prior]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
-    assert one == other and other.priors["baseline_mm"] == Prior(199.0, 0.2)
-
-
-def test_one_camera_of_both_pictures_may_be_a_number(tmp_path):
-    """As in the template."""
-    text = re.sub(r"(?m)^(source|left|right) = .*\n", "", RIG_FILE).replace("[cameras]", "[cameras]\nsource = 3")
-    assert read_rig(write_rig(tmp_path, text)).cameras["source"] == 3
 
 
 def test_rig_table_round_trip():
@@ -298,15 +274,6 @@ def test_rig_file(tmp_path):
     assert minimal.table == RigTable() and minimal.truth == minimal.table.priors and minimal.sheets_mm == {}
 
 
-def test_a_true_rig_may_have_a_transmission_error_that_no_prior_admits(tmp_path):
-    text = RIG_FILE.replace("[rig.prior]", "harmonic_period_deg.tilt = { value = 45.0, u = 0.0 }\n[rig.prior]")
-    text = text.replace("[truth]", "[truth]\n'harmonic_deg.tilt.1.sin' = { value = 0.0, u = 0.1 }")
-    rig = read_rig(write_rig(tmp_path, text))
-    assert rig.truth["harmonic_deg.tilt.1.sin"] == Prior(0.0, 0.1)
-    assert rig.table.priors["harmonic_deg.tilt.1.sin"] == Prior(0.0, 0.0)
-    assert rig.table.harmonic_period_deg == {"tilt": (45.0,)}
-
-
 RIG_FILE_REFUSED = {
     "true harmonic without period": (
         "[truth]",
@@ -393,18 +360,6 @@ def test_absolute_encoders_are_read_written_and_part_of_the_rig():
 def test_other_words_for_absolute_encoders_are_refused(value):
     with pytest.raises(InputError, match=r'absolute.*list of "pan" and "tilt", or of one of them'):
         rig_table(f"[rig]\nabsolute = {value}\n")
-
-
-def test_the_scatter_of_homings_is_read_and_written_where_it_is_stated():
-    def homings(text: str) -> list[tuple[float, float]]:
-        priors = rig_table(text).priors
-        return [(priors[name].value, priors[name].u) for name in HOME_SD_NAMES]
-
-    both = '[rig]\nabsolute = ["tilt"]\n[rig.prior]\n"home_sd_deg.pan" = { value = 0.002, u = 0 }\n'
-    assert homings("") == [(0.05, 1.0)] * 2 and homings(both) == [(0.002, 0.0), (0.0, 0.0)]
-    assert homings("[rig.prior]\nhome_sd_deg.pan = { value = 0.002, u = 0.5 }\n") == [(0.002, 0.5), (0.05, 1.0)]
-    assert rig_table(rig_table_toml(rig_table(both))) == rig_table(both)
-    assert "home_sd" not in rig_table_toml(RigTable(absolute=("pan",)))
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,10 @@ import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.plausibility import check_campaign, misfit_causes
-from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
-from tvsbayes.instrument.mechanisms import MECHANISMS, SIGHTING_HEAD, TWO_MIRROR
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD, TWO_MIRROR
 from tvsbayes.instrument.plan import PlanBuilder
-from tvsbayes.instrument.rig import Rig, RigTable, parse_rig_table, rig_table_toml
+from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.sightings import tangent_frames
 from tvsbayes.report import figures as plots
 from tvsbayes.twin.simulated_campaign import simulate
@@ -81,21 +80,6 @@ def test_sightings_of_a_scanner_are_refused(simulated, tmp_path):
     (tmp_path / "campaign.toml").write_text('format = "tvsbayes-campaign/1"\n[rig]\n')
     with pytest.raises(InputError, match='mechanism = "pan-tilt"'):
         read_campaign(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["mirror_offset_mm", "extrinsics.translation_mm.x", "focal_scale", "baseline_mm"])
-def test_terms_of_other_mechanisms_are_refused(name):
-    text = f'[rig]\nmechanism = "pan-tilt"\n[rig.prior]\n"{name}" = {{ value = 1.0, u = 1.0 }}\n'
-    with pytest.raises(InputError, match="means nothing to this mechanism"):
-        parse_rig_table(parse_toml(text.encode(), "campaign.toml").table("rig"), sightings=True)
-
-
-@pytest.mark.parametrize("key", MECHANISMS)
-def test_tables_of_sightings_round_trip(key):
-    table = RigTable(mechanism=MECHANISMS[key])
-    text = rig_table_toml(table)
-    assert parse_rig_table(parse_toml(text.encode(), "campaign.toml").table("rig"), table.mechanism.sightings) == table
-    assert ("mechanism" in text) == (table.mechanism is not TWO_MIRROR), "files of scanners keep their text and hash"
 
 
 @pytest.mark.parametrize(

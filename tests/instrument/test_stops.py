@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +9,7 @@ import pytest
 from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.protocols import RUN_UP_STEPS
-from tvsbayes.instrument.stops import Stop, few_stops, legs_of, observed_stops, redraws, rests_of, separation
+from tvsbayes.instrument.stops import Stop, few_stops, observed_stops, redraws, separation
 
 
 def pan_moves(*counters: int, approach: str = "left") -> tuple[Move, ...]:
@@ -23,24 +21,6 @@ def pan_separation(*counters: int) -> str | None:
     """Verdict where every move is followed by a look."""
     moves = pan_moves(*counters)
     return separation(observed_stops(moves, range(len(moves)), "pan"), "pan")
-
-
-def test_stops_have_the_sense_of_the_last_move_of_their_axis():
-    moves = pan_moves(0, 200, 150, 150, 180)
-    assert observed_stops(moves, {0, 1, 2, 4}, "pan") == (
-        Stop(0, 0, 1),
-        Stop(0, 200, 1),
-        Stop(0, 150, -1),
-        Stop(0, 180, 1),
-    )
-    assert observed_stops(moves, {0, 1, 2, 4}, "tilt") == (Stop(0, 0, 1),)
-
-
-def test_two_looks_at_rest_are_one_stop():
-    """Moves to the same counters, or of the other axis, do not end a rest."""
-    moves = (*pan_moves(0, 200, 200), move_row(3, 0, 3.0, 200, 50), move_row(4, 0, 4.0, 0, 50))
-    assert observed_stops(moves, {1, 2, 3, 4}, "pan") == (Stop(0, 200, 1), Stop(0, 0, -1))
-    assert observed_stops(moves, {1, 2, 3, 4}, "tilt") == (Stop(0, 0, 1), Stop(0, 50, 1))
 
 
 def test_a_homing_begins_a_new_stop_at_the_same_counter():
@@ -60,21 +40,8 @@ def test_return_moves_of_one_step_count_are_named_with_a_remedy():
     assert "add N = 100 or a cleared approach" in text
 
 
-def test_one_odd_leg_among_many_is_not_enough():
-    """The first start, reached by the homing, adds little information; one leg of another length little more."""
-    assert "nearly every leg has |N| = 200" in pan_separation(*[0, 200] * 24, 100)
-
-
 def test_two_step_counts_separate():
     assert pan_separation(*[0, 200, 0, 100] * 6) is None
-
-
-def test_cleared_starts_separate():
-    """Both ends of one |N| seen from both sides: run-ups beyond either end."""
-    cycle = [-RUN_UP_STEPS, 0, 200, 200 + RUN_UP_STEPS, 200, 0]
-    moves = pan_moves(*cycle * 4)
-    observed = [m.move for m in moves if m.pan_steps in (0, 200)]
-    assert separation(observed_stops(moves, observed, "pan"), "pan") is None
 
 
 def test_homing_is_no_leg():
@@ -103,15 +70,6 @@ def test_every_segment_has_its_own_zero():
     stops = [Stop(segment, n, sign) for segment, sign in ((0, 1), (1, -1)) for n in (0, 100, 200)]
     assert separation(stops, "tilt") is not None
     assert separation([replace(stop, segment=0) for stop in stops], "tilt") is None
-
-
-def test_a_rest_has_its_approach():
-    """Distance of the last move, distance since the last reversal, and the homing of the counter."""
-    moves = (*pan_moves(0, 200, 260, 260, 100), move_row(5, 1, 5.0, 30, 0, "right", "up"))
-    rests = [(rest.move, rest.sign, rest.distance, rest.leg, rest.homing) for rest in rests_of(moves, "pan")]
-    assert rests[:3] == [(0, 1, 0, math.inf, 0), (1, 1, 200, math.inf, 0), (2, 1, 60, math.inf, 0)]
-    assert rests[3:] == [(2, 1, 60, math.inf, 0), (4, -1, -160, 160, 0), (5, -1, 0, math.inf, 5)]
-    assert legs_of(moves) == {"left": [200, 60], "right": [160]}
 
 
 def test_a_stop_error_is_redrawn_when_its_counter_changes_or_is_set():
