@@ -32,8 +32,8 @@ from tvsbayes.instrument.protocols import RUN_UP_STEPS, four_point_protocol, mix
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
 from tvsbayes.planning.limits import MANY_TIMES, split_of
-from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import parse_target, sensitivity
+from tvsbayes.statistics.optimal_design import covariance_of
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import simulate
 

@@ -28,9 +28,10 @@ from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge
 from tvsbayes.planning.limits import MANY_TIMES, limit_of, split_of
-from tvsbayes.planning.looks import LookArrays, covariance_of
+from tvsbayes.planning.looks import LookArrays
 from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, sensitivity
+from tvsbayes.statistics.optimal_design import covariance_of
 
 REPEATS = (2, 4, 8, 16, 24)
 TARGET = parse_target(DEFAULT_TARGET)

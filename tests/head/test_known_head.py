@@ -23,8 +23,8 @@ from tvsbayes.instrument.plan import PlanBuilder, PlanStep, read_plan
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.pipeline import calibrate, load_calibration
 from tvsbayes.planning.expectation import information_of, prior_knowledge
-from tvsbayes.planning.looks import covariance_of
 from tvsbayes.posterior.transport import transport
+from tvsbayes.statistics.optimal_design import covariance_of
 from tvsbayes.twin.head_physics import head_beam
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth

@@ -14,8 +14,9 @@ from tvsbayes.instrument.parameters import CREEP_NAMES, NOISE_NAMES
 from tvsbayes.planning.assurance import Assurance, Family, judged_z
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import information_of
-from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
+from tvsbayes.planning.looks import CONTRAST_COLUMNS
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
+from tvsbayes.statistics.optimal_design import covariance_of
 
 pytestmark = [pytest.mark.thorough, pytest.mark.usefixtures("small_searches")]
 

@@ -13,11 +13,12 @@ from support.commands import steps
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.planning.candidates import Positions, candidates, from_all_sides, run_up_steps
+from tvsbayes.planning.candidates import candidates, from_all_sides, run_up_steps
 from tvsbayes.planning.expectation import information_of, prior_knowledge
-from tvsbayes.planning.looks import Looks, arrange, covariance_of
+from tvsbayes.planning.looks import Looks, arrange
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.target import parse_target, sensitivity
+from tvsbayes.statistics.optimal_design import covariance_of
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -117,6 +118,6 @@ OVERSHOOT = np.array([10, 20])
     ],
 )
 def test_a_side_is_offered_where_its_run_up_stays_inside(position, sides):
-    looks = from_all_sides(Positions(np.array([position]), np.array([3])), LIMITS, OVERSHOOT)
+    looks = from_all_sides(Looks(np.array([position]), np.ones((1, 2)), np.array([3])), LIMITS, OVERSHOOT)
     assert {tuple(side) for side in looks.side.tolist()} == sides and len(looks) == len(sides)
     assert all(tuple(steps) == position for steps in looks.steps.tolist()) and set(looks.sheet.tolist()) <= {3}

@@ -27,12 +27,13 @@ from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.gear_places import FittedErrors, GearPlaces, regular_places, windows_of
 from tvsbayes.planning.limits import split_of
-from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, information_of_looks
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.planner import baseline_of
 from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import GEARS_AT_POINT, STOP_AT_POINT, parse_target, sensitivity
 from tvsbayes.statistics.gaussian_process import matern52
+from tvsbayes.statistics.optimal_design import covariance_of
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 LENGTH_DEG, PAN, TILT = 8.0, 0.06, 0.07

@@ -11,7 +11,6 @@ from support.coarse_planning import ROUNDING
 
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.plan import plan_minutes
-from tvsbayes.planning.candidates import Positions
 from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.looks import (
@@ -109,8 +108,7 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
 
 def test_a_position_is_visible_to_the_share_of_instruments_that_see_it(knowledge):
     z = draw_instruments(knowledge, 4, seed=1).z
-    positions = Positions(np.array([[0, 0], [240, 0], [900, 0]]), np.array([0, 0, 1]))
-    looks = Looks(positions.steps, np.ones((3, 2), dtype=int), positions.sheet)
+    looks = Looks(np.array([[0, 0], [240, 0], [900, 0]]), np.ones((3, 2), dtype=int), np.array([0, 0, 1]))
     shown = [LookArrays(looks, knowledge, False).at(point, knowledge.space).seen for point in z]
-    share = positions.visible(knowledge, z)
+    share = LookArrays(looks, knowledge, False).in_images(z).mean(axis=0)
     assert share == pytest.approx(np.mean(shown, axis=0), abs=1e-12) and share[2] == 0 < share[0]

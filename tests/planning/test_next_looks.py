@@ -16,12 +16,12 @@ from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.stops import counters_made, rests_of
 from tvsbayes.planning.candidates import counter_range, expected_run_up
 from tvsbayes.planning.expectation import Knowledge, information_of, knowledge_of
-from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.next_looks import Confirmation, next_looks
 from tvsbayes.planning.target import parse_target, sensitivity
 from tvsbayes.posterior.draws import Draws
 from tvsbayes.results.estimates import Measured
 from tvsbayes.results.plan_record import steps_of
+from tvsbayes.statistics.optimal_design import covariance_of
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 SAMPLED = Confirmation("importance", False, dict.fromkeys(DIRECTIONS, Measured(0.06, 3e-4, (0.0594, 0.0606))))
@@ -76,7 +76,7 @@ def test_what_is_promised_is_the_information_of_the_whole_run(proposal, mounted_
 
 def test_every_look_is_reached_with_a_run_up_inside_the_limits(proposal, mounted_rig, begun_fit):
     """Limits are not stated: what was commanded is the limit."""
-    limits = counter_range(mounted_rig.limits, counters_made(begun_fit.campaign.moves)).limits
+    limits, _ = counter_range(mounted_rig.limits, counters_made(begun_fit.campaign.moves))
     least = expected_run_up(knowledge_of(begun_fit, mounted_rig))
     assert proposal.steps[0].action == "place" and sum(step.action == "look" for step in proposal.steps) == 12
     log = run_plan(whole_plan(mounted_rig, proposal), mounted_rig)

@@ -20,7 +20,7 @@ from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, pa
 from tvsbayes.instrument.stops import INSEPARABLE, inseparable, separation
 from tvsbayes.planning.expectation import prior_knowledge
 from tvsbayes.planning.looks import Looks
-from tvsbayes.planning.plan_check import CURING, JUDGING, appended, beyond_limits, check_plan, judge
+from tvsbayes.planning.plan_check import CURING, JUDGING, appended, beyond_limits, check_plan, evaluated
 from tvsbayes.results.plan_record import steps_of
 
 pytestmark = pytest.mark.usefixtures("small_searches")
@@ -120,11 +120,11 @@ def test_plan_and_fit_judge_by_one_rule(mounted_rig):
     0.44. A fit at the very instrument of the plan, whose covariance is the plan's, judges the same numbers.
     """
     for plan, together in ((partly_cleared(24, 2), True), (partly_cleared(24, 4), False)):
-        judged, check = judge(plan, prior_knowledge(mounted_rig)), check_plan(mounted_rig, plan)
+        planned, check = evaluated(plan, prior_knowledge(mounted_rig)), check_plan(mounted_rig, plan)
         assert {fault.axis for fault in check.faults} == ({"pan", "tilt"} if together else set())
         for axis in AXES:
-            correlation = judged.exchange(axis)
+            correlation = planned.exchange(axis)
             assert inseparable(correlation) == together and abs(correlation - INSEPARABLE) < 0.2
-            if separation(judged.stops(axis), axis) is not None:
+            if separation(planned.stops(axis), axis) is not None:
                 assert together
     assert weaknesses.inseparable is inseparable

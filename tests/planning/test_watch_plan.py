@@ -18,7 +18,7 @@ from tvsbayes.instrument.plan import plan_minutes, read_plan
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.planning import watch_plan as plans
-from tvsbayes.planning.watch_plan import Pattern, WatchDesigns, watch_plan
+from tvsbayes.planning.watch_plan import WatchDesigns, watch_plan
 from tvsbayes.twin.simulated_campaign import simulate
 
 pytestmark = pytest.mark.thorough
@@ -74,11 +74,11 @@ def test_independent_stops_add_up_to_the_plan_itself(designs):
     pattern = designs.grown(("d1", "d2"), 4.0)[2]
     limit = np.log(0.01 / len(CHANGES))
     for homings in (1, 3):
-        np.testing.assert_allclose(designs.powers(pattern, homings), designs.judged(pattern, homings), atol=0.06)
+        np.testing.assert_allclose(designs.powers(pattern, homings), designs.own_powers(pattern, homings), atol=0.06)
     # More homings with the same looks, never less seen; a turned positioner gains most.
     few, many = (designs.powers(pattern, homings) for homings in (1, 7))
     assert np.all(many >= few - 1e-9) and limit < 0
-    one_homing = Pattern({sheet: looks * 7 for sheet, looks in pattern.looks.items()})
+    one_homing = {sheet: looks * 7 for sheet, looks in pattern.items()}
     turned = NAMES.index("positioner: rotation")
     assert designs.powers(one_homing, 1)[turned] < many[turned]
 
@@ -98,14 +98,14 @@ def test_looks_keep_to_the_sheets_of_the_rig(watched_fit):
     """The campaign looked at d1 and d2."""
     rig = read_rig(RIG)
     designs = WatchDesigns(watched_fit, replace(rig, sheets_mm={"d2": 275.0}), 0)
-    assert {one.target for one in designs.candidates} == {"d2"}
+    assert {one.spot.target for one in designs.candidates} == {"d2"}
     with pytest.raises(InputError, match="sheets that the rig does not have"):
         WatchDesigns(watched_fit, replace(rig, sheets_mm={"wall": 275.0}), 0)
 
 
 def test_a_short_budget_is_kept_or_refused(watched_fit, monkeypatch):
-    tried, kept = plans._trials, []
-    monkeypatch.setattr(plans, "_trials", lambda designs: kept or kept.extend(tried(designs)) or kept)
+    tried, kept = plans._Trials, []
+    monkeypatch.setattr(plans, "_Trials", lambda designs: (kept or kept.append(tried(designs)) or kept)[0])
     short = watch_plan(watched_fit, read_rig(RIG), minutes=2.0)
     assert short.minutes <= 2 and short.looks >= 4
     with pytest.raises(InputError, match="4 looks take"):

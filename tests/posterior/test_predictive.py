@@ -58,9 +58,7 @@ def taken_again_deg(dozen, physical: np.ndarray, play_deg: np.ndarray, seed: int
         return np.zeros((len(z), len(play_deg), 4))
 
     linearised = SimpleNamespace(play_sd_rad=np.radians(play_deg))
-    fit = SimpleNamespace(
-        campaign=dozen.campaign, space=dozen.space, arrays=dozen.arrays, linearised=linearised
-    )
+    fit = SimpleNamespace(campaign=dozen.campaign, space=dozen.space, arrays=dozen.arrays, linearised=linearised)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tvsbayes.posterior.predictive.looks", looks)
         generator = np.random.default_rng(seed)

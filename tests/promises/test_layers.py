@@ -46,7 +46,13 @@ JAX_FREE_PACKAGES = (
     *("cameras", "report"),
 )
 JAX_FREE_MODULES = (
-    *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),
+    *(
+        "statistics.intervals",
+        "statistics.optimal_design",
+        "estimators.four_point",
+        "estimators.spot_pattern",
+        "estimators.plausibility",
+    ),
     *("estimators.findings", "estimators.counter_pattern"),
     *("comparison.gap", "comparison.changes", "comparison.held_out"),
     *("comparison.departures", "comparison.axis_sessions"),

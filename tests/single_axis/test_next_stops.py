@@ -12,11 +12,13 @@ from support.axes import campaign, drawn, runs
 
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.single_axis.axis_campaign import AxisStop, read_axis
+from tvsbayes.single_axis.axis_campaign import AxisMove, Reading, read_axis
+from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, deviation_functionals, headline_functionals
 from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import SIDES, reversal_of, rows_of
-from tvsbayes.single_axis.next_stops import _run_up_start, _with_stop, plan_next
+from tvsbayes.single_axis.next_stops import TARGETS, plan_next
 from tvsbayes.twin.simulated_axis import draw_axis, simulate_axis
 
 
@@ -104,14 +106,36 @@ def turned():
     return campaign(moves, values, u=0.002)
 
 
-@pytest.mark.parametrize("direction", ["forward", "backward"])
-def test_a_stop_to_be_read_moves_neither_line_nor_reversal(turned, direction):
-    rows = rows_of(turned)
-    via = _run_up_start(turned, 45.0, SIDES[direction])
-    more = rows_of(_with_stop(turned, rows, AxisStop(via, 45.0, direction), 60.0))
-    assert len(more.value) == len(rows.value) + 1
-    # Least squares of a point on the line, by another factorisation.
-    np.testing.assert_allclose([*more.line, reversal_of(more).value], [*rows.line, reversal_of(rows).value], atol=1e-9)
+@pytest.mark.parametrize("target", TARGETS)
+def test_stops_are_worth_what_the_model_with_their_readings_says(fitted, target):
+    """Of all readings and those before, on the line: a line over the commands read, the drift, the path."""
+    campaign, rows = fitted.campaign, fitted.rows
+    gap_s = np.median([b.time_s - a.time_s for a, b in pairwise(campaign.moves) if b.time_s > a.time_s])
+    moves, readings = list(campaign.moves), list(campaign.readings)
+    places = np.unique(np.r_[np.linspace(*campaign.range_allowed, 17).round(), rows.command.min()])
+
+    def variances(rows, w) -> tuple[float, float]:
+        """Mean variance given the scales, and that of the means."""
+        model = AxisModel.of(replace(rows, line=fitted.rows.line), fitted.model.priors, places)
+        model = replace(model, coordinates=fitted.model.coordinates)
+        if target == "position":
+            functionals = deviation_functionals(model, w, places)
+        else:
+            functionals = headline_functionals(model, w)[[HEADLINE_DRAWS.index(target)]]
+        linear = model.linear(w)
+        return np.mean(linear.sd_of(functionals) ** 2), np.mean(linear.mean_of(functionals).var(axis=0))
+
+    few = fitted.w[np.linspace(0, len(fitted.w) - 1, 24).astype(int)]
+    (given, between), (before, _) = variances(rows, fitted.w), variances(rows, few)
+    for stop in plan_next(fitted, target, count=2).next:
+        for command in (stop.command,) if stop.via is None else (stop.via, stop.command):
+            moves.append(AxisMove(len(moves), moves[-1].segment, moves[-1].time_s + gap_s, command))
+        value = rows.line.offset + rows.line.slope * stop.command
+        value -= 0.5 * SIDES[stop.direction] * reversal_of(rows).value
+        readings.append(Reading(len(readings), len(moves) - 1, value, readings[0].u))
+        after, _ = variances(rows_of(replace(campaign, moves=tuple(moves), readings=tuple(readings))), few)
+        # The prior of the offset is at the mean of the commands, which moves with the stop.
+        assert stop.u == pytest.approx(np.sqrt(between + given * after / before), rel=1e-9)
 
 
 def test_simulated_axes_round_trip_and_repeat_by_seed(tmp_path):

@@ -306,10 +306,10 @@ def plan(
         message = f"{escaped(str(known), 200)} is the campaign of another mechanism than {escaped(str(rig), 200)}"
         raise InputError("usage", message, remedy="name a campaign of the same mechanism")
     from tvsbayes.planning.planner import plan as find_plan
-    from tvsbayes.planning.search import CRITERIA
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import plan_text
     from tvsbayes.results.plan_record import plan_document
+    from tvsbayes.statistics.optimal_design import CRITERIA
 
     parsed_target = parse_target(target or DEFAULT_TARGET)
     if count is not None:

@@ -26,7 +26,6 @@ from tvsbayes.comparison.departures import (
 from tvsbayes.compensation.promise import reading_u, run_up_of, table_commands
 from tvsbayes.compensation.verification import (
     VerifyPlan,
-    discriminating_visits,
     planned_stops,
     reachable_stops,
     spread_stops,
@@ -40,6 +39,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, refuse_same_reading
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedAxis
+from tvsbayes.statistics.optimal_design import discriminating_visits
 from tvsbayes.statistics.predicted_readings import frees_shift
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
@@ -217,11 +217,10 @@ def plan_watch_axis(fit: AxisFit, *, minutes: float | None = None, seed: int = 0
     wanted = float(ndtri(1 - 0.5 * FALSE_ALARM_RATE / len(changes)) + ndtri(POWER_MIN)) ** 2
 
     def planned(which: Sequence[int], most: int = STOPS_MAX) -> tuple[VerifyPlan, np.ndarray, float]:
-        chosen = discriminating_visits(
-            [changes[k].size * shifts[:, k] for k in which], common, noise, first, wanted, most
-        )
-        plan = VerifyPlan(planned_stops(command, side, chosen.visits), run_up, chosen.reached >= wanted, chosen.reached)
-        return plan, chosen.visits, move_minutes * plan.moves
+        off = [changes[k].size * shifts[:, k] for k in which]
+        visits, reached = discriminating_visits(off, common, noise, first, wanted, most)
+        plan = VerifyPlan(planned_stops(command, side, visits), run_up, reached >= wanted, reached)
+        return plan, visits, move_minutes * plan.moves
 
     every = range(len(changes))
     plan, visits, taken = planned(every)

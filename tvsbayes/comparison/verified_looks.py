@@ -25,11 +25,12 @@ from tvsbayes.comparison.watched_looks import WatchedLooks, usable_looks
 from tvsbayes.compensation.promise import refuse_answer
 from tvsbayes.compensation.verification import (
     IDENTIFIED,
+    PLANNED_MAX,
     SEPARATE,
     Trial,
     VerifyStop,
-    discriminating_visits,
     other_axis,
+    planned_stops,
     size_of,
     verification_of,
 )
@@ -47,6 +48,7 @@ from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
 from tvsbayes.results.store import FitFiles, stored_fit
+from tvsbayes.statistics.optimal_design import discriminating_visits
 from tvsbayes.statistics.predicted_readings import PredictedReadings, frees_shift, less_means
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
@@ -379,11 +381,10 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     if not len(reach):
         message = f"{AXES[k]}: no look has room for a run-up of {run_up} steps within the counters {least} to {most}"
         raise NothingToEstimate("limits", message, remedy="drive further in a campaign, and fit it")
-    visits = discriminating_visits(
-        [world[reach] for world in worlds], common[np.ix_(reach, reach)], noise[reach], np.repeat(spread, 2)[reach]
-    )
-    chosen = [i for i, count in zip(reach.tolist(), visits.visits, strict=True) for _ in range(int(count))]
-    return [VerifyStop(float(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached
+    first, off = np.repeat(spread, 2)[reach], [world[reach] for world in worlds]
+    shared = common[np.ix_(reach, reach)]
+    visits, reached = discriminating_visits(off, shared, noise[reach], first, IDENTIFIED, PLANNED_MAX)
+    return list(planned_stops(steps[reach, k], sides[reach, k], visits)), reached
 
 
 def _remarks(fit: JointFit, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:

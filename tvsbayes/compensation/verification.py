@@ -8,7 +8,7 @@ ratio, play and scatter of unknown size. Commands in the campaign's counts. No J
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -46,6 +46,7 @@ from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedAxis, longest_use
+from tvsbayes.statistics.optimal_design import discriminating_visits
 from tvsbayes.statistics.predicted_readings import PredictedReadings, State, less_means, log_mean
 from tvsbayes.statistics.streams import Stream, random_stream
 
@@ -404,49 +405,6 @@ class VerifyPlan:
         return stops_csv(self.arrivals)
 
 
-def _separation(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:
-    """Compute the squared distance of the nearest hypothesis, for numbers of visits to candidates (m,)."""
-    used = np.flatnonzero(visits)
-    scatter = covariance[np.ix_(used, used)] + np.diag(noise[used] / visits[used])
-    return min(_distance(o[used], scatter) for o in off)
-
-
-@dataclass(frozen=True)
-class DiscriminatingVisits:
-    """Number of visits to each candidate, shape (m,), and the squared distance of the nearest hypothesis by them."""
-
-    visits: np.ndarray
-    reached: float
-
-
-def discriminating_visits(
-    off: Sequence[np.ndarray],
-    common: np.ndarray,
-    noise: np.ndarray,
-    first: np.ndarray,
-    wanted: float = IDENTIFIED,
-    most: int = PLANNED_MAX,
-) -> DiscriminatingVisits:
-    """Choose the fewest visits that discriminate the hypotheses, by greedy choice.
-
-    Args:
-        off: deviation of each other hypothesis at the candidates, shape (m,) each.
-        common: covariance (m, m) of errors common to all visits.
-        noise: variances of the noise drawn at each visit, shape (m,).
-        first: mask of candidates that are always visited; all where it holds none.
-        wanted: squared distance of the nearest one that is enough.
-        most: largest number of visits.
-    """
-    visits = first.astype(float) if first.any() else np.ones(len(first))
-    reached = _separation(off, common, noise, visits)
-    while reached < wanted and visits.sum() < most:
-        each = [_separation(off, common, noise, visits + row) for row in np.eye(len(visits))]
-        best = int(np.argmax(each))
-        visits[best] += 1
-        reached = each[best]
-    return DiscriminatingVisits(visits, reached)
-
-
 def refuse_drive(made: Compensation) -> None:
     """Refuse the table of a drive at constant rate, whose readings contain no stops.
 
@@ -529,6 +487,6 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         off.append(play)
     if not np.any(off[0]):
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
-    chosen = discriminating_visits(off, covariance - np.diag(noise) + shift, noise, spread_stops(command))
-    stops, reached = planned_stops(command, side, chosen.visits), chosen.reached
-    return VerifyPlan(stops, run_up, reached >= IDENTIFIED, float(np.sqrt(reached)))
+    common = covariance - np.diag(noise) + shift
+    visits, reached = discriminating_visits(off, common, noise, spread_stops(command), IDENTIFIED, PLANNED_MAX)
+    return VerifyPlan(planned_stops(command, side, visits), run_up, reached >= IDENTIFIED, float(np.sqrt(reached)))

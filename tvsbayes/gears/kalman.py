@@ -59,8 +59,10 @@ def state_updated(
 
 def whitened(
     columns: np.ndarray, keep: np.ndarray, variance: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Columns as innovations over their sd (rows, n, c), and the log-determinant of the scatter (n,).
+
+    Also the states after the last row: means (states, n, c) by columns, covariance (states, states, n).
 
     Args:
         columns: observations of the sum of all states, shape (rows, n or 1, c), in time order.
@@ -85,4 +87,4 @@ def whitened(
             innovation -= own
         for own, gain in zip(means, gains[row], strict=True):
             own += gain * innovation
-    return white / np.sqrt(scatter)[..., None], np.log(scatter).sum(axis=0)
+    return white / np.sqrt(scatter)[..., None], np.log(scatter).sum(axis=0), means, covariance

@@ -6,8 +6,10 @@ An instrument is drawn from `[truth]` of the rig file, or from the posterior of 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,9 +22,10 @@ from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.gear_places import GearPlaces
-from tvsbayes.planning.looks import LookArrays, LookPlan, Looks, Seen, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.looks import LookArrays, LookPlan, Looks, Seen, arrange, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.progress import Advance, unshown
+from tvsbayes.statistics.optimal_design import covariance_of
 from tvsbayes.statistics.streams import Stream, random_stream
 
 STOPS, PIXEL = slice(0, 4), 4
@@ -134,17 +137,11 @@ class Family:
         return len(self.picks) // LOOKS_PER_EXPERIMENT
 
 
-@dataclass(frozen=True)
-class _VisibleInstruments:
-    """Instruments of a block that can make looks of a family, their expectations, and the target's sensitivity.
+class _Block(NamedTuple):
+    """The n instruments of a block that can make looks of a family and reach the target's point.
 
-    Attributes:
-        rows: numbers of the n instruments that see any look and reach the target's point.
-        instruments: these.
-        seen: expectations, shapes (n, looks, ...).
-        gradient: gradient of the target by parts, to be summed by weights, shape (n, parts, q, p + e); for lines a part
-            for each place and one for none, else a single part.
-        own_variance: additional variance of the target, shape (n, q).
+    `rows` are their numbers, `seen` their expectations (n, looks, ...), `gradient` that of the target by parts (n,
+    parts, q, p + e): for lines a part for each place and one for none, else a single part.
     """
 
     rows: np.ndarray
@@ -169,7 +166,7 @@ class Assurance:
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
         self.looks = family.candidates.looks[self.distinct]
         self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
-        self._scene = lru_cache(maxsize=self.CACHED)(self._evaluate)
+        self._block = lru_cache(maxsize=self.CACHED)(self._evaluate)
         self._values: dict[int, np.ndarray] = {}
 
     def of(self, family: Family) -> Assurance:
@@ -182,9 +179,9 @@ class Assurance:
         designs = {n: self.family.arranged(n) for n in sizes if n not in self._values}
         values_by_size = {n: np.full(draws, np.inf) for n in designs}
         for first in range(0, draws, block_size) if designs else ():
-            scene = self._scene(first, min(first + block_size, draws))
+            block = self._block(first, min(first + block_size, draws))
             for n, design in designs.items():
-                values_by_size[n][scene.rows] = self._reported_values(scene, n, design)
+                values_by_size[n][block.rows] = self._reported_values(block, n, design)
             advance((first + block_size) / draws)
         self._values |= values_by_size
         return {n: self._values[n] for n in sizes}
@@ -193,24 +190,22 @@ class Assurance:
         """Compute the share of truths whose fit of n experiments reports the target as met."""
         return float(np.mean(self.values([experiments])[experiments] <= self.target.limit))
 
-    def _evaluate(self, first: int, end: int) -> _VisibleInstruments:
-        block, knowledge = self.instruments[np.arange(first, end)], self.family.knowledge
-        gears = [instrument_gears(knowledge, physical) for physical in block.physical]
+    def _evaluate(self, first: int, end: int) -> _Block:
+        drawn, knowledge = self.instruments[np.arange(first, end)], self.family.knowledge
+        gears = [instrument_gears(knowledge, physical) for physical in drawn.physical]
         turning = np.array([places.turning(self.looks.steps, self.looks.side) for places in gears])
-        expectation = self.arrays.at_all(block.z, block.value, turning)
-        poses = expectation.mirror_angles_rad[:, self.index].mean(axis=1)
-        rows, sensitivities = [], []
-        for row in np.flatnonzero(expectation.seen.any(axis=1)).tolist():
-            try:
-                sensitivities.append(self._target_at(block.z[row], block.space_of(row), poses[row], gears[row]))
-            except InputError:
-                continue
-            rows.append(row)
-        visible, count = np.array(rows, dtype=int), len(self.target.indices)
-        shape = len(rows), knowledge.gears.size // 2 + 1 if self._of_lines else 1, count
-        gradient = np.array([s.gradient for s in sensitivities]).reshape(*shape, knowledge.size)
-        own_variance = np.array([s.own_variance for s in sensitivities]).reshape(shape).sum(axis=1)
-        return _VisibleInstruments(first + visible, block[visible], expectation[visible], gradient, own_variance)
+        seen = self.arrays.at_all(drawn.z, drawn.value, turning)
+        poses = seen.mirror_angles_rad[:, self.index].mean(axis=1)
+        at: dict[int, Sensitivity] = {}
+        for row in np.flatnonzero(seen.seen.any(axis=1)).tolist():
+            # No beam of an instrument may reach the target's point.
+            with suppress(InputError):
+                at[row] = self._target_at(drawn.z[row], drawn.space_of(row), poses[row], gears[row])
+        rows = np.array(list(at), dtype=int)
+        shape = len(at), knowledge.gears.size // 2 + 1 if self._of_lines else 1, len(self.target.indices)
+        gradient = np.array([s.gradient for s in at.values()]).reshape(*shape, knowledge.size)
+        own_variance = np.array([s.own_variance for s in at.values()]).reshape(shape).sum(axis=1)
+        return _Block(first + rows, drawn[rows], seen[rows], gradient, own_variance)
 
     def _target_at(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
         """Compute the sensitivity of the target at an instrument; for lines by place (leading axis c + 1).
@@ -222,30 +217,25 @@ class Assurance:
             return Sensitivity(np.asarray(gears.parts(z, space, pose_rad).gradient)[:, list(self.target.indices)])
         return sensitivity(self.target, z, space, self.family.knowledge.rig.table, pose_rad, gears)
 
-    def _reported_values(self, scene: _VisibleInstruments, experiments: int, design: LookPlan) -> np.ndarray:
+    def _reported_values(self, block: _Block, experiments: int, design: LookPlan) -> np.ndarray:
         """Compute the reported uncertainty for the instruments of a block, shape (n,)."""
         knowledge, picks = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * experiments]
         context = design.path, knowledge.space, knowledge.home_variances_rad2, design.warm_minutes(knowledge.rig)
 
         def covariance(seen: Seen) -> np.ndarray:
-            information = information_of_looks(seen, picks, *context)
-            return covariance_of(knowledge.precision + information)
+            return covariance_of(knowledge.precision + information_of_looks(seen, picks, *context))
 
-        first = covariance(scene.seen)
-        noise = self.noise[scene.rows]
-        z = judged_z(scene.instruments, scene.seen, self.looks.side, picks, first, knowledge, noise)
-        covariance_judged = covariance(self.rescaled(scene.seen, scene.instruments, z))
-        return self._sensitivity_of(scene, picks).values(covariance_judged, self.target.factor)
-
-    def _sensitivity_of(self, scene: _VisibleInstruments, picks: np.ndarray) -> Sensitivity:
-        """Compute the sensitivity of the target for a design: ratios along the lines through the visible looks."""
-        gears, rows = self.family.knowledge.gears, list(self.target.indices)
-        weights = np.ones((len(scene.rows), len(rows), 1))
+        instruments, first = block.instruments, covariance(block.seen)
+        z = judged_z(instruments, block.seen, self.looks.side, picks, first, knowledge, self.noise[block.rows])
+        weights = np.ones((len(block.rows), len(self.target.indices), 1))
         if self._of_lines:
-            times_seen = scene.seen.seen * np.bincount(picks, minlength=len(self.looks))
-            weights = gears.weights(gears.line_through(self.looks.steps, times_seen))[:, rows]
-        gradient = np.einsum("nqi,niqp->nqp", weights, scene.gradient)
-        return Sensitivity(gradient, {"at the point": scene.own_variance})
+            # Ratios along the lines through the visible looks.
+            times_seen = block.seen.seen * np.bincount(picks, minlength=len(self.looks))
+            lines = knowledge.gears.line_through(self.looks.steps, times_seen)
+            weights = knowledge.gears.weights(lines)[:, list(self.target.indices)]
+        gradient = np.einsum("nqi,niqp->nqp", weights, block.gradient)
+        at = Sensitivity(gradient, {"at the point": block.own_variance})
+        return at.values(covariance(self.rescaled(block.seen, instruments, z)), self.target.factor)
 
     def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
         """Whiten looks (n, m) again with the noise scales of other coordinates (n, p) and the same scatter of looks.

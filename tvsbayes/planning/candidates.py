@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,14 +35,12 @@ class Candidates:
     Attributes:
         looks: the candidates.
         run_up: run-up (pan, tilt), steps.
-        limits: lowest and highest counter of (pan, tilt), shape (2, 2).
         turned: whether a look lies a full turn of pan away, shape (m,).
         notes: sentences on excluded looks and the reasons.
     """
 
     looks: Looks
     run_up: np.ndarray
-    limits: np.ndarray
     turned: np.ndarray
     notes: tuple[str, ...]
 
@@ -78,32 +76,13 @@ def expected_run_up(knowledge: Knowledge) -> np.ndarray:
     return run_up_steps(np.median(physical, axis=0), knowledge.space.mechanism, play_deg)
 
 
-@dataclass(frozen=True)
-class Positions:
-    """Counters (pan, tilt), shape (m, 2), each on a sheet, shape (m,)."""
-
-    steps: np.ndarray
-    sheet: np.ndarray
-
-    @classmethod
-    def grid(cls, window: np.ndarray, counts: tuple[int, int], sheets: int) -> Positions:
-        """Build a regular grid of (pan, tilt) over a window (2, 2) of lowest and highest counters, on every sheet."""
-        levels = [np.unique(np.linspace(low, high, n).round()) for (low, high), n in zip(window, counts, strict=True)]
-        pan, tilt, sheet = np.meshgrid(*levels, np.arange(sheets), indexing="ij")
-        return cls(np.stack([pan.ravel(), tilt.ravel()], 1).astype(int), sheet.ravel())
-
-    def __getitem__(self, chosen: np.ndarray) -> Positions:
-        return Positions(self.steps[chosen], self.sheet[chosen])
-
-    def with_turns(self, pan_turns: Sequence[int]) -> Positions:
-        """Append the positions shifted by turns of pan, steps."""
-        shifted = [self.steps, *(self.steps + np.array([turn, 0]) for turn in pan_turns)]
-        return Positions(np.concatenate(shifted), np.tile(self.sheet, len(shifted)))
-
-    def visible(self, knowledge: Knowledge, points: np.ndarray) -> np.ndarray:
-        """Compute the share of instruments at points (n, p) whose images both show the spot, shape (m,)."""
-        arrays = LookArrays(Looks(self.steps, np.ones_like(self.steps), self.sheet), knowledge, False)
-        return arrays.in_images(points).mean(axis=0)
+def look_grid(window: np.ndarray, counts: tuple[int, int], sheets: int, turns: Sequence[int] = ()) -> Looks:
+    """Build a grid of (pan, tilt) over a window (2, 2) of counters, on every sheet, and again turns of pan away."""
+    levels = [np.unique(np.linspace(low, high, n).round()) for (low, high), n in zip(window, counts, strict=True)]
+    pan, tilt, sheet = (axis.ravel() for axis in np.meshgrid(*levels, np.arange(sheets), indexing="ij"))
+    here = np.stack([pan, tilt], axis=1).astype(int)
+    steps = np.concatenate([here + np.array([turn, 0]) for turn in (0, *turns)])
+    return Looks(steps, np.ones_like(steps), np.tile(sheet, 1 + len(turns)))
 
 
 def have_room(steps: np.ndarray, side: np.ndarray, limits: np.ndarray, run_up: np.ndarray) -> np.ndarray:
@@ -112,44 +91,33 @@ def have_room(steps: np.ndarray, side: np.ndarray, limits: np.ndarray, run_up: n
     return np.all((end_points >= limits[:, 0]) & (end_points <= limits[:, 1]), axis=(0, -1))
 
 
-def from_all_sides(positions: Positions, limits: np.ndarray, run_up: np.ndarray) -> Looks:
-    """Build looks at positions from all four sides whose run-up is inside the limits (2, 2)."""
-    parts = []
-    for side in itertools.product((1, -1), repeat=2):
-        inside = have_room(positions.steps, np.array(side), limits, run_up)
-        sides = np.tile(np.array(side), (int(inside.sum()), 1))
-        parts.append(Looks(positions.steps[inside], sides, positions.sheet[inside]))
-    return Looks(*(np.concatenate([getattr(some, part.name) for some in parts]) for part in fields(Looks)))
+def from_all_sides(some: Looks, limits: np.ndarray, run_up: np.ndarray) -> Looks:
+    """Build the looks at the same counters from all four sides whose run-up is inside the limits (2, 2)."""
+    sides = np.repeat(list(itertools.product((1, -1), repeat=2)), len(some), axis=0)
+    looks = Looks(np.tile(some.steps, (4, 1)), sides, np.tile(some.sheet, 4))
+    return looks[have_room(looks.steps, looks.side, limits, run_up)]
 
 
-@dataclass(frozen=True)
-class CounterRange:
-    """Lowest and highest counter of (pan, tilt), shape (2, 2), and notes where the rig file states none."""
-
-    limits: np.ndarray
-    notes: tuple[str, ...]
-
-
-def counter_range(stated: CounterLimits, widest: Mapping[str, tuple[int, int]]) -> CounterRange:
-    """Return the limits of the rig file, else `widest`."""
+def counter_range(stated: CounterLimits, widest: Mapping[str, tuple[int, int]]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the limits (2, 2) of the rig file, else `widest`, and notes where the rig file states none."""
     by_axis = stated.within(widest)
     steps = np.array([by_axis[axis] for axis in AXES])
     if not stated.unstated:
-        return CounterRange(steps, ())
+        return steps, ()
     ranges = ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in by_axis.items())
     note = (
         f"[positioner] does not state {', '.join(stated.unstated)}: counters stay within {ranges}; wider limits would "
         "allow longer travel, and full turns"
     )
-    return CounterRange(steps, (note,))
+    return steps, (note,)
 
 
 def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Find the range of counters (pan, tilt) in view of both cameras at the most probable instrument, (2, 2)."""
     reach = REACH_DEG / np.abs(ratio)
     window = np.stack([np.maximum(limits[:, 0], -reach), np.minimum(limits[:, 1], reach)], axis=1)
-    coarse = Positions.grid(window, (COARSE_PAN, COARSE_TILT), len(knowledge.sheets))
-    steps = coarse.steps[coarse.visible(knowledge, knowledge.z[None]) > 0]
+    coarse = look_grid(window, (COARSE_PAN, COARSE_TILT), len(knowledge.sheets))
+    steps = coarse.steps[LookArrays(coarse, knowledge, False).in_images(knowledge.z[None])[0]]
     if not len(steps):
         raise InputError(
             "out-of-view",
@@ -161,20 +129,15 @@ def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) ->
     return np.stack([steps.min(axis=0), steps.max(axis=0)], axis=1)
 
 
-@dataclass(frozen=True)
-class _InView:
-    """Positions visible to drawn instruments, and notes on excluded ones."""
-
-    positions: Positions
-    notes: tuple[str, ...]
-
-
-def _visible_positions(knowledge: Knowledge, box: np.ndarray, turns: Sequence[int], half_turn: float) -> _InView:
-    """Find positions of a box (2, 2) and full turns away visible to `VISIBLE_SHARE` of drawn instruments."""
-    positions = Positions.grid(box, (PAN_LEVELS, TILT_LEVELS), len(knowledge.sheets)).with_turns(turns)
-    share = positions.visible(knowledge, draws_of(knowledge, VISIBILITY_DRAWS, np.random.default_rng(23)))
+def _visible_looks(
+    knowledge: Knowledge, box: np.ndarray, turns: Sequence[int], half_turn: float
+) -> tuple[Looks, tuple[str, ...]]:
+    """Find looks in a box (2, 2) and full turns away visible to `VISIBLE_SHARE` of drawn instruments; notes."""
+    looks = look_grid(box, (PAN_LEVELS, TILT_LEVELS), len(knowledge.sheets), turns)
+    arrays = LookArrays(looks, knowledge, False)
+    share = arrays.in_images(draws_of(knowledge, VISIBILITY_DRAWS, np.random.default_rng(23))).mean(axis=0)
     visible = share >= VISIBLE_SHARE
-    in_box = np.abs(positions.steps[:, 0] - box[0].mean()) < half_turn
+    in_box = np.abs(looks.steps[:, 0] - box[0].mean()) < half_turn
     notes = []
     if turns and not (visible & ~in_box).any():
         notes.append(
@@ -182,13 +145,13 @@ def _visible_positions(knowledge: Knowledge, box: np.ndarray, turns: Sequence[in
             "first, then plan with --given"
         )
     if (visible & in_box).sum() < 2 * LOOKS_PER_EXPERIMENT:
-        visible = in_box & (positions.visible(knowledge, knowledge.z[None]) > 0)
+        visible = in_box & arrays.in_images(knowledge.z[None])[0]
         notes.append(
             "the pose of the positioner is stated with so large a u that looks may miss the images (as few as "
             f"{100 * share[visible].min(initial=1.0):.0f} % of drawn instruments see one): state all six extrinsics in "
             "[rig.prior], to some 0.03 rad and 5 mm, or measure little and plan with --given"
         )
-    return _InView(positions[visible], tuple(notes))
+    return looks[visible], tuple(notes)
 
 
 def candidates(knowledge: Knowledge) -> Candidates:
@@ -213,14 +176,12 @@ def candidates(knowledge: Knowledge) -> Candidates:
     elif not rig.has_images:
         reach = {axis: int(REACH_DEG / abs(r)) for axis, r in zip(AXES, ratio.tolist(), strict=True)}
         widest = {axis: (-steps, steps) for axis, steps in reach.items()}
-    stated_range = counter_range(rig.limits, widest)
-    limits = stated_range.limits
-    run_up = expected_run_up(knowledge)
-    box = _box_in_view(knowledge, limits, ratio)
+    limits, range_notes = counter_range(rig.limits, widest)
+    run_up, box = expected_run_up(knowledge), _box_in_view(knowledge, limits, ratio)
     turn = round(FULL_TURN_DEG / abs(float(ratio[0])))
     turns = [n for n in (turn, -turn) if limits[0, 0] <= box[0, 1] + n and box[0, 0] + n <= limits[0, 1]]
-    view = _visible_positions(knowledge, box, turns, 0.5 * turn)
-    looks = from_all_sides(view.positions, limits, run_up)
+    visible, view_notes = _visible_looks(knowledge, box, turns, 0.5 * turn)
+    looks = from_all_sides(visible, limits, run_up)
     if not len(looks):
         raise InputError(
             "limits",
@@ -231,4 +192,4 @@ def candidates(knowledge: Knowledge) -> Candidates:
             remedy="widen the limits in [positioner], or state backlash and ratio more closely in [rig.prior]",
         )
     turned = np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn
-    return Candidates(looks, run_up, limits, turned, (*stated_range.notes, *view.notes))
+    return Candidates(looks, run_up, turned, (*range_notes, *view_notes))

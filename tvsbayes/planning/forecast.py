@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
 
 from tvsbayes.errors import TvsError
-from tvsbayes.estimators.four_point import DirectionResult, classic, ratio_slopes, select_experiments
+from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, names_of
@@ -44,29 +43,16 @@ class ClassicForecast:
 CLASSIC_DRAWS = 100
 
 
-@dataclass(frozen=True)
-class _Experiments:
-    """The second experiment in each of `DIRECTIONS` on a drawn instrument without noise; arrays over these four.
+def _experiments(
+    rig: Rig, sheets: tuple[str, str], physical: np.ndarray
+) -> tuple[Campaign, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float] | None:
+    """Simulate two of the paper's experiments in each direction, without noise; None where one lacks the second.
 
-    Attributes:
-        campaign: campaign of all experiments.
-        pixels, steps, axis: as in `Selection`.
-        true_ratio: local ratios at the mean pose of the looks, deg/step.
-        angle_variance: variance of the angle between spots by stops and scatter of looks, deg^2.
-        spot_sd_px: noise of a pixel coordinate.
+    Returns:
+        The campaign; of the second experiment in each of `DIRECTIONS` pixels, steps and axis as in `Selection`, local
+        ratios at the mean pose of the looks (deg/step), variance of the angle between spots by stops and scatter of
+        looks (deg^2); the noise of a pixel coordinate.
     """
-
-    campaign: Campaign
-    pixels: np.ndarray
-    steps: np.ndarray
-    axis: np.ndarray
-    true_ratio: np.ndarray
-    angle_variance: np.ndarray
-    spot_sd_px: float
-
-
-def _experiments(rig: Rig, sheets: tuple[str, str], physical: np.ndarray) -> _Experiments | None:
-    """Simulate two of the paper's experiments in each direction; None where a direction lacks the second."""
     parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
     noise_free = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
     stereo = rig.stereo_pair.with_vector(physical[len(rig.table.mechanism.rig_names) :])
@@ -83,15 +69,13 @@ def _experiments(rig: Rig, sheets: tuple[str, str], physical: np.ndarray) -> _Ex
     factor = (near_mm**2 + far_mm**2) / (far_mm - near_mm) ** 2
     stops = np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
     scatter = np.repeat([parameters[name] ** 2 for name in LOOK_SCATTER_NAMES], 2)
-    return _Experiments(
-        campaign=simulated.campaign,
-        pixels=selection.pixels[second],
-        steps=selection.steps[second],
-        axis=selection.axis[second],
-        true_ratio=np.array([true_ratio[d] for d in DIRECTIONS]),
+    return (
+        simulated.campaign,
+        *(selection.pixels[second], selection.steps[second], selection.axis[second]),
+        np.array([true_ratio[d] for d in DIRECTIONS]),
         # An experiment begins at a stop of the opposite direction.
-        angle_variance=stops + stops[[1, 0, 3, 2]] + 2 * factor * scatter,
-        spot_sd_px=rig.spot_sd_px * parameters["pixel_scale"],
+        stops + stops[[1, 0, 3, 2]] + 2 * factor * scatter,
+        rig.spot_sd_px * parameters["pixel_scale"],
     )
 
 
@@ -105,21 +89,17 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     if len(rig.sheets_mm) < 2:
         return None
     sheets = knowledge.sheets[0], knowledge.sheets[1]
-    drawn = [_experiments(rig, sheets, physical) for physical in instruments.physical[:CLASSIC_DRAWS]]
+    drawn = (_experiments(rig, sheets, physical) for physical in instruments.physical[:CLASSIC_DRAWS])
     complete = [experiments for experiments in drawn if experiments is not None]
     if not complete:
         return None
-
-    def of_all(name: str) -> np.ndarray:
-        return np.array([getattr(experiments, name) for experiments in complete])
-
-    steps, true_ratio = of_all("steps"), of_all("true_ratio")
-    slopes = ratio_slopes(of_all("pixels"), steps.ravel(), of_all("axis").ravel(), rig.stereo_pair)
+    campaigns, *arrays = zip(*complete, strict=True)
+    pixels, steps, axis, true_ratio, angle_variance, spot_sd_px = map(np.array, arrays)
+    slopes = ratio_slopes(pixels, steps.ravel(), axis.ravel(), rig.stereo_pair)
     ratio = slopes.ratio.reshape(steps.shape)
-    by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(steps.shape)
-    variance = by_pixel * of_all("spot_sd_px")[:, None] ** 2
-    variance += of_all("angle_variance") * (ratio / true_ratio / steps) ** 2
-    directions = classic(complete[0].campaign).directions.values()
+    variance = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(steps.shape) * spot_sd_px[:, None] ** 2
+    variance += angle_variance * (ratio / true_ratio / steps) ** 2
+    directions = classic(campaigns[0]).directions.values()
     stereo_u = np.array([r.u_stereo_deg_per_step for r in directions if r is not None])
     return ClassicForecast(np.sqrt(variance), ratio - true_ratio, stereo_u)
 
@@ -168,40 +148,36 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
     if forecast is None or not target.of_ratios:
         return None
     half_width = target.limit * NORMAL_95 / target.factor
-    measured = {} if campaign is None else _measured(campaign)
+    try:
+        measured = {} if campaign is None else classic(campaign).directions
+    except TvsError:
+        # No complete experiments.
+        measured = {}
     answers = []
     for index in target.indices:
-        direction = DIRECTIONS[index]
-        low, sd, high = np.quantile(forecast.sd[:, index], [0.025, 0.5, 0.975])
-        result = measured.get(direction)
+        result = measured.get(DIRECTIONS[index])
+        from_data = result is not None and result.sd_deg_per_step is not None
+        low, sd, high = np.quantile(forecast.sd[:, index], [0.025, 0.5, 0.975]).tolist()
         if result is not None and result.sd_deg_per_step is not None:
-            sd, n = result.sd_deg_per_step, result.n
-            low, high = (sd * math.sqrt((n - 1) / special.chdtri(n - 1, p)) for p in (0.025, 0.975))
-        error = np.quantile(forecast.error[:, index], [0.5, 0.025, 0.975])
-        counts = [classic_count(float(s), half_width) for s in (low, sd, high)]
+            sd, dof = result.sd_deg_per_step, result.n - 1
+            low, high = (sd * math.sqrt(dof / float(special.chdtri(dof, p))) for p in (0.025, 0.975))
+        systematic, *interval = np.quantile(forecast.error[:, index], [0.5, 0.025, 0.975]).tolist()
+        least, count, most = (classic_count(s, half_width) for s in (low, sd, high))
         answers.append(
             ClassicAnswer(
-                direction=direction,
-                sd=float(sd),
-                sd_interval95=(float(low), float(high)),
+                direction=DIRECTIONS[index],
+                sd=sd,
+                sd_interval95=(low, high),
                 half_width=half_width,
-                experiments=counts[1],
-                experiments_interval95=(counts[0], counts[2]),
+                experiments=count,
+                experiments_interval95=(least, most),
                 stereo_u=float(forecast.stereo_u[index]),
-                systematic=float(error[0]),
-                systematic_interval95=(float(error[1]), float(error[2])),
-                from_data=result is not None and result.sd_deg_per_step is not None,
+                systematic=systematic,
+                systematic_interval95=(interval[0], interval[1]),
+                from_data=from_data,
             )
         )
     return max(answers, key=lambda a: a.experiments)
-
-
-def _measured(campaign: Campaign) -> Mapping[str, DirectionResult | None]:
-    """Return the classic results by direction; empty without complete experiments."""
-    try:
-        return classic(campaign).directions
-    except TvsError:
-        return {}
 
 
 def value_of_classic(forecast: ClassicForecast | None, target: Target, experiments: int) -> float | None:

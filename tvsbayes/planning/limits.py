@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, describe_looks
-from tvsbayes.instrument.rig import RigTable
+from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.planning.expectation import Knowledge
-from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import GEARS_AT_POINT, Sensitivity, Target
 from tvsbayes.results.plan_record import Advice, Batch, actions_of
 from tvsbayes.results.records import Record
+from tvsbayes.statistics.optimal_design import covariance_of
 
 
 class Limit(Record, frozen=True):
@@ -96,19 +96,53 @@ def _requirement(table: RigTable, columns: Sequence[int], share: float) -> str:
 
 def _needed_at_point(aim: Sensitivity, target: Target) -> str | None:
     """Write the required improvement at the target's point itself; None where its variance permits the target."""
-    total = aim.own_variance
-    gears = aim.own.get(GEARS_AT_POINT, np.zeros_like(total))
+    gears = aim.own.get(GEARS_AT_POINT, np.zeros_like(aim.own_variance))
     # The worst quantity is taken for each part.
-    stop, gear, worst = (target.factor * math.sqrt(max(variance)) for variance in (total - gears, gears, total))
-    unit = target.unit
+    parts = (aim.own_variance - gears, gears, aim.own_variance)
+    stop, gear, worst = (target.factor * math.sqrt(max(variance)) for variance in parts)
     if stop > target.limit:
-        reason = f"{stop:.3g} {unit} come from the stop and the reading at the point itself"
-        return f"{reason}: only a smaller stop error or aperture noise would help"
+        return (
+            f"{stop:.3g} {target.unit} come from the stop and the reading at the point itself: only a smaller stop "
+            "error or aperture noise would help"
+        )
     if worst > target.limit:
-        reason = f"{worst:.3g} {unit} come from the point itself: {stop:.3g} from the stop and the reading there, "
-        reason += f"{gear:.3g} from errors of the gears, which looks at other counters do not determine"
-        return f"{reason}; widen the limits in [positioner] until looks reach the point's counters"
+        return (
+            f"{worst:.3g} {target.unit} come from the point itself: {stop:.3g} from the stop and the reading there, "
+            f"{gear:.3g} from errors of the gears, which looks at other counters do not determine; widen the limits in "
+            "[positioner] until looks reach the point's counters"
+        )
     return None
+
+
+def _needed_inputs(
+    value_with: Callable[[Mapping[str, float]], float], names: Sequence[str], rig: Rig, limit: float
+) -> str:
+    """Write the sufficient uncertainties of inputs, in their order: as many as needed, each to a tenth but the last.
+
+    Args:
+        value_with: value of the target with uncertainties of inputs scaled by shares.
+        names: names of the inputs.
+        rig: its priors.
+        limit: the value must not exceed it.
+    """
+    scaled: dict[str, float] = {}
+    for name in names:
+        if value_with({**scaled, name: 1e-3}) > limit:
+            scaled[name] = 0.1
+            continue
+        low, high = 1e-3, 1.0
+        for _ in range(40):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if value_with({**scaled, name: middle}) <= limit else (low, middle)
+        scaled[name] = low
+        # Earlier inputs that need no improvement keep their uncertainty.
+        for other in [n for n in scaled if n != name]:
+            others = {n: share for n, share in scaled.items() if n != other}
+            scaled = others if value_with(others) <= limit else scaled
+        groups = rig.table.mechanism.prior_groups
+        stated = "; ".join(_requirement(rig.table, groups[n], share) for n, share in scaled.items())
+        return f"it suffices to know {stated}"
+    return "no single input is the limit: widen the limits or add sheets"
 
 
 def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: Target) -> Limit:
@@ -120,45 +154,23 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
         aim: sensitivity of the target.
         target: the target.
     """
-    many_looks = MANY_TIMES * data
-    floor = aim.value(covariance_of(knowledge.precision + many_looks), target.factor)
-    shares = split_of(knowledge, many_looks, None, aim)
-    cause = next(iter(shares))
-    if floor <= target.limit:
-        return Limit(floor, cause, shares, True, None)
-    groups = knowledge.rig.table.mechanism.prior_groups
-    if (at_point := _needed_at_point(aim, target)) is not None:
-        return Limit(floor, cause, shares, False, at_point)
+    groups, many_looks = knowledge.rig.table.mechanism.prior_groups, MANY_TIMES * data
 
-    def with_inputs(scaled: Mapping[str, float]) -> float:
+    def value_with(scaled: Mapping[str, float]) -> float:
         precision = knowledge.precision.copy()
         for name, share in scaled.items():
-            columns = groups[name]
             # The prior's precision is 1 in its coordinates; that of the campaign is added.
-            precision[columns, columns] += share**-2 - 1
+            precision[groups[name], groups[name]] += share**-2 - 1
         return aim.value(covariance_of(precision + many_looks), target.factor)
 
-    scaled: dict[str, float] = {}
-    names = [name for name in shares if name in groups]
-    if knowledge.after_data:
-        names = sorted(groups, key=lambda name: with_inputs({name: 1e-3}))
-    for name in names:
-        if with_inputs({**scaled, name: 1e-3}) > target.limit:
-            scaled[name] = 0.1
-            continue
-        low, high = 1e-3, 1.0
-        for _ in range(40):
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if with_inputs({**scaled, name: middle}) <= target.limit else (low, middle)
-        scaled[name] = low
-        # Earlier inputs that need no improvement keep their uncertainty.
-        for other in [n for n in scaled if n != name]:
-            others = {n: s for n, s in scaled.items() if n != other}
-            if with_inputs(others) <= target.limit:
-                scaled = others
-        stated = "; ".join(_requirement(knowledge.rig.table, groups[n], s) for n, s in scaled.items())
-        return Limit(floor, cause, shares, False, f"it suffices to know {stated}")
-    return Limit(floor, cause, shares, False, "no single input is the limit: widen the limits or add sheets")
+    floor, shares = value_with({}), split_of(knowledge, many_looks, None, aim)
+    needed = None
+    if floor > target.limit:
+        names = [name for name in shares if name in groups]
+        if knowledge.after_data:
+            names = sorted(groups, key=lambda name: value_with({name: 1e-3}))
+        needed = _needed_at_point(aim, target) or _needed_inputs(value_with, names, knowledge.rig, target.limit)
+    return Limit(floor, next(iter(shares)), shares, needed is None, needed)
 
 
 def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:

@@ -17,12 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays, no_gears
 from tvsbayes.instrument.mechanisms import CONTRAST_COLUMNS
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, action_seconds
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.compiled import compiled, in_batches, placed
-from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.planning.expectation import Knowledge, expect, largest_px, sheet_points
@@ -73,6 +72,13 @@ class LookPlan:
         waypoints = np.stack([self.via, self.goal], axis=1).reshape(-1, 2)
         return np.diff(waypoints, axis=0, prepend=[self.home]).reshape(-1, 2, 2)
 
+    @cached_property
+    def _counts(self) -> dict[str, np.ndarray]:
+        """Count the actions at every position, shape (m,) each."""
+        names = np.array(["", *self.sheet])
+        moves = self._legs.any(axis=2).sum(axis=1)
+        return {"place": (names[1:] != names[:-1]).astype(int), "move": moves, "look": np.ones_like(moves)}
+
     @property
     def path(self) -> np.ndarray:
         """Compute the steps per axis from the homing to each look (in the caller's order), shape (m, 2)."""
@@ -82,13 +88,10 @@ class LookPlan:
 
     def warm_minutes(self, rig: Rig) -> np.ndarray:
         """Compute minutes (m,) by `[costs]` from homing to the last move before each look, in the caller's order."""
-        cost = {name: action_seconds(rig, {name: 1}) for name in ("home", "place", "move", "look")}
-        moves = self._legs.any(axis=2).sum(axis=1)
-        placed = np.array([now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True)])
-        taken = placed * cost["place"] + moves * cost["move"] + cost["look"]
-        ends = cost["home"] + np.cumsum(taken)
+        cost = {name: action_seconds(rig, {name: 1}) for name in ("home", *self._counts)}
+        ends = cost["home"] + np.cumsum(sum(count * cost[name] for name, count in self._counts.items()))
         # The time of a row is the start of its move; without a move it is that of the previous row.
-        last = np.where(moves > 0, ends - cost["look"] - cost["move"], 0.0)
+        last = np.where(self._counts["move"] > 0, ends - cost["look"] - cost["move"], 0.0)
         minutes = np.empty(len(self.order))
         minutes[self.order] = np.maximum.accumulate(last) / 60
         return minutes
@@ -96,9 +99,7 @@ class LookPlan:
     @property
     def actions(self) -> dict[str, int]:
         """Count the actions of each kind."""
-        moves, looks = int(self._legs.any(axis=2).sum()), len(self.order)
-        places = sum(now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True))
-        return {"home": 1, "place": places, "move": moves, "look": looks}
+        return {"home": 1, **{name: int(count.sum()) for name, count in self._counts.items()}}
 
     def minutes(self, rig: Rig) -> float:
         """Compute the duration by `[costs]`, minutes."""
@@ -117,11 +118,10 @@ class LookPlan:
         return self._plan(PlanBuilder(at=self.home))
 
     def _plan(self, plan: PlanBuilder) -> tuple[PlanStep, ...]:
-        placed = ""
-        for sheet, via, goal in zip(self.sheet, self.via.tolist(), self.goal.tolist(), strict=True):
-            if sheet != placed:
-                placed = sheet
-                plan.place(placed)
+        placed = self._counts["place"].tolist()
+        for sheet, new, via, goal in zip(self.sheet, placed, self.via.tolist(), self.goal.tolist(), strict=True):
+            if new:
+                plan.place(sheet)
             plan.move(*via)
             plan.move(*goal)
             plan.look()
@@ -215,11 +215,8 @@ def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer)
             hours=jnp.zeros((1, 2)),
             tangents=jnp.zeros((1, 2, 3)) if observer.image_px is None else None,
         )
-        none = jnp.zeros(0, dtype=bool)
-        places = Places(jnp.zeros(0), none, none)
-        gears = GearArrays(places, jnp.zeros((1, 0)), jnp.zeros(0, dtype=jnp.int32), none, none)
-        count = jnp.ones((), dtype=jnp.int32)
-        arrays = CampaignArrays(pair.moves(observer.warm_minutes), spot, gears, observer.azimuth_convention, count)
+        count, moves = jnp.ones((), dtype=jnp.int32), pair.moves(observer.warm_minutes)
+        arrays = CampaignArrays(moves, spot, no_gears(1), observer.azimuth_convention, count)
         # Errors of the gears act as an offset, so their columns follow from the offset's, see `at_all`.
         no_turning = jnp.zeros((1, 2, 0))
         expectation = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], observer.image_px, no_turning)
@@ -352,10 +349,3 @@ def information_of_looks(
     coupling = information[..., :-2, -2:]
     offsets = information[..., -2:, -2:] + np.diag(1 / home_variances_rad2)
     return information[..., :-2, :-2] - coupling @ np.linalg.solve(offsets, np.swapaxes(coupling, -1, -2))
-
-
-def covariance_of(information: np.ndarray) -> np.ndarray:
-    """Invert positive definite matrices (..., p, p) whose diagonals span many orders of magnitude."""
-    scale = 1 / np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
-    scales = scale[..., :, None] * scale[..., None, :]
-    return np.linalg.inv(information * scales) * scales

@@ -20,7 +20,7 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import counters_made
 from tvsbayes.planning.candidates import sheet_choices
 from tvsbayes.planning.expectation import knowledge_of
-from tvsbayes.planning.planner import design_problem
+from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.results.estimates import Measured, Uncertain
@@ -101,22 +101,20 @@ def next_looks(
     """
     if not fit.converged:
         raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
-    power_s = powered_on_s(fit.campaign.header)
-    knowledge = replace(knowledge_of(fit, rig), warm_minutes=float(warm_minutes(fit.campaign.moves, power_s)[-1]))
+    moves, made = fit.campaign.moves, counters_made(fit.campaign.moves)
     if planned is not None:
-        made = counters_made(fit.campaign.moves)
-        allowed = {axis: (min(made[axis][0], low), max(made[axis][1], high)) for axis, (low, high) in planned.items()}
-        knowledge = replace(knowledge, made=allowed)
-    problem = design_problem(knowledge, target, fit.reference_pose_rad, False)
+        made = {axis: (min(made[axis][0], low), max(made[axis][1], high)) for axis, (low, high) in planned.items()}
+    warm = float(warm_minutes(moves, powered_on_s(fit.campaign.header))[-1])
+    problem = DesignProblem.of(
+        replace(knowledge_of(fit, rig), warm_minutes=warm, made=made), target, fit.reference_pose_rad
+    )
     # The segment continues: no new home offset, and the expectation of the looks includes the creep so far.
     problem = replace(problem, knowledge=replace(problem.knowledge, after_data=False), warming=False)
-    session = PlanLog(list(fit.campaign.moves), targets=[ordered_spots(fit.campaign)[-1].target])
+    session = PlanLog(list(moves), targets=[ordered_spots(fit.campaign)[-1].target])
     sheet_of_look, sheets = problem.candidates.looks.sheet, range(len(problem.knowledge.sheets))
     subsets = [np.isin(sheet_of_look, choice) for choice in sheet_choices(sheets, 2)]
     best = max(problem.choices(count, subsets, session), key=lambda choice: choice.gain_per_minute)
-    sds = np.asarray(fit.draws.effective_deg_per_step).std(axis=0)
-    confirmation_result = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
-    order = best.design.order
+    order, sds = best.design.order, np.asarray(fit.draws.effective_deg_per_step).std(axis=0)
     places, quantity = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
     ratios = map(Uncertain, np.asarray(fit.mode.effective_deg_per_step).tolist(), sds.tolist())
     return NextLooks(
@@ -131,5 +129,5 @@ def next_looks(
             f"{count} looks at {places} lower {quantity} most per minute: from {problem.now:.3g} to {best.value:.3g} "
             f"{target.unit} in {best.minutes:.1f} minutes"
         ),
-        confirmed=confirmation_result,
+        confirmed=confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None,
     )

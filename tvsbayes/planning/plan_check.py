@@ -1,6 +1,6 @@
 """Faults of a plan in words, and the smallest addition that corrects each.
 
-Plans are judged at the most probable instrument by the rules for fits (`stops.inseparable`, `stops.few_stops`).
+Plans are evaluated at the most probable instrument by the rules for fits (`stops.inseparable`, `stops.few_stops`).
 Counters in steps, u of the ratios in deg/step, minutes by the rig's `[costs]`.
 """
 
@@ -22,30 +22,24 @@ from tvsbayes.instrument.plan import PlanStep, continued, describe_looks, run_pl
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.planning.candidates import Candidates, candidates
-from tvsbayes.planning.expectation import (
-    Knowledge,
-    PlanInformation,
-    expect,
-    information_of,
-    prior_knowledge,
-)
-from tvsbayes.planning.looks import LookArrays, Looks, arrange, covariance_of
-from tvsbayes.planning.search import Search
+from tvsbayes.planning.expectation import Knowledge, PlanInformation, expect, information_of, prior_knowledge
+from tvsbayes.planning.looks import LookArrays, Looks, arrange
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
 from tvsbayes.results.plan_record import Action, actions_of
 from tvsbayes.results.records import Record
+from tvsbayes.statistics.optimal_design import Search, covariance_of
 
 ADDED_LOOKS_MAX = 24
 """Largest number of looks in an addition."""
 JUDGING, CURING = "evaluating the plan", "searching for more looks"
-JUDGED_SECONDS, EXPECT_COMPILED_SECONDS, CURED_SECONDS = 0.2, 12.0, 1.0
+EVALUATED_SECONDS, EXPECT_COMPILED_SECONDS, CURED_SECONDS = 0.2, 12.0, 1.0
 """Expected durations for the progress display, s."""
 
 
-def judging_seconds() -> float:
-    """Predict the duration of judging a plan, s."""
-    return JUDGED_SECONDS + expect.wait(EXPECT_COMPILED_SECONDS)
+def evaluation_seconds() -> float:
+    """Predict the duration of evaluating a plan, s."""
+    return EVALUATED_SECONDS + expect.wait(EXPECT_COMPILED_SECONDS)
 
 
 class PlanFault(Record, frozen=True):
@@ -86,7 +80,7 @@ class PlanCheck(Record, frozen=True, tag_field="kind", tag="rig with plan"):
 
 
 @dataclass(frozen=True)
-class Judgement:
+class PlanEvaluation:
     """Expected headlines of a plan: their covariance, shape (9, 9), gradients and prior variances, shape (9,)."""
 
     information: PlanInformation
@@ -100,11 +94,9 @@ class Judgement:
 
     def exchange(self, axis: Axis) -> float:
         """Compute the correlation of ratio and backlash of an axis; its square is their common share of variance."""
-        ratio, backlash = self.rows(axis)
-        c = self.covariance
-        if self.prior[backlash] == 0:
-            return 0.0
-        return float(c[ratio, backlash] / np.sqrt(c[ratio, ratio] * c[backlash, backlash]))
+        rows = self.rows(axis)
+        (ratio, both), (_, backlash) = self.covariance[np.ix_(rows, rows)]
+        return float(both / np.sqrt(ratio * backlash)) if self.prior[rows[1]] else 0.0
 
     def u(self, axis: Axis) -> float:
         """Return the uncertainty of the worse effective ratio of an axis, deg/step."""
@@ -127,22 +119,20 @@ class Judgement:
 
     def fault(self, axis: Axis) -> str | None:
         """Describe the fault of the axis: ratio or backlash not determined, or not separable; None without one."""
-        ratio, backlash = self.contraction()[self.rows(axis)]
-        stops = self.stops(axis)
-        free = self.prior[self.rows(axis)[1]] > 0
-        if ratio < CONTRACTION_LIMIT:
-            text = f"the plan does not determine the {axis} ratio"
-        elif backlash < CONTRACTION_LIMIT:
-            text = f"the plan does not determine the {axis} backlash"
-        elif inseparable(self.exchange(axis)) or (free and one_sided(stops, axis) is not None):
-            text = self.inseparable_text(axis)
+        for name, contraction in zip(("ratio", "backlash"), self.contraction()[self.rows(axis)], strict=True):
+            if contraction < CONTRACTION_LIMIT:
+                text = f"the plan does not determine the {axis} {name}"
+                break
         else:
-            return None
-        reason = separation(stops, axis)
+            free = self.prior[self.rows(axis)[1]] > 0
+            if not (inseparable(self.exchange(axis)) or (free and one_sided(self.stops(axis), axis) is not None)):
+                return None
+            text = self.inseparable_text(axis)
+        reason = separation(self.stops(axis), axis)
         return text if reason is None else f"{text}: {reason}"
 
 
-def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = False) -> Judgement:
+def evaluated(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = False) -> PlanEvaluation:
     """Compute expected headlines of a plan at the most probable instrument.
 
     Raises:
@@ -152,7 +142,7 @@ def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = F
     gradient = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, information.pose_rad).gradient)
     covariance = gradient @ covariance_of(knowledge.precision + information.fisher) @ gradient.T
     prior = np.einsum("qi,ij,qj->q", gradient, knowledge.covariance, gradient)
-    return Judgement(information, covariance, gradient, prior)
+    return PlanEvaluation(information, covariance, gradient, prior)
 
 
 def appended(steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, run_up: np.ndarray) -> tuple[PlanStep, ...]:
@@ -161,70 +151,40 @@ def appended(steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, run_
     return continued(arrange(looks, knowledge.sheets, run_up, end.at).steps_onwards, len(steps), end.sheet)
 
 
-@dataclass(frozen=True)
-class _Remedy:
-    """Steps to append to a plan, and the judgement of the longer plan."""
-
-    addition: tuple[PlanStep, ...]
-    after: Judgement
-
-
-def _remedy(
-    steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates, axis: Axis, before: Judgement
-) -> _Remedy | None:
-    """Find the fewest looks after which the axis has no fault, on the present sheet; None if there are none."""
-    expectation = LookArrays(possible.looks, knowledge, False).at(knowledge.z, knowledge.space)
-    rows = before.rows(axis)
-    precision = knowledge.precision + before.information.fisher
-    search = Search(expectation.rows[..., :-2], precision, before.gradient[rows], np.zeros(len(rows)), "A")
+def _fault(
+    steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates | None, plan: PlanEvaluation, axis: Axis
+) -> PlanFault | None:
+    """Describe the fault of an axis with the fewest looks on the present sheet that correct it; None without one."""
+    text = plan.fault(axis)
+    if text is None or possible is None:
+        return None if text is None else PlanFault(axis, text)
+    seen, rows = LookArrays(possible.looks, knowledge, False).at(knowledge.z, knowledge.space), plan.rows(axis)
+    precision = knowledge.precision + plan.information.fisher
+    search = Search(seen.rows[..., :-2], precision, plan.gradient[rows], np.zeros(len(rows)), "A")
     sheet = run_plan(steps, knowledge.rig).sheet
     allowed = possible.looks.sheet == (knowledge.sheets.index(sheet) if sheet in knowledge.sheets else 0)
     picks = np.array(search.among(allowed).greedy(ADDED_LOOKS_MAX), dtype=int)
     for count in range(1, len(picks) + 1):
         addition = appended(steps, possible.looks[picks[:count]], knowledge, possible.run_up)
-        after = judge((*steps, *addition), knowledge)
+        after = evaluated((*steps, *addition), knowledge)
         if after.fault(axis) is None:
-            return _Remedy(addition, after)
-    return None
+            looks = f"{plural(count, 'more look')}, {describe_looks(knowledge.rig, addition, steps)}"
+            text += f"; smallest addition: {looks}: u of the {axis} ratio {plan.u(axis):.2g} -> {after.u(axis):.2g} "
+            return PlanFault(axis, f"{text}deg/step", actions_of(addition), after.u(axis))
+    return PlanFault(axis, f"{text}; up to {ADDED_LOOKS_MAX} more looks do not change that on this rig")
 
 
 def beyond_limits(limits: CounterLimits, moves: Sequence[Move]) -> list[str]:
     """Describe axes beyond the limits of `[positioner]` in sentences."""
-    faults = []
-    for axis in AXES:
-        counters = [getattr(move, f"{axis}_steps") for move in moves]
-        lowest, highest = min(counters), max(counters)
-        if not (limits.allow(axis, lowest) and limits.allow(axis, highest)):
-            faults.append(f"{axis} moves from {lowest} to {highest} steps; [positioner] allows {limits.words(axis)}")
-    return faults
+    made = {axis: [getattr(move, f"{axis}_steps") for move in moves] for axis in AXES}
+    return [
+        f"{axis} moves from {min(counters)} to {max(counters)} steps; [positioner] allows {limits.words(axis)}"
+        for axis, counters in made.items()
+        if not (limits.allow(axis, min(counters)) and limits.allow(axis, max(counters)))
+    ]
 
 
-def _fault(
-    steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates | None, plan: Judgement, axis: Axis, text: str
-) -> PlanFault:
-    """Build a fault with its smallest addition, if there are candidates."""
-    before = plan.u(axis)
-    if possible is None:
-        return PlanFault(axis, text)
-    remedy = _remedy(steps, knowledge, possible, axis, plan)
-    if remedy is None:
-        return PlanFault(axis, f"{text}; up to {ADDED_LOOKS_MAX} more looks do not change that on this rig")
-    looks, after = sum(s.action == "look" for s in remedy.addition), remedy.after.u(axis)
-    looks_text = f"{plural(looks, 'more look')}, {describe_looks(knowledge.rig, remedy.addition, steps)}"
-    text += f"; smallest addition: {looks_text}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
-    return PlanFault(axis, text, actions_of(remedy.addition), after)
-
-
-def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:
-    """Return the looks that the rig can make; add a warning where there are none."""
-    try:
-        return candidates(knowledge)
-    except InputError as error:
-        warnings.append(f"no looks can be added on this rig: {error.message}")
-        return None
-
-
-def _few_stops(knowledge: Knowledge, plan: Judgement) -> list[str]:
+def _few_stops(knowledge: Knowledge, plan: PlanEvaluation) -> list[str]:
     """Describe directions with too few stops for their scatter in a sentence."""
     counts = few_stops(plan.information.moves, plan.information.seen_moves)
     free, index = np.asarray(knowledge.space.u) > 0, knowledge.space.mechanism.index
@@ -232,7 +192,7 @@ def _few_stops(knowledge: Knowledge, plan: Judgement) -> list[str]:
     return [f"few stops ({counts_text}): too few to estimate their scatter; add stops"] if counts_text else []
 
 
-def _few_counters(knowledge: Knowledge, plan: Judgement) -> list[str]:
+def _few_counters(knowledge: Knowledge, plan: PlanEvaluation) -> list[str]:
     """Describe axes with too few counters to separate gear error and ratio in sentences."""
     gears, notes = knowledge.gears, list[str]()
     if not gears.size:
@@ -250,15 +210,6 @@ def _few_counters(knowledge: Knowledge, plan: Judgement) -> list[str]:
     return notes
 
 
-def _with_gears(knowledge: Knowledge, steps: Sequence[PlanStep], possible: Candidates | None) -> Knowledge:
-    """Add errors of gears over the counters of the plan and of all candidates."""
-    log = run_plan(steps, knowledge.rig)
-    looks = [log.moves[look.move] for look in log.looks]
-    reached = np.array([(move.pan_steps, move.tilt_steps) for move in looks]).reshape(-1, 2)
-    reached = reached if possible is None else np.concatenate([reached, possible.looks.steps])
-    return knowledge.with_gears(reached) if len(reached) else knowledge
-
-
 def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = None) -> PlanCheck:
     """Find faults of a plan on a rig, in words, and the smallest addition that corrects each (formulation 6).
 
@@ -270,42 +221,45 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = N
     Raises:
         InputError: a plan that looks at nothing or places an unknown sheet.
     """
-    knowledge = prior_knowledge(rig)
-    with Job({JUDGING: judging_seconds(), CURING: CURED_SECONDS}, progress) as job:
+    knowledge, warnings = prior_knowledge(rig), list[str]()
+
+    def possible() -> Candidates | None:
+        try:
+            return candidates(knowledge)
+        except InputError as error:
+            warnings.append(f"no looks can be added on this rig: {error.message}")
+            return None
+
+    with Job({JUDGING: evaluation_seconds(), CURING: CURED_SECONDS}, progress) as job:
         job.begin(JUDGING)
-        possible, warnings = None, list[str]()
-        if knowledge.gears_vary:
-            possible = _candidates(knowledge, warnings)
-            knowledge = _with_gears(knowledge, steps, possible)
-        plan = judge(steps, knowledge)
+        pool = possible() if knowledge.gears_vary else None
+        log = run_plan(steps, rig)
+        reached = [(log.moves[look.move].pan_steps, log.moves[look.move].tilt_steps) for look in log.looks]
+        if reached:
+            # Errors of the gears over the counters of the plan and of all candidates.
+            knowledge = knowledge.with_gears(np.array(reached + ([] if pool is None else pool.looks.steps.tolist())))
+        plan = evaluated(steps, knowledge)
         job.begin(CURING)
-        information = plan.information
-        looks, in_view = len(information.look_moves), int(information.expectation.seen.sum())
+        looks, in_view = len(plan.information.look_moves), int(plan.information.expectation.seen.sum())
         if in_view < looks:
             warnings.append(f"{looks - in_view} of {looks} looks miss an image at the most probable instrument")
-        warnings += beyond_limits(rig.limits, information.moves)
-        texts = {axis: text for axis in AXES if (text := plan.fault(axis)) is not None}
-        if texts and not knowledge.gears_vary:
-            possible = _candidates(knowledge, warnings)
-        faults = tuple(_fault(steps, knowledge, possible, plan, axis, text) for axis, text in texts.items())
-    warnings += [fault.text for fault in faults]
-    warnings += _few_counters(knowledge, plan)
-    warnings += _few_stops(knowledge, plan)
+        warnings += beyond_limits(rig.limits, plan.information.moves)
+        if not knowledge.gears_vary and any(plan.fault(axis) is not None for axis in AXES):
+            pool = possible()
+        found = (_fault(steps, knowledge, pool, plan, axis) for axis in AXES)
+        faults = tuple(fault for fault in found if fault is not None)
+    warnings += [fault.text for fault in faults] + _few_counters(knowledge, plan) + _few_stops(knowledge, plan)
     placed = {s.target for s in steps if s.action == "place"}
     if len({rig.sheets_mm[name] for name in placed}) == 1 and len(rig.sheets_mm) > 1:
-        warnings.append(
-            "all looks are at one depth: a second sheet position lowers u of ratios; place "
-            + ", ".join(name for name in knowledge.sheets if name not in placed)
-        )
-    u, shares = np.sqrt(np.diag(plan.covariance)), plan.contraction()
+        others = ", ".join(name for name in knowledge.sheets if name not in placed)
+        warnings.append(f"all looks are at one depth: a second sheet position lowers u of ratios; place {others}")
+    u, shares = np.sqrt(np.diag(plan.covariance)).tolist(), plan.contraction().tolist()
     return PlanCheck(
         looks=looks,
         seen=in_view,
-        minutes=information.minutes,
-        expected=dict(zip(TARGET_ROWS, map(float, u), strict=True)),
-        contraction={
-            name: None if math.isnan(share) else float(share) for name, share in zip(TARGET_ROWS, shares, strict=True)
-        },
+        minutes=plan.information.minutes,
+        expected=dict(zip(TARGET_ROWS, u, strict=True)),
+        contraction={n: None if math.isnan(share) else share for n, share in zip(TARGET_ROWS, shares, strict=True)},
         faults=faults,
         warnings=tuple(warnings),
     )

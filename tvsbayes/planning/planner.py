@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -23,7 +23,6 @@ from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_p
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
 from tvsbayes.planning.assurance import Assurance, Family, instrument_gears
-from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.drawn_rigs import Instruments, alike, draw_instruments
 from tvsbayes.planning.expectation import (
     Expectation,
@@ -33,22 +32,17 @@ from tvsbayes.planning.expectation import (
     knowledge_of,
     prior_knowledge,
 )
-from tvsbayes.planning.forecast import (
-    ClassicAnswer,
-    ClassicForecast,
-    classic_answer,
-    classic_forecast,
-    value_of_classic,
-)
+from tvsbayes.planning.forecast import ClassicAnswer, classic_answer, classic_forecast, value_of_classic
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
-from tvsbayes.planning.looks import LookArrays, Looks, covariance_of, looks_wait
-from tvsbayes.planning.plan_check import JUDGING, Judgement, judge, judging_seconds
-from tvsbayes.planning.search import LADDER, DesignProblem, Refined, Scope, design_family, refine, smallest_design
+from tvsbayes.planning.looks import LookArrays, Looks, looks_wait
+from tvsbayes.planning.plan_check import JUDGING, PlanEvaluation, evaluated, evaluation_seconds
+from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family, refine
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.plan_record import Advice, Batch
 from tvsbayes.results.records import Record
 from tvsbayes.statistics.chances import ASSURED, share_error
+from tvsbayes.statistics.optimal_design import covariance_of, smallest_design
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
@@ -145,47 +139,8 @@ BASELINE_DRAWS = 20
 """Drawn instruments at which other protocols are evaluated, move by move."""
 IN_VIEW = 0.9
 """Share of the looks of a plan that half of the drawn instruments see at least, without a note."""
-
-
-def _baselines(
-    knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None, instruments: Instruments
-) -> list[Baseline]:
-    """Evaluate the paper's protocol, its mixture of step counts and starts, and the grid, on this rig's sheets."""
-    sheets = knowledge.sheets
-    plans: dict[str, tuple[PlanStep, ...]] = {}
-    if len(sheets) > 1:
-        pair = sheets[0], sheets[1]
-        plans = {"paper": paper_protocol(targets=pair), "mixed": mixed_protocol(targets=pair)}
-    plans["grid"] = grid_protocol(targets=sheets[:3])
-    places = [
-        replace(knowledge, z=z, space=instruments.space_of(row), gears=instrument_gears(knowledge, physical))
-        for row, (z, physical) in enumerate(
-            zip(instruments.z[:BASELINE_DRAWS], instruments.physical[:BASELINE_DRAWS], strict=True)
-        )
-    ]
-    found = []
-    for name, steps in plans.items():
-        each = [baseline_of(name, information_of(steps, at, aperture=aperture), at, target, pose_rad) for at in places]
-        seen, joint = (float(np.median([getattr(one, key) for one in each])) for key in ("seen", "joint"))
-        found.append(structs.replace(each[0], seen=int(seen), joint=joint if math.isfinite(joint) else None))
-    return found
-
-
-def baseline_of(
-    name: str, information: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
-) -> Baseline:
-    """Evaluate a plan at one instrument; ratios are at `pose_rad`, by default the plan's, as in a fit.
-
-    The target is infinite where no beam of the instrument reaches the target's point.
-    """
-    pose = information.pose_rad if pose_rad is None else pose_rad
-    try:
-        at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
-        value = at.value(covariance_of(knowledge.precision + information.fisher), target.factor)
-    except InputError:
-        value = math.inf
-    in_view = int(information.expectation.seen.sum())
-    return Baseline(name, len(information.look_moves), in_view, information.minutes, value)
+LOOKING, CHOOSING = "looking from every place", "choosing looks"
+COUNTING, EXCHANGING = "counting experiments", "exchanging looks"
 
 
 def plan(
@@ -231,121 +186,8 @@ def plan(
     if like is not None:
         knowledge = alike(knowledge, knowledge_of(like, rig))
     campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
-    scope = Scope(criterion, aperture, largest, minutes)
+    scope = Scope(criterion, aperture, largest, math.inf if minutes is None else minutes)
     return plan_from(knowledge, target, campaign, pose, scope=scope, draws=draws, seed=seed, progress=progress)
-
-
-def _curve(
-    assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], size: _Size, plan: Refined
-) -> tuple[CurveRow, ...]:
-    """Compute results of up to n experiments, for each size; that of the plan has the plan's own looks.
-
-    Noise scales estimated from few stops make values vary from size to size. A row states the best of all sizes up to
-    its own, so that more experiments never appear worse. The best of several estimates has an optimistic bias.
-    """
-    target, draws = assurance.target, len(assurance.instruments)
-    rows, best_value, best_share = [], math.inf, 0.0
-    for n in size.sizes:
-        reported = plan.reported if n == size.experiments else assurance.values([n])[n]
-        best_value = min(best_value, float(np.median(reported)))
-        best_share = max(best_share, float(np.mean(reported <= target.limit)))
-        classic_value = value_of_classic(forecast, target, n)
-        joint = best_value if math.isfinite(best_value) else None
-        rows.append(CurveRow(n, durations[n], classic_value, joint, best_share, share_error(best_share, draws)))
-    return tuple(rows)
-
-
-def few_looks(looks: Looks, target: Target) -> list[str]:
-    """Write notes on directions with too few stops in a design for reliable intervals.
-
-    Every look of a design is a separate stop.
-    """
-    notes = []
-    sides = {d: looks.side[:, AXES.index(axis)] == sign for d, (axis, sign) in DIRECTION_SIGNS.items()}
-    for direction, stops in too_few({d: int(np.sum(reached)) for d, reached in sides.items()}).items():
-        reached = f"only {plural(stops, 'stop')} {direction}"
-        remedy = "plan u(worst), which asks for every direction"
-        if target.quantity == "worst":
-            remedy = f"look more often: {FEW_STOPS} stops determine their scatter"
-        notes.append(f"{reached}: this plan is for its target only; for reliable intervals of {direction} {remedy}")
-    return notes
-
-
-def design_problem(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> DesignProblem:
-    """Build the candidates for an instrument, and a target there.
-
-    Raises:
-        InputError: nothing to look at or in view; a fixed target.
-    """
-    possible = candidates(knowledge)
-    knowledge = knowledge.with_gears(possible.looks.steps)
-    expectation = LookArrays(possible.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
-    pose = expectation.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
-    at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
-    problem = DesignProblem(knowledge, possible, expectation, target, at_centre)
-    if problem.now == 0:
-        raise InputError(
-            "target",
-            f"{target.quantity} is held fixed by the rig (u = 0): no plan changes its uncertainty",
-            column="--target",
-            found=target.text,
-            allowed="a quantity that is to be estimated",
-            remedy="state u > 0 for it in [rig.prior], or another target",
-        )
-    return problem
-
-
-def _durations(family: Family, scope: Scope) -> dict[int, float]:
-    """Compute minutes by number of experiments, for those that the time allows."""
-    durations = {n: family.arranged(n).minutes(family.knowledge.rig) for n in range(1, scope.largest + 1)}
-    allowed = {n: minutes for n, minutes in durations.items() if scope.minutes is None or minutes <= scope.minutes}
-    if not allowed:
-        raise InputError(
-            "minutes",
-            f"one experiment of four looks takes {durations[1]:.1f} minutes",
-            column="--minutes",
-            allowed=f"at least {durations[1]:.1f}",
-            remedy="allow more minutes, or lower [costs] if the machine is faster",
-        )
-    return allowed
-
-
-@dataclass(frozen=True)
-class _Size:
-    """Number of experiments, the sizes of the curve, and the smallest with an assurance of 80 % and 95 %."""
-
-    sizes: tuple[int, ...]
-    n80: int | None
-    n95: int | None
-    experiments: int
-
-
-def _size(assurance: Assurance, durations: Mapping[int, float], advance: Advance) -> _Size:
-    largest = max(durations)
-    sizes = sorted({n for n in LADDER if n <= largest} | {largest})
-    assurance.values(sizes, advance)
-
-    def smallest(level: float) -> int | None:
-        return smallest_design(lambda n: assurance.met_share(n) >= level, sizes)
-
-    n80, n95 = map(smallest, ASSURED)
-    shown = sorted({*sizes, *(n for n in (n80, n95) if n)})
-    return _Size(tuple(shown), n80, n95, n95 or n80 or largest)
-
-
-LOOKING, CHOOSING = "looking from every place", "choosing looks"
-COUNTING, EXCHANGING = "counting experiments", "exchanging looks"
-
-
-def _stages(draws: int) -> dict[str, float]:
-    """Return the stages of planning with expected seconds."""
-    return {
-        LOOKING: 0.1 + looks_wait(),
-        CHOOSING: 2.5,
-        COUNTING: 2.0 * draws / PLAN_DRAWS,
-        EXCHANGING: 3.0,
-        JUDGING: judging_seconds(),
-    }
 
 
 def plan_from(
@@ -360,74 +202,151 @@ def plan_from(
     progress: Show | None = None,
 ) -> PlanResult:
     """Plan from knowledge; effective ratios are at `pose_rad`, by default in the middle of the candidates."""
-    with Job(_stages(draws), progress) as job:
-        return _plan_in_stages(knowledge, target, campaign, pose_rad, scope, draws, seed, job)
+    counting = {COUNTING: 2.0 * draws / PLAN_DRAWS, EXCHANGING: 3.0, JUDGING: evaluation_seconds()}
+    with Job({LOOKING: 0.1 + looks_wait(), CHOOSING: 2.5, **counting}, progress) as job:
+        job.begin(LOOKING)
+        problem = DesignProblem.of(knowledge, target, pose_rad, scope.aperture)
+        knowledge = problem.knowledge
+        job.begin(CHOOSING)
+        family = design_family(problem, scope, job.at)
+        durations = _durations(family, scope)
+        job.begin(COUNTING)
+        assurance = Assurance(family, target, draw_instruments(knowledge, draws, seed), seed)
+        sizes, n80, n95 = _sizes(assurance, durations, job.at)
+        experiments = n95 or n80 or max(durations)
+        job.begin(EXCHANGING)
+        planned, reported = refine(assurance, problem, experiments, scope, job.at)
+        job.begin(JUDGING)
+        steps = planned.arranged(experiments).steps
+        evaluation = evaluated(steps, knowledge, aperture=scope.aperture)
+        values = assurance.values(sizes) | {experiments: reported}
+        forecast = classic_forecast(knowledge, assurance.instruments)
+        curve = _curve(values, target, {n: value_of_classic(forecast, target, n) for n in values}, durations)
+        row = next(row for row in curve if row.experiments == experiments)
+        information, looks = evaluation.information, planned.looks(experiments)
+        in_view = LookArrays(looks, knowledge, scope.aperture).in_images(assurance.instruments.z).sum(axis=1)
+        baseline = Baseline("planned", len(looks), int(np.median(in_view)), information.minutes, row.joint)
+        of_largest = problem.information(family.picks, family.arranged(family.largest))
+        limit = limit_of(knowledge, of_largest, problem.at_centre, target)
+        batches = next_experiments(problem) if knowledge.after_data else ()
+        result = PlanResult(
+            target=target,
+            steps=(replace(steps[0], made_for=target.text), *steps[1:]),
+            experiments=experiments,
+            looks=len(planned.picks),
+            minutes=information.minutes,
+            now=problem.now,
+            expected=row.joint,
+            assurance=row.assurance,
+            assurance_se=row.assurance_se,
+            curve=curve,
+            n80=n80,
+            n95=n95,
+            limit=limit,
+            shares=split_of(knowledge, information.fisher, _by_pixels(information.expectation), problem.at_centre),
+            baselines=(baseline, *_baselines(knowledge, target, scope.aperture, pose_rad, assurance.instruments)),
+            next=batches,
+            stop=stop_now(problem.now, target, limit, batches, knowledge.after_data),
+            classic=classic_answer(target, forecast, campaign),
+            met=row.assurance >= ASSURED[0],
+            notes=(*problem.candidates.notes, *_notes(baseline, looks, target, evaluation)),
+            draws=draws,
+            seed=seed,
+            criterion=scope.criterion,
+        )
+    if not knowledge.after_data or problem.now > target.limit:
+        return result
+    none = {"steps": (), "experiments": 0, "looks": 0, "minutes": 0.0, "assurance": None, "assurance_se": None}
+    return structs.replace(result, **none, expected=problem.now, met=True, notes=problem.candidates.notes)
 
 
-def _plan_in_stages(
-    knowledge: Knowledge,
+def _sizes(
+    assurance: Assurance, durations: Mapping[int, float], advance: Advance
+) -> tuple[list[int], int | None, int | None]:
+    """Find the sizes of the curve, and the smallest with an assurance of 80 % and of 95 %."""
+    sizes = sorted({n for n in LADDER if n in durations} | {max(durations)})
+    assurance.values(sizes, advance)
+
+    def smallest(level: float) -> int | None:
+        return smallest_design(lambda n: assurance.met_share(n) >= level, sizes)
+
+    n80, n95 = map(smallest, ASSURED)
+    return sorted({*sizes, *(n for n in (n80, n95) if n)}), n80, n95
+
+
+def _durations(family: Family, scope: Scope) -> dict[int, float]:
+    """Compute minutes by number of experiments, for those that the time allows."""
+    durations = {n: family.arranged(n).minutes(family.knowledge.rig) for n in range(1, scope.largest + 1)}
+    if durations[1] > scope.minutes:
+        raise InputError(
+            "minutes",
+            f"one experiment of four looks takes {durations[1]:.1f} minutes",
+            column="--minutes",
+            allowed=f"at least {durations[1]:.1f}",
+            remedy="allow more minutes, or lower [costs] if the machine is faster",
+        )
+    return {n: minutes for n, minutes in durations.items() if minutes <= scope.minutes}
+
+
+def _curve(
+    values: Mapping[int, np.ndarray],
     target: Target,
-    campaign: Campaign | None,
-    pose_rad: np.ndarray | None,
-    scope: Scope,
-    draws: int,
-    seed: int,
-    job: Job,
-) -> PlanResult:
-    job.begin(LOOKING)
-    problem = design_problem(knowledge, target, pose_rad, scope.aperture)
-    knowledge = problem.knowledge
-    job.begin(CHOOSING)
-    family = design_family(problem, scope, job.at)
-    durations = _durations(family, scope)
-    job.begin(COUNTING)
-    assurance = Assurance(family, target, draw_instruments(knowledge, draws, seed), seed)
-    forecast = classic_forecast(knowledge, assurance.instruments)
-    size = _size(assurance, durations, job.at)
-    job.begin(EXCHANGING)
-    refined = refine(family, problem, size.experiments, scope, assurance, job.at)
-    job.begin(JUDGING)
-    steps = refined.family.arranged(size.experiments).steps
-    judgement = judge(steps, knowledge, aperture=scope.aperture)
-    curve = _curve(assurance, forecast, durations, size, refined)
-    row = next(row for row in curve if row.experiments == size.experiments)
-    looks = refined.family.looks(size.experiments)
-    in_view = LookArrays(looks, knowledge, scope.aperture).in_images(assurance.instruments.z).sum(axis=1)
-    planned = Baseline("planned", len(looks), int(np.median(in_view)), judgement.information.minutes, row.joint)
-    largest_information = problem.information(family.picks, family.arranged(family.largest))
-    limit = limit_of(knowledge, largest_information, problem.at_centre, target)
-    pixel_information = _pixel_part(judgement.information.expectation)
-    batches = next_experiments(problem) if knowledge.after_data else ()
-    met_already = knowledge.after_data and problem.now <= target.limit
-    notes = _notes(planned, looks, target, judgement)
-    return PlanResult(
-        target=target,
-        steps=() if met_already else (replace(steps[0], made_for=target.text), *steps[1:]),
-        experiments=0 if met_already else size.experiments,
-        looks=0 if met_already else len(refined.family.picks),
-        minutes=0.0 if met_already else judgement.information.minutes,
-        now=problem.now,
-        expected=problem.now if met_already else row.joint,
-        assurance=None if met_already else row.assurance,
-        assurance_se=None if met_already else row.assurance_se,
-        curve=curve,
-        n80=size.n80,
-        n95=size.n95,
-        limit=limit,
-        shares=split_of(knowledge, judgement.information.fisher, pixel_information, problem.at_centre),
-        baselines=(planned, *_baselines(knowledge, target, scope.aperture, pose_rad, assurance.instruments)),
-        next=batches,
-        stop=stop_now(problem.now, target, limit, batches, knowledge.after_data),
-        classic=classic_answer(target, forecast, campaign),
-        met=met_already or row.assurance >= ASSURED[0],
-        notes=(*problem.candidates.notes, *([] if met_already else notes)),
-        draws=draws,
-        seed=seed,
-        criterion=scope.criterion,
-    )
+    classic: Mapping[int, float | None],
+    durations: Mapping[int, float],
+) -> tuple[CurveRow, ...]:
+    """Compute results of up to n experiments from the values (draws,) that fits of n experiments report.
+
+    Noise scales estimated from few stops make values vary from size to size. A row states the best of all sizes up to
+    its own, so that more experiments never appear worse. The best of several estimates has an optimistic bias.
+    """
+    rows, best_value, best_share = [], math.inf, 0.0
+    for n, reported in values.items():
+        best_value = min(best_value, float(np.median(reported)))
+        best_share = max(best_share, float(np.mean(reported <= target.limit)))
+        joint = best_value if math.isfinite(best_value) else None
+        rows.append(CurveRow(n, durations[n], classic[n], joint, best_share, share_error(best_share, len(reported))))
+    return tuple(rows)
 
 
-def _notes(planned: Baseline, looks: Looks, target: Target, judgement: Judgement) -> list[str]:
+def _baselines(
+    knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None, instruments: Instruments
+) -> list[Baseline]:
+    """Evaluate the paper's protocol, its mixture of step counts and starts, and the grid, on this rig's sheets."""
+    plans = {"grid": grid_protocol(targets=knowledge.sheets[:3])}
+    if len(knowledge.sheets) > 1:
+        pair = knowledge.sheets[0], knowledge.sheets[1]
+        plans = {"paper": paper_protocol(targets=pair), "mixed": mixed_protocol(targets=pair), **plans}
+    physical = instruments.physical[:BASELINE_DRAWS]
+    places = [
+        replace(knowledge, z=z, space=instruments.space_of(row), gears=instrument_gears(knowledge, values))
+        for row, (z, values) in enumerate(zip(instruments.z, physical, strict=False))
+    ]
+    found = []
+    for name, steps in plans.items():
+        each = [baseline_of(name, information_of(steps, at, aperture=aperture), at, target, pose_rad) for at in places]
+        seen, joint = (float(np.median([getattr(one, key) for one in each])) for key in ("seen", "joint"))
+        found.append(structs.replace(each[0], seen=int(seen), joint=joint if math.isfinite(joint) else None))
+    return found
+
+
+def baseline_of(
+    name: str, information: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
+) -> Baseline:
+    """Evaluate a plan at one instrument; ratios are at `pose_rad`, by default the plan's, as in a fit.
+
+    The target is infinite where no beam of the instrument reaches the target's point.
+    """
+    pose = information.pose_rad if pose_rad is None else pose_rad
+    try:
+        at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
+        value = at.value(covariance_of(knowledge.precision + information.fisher), target.factor)
+    except InputError:
+        value = math.inf
+    in_view = int(information.expectation.seen.sum())
+    return Baseline(name, len(information.look_moves), in_view, information.minutes, value)
+
+
+def _notes(planned: Baseline, looks: Looks, target: Target, evaluation: PlanEvaluation) -> list[str]:
     """Write notes on what a plan leaves open."""
     notes = few_looks(looks, target)
     if planned.seen < IN_VIEW * len(looks):
@@ -435,13 +354,28 @@ def _notes(planned: Baseline, looks: Looks, target: Target, judgement: Judgement
             f"half of the drawn instruments see at most {planned.seen} of the {len(looks)} looks: state in [rig.prior] "
             "and [truth] more closely where the positioner stands (extrinsics), or plan --like a campaign of that build"
         )
-    notes += [judgement.inseparable_text(axis) for axis in AXES if inseparable(judgement.exchange(axis))]
-    return notes
+    return notes + [evaluation.inseparable_text(axis) for axis in AXES if inseparable(evaluation.exchange(axis))]
 
 
-def _pixel_part(expectation: Expectation) -> np.ndarray:
+def few_looks(looks: Looks, target: Target) -> list[str]:
+    """Write notes on directions with too few stops in a design for reliable intervals.
+
+    Every look of a design is a separate stop.
+    """
+    remedy = "plan u(worst), which asks for every direction"
+    if target.quantity == "worst":
+        remedy = f"look more often: {FEW_STOPS} stops determine their scatter"
+    stops = {d: int(np.sum(looks.side[:, AXES.index(axis)] == sign)) for d, (axis, sign) in DIRECTION_SIGNS.items()}
+    return [
+        f"only {plural(count, 'stop')} {direction}: this plan is for its target only; for reliable intervals "
+        f"of {direction} {remedy}"
+        for direction, count in too_few(stops).items()
+    ]
+
+
+def _by_pixels(expectation: Expectation) -> np.ndarray:
     """Compute the part of pixel noise alone in the information, (C^-1 J)^T (C^-1 J), shape (p + e, p + e)."""
-    spots = LinearSpots(
+    looks = LinearSpots(
         residual=np.zeros(expectation.jacobian.shape[:2]),
         load=np.asarray(expectation.load),
         renewed=np.asarray(expectation.keep) == 0,
@@ -449,5 +383,5 @@ def _pixel_part(expectation: Expectation) -> np.ndarray:
         jacobian=np.asarray(expectation.jacobian),
         places=np.zeros((*expectation.jacobian.shape[:2], 0)),
     )
-    gain = np.concatenate([group.jacobian for group in stop_information(spots).groups])
+    gain = np.concatenate([group.jacobian for group in stop_information(looks).groups])
     return gain.T @ gain

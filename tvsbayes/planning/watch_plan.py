@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy import linalg
 
 from tvsbayes.comparison.departures import (
     FALSE_ALARM_RATE,
@@ -40,8 +41,8 @@ from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.planning.candidates import counter_range, have_room, run_up_steps, sheet_choices
 from tvsbayes.planning.expectation import home_variances_rad2
 from tvsbayes.planning.looks import run_up_start
-from tvsbayes.planning.search import smallest_design
 from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
+from tvsbayes.statistics.optimal_design import Prospects, covariance_of, smallest_design
 from tvsbayes.statistics.streams import Stream, random_stream
 
 PATTERN_MAX = 12
@@ -49,8 +50,22 @@ PATTERN_MAX = 12
 CANDIDATES_MAX = 32
 CHANGE_DIRECTIONS = 24
 """Number of directions of a change for judging patterns."""
+MINUTES = 10.0
+"""Default limit of the duration of a plan, minutes."""
+HOMINGS_MAX = 3000
+"""Largest number of homings on a sheet that is stated as needed."""
+HOMING_COUNTS: tuple[int, ...] = tuple(np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int)).tolist())
+"""Trial numbers of homings, before bisection between two of them."""
+BISECTED_MAX = 12
+"""Largest number of patterns for which the fewest homings are found."""
+CORRECTIONS = 4
+"""Largest number of increases by a tenth where the plan's own moves have less power than independent stops."""
 NONCENTRALITY_ENOUGH = 20.0
 """Noncentrality at which a test of three components, at 1 % over eight tests, has a power of 80 %."""
+
+
+type Pattern = dict[str, tuple[int, ...]]
+"""Numbers of the candidates to look at after a homing, by sheet."""
 
 
 @dataclass(frozen=True)
@@ -59,43 +74,26 @@ class Candidate:
 
     steps: tuple[int, int]
     side: tuple[int, int]
-    target: str
     spot: Look
 
 
 def _candidates(campaign: Campaign, spots: Sequence[Look], used: np.ndarray) -> list[Candidate]:
     """List one look of each kind, at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
-    rests = [rests_of(campaign.moves, axis) for axis in AXES]
-    by_place: dict[tuple, Candidate] = {}
-    for row, spot in enumerate(spots):
-        rests_here = [rests[axis][spot.move] for axis in range(2)]
-        side = rests_here[0].sign, rests_here[1].sign
-        if used[row] and all(side):
-            steps = rests_here[0].steps, rests_here[1].steps
-            by_place.setdefault((steps, side, spot.target), Candidate(steps, side, spot.target, spot))
-    if not by_place:
+    by_move = list(zip(*(rests_of(campaign.moves, axis) for axis in AXES), strict=True))
+    kinds: dict[tuple, Candidate] = {}
+    for spot in (spot for spot, use in zip(spots, used, strict=True) if use):
+        pan, tilt = by_move[spot.move]
+        if pan.sign and tilt.sign:
+            look = Candidate((pan.steps, tilt.steps), (pan.sign, tilt.sign), spot)
+            kinds.setdefault((look.steps, look.side, spot.target), look)
+    if not kinds:
         return []
-    all_steps = np.array([candidate.steps for candidate in by_place.values()], dtype=float)
-    middle, width = all_steps.mean(axis=0), np.maximum(np.ptp(all_steps, axis=0), 1.0)
-    outer = sorted(by_place.values(), key=lambda candidate: -float(np.max(np.abs((candidate.steps - middle) / width))))
+    steps = np.array([look.steps for look in kinds.values()], dtype=float)
+    distance = np.max(np.abs((steps - steps.mean(axis=0)) / np.maximum(np.ptp(steps, axis=0), 1.0)), axis=1)
     sheets: dict[str, list[Candidate]] = {}
-    for candidate in outer:
-        sheet_candidates = sheets.setdefault(candidate.target, [])
-        if len(sheet_candidates) < CANDIDATES_MAX:
-            sheet_candidates.append(candidate)
-    return [candidate for sheet_candidates in sheets.values() for candidate in sheet_candidates]
-
-
-@dataclass(frozen=True)
-class Pattern:
-    """Numbers of the candidates to look at after a homing, by sheet."""
-
-    looks: dict[str, tuple[int, ...]]
-
-    @property
-    def size(self) -> int:
-        """Count the looks with one homing on every sheet."""
-        return sum(map(len, self.looks.values()))
+    for _, look in sorted(zip(-distance, kinds.values(), strict=True), key=lambda pair: pair[0]):
+        sheets.setdefault(look.spot.target, []).append(look)
+    return [look for looks in sheets.values() for look in looks[:CANDIDATES_MAX]]
 
 
 def _rig_of(campaign: Campaign, spots: Sequence[Look], used: np.ndarray) -> Rig:
@@ -122,11 +120,9 @@ class WatchDesigns:
         self.campaign = homed(fit.campaign, fit.sides)
         self.z = noise_draws(fit, 2, seed).centre
         self._home_variances = home_variances_rad2(fit.z, fit.space)
-        spots = ordered_spots(self.campaign)
-        used = fit.arrays.used
+        spots, used = ordered_spots(self.campaign), fit.arrays.used
         self.rig = _rig_of(self.campaign, spots, used) if rig is None else rig
-        all_candidates = _candidates(self.campaign, spots, used)
-        self.candidates = [look for look in all_candidates if self._reachable(look)]
+        self.candidates = [look for look in _candidates(self.campaign, spots, used) if self._reachable(look)]
         if not self.candidates:
             raise InputError(
                 "no-look",
@@ -153,54 +149,47 @@ class WatchDesigns:
     @cached_property
     def _limits(self) -> np.ndarray:
         """Return the lowest and highest counter of (pan, tilt): the rig's, else those of the campaign; (2, 2)."""
-        return counter_range(self.rig.limits, counters_made(self.campaign.moves)).limits
+        return counter_range(self.rig.limits, counters_made(self.campaign.moves))[0]
 
-    def _reachable(self, candidate: Candidate) -> bool:
-        if candidate.target not in self.rig.depths_mm:
+    def _reachable(self, look: Candidate) -> bool:
+        if look.spot.target not in self.rig.depths_mm:
             return False
-        steps, side = np.array(candidate.steps), np.array(candidate.side)
-        return bool(have_room(steps, side, self._limits, self._run_up))
+        return bool(have_room(np.array(look.steps), np.array(look.side), self._limits, self._run_up))
 
     def _prepare(self, linear: LinearSpots, first: int, places: list[int]) -> None:
-        """Compute the information of the first session and of every candidate (its row), stop errors integrated out."""
+        """Compute the information of the first session, and whitened rows of every candidate (its row of `linear`).
+
+        Columns are what was fitted, then the changes, then the two offsets of a homing; stop errors are integrated out.
+        """
         spelled = linear.spelled_out(linear.places)
         shifts = slice(len(self.z), len(self.z) + columns_of(self.changes)[-1].stop)
         fisher = stop_information(rows_of(spelled, slice(first))).fisher
         keep = np.r_[: shifts.start, shifts.stop : shifts.stop + linear.places.shape[2]]
         self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
-        whitened = []
-        for candidate, row in zip(self.candidates, places, strict=True):
-            slope = linear.load[row, :, :2]
-            variance = self._stop_variance(candidate)
-            columns = spelled.jacobian[row]
-            fitted = columns[:, keep].copy()
-            # The path since homing is short in these plans: only the first session informs on the contrast.
-            fitted[:, CONTRAST_COLUMNS] = 0.0
-            joined = np.concatenate([fitted, columns[:, shifts], slope], axis=1)
-            root = np.linalg.cholesky(np.eye(4) + slope @ np.diag(variance) @ slope.T)
-            whitened.append(np.linalg.solve(root, joined))
-        rows = np.array(whitened)
-        self.each = np.einsum("mia,mib->mab", rows, rows)
+        columns, slope = spelled.jacobian[places], linear.load[places, :, :2]
+        fitted = columns[..., keep]
+        # The path since homing is short in these plans: only the first session informs on the contrast.
+        fitted[..., CONTRAST_COLUMNS] = 0.0
+        sides = (np.array([look.side for look in self.candidates]) > 0).astype(int)
+        stops = self.fit.space.mechanism.stop_columns
+        stop_sd = np.radians(np.asarray(physical_at(self.z, self.fit.space).value)[stops[[0, 1], sides]])
+        root = np.linalg.cholesky(np.eye(4) + (slope * stop_sd[:, None] ** 2) @ slope.swapaxes(1, 2))
+        self._rows = np.linalg.solve(root, np.concatenate([fitted, columns[..., shifts], slope], axis=2))
+        self._each = self._rows.swapaxes(1, 2) @ self._rows
         generator = random_stream(self.seed, Stream.WATCHED_CHANGES)
         self._directions = []
         for change in self.changes:
             directions = generator.standard_normal((CHANGE_DIRECTIONS, len(change.names)))
             self._directions.append(change.size * directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
-    def _stop_variance(self, candidate: Candidate) -> np.ndarray:
-        physical = physical_at(self.z, self.fit.space).value
-        stops = self.fit.space.mechanism.stop_columns
-        columns = [stops[axis, int(side > 0)] for axis, side in enumerate(candidate.side)]
-        return np.radians([physical[column] for column in columns]) ** 2
-
     def information(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
         """Compute the information on the changes by a pattern with so many homings on every sheet, shape (q, q).
 
         With `also_before` the same looks are added to the campaign too.
         """
-        total = np.zeros((self.each.shape[1] - 2,) * 2)
-        for looks in pattern.looks.values():
-            block = self.each[list(looks)].sum(axis=0)
+        total = np.zeros((self._each.shape[1] - 2,) * 2)
+        for looks in pattern.values():
+            block = self._each[list(looks)].sum(axis=0)
             cross, offsets = block[:-2, -2:], block[-2:, -2:] + np.diag(1 / self._home_variances)
             total += homings * (block[:-2, :-2] - cross @ np.linalg.solve(offsets, cross.T))
         count = len(self.known)
@@ -214,40 +203,47 @@ class WatchDesigns:
         departure = Departure(0.0, 0, np.zeros(len(information)), information, self.changes)
         return np.array(powers(departure, np.log(FALSE_ALARM_RATE / len(self.changes)), self.seed))
 
-    def _score(self, pattern: Pattern, homings: float) -> float:
-        """Score a pattern: mean logs of insufficient noncentralities, over directions and changes."""
-        information, total = self.information(pattern, homings), 0.0
+    def _scores(self, information: np.ndarray) -> np.ndarray:
+        """Score informations (m, q, q): mean logs of insufficient noncentralities over directions of changes, (m,)."""
+        total = np.zeros(len(information))
         for rows, directions in zip(columns_of(self.changes), self._directions, strict=True):
-            shares = np.einsum("ni,ij,nj->n", directions, information[rows, rows], directions) / NONCENTRALITY_ENOUGH
-            total += float(np.mean(np.minimum(np.log(np.maximum(shares, 1e-12)), 0.0)))
+            shares = np.einsum("ni,mij,nj->mn", directions, information[:, rows, rows], directions, optimize=True)
+            total += np.mean(np.minimum(np.log(np.maximum(shares / NONCENTRALITY_ENOUGH, 1e-12)), 0.0), axis=1)
         return total
 
     def grown(self, sheets: Sequence[str], homings: float) -> list[Pattern]:
-        """Grow patterns of one look on every sheet, two and so on, by the best addition to the previous looks."""
-        pattern, patterns = Pattern(dict.fromkeys(sheets, ())), []
+        """Grow patterns of one look on every sheet, two and so on, by the best addition to the previous looks.
+
+        So many homings on a sheet are one, of looks whose noise is smaller by their root, as are the offsets.
+        """
+        count, on = len(self.known), np.array([look.spot.target for look in self.candidates])
+        fitted, shifts, slope = np.split(np.sqrt(homings) * self._rows, [count, self._rows.shape[2] - 2], axis=2)
+        rows = np.concatenate([fitted, *(np.where(on == sheet, slope.T, 0.0).T for sheet in sheets)], axis=2)
+        offsets = np.diag(np.tile(self._home_variances / homings, len(sheets)))
+        prospects = Prospects.of_shifts(rows, linalg.block_diag(covariance_of(self.known), offsets), shifts)
+        pattern: Pattern = {}
+        patterns, information = list[Pattern](), np.zeros((shifts.shape[2],) * 2)
         for _ in range(PATTERN_MAX):
             for sheet in sheets:
-                numbers = [k for k, candidate in enumerate(self.candidates) if candidate.target == sheet]
-                extensions = [Pattern({**pattern.looks, sheet: (*pattern.looks[sheet], number)}) for number in numbers]
-                pattern = max(extensions, key=lambda candidate: self._score(candidate, homings))
+                after = information + prospects.gains()
+                best = int(np.argmax(np.where(on == sheet, self._scores(after), -np.inf)))
+                pattern = {**pattern, sheet: (*pattern.get(sheet, ()), best)}
+                prospects, information = prospects.measured(best), after[best]
             patterns.append(pattern)
         return patterns
 
+    @cached_property
     def patterns(self) -> list[Pattern]:
         """Build patterns for every choice of sheets, grown for few homings and for many."""
-        names = list(dict.fromkeys(candidate.target for candidate in self.candidates))
+        names = list(dict.fromkeys(look.spot.target for look in self.candidates))
         scopes = [(sheets, homings) for sheets in sheet_choices(names, 2) for homings in (1.0, 8.0)]
         grown = [pattern for sheets, homings in scopes for pattern in self.grown(sheets, homings)]
-        return list({tuple(pattern.looks.items()): pattern for pattern in grown}.values())
+        return list({tuple(pattern.items()): pattern for pattern in grown}.values())
 
     def steps(self, pattern: Pattern, homings: int) -> tuple[PlanStep, ...]:
         """Build the plan: each sheet placed once, with the pattern after every homing."""
-        return tuple(step for step, _ in self._ordered(pattern, homings))
-
-    def _ordered(self, pattern: Pattern, homings: int) -> list[tuple[PlanStep, Look | None]]:
-        """Build the steps with the campaign's spot of each look."""
-        plan, counts = PlanBuilder(), {}
-        for sheet, looks in pattern.looks.items():
+        plan = PlanBuilder()
+        for sheet, looks in pattern.items():
             for homing in range(homings):
                 plan.home()
                 if not homing:
@@ -256,135 +252,86 @@ class WatchDesigns:
                     goal, side, at = map(np.array, (look.steps, look.side, plan.at))
                     plan.move(*map(int, run_up_start(goal, side, at, self._run_up)))
                     plan.move(*look.steps)
-                    counts[len(plan.steps)] = look.spot
                     plan.look()
-        return [(step, counts.get(step.step)) for step in plan.steps]
+        return tuple(plan.steps)
 
     def minutes(self, pattern: Pattern, homings: int) -> float:
         """Compute the duration by `[costs]`, minutes."""
         return plan_minutes(self.rig, self.steps(pattern, homings))
 
-    def judged(self, pattern: Pattern, homings: int) -> list[float]:
+    def own_powers(self, pattern: Pattern, homings: int) -> list[float]:
         """Compute powers of the plan by its own moves, at the limit of all tests together."""
-        ordered = self._ordered(pattern, homings)
-        log = run_plan([step for step, _ in ordered], self.rig)
-        seen = [spot for _, spot in ordered if spot is not None]
+        log = run_plan(self.steps(pattern, homings), self.rig)
+        taken = [self.candidates[k].spot for looks in pattern.values() for k in looks * homings]
         spots = tuple(
-            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(seen, log.looks, strict=True))
+            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(taken, log.looks, strict=True))
         )
         planned = replace(self.fit.campaign, moves=tuple(log.moves), spots=spots)
         departure = WatchedLooks(self.fit, planned).departure(self.z)
         return powers(departure, null_distribution(departure, self.seed).limit, self.seed)
 
 
-MINUTES = 10.0
-"""Default limit of the duration of a plan, minutes."""
-HOMINGS_MAX = 3000
-"""Largest number of homings on a sheet that is stated as needed."""
-HOMING_COUNTS: tuple[int, ...] = tuple(np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int)).tolist())
-"""Trial numbers of homings, before bisection between two of them."""
-BISECTED_MAX = 12
-"""Largest number of patterns for which the fewest homings are found."""
-CORRECTIONS = 4
-"""Largest number of increases by a tenth where the plan's own moves have less power than independent stops."""
+class _Trials:
+    """Every pattern t with every of `HOMING_COUNTS`: powers (t, counts, changes), looks and minutes (t, counts)."""
 
+    def __init__(self, designs: WatchDesigns):
+        self.designs, self.sizes = designs, [sum(map(len, pattern.values())) for pattern in designs.patterns]
+        self.powers = np.array([[designs.powers(each, n) for n in HOMING_COUNTS] for each in designs.patterns])
+        once, twice = (np.array([designs.minutes(each, n) for each in designs.patterns]) for n in (1, 2))
+        self._first, self._further = once, twice - once
+        self.looks = np.outer(self.sizes, HOMING_COUNTS)
+        self.minutes = once[:, None] + np.outer(self._further, np.array(HOMING_COUNTS) - 1)
 
-@dataclass(frozen=True)
-class _Trial:
-    """A pattern with its powers at `HOMING_COUNTS`, shape (counts, changes), and its duration."""
-
-    designs: WatchDesigns
-    pattern: Pattern
-    powers: np.ndarray
-    first_minutes: float
-    minutes_each: float
-
-    def looks(self, homings: int) -> int:
-        """Count the looks on all its sheets."""
-        return homings * self.pattern.size
-
-    def minutes(self, homings: int) -> float:
-        """Compute the duration with so many homings on every sheet, minutes."""
-        return self.first_minutes + (homings - 1) * self.minutes_each
+    def minutes_of(self, trial: int, homings: int) -> float:
+        """Compute the duration of a pattern with so many homings on every sheet, minutes."""
+        return float(self._first[trial] + (homings - 1) * self._further[trial])
 
     def allowed(self, minutes: float) -> np.ndarray:
-        """Mark the `HOMING_COUNTS` within a budget."""
-        return np.array([self.minutes(n) <= minutes and LOOKS_MIN <= self.looks(n) <= LOOKS_MAX for n in HOMING_COUNTS])
+        """Mark what a budget and the numbers of looks allow, shape (t, counts)."""
+        return (self.minutes <= minutes) & (self.looks >= LOOKS_MIN) & (self.looks <= LOOKS_MAX)
 
-    def first_need(self, mask: np.ndarray) -> _Need | None:
-        """Find the first of `HOMING_COUNTS` with enough power for the changes of a mask."""
-        enough = np.all(self.powers[:, mask] >= POWER_MIN, axis=1)
-        return _Need(self, HOMING_COUNTS[int(np.argmax(enough))]) if enough.any() else None
+    def noticeable(self, minutes: float) -> np.ndarray:
+        """Find the largest set of changes that a plan within the budget detects, as a mask."""
+        rows = self.powers[self.allowed(minutes)]
+        best = max(rows, key=lambda row: (np.sum(row >= POWER_MIN), np.sum(row)))
+        return np.asarray(best >= POWER_MIN)
 
+    def most_powerful(self, minutes: float) -> tuple[int, int]:
+        """Find the pattern and its homings with the largest total power."""
+        total, allowed = self.powers.sum(axis=2), np.argwhere(self.allowed(minutes)).tolist()
+        _, trial, homings = max((float(total[t, n]), t, HOMING_COUNTS[n]) for t, n in allowed)
+        return trial, homings
 
-def _trials(designs: WatchDesigns) -> list[_Trial]:
-    trials = []
-    for pattern in designs.patterns():
-        powers = np.array([designs.powers(pattern, homings) for homings in HOMING_COUNTS])
-        once, twice = (designs.minutes(pattern, homings) for homings in (1, 2))
-        trials.append(_Trial(designs, pattern, powers, once, twice - once))
-    return trials
+    def fewest(self, mask: np.ndarray, minutes: float = np.inf) -> tuple[int, int] | None:
+        """Find pattern and homings of the fewest looks that detect the changes of a mask; of equals the quickest."""
+        enough = np.all(self.powers[..., mask] >= POWER_MIN, axis=2)
+        first = [(int(np.argmax(row)), trial) for trial, row in enumerate(enough) if row.any()]
+        found = []
+        # Patterns are first ranked by trial counts: values in between cost a bisection for each.
+        for count, trial in sorted(first, key=lambda one: self.looks[one[1], one[0]])[:BISECTED_MAX]:
+            pattern, bracket = self.designs.patterns[trial], HOMING_COUNTS[max(count - 1, 0) : count + 1]
 
+            def detects(homings: int, pattern: Pattern = pattern) -> bool:
+                return bool(np.all(self.designs.powers(pattern, homings)[mask] >= POWER_MIN))
 
-@dataclass(frozen=True)
-class _Need:
-    """A pattern with a number of homings on every sheet."""
+            homings = smallest_design(detects, bracket)
+            assert homings is not None, "the first sufficient count is enough"
+            homings = max(homings, -(-LOOKS_MIN // self.sizes[trial]))
+            if self.minutes_of(trial, homings) <= minutes:
+                found.append((homings * self.sizes[trial], self.minutes_of(trial, homings), trial, homings))
+        return min(found, key=lambda one: one[:2])[2:] if found else None
 
-    trial: _Trial
-    homings: int
-
-    @property
-    def looks(self) -> int:
-        return self.trial.looks(self.homings)
-
-    @property
-    def all_homings(self) -> int:
-        return self.homings * len(self.trial.pattern.looks)
-
-    @property
-    def minutes(self) -> float:
-        return self.trial.minutes(self.homings)
-
-    @cached_property
-    def judged(self) -> list[float]:
-        """Compute powers by the plan's own moves."""
-        return self.trial.designs.judged(self.trial.pattern, self.homings)
-
-    def fewest(self, mask: np.ndarray) -> _Need:
-        """Find the fewest homings that are enough for the changes of a mask, as the first of the trial counts is."""
-
-        def enough(homings: int) -> bool:
-            return bool(np.all(self.trial.designs.powers(self.trial.pattern, homings)[mask] >= POWER_MIN))
-
-        homings = smallest_design(enough, [n for n in HOMING_COUNTS if n <= self.homings][-2:])
-        assert homings is not None, "the first sufficient count is enough"
-        return replace(self, homings=max(homings, -(-LOOKS_MIN // self.trial.pattern.size)))
-
-
-def _fewest(trials: list[_Trial], mask: np.ndarray, minutes: float = np.inf) -> _Need | None:
-    """Find the fewest looks that detect the changes of a mask; among equal numbers the least time."""
-    # Patterns are first ranked by trial counts: values in between cost a bisection for each.
-    first_needs = [need for trial in trials if (need := trial.first_need(mask)) is not None]
-    needs = [need.fewest(mask) for need in sorted(first_needs, key=lambda need: need.looks)[:BISECTED_MAX]]
-    within = (need for need in needs if need.minutes <= minutes)
-    return min(within, key=lambda need: (need.looks, need.minutes), default=None)
-
-
-def _noticeable(trials: list[_Trial], minutes: float) -> np.ndarray:
-    """Find the largest set of changes that a plan within the budget detects, as a mask."""
-    rows = [row for trial in trials for row in trial.powers[trial.allowed(minutes)]]
-    return np.asarray(max(rows, key=lambda row: (np.sum(row >= POWER_MIN), np.sum(row))) >= POWER_MIN)
-
-
-def _most_powerful(trials: list[_Trial], minutes: float) -> _Need:
-    """Find the pattern with the largest total power, where no change can be detected with enough power."""
-    by_power = [
-        (float(trial.powers[rung].sum()), number, HOMING_COUNTS[rung])
-        for number, trial in enumerate(trials)
-        for rung in np.flatnonzero(trial.allowed(minutes))
-    ]
-    _, number, homings = max(by_power)
-    return _Need(trials[number], homings)
+    def looks_to_add(self) -> list[int | None]:
+        """Compute looks that campaign and every watch have to add to detect each change, to the next trial count."""
+        fewest: list[int | None] = [None] * self.powers.shape[2]
+        for pattern, sizes in zip(self.designs.patterns, self.looks.tolist(), strict=True):
+            for homings, looks in zip(HOMING_COUNTS, sizes, strict=True):
+                enough = self.designs.powers(pattern, homings, True) >= POWER_MIN
+                pairs = zip(fewest, enough.tolist(), strict=True)
+                fewest = [min(looks, best or looks) if met else best for best, met in pairs]
+                if enough.all():
+                    break
+        return fewest
 
 
 def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTES, seed: int = 0) -> WatchPlan:
@@ -403,9 +350,9 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
     if not fit.converged:
         raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
     designs = WatchDesigns(fit, rig, seed)
-    trials = _trials(designs)
-    if not any(trial.allowed(minutes).any() for trial in trials):
-        least_minutes = min(trial.minutes(-(-LOOKS_MIN // trial.pattern.size)) for trial in trials)
+    trials = _Trials(designs)
+    if not trials.allowed(minutes).any():
+        least_minutes = min(trials.minutes_of(trial, -(-LOOKS_MIN // n)) for trial, n in enumerate(trials.sizes))
         raise InputError(
             "minutes",
             f"{LOOKS_MIN} looks take {least_minutes:.1f} minutes",
@@ -413,56 +360,38 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
             allowed=f"at least {least_minutes:.1f}",
             remedy="allow more minutes, or lower [costs] if the machine is faster",
         )
-    noticed = _noticeable(trials, minutes)
-    need = (_fewest(trials, noticed, minutes) if noticed.any() else None) or _most_powerful(trials, minutes)
-    need = _corrected(need, noticed, minutes)
-    changes = _changes(need, trials)
+    noticed = trials.noticeable(minutes)
+    found = trials.fewest(noticed, minutes) if noticed.any() else None
+    trial, homings = found or trials.most_powerful(minutes)
+    pattern, size = designs.patterns[trial], trials.sizes[trial]
+    own = designs.own_powers(pattern, homings)
+    for _ in range(CORRECTIONS):
+        # Shared stops may reduce the power.
+        more = homings + -(-homings // 10)
+        if np.all(np.array(own)[noticed] >= POWER_MIN) or trials.minutes_of(trial, more) > minutes:
+            break
+        if size * more > LOOKS_MAX:
+            break
+        homings, own = more, designs.own_powers(pattern, more)
+    needs = [trials.fewest(alone) for alone in np.eye(len(designs.changes), dtype=bool)]
+    to_add = trials.looks_to_add() if None in needs else [None] * len(needs)
+    changes = []
+    for change, power, need, looks_to_add in zip(designs.changes, own, needs, to_add, strict=True):
+        what = change.what, change.size, change.unit, power
+        if need is None:
+            changes.append(PlannedChange(*what, None, None, None, looks_to_add))
+            continue
+        sheets, looks = len(designs.patterns[need[0]]), trials.sizes[need[0]]
+        changes.append(PlannedChange(*what, looks * need[1], sheets * need[1], trials.minutes_of(*need), None))
     return WatchPlan(
-        steps=designs.steps(need.trial.pattern, need.homings),
-        looks=need.looks,
-        homings=need.all_homings,
-        minutes=designs.minutes(need.trial.pattern, need.homings),
+        steps=designs.steps(pattern, homings),
+        looks=size * homings,
+        homings=homings * len(pattern),
+        minutes=designs.minutes(pattern, homings),
         minutes_allowed=minutes,
         power_wanted=POWER_MIN,
         false_alarm_rate=FALSE_ALARM_RATE,
         met=all(change.power >= POWER_MIN for change in changes),
-        changes=changes,
+        changes=tuple(changes),
         home_sd_by_prior=fit.home_sd_by_prior,
     )
-
-
-def _changes(plan: _Need, trials: list[_Trial]) -> tuple[PlannedChange, ...]:
-    """Describe every change by the plan's power for it and the looks needed for it alone."""
-    tested = plan.trial.designs.changes
-    needs = [_fewest(trials, mask) for mask in np.eye(len(tested), dtype=bool)]
-    additions = _looks_to_add(trials) if None in needs else [None] * len(needs)
-    changes = []
-    for change, power, need, looks_to_add in zip(tested, plan.judged, needs, additions, strict=True):
-        sizes = (None, None, None, looks_to_add) if need is None else (need.looks, need.all_homings, need.minutes, None)
-        changes.append(PlannedChange(change.what, change.size, change.unit, power, *sizes))
-    return tuple(changes)
-
-
-def _looks_to_add(trials: list[_Trial]) -> list[int | None]:
-    """Compute additional looks of the campaign and of every watch to detect each change, to the next trial count."""
-    fewest: list[int | None] = [None] * trials[0].powers.shape[1]
-    for trial in trials:
-        for homings in HOMING_COUNTS:
-            looks, enough = trial.looks(homings), trial.designs.powers(trial.pattern, homings, True) >= POWER_MIN
-            fewest = [
-                min(looks, best or looks) if met else best for best, met in zip(fewest, enough.tolist(), strict=True)
-            ]
-            if enough.all():
-                break
-    return fewest
-
-
-def _corrected(need: _Need, noticed: np.ndarray, minutes: float) -> _Need:
-    """Add homings where shared stops reduce the power for the changes of a mask."""
-    for _ in range(CORRECTIONS):
-        more = replace(need, homings=need.homings + -(-need.homings // 10))
-        enough = np.all(np.array(need.judged)[noticed] >= POWER_MIN)
-        if enough or more.minutes > minutes or more.looks > LOOKS_MAX:
-            break
-        need = more
-    return need

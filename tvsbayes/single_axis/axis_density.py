@@ -25,17 +25,17 @@ HEADLINE_DRAWS = (*(quantity.name for quantity in LINES), "effective_per_command
 """Rows of `headline_functionals`."""
 
 
-def line_weights(model: AxisModel, w: np.ndarray) -> np.ndarray:
-    """Slope of the least-squares line of the error by position over the rows, with equal weights.
+def line_weights(model: AxisModel, w: np.ndarray, read: np.ndarray | None = None) -> np.ndarray:
+    """Slope of the least-squares line of the error by position over commands `read`, by default those of the rows.
 
     Shape (columns,), or (n, columns) at draws w (n, d) where a period is not known.
     """
-    rows = model.rows
-    deviations = rows.command - rows.command.mean()
+    command = model.rows.command if read is None else read
+    deviations = command - command.mean()
     weights = deviations / (deviations @ deviations)
     if not model.repeats_by_draw:
-        return weights @ model.functional(rows.command)
-    return np.concatenate([weights @ model.functional(rows.command, part) for part in blocks_of(w)])
+        return weights @ model.functional(command)
+    return np.concatenate([weights @ model.functional(command, part) for part in blocks_of(w)])
 
 
 def blocks_of(w: np.ndarray) -> list[np.ndarray]:
@@ -43,9 +43,9 @@ def blocks_of(w: np.ndarray) -> list[np.ndarray]:
     return np.array_split(w, max(1, len(w) // 100))
 
 
-def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
+def headline_functionals(model: AxisModel, w: np.ndarray, read: np.ndarray | None = None) -> np.ndarray:
     """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as in `line_weights`."""
-    weights = line_weights(model, w)
+    weights = line_weights(model, w, read)
     functionals = np.concatenate([line_functionals(model), model.line_terms(per_command=1.0)[None]])
     if weights.ndim == 2:
         functionals = np.repeat(functionals[None], len(weights), axis=0)
@@ -53,14 +53,16 @@ def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
     return functionals
 
 
-def deviation_functionals(model: AxisModel, w: np.ndarray, commands: np.ndarray) -> np.ndarray:
-    """Error that repeats by position at commands (t,), minus its least-squares line over the rows.
+def deviation_functionals(
+    model: AxisModel, w: np.ndarray, commands: np.ndarray, read: np.ndarray | None = None
+) -> np.ndarray:
+    """Error that repeats by position at commands (t,), minus its least-squares line as in `line_weights`.
 
     Shape (t, columns); (n, t, columns) for draws w (n, d) where a period is unknown.
     """
-    level = model.functional(model.rows.command, w).mean(axis=-2)
-    slope = line_weights(model, w)
-    offsets = (commands - model.middle)[:, None]
+    read = model.rows.command if read is None else read
+    level, slope = model.functional(read, w).mean(axis=-2), line_weights(model, w, read)
+    offsets = (commands - read.mean())[:, None]
     return model.functional(commands, w) - level[..., None, :] - offsets * slope[..., None, :]
 
 

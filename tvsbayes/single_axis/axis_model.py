@@ -325,8 +325,8 @@ class AxisModel:
             means[:, column] = self.priors[name].value
         return means
 
-    def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns (n or 1, rows, c) in units of the scatter, decorrelated, and its log-determinant (n,).
+    def _filtered(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Columns (n or 1, rows, c) through `gears.kalman.whitened`, whose rows come first.
 
         The states of the filter are the drift of the zero and the error of the stop; in motion, the seeing.
         """
@@ -349,8 +349,18 @@ class AxisModel:
         keep[:, 0] = np.r_[0, rows.zero[1:] == rows.zero[:-1]][:, None]
         variance[:, 0] = np.outer(rows.hours, values["drift_per_root_hour"] ** 2)
         keep[:, 1], variance[:, 1] = carry.T, ((1 - carry**2) * stop).T
-        white, log_scatter = whitened(np.swapaxes(columns, 0, 1), keep, variance, np.ascontiguousarray(reading.T))
+        return whitened(np.swapaxes(columns, 0, 1), keep, variance, np.ascontiguousarray(reading.T))
+
+    def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (n or 1, rows, c) in units of the scatter, decorrelated, and its log-determinant (n,)."""
+        white, log_scatter, *_ = self._filtered(values, columns)
         return np.swapaxes(white, 0, 1), log_scatter
+
+    def drift(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Drift of the zero after the last row at draws w (n, d): means by column (n, columns), variances (n,)."""
+        values = self.coordinates.values(w)
+        *_, means, covariance = self._filtered(values, self._columns(w, values, None))
+        return means[0, :, 1:], covariance[0, 0]
 
     def between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Variance (n,) of both processes midway between nodes, as lost by cubic interpolation."""

@@ -180,7 +180,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
     """
     used = _expanded(campaign, [r for r in campaign.noisy if r.status == "ok" and r.value is not None])
     rows = _rows_at_stops(campaign, used) if campaign.rate is None else _rows_in_motion(campaign, used, campaign.rate)
-    errors = _reference_errors(campaign, rows)
+    errors = reference_errors(campaign, rows.value, rows.time_s, _common_u(campaign, rows))
     reference = np.column_stack(list(errors.values())) if errors else np.zeros((len(rows.value), 0))
     rows = replace(rows, reference=reference, reference_causes=tuple(errors))
     return rows if rows.in_motion or legs_are_long(rows) else _line_with_play(rows)
@@ -230,17 +230,25 @@ def _expanded(campaign: AxisCampaign, readings: list[Reading]) -> list[Reading]:
     return [replace(reading, value=v) for reading, v in zip(readings, true.tolist(), strict=True)]
 
 
-def _reference_errors(campaign: AxisCampaign, rows: AxisRows) -> dict[str, np.ndarray]:
-    """Errors of rows (r,) per standard normal number of each cause; a common u is the mean of a row's readings."""
-    reference, value, stated = campaign.reference, rows.value, defaultdict[int, list[float]](list)
-    for reading in campaign.readings if reference.common else ():
+def _common_u(campaign: AxisCampaign, rows: AxisRows) -> np.ndarray:
+    """Mean u (r,) of each row's readings where they share their errors, else 0."""
+    stated = defaultdict[int, list[float]](list)
+    for reading in campaign.readings if campaign.reference.common else ():
         if reading.status == "ok" and reading.value is not None:
             stated[reading.move].append(reading.u)
+    return np.array([np.mean(stated.get(int(move), [0.0])) for move in rows.move])
+
+
+def reference_errors(
+    campaign: AxisCampaign, value: np.ndarray, time_s: np.ndarray, common_u: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Errors of readings (r,) at times (r,), with u in common, per standard normal number of each cause."""
+    reference = campaign.reference
     errors = {
         "u": np.full(len(value), reference.u),
         "u_per_unit": reference.u_per_unit * value,
-        "expansion_per_K": reference.expansion_per_K.u * value * _above_standard(campaign, rows.time_s),
-        "u of readings": np.array([np.mean(stated.get(int(move), [0.0])) for move in rows.move]),
+        "expansion_per_K": reference.expansion_per_K.u * value * _above_standard(campaign, time_s),
+        "u of readings": common_u,
     }
     return {name: column for name, column in errors.items() if np.any(column != 0)}
 

@@ -8,20 +8,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.gears.states import HOUR_S, travelled
+from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, AxisStop, Reading, stops_csv
+from tvsbayes.single_axis.axis_campaign import AxisStop, stops_csv
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, deviation_functionals, headline_functionals
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_model import AxisModel, reading_variance, stop_variance
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
-from tvsbayes.single_axis.axis_rows import SIDES, AxisRows, reversal_of, rows_of
+from tvsbayes.single_axis.axis_rows import DIRECTIONS, PlayPlaces, reference_errors, reversal_of, warm_from
+from tvsbayes.single_axis.waves import wave_columns
+from tvsbayes.statistics.optimal_design import Prospects
 
 TARGETS = (*(name for name, quantity in AXIS_QUANTITIES.items() if quantity.target), "position")
 """Targets of a plan; "position" is the mean uncertainty of the error by position over the range."""
@@ -95,92 +100,143 @@ class AxisPlan(Shown):
         return stops_csv(AxisStop(stop.via, stop.command, stop.direction) for stop in self.next)
 
 
-def _move_seconds(campaign: AxisCampaign) -> float:
-    times = [m.time_s for m in campaign.moves]
-    gaps = [b - a for a, b in pairwise(times) if b > a]
-    return float(np.median(gaps)) if gaps else MOVE_S
-
-
-def _whole(campaign: AxisCampaign) -> bool:
-    """Whether all commands are whole numbers, so that a plan gives such alone."""
-    return all(move.command == round(move.command) for move in campaign.moves)
-
-
-def _run_up_start(campaign: AxisCampaign, command: float, side: int) -> float | None:
-    """The command to visit first, so that the last move to `command` is towards `side`; None where it is already."""
-    if side * (command - campaign.moves[-1].command) > 0:
-        return None
-    low, high = campaign.range_allowed
-    via = command - side * RUN_UP_SHARE * (high - low)
-    return float(np.round(via)) if _whole(campaign) else via
-
-
-def _with_stop(campaign: AxisCampaign, rows: AxisRows, stop: AxisStop, seconds: float) -> AxisCampaign:
-    """The campaign with one more stop.
-
-    Its reading lies on the line with a reversal through the `rows`, and so does not change the line.
-    """
-    moves, last = list(campaign.moves), campaign.moves[-1]
-    for command in (stop.command,) if stop.via is None else (stop.via, stop.command):
-        moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
-    line, play = rows.line, reversal_of(rows).value
-    value = line.offset + line.slope * stop.command - 0.5 * float(np.sign(line.slope)) * SIDES[stop.direction] * play
-    u = float(np.median([r.u for r in campaign.noisy if r.status == "ok"]))
-    number = max(r.reading for r in campaign.readings) + 1
-    reading = Reading(number, len(moves) - 1, value, u)
-    return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading))
-
-
-def _variance(model: AxisModel, w: np.ndarray, target: str, places: np.ndarray) -> tuple[float, float]:
-    """Variance of a target, unit^2: mean of its variances given the scales, draws (n, d), and that of their means."""
-    if target == "position":
-        functionals = deviation_functionals(model, w, places)
-    else:
-        functionals = headline_functionals(model, w)[..., [HEADLINE_DRAWS.index(target)], :]
-    linear = model.linear(w)
-    between = np.var(linear.mean_of(functionals), axis=0)
-    return float(np.mean(linear.sd_of(functionals) ** 2)), float(np.mean(between))
-
-
-class _Aim:
-    """A target, and its u after more stops.
+class _Options(NamedTuple):
+    """Stops that may be read next, arrays (m,); at n draws of the scales.
 
     Attributes:
-        places: commands of the candidates, shape (n,).
-        u_now: present u.
+        command, side: of the stops; `via`: command to visit first, NaN where not needed.
+        moves: number of moves; `path`: commands travelled since the homing, after them.
+        drift: variance of the drift of the zero then, shape (n, m).
+        scatter: variance of the reading, drift included, shape (n, m).
+        innovations: columns less what the drift so far explains, shape (n, m, columns).
+    """
+
+    command: np.ndarray
+    side: np.ndarray
+    via: np.ndarray
+    moves: np.ndarray
+    path: np.ndarray
+    drift: np.ndarray
+    scatter: np.ndarray
+    innovations: np.ndarray
+
+
+class _Onward:
+    """An axis that goes on from its last move, with a target, at a few draws w (n, d) of the scales.
+
+    A stop is read with its play taken up; its error is new, and the drift of the zero goes on: one more step of the
+    filter of the readings.
+
+    Attributes:
+        places: commands that may be read.
+        u_now: u of the target after the stops so far.
+        move_s: time of a move.
 
     Raises:
         NothingToEstimate: the target is fixed.
     """
 
-    def __init__(self, fit: AxisFit, target: str, places: np.ndarray):
-        self.target, self.places, self._model, w = target, places, fit.model, fit.w
-        self._given, self._between = _variance(self._with(fit.campaign), w, target, places)
-        if target == "backlash" and fit.model.play_is_sampled:
-            # A sampled play has no variance given the scales: that of a linear play replaces it, for which every
-            # reversal is longer than the play.
+    def __init__(self, fit: AxisFit, target: str):
+        self.campaign, self.target, moves = fit.campaign, target, fit.campaign.moves
+        gaps = [gap for a, b in pairwise(moves) if (gap := b.time_s - a.time_s) > 0]
+        self.move_s = float(np.median(gaps)) if gaps else MOVE_S
+        (low, high), self.whole = fit.campaign.range_allowed, all(m.command == round(m.command) for m in moves)
+        self.places = np.unique(np.r_[np.linspace(low, high, CANDIDATES), np.clip(fit.rows.command.min(), low, high)])
+        if self.whole:
+            self.places = np.unique(np.clip(np.round(self.places), math.ceil(low), math.floor(high)))
+        known, w = fit.model.coordinates, fit.w
+        model = AxisModel.of(fit.rows, fit.model.priors, self.places, known.waves)
+        self.model = replace(model, coordinates=known)
+        linear, functionals = self.model.linear(w), self._functionals(w, fit.rows.command)
+        self._given = float(np.mean(linear.sd_of(functionals) ** 2))
+        self._between = float(np.mean(np.var(linear.mean_of(functionals), axis=0)))
+        if target == "backlash" and self.model.play_is_sampled:
+            # A sampled play has no variance given the scales: that of a linear play replaces it.
             self._given, self._between = self._given + self._between, 0.0
-            names = fit.model.coordinates.names
-            linear = replace(fit.model.coordinates, names=tuple(name for name in names if name != "backlash"))
-            self._model, w = replace(fit.model, coordinates=linear), np.delete(w, names.index("backlash"), axis=1)
-        self._few = w[np.linspace(0, len(w) - 1, DRAWS).astype(int)]
-        self._given_few, _ = _variance(self._with(fit.campaign), self._few, target, places)
+            names = tuple(name for name in known.names if name != "backlash")
+            w = np.delete(w, known.names.index("backlash"), axis=1)
+            self.model = replace(self.model, coordinates=replace(known, names=names))
+        self.w = w[np.linspace(0, len(w) - 1, DRAWS).astype(int)]
+        linear, functionals = self.model.linear(self.w), self._functionals(self.w, fit.rows.command)
+        self._given_few, self._covariance = float(np.mean(linear.sd_of(functionals) ** 2)), linear.covariance
         if not self._given_few:
             remedy = f"state {target} in [axis] with u above 0, or name another target"
             raise NothingToEstimate("held", f"{target} is held at its value: no reading changes it", remedy=remedy)
-        self.u_now = math.sqrt(self._between + self._given)
+        self.u_now, self._scales = math.sqrt(self._between + self._given), self.model.coordinates.values(self.w)
+        self._drift, self._drift_variance = self.model.drift(self.w)
+        self._read, self._read_s, self._time_s = fit.rows.command, fit.rows.time_s[-1], moves[-1].time_s
+        self._at, self._path = moves[-1].command, travelled(fit.rows.legs.command, fit.rows.legs.segment)[-1]
 
-    def _with(self, campaign: AxisCampaign) -> AxisModel:
-        """The model of the readings of a campaign, with the coordinates of the fit."""
-        rows = replace(rows_of(campaign), line=self._model.rows.line)
-        model = AxisModel.of(rows, self._model.priors, self.places, self._model.coordinates.waves)
-        return replace(model, coordinates=self._model.coordinates)
+    def _functionals(self, w: np.ndarray, read: np.ndarray) -> np.ndarray:
+        """Functionals (t, columns) of the target where commands are `read`, or (n, t, columns) by draws w (n, d)."""
+        if self.target == "position":
+            return deviation_functionals(self.model, w, self.places, read)
+        return headline_functionals(self.model, w, read)[..., [HEADLINE_DRAWS.index(self.target)], :]
 
-    def u(self, campaign: AxisCampaign) -> float:
-        """The u with the readings of a campaign."""
+    def options(self) -> _Options:
+        """Stops at all places from both sides, with a run-up where needed, as far as it stays in reach."""
+        low, high = self.campaign.range_allowed
+        command, side = np.repeat(self.places, 2), np.tile([1, -1], len(self.places))
+        via = command - side * RUN_UP_SHARE * (high - low)
+        via = np.where(side * (command - self._at) > 0, np.nan, np.round(via) if self.whole else via)
+        inside = np.isnan(via) | ((via >= low) & (via <= high))
+        command, side, via = command[inside], side[inside], via[inside]
+        first, moves = np.where(np.isnan(via), self._at, via), 1 + ~np.isnan(via)
+        path = self._path + np.abs(first - self._at) + np.abs(command - first)
+        time_s, rows = self._time_s + moves * self.move_s, self.model.rows
+        hours = np.maximum(time_s - self._read_s, 0.0) / HOUR_S
+        drift = self._drift_variance[:, None] + np.outer(self._scales["drift_per_root_hour"] ** 2, hours)
+        of_one = np.full(len(command), np.median(rows.variance * rows.count))
+        scatter = drift + stop_variance(self._scales, side) + reading_variance(self._scales, of_one, rows)
+        if not self.model.places.exact:
+            scatter = scatter + self.model.between_nodes(self._scales)[:, None]
+        innovations = self._columns(command, side, time_s, path) - self._drift[:, None]
+        return _Options(command, side, via, moves, path, drift, scatter, innovations)
+
+    def _columns(self, command: np.ndarray, side: np.ndarray, time_s: np.ndarray, path: np.ndarray) -> np.ndarray:
+        """Columns (n, m, columns) of stops read at times (m,) after a path (m,) since the homing."""
+        model, rows, campaign = self.model, self.model.rows, self.campaign
+        out = -np.sign(rows.line.slope) * side[None]
+        value = rows.line.offset + rows.line.slope * command + 0.5 * out[0] * reversal_of(rows).value
+        clock = np.array([move.time_s for move in campaign.moves], dtype=float)
+        warm_s, kelvin = time_s - warm_from(campaign), kelvin_at(campaign.moves, time_s, clock)
+        waves = [
+            wave_columns(model.clock(wave, command, time_s, value), draws.period, model.record(wave))
+            for wave, draws in zip(model.coordinates.waves, model.coordinates.wave_draws(self.w), strict=True)
+        ]
+        columns = np.zeros((len(self.w), len(command), model.columns))
+        play = PlayPlaces(command[None], path[None], out, out, np.zeros_like(out))
+        model.fill(columns, command, play, model.in_time(self._scales["creep_minutes"], warm_s, kelvin), waves)
+        columns[..., model.layout["homed"]] = model.homed == rows.zero[-1]
+        u = np.full(len(command), np.median([r.u for r in campaign.readings if r.status == "ok"]))
+        errors = reference_errors(campaign, value, time_s, u * campaign.reference.common)
+        for column, cause in enumerate(rows.reference_causes, start=model.layout["reference"].start):
+            columns[..., column] = errors[cause]
+        return columns
+
+    def u_after(self, options: _Options) -> np.ndarray:
+        """U of the target (m,) after each of the stops; a line over the commands read goes over this one too."""
+        each = [self._functionals(self.w, np.r_[self._read, command]) for command in options.command]
+        wanted = np.stack([np.broadcast_to(one, (len(self.w), *one.shape[-2:])) for one in each], axis=1)
+        rows = (options.innovations / np.sqrt(options.scatter)[..., None])[:, :, None]
+        given, self._prospects = [], []
+        for row, covariance, functionals in zip(rows, self._covariance, wanted, strict=True):
+            moved = functionals @ covariance
+            self._prospects.append(Prospects.of_shifts(row, covariance, row @ moved.swapaxes(1, 2)))
+            gains = np.diagonal(self._prospects[-1].gains(), axis1=1, axis2=2)
+            given.append(np.mean(np.sum(moved * functionals, axis=2) - gains, axis=1))
         # With few draws the ratio of variances is more accurate than the variance.
-        given, _ = _variance(self._with(campaign), self._few, self.target, self.places)
-        return math.sqrt(self._between + self._given * given / self._given_few)
+        return np.sqrt(self._between + self._given * np.mean(given, axis=0) / self._given_few)
+
+    def read(self, options: _Options, k: int, u: float) -> None:
+        """Go to one of the stops and read it."""
+        gain = options.drift[:, k] / options.scatter[:, k]
+        self._drift = self._drift + gain[:, None] * options.innovations[:, k]
+        self._drift_variance = options.drift[:, k] * (1.0 - gain)
+        self._covariance = np.array([each.measured(k).covariance for each in self._prospects])
+        self._at, self._path, self._read = options.command[k], options.path[k], np.r_[self._read, options.command[k]]
+        self._time_s = self._read_s = self._time_s + options.moves[k] * self.move_s
+        self.u_now = u
 
 
 def plan_next(
@@ -214,28 +270,21 @@ def plan_next(
     if target not in TARGETS:
         allowed = ", ".join(TARGETS)
         raise InputError("target", f"--target {target[:60]!r}", allowed=allowed, remedy="name one of them")
-    low, high = fit.campaign.range_allowed
-    grid = np.unique(np.r_[np.linspace(low, high, CANDIDATES), np.clip(fit.rows.command.min(), low, high)])
-    if _whole(fit.campaign):
-        grid = np.unique(np.clip(np.round(grid), math.ceil(low), math.floor(high)))
-    aim, move_s = _Aim(fit, target, grid), _move_seconds(fit.campaign)
-    stops: list[NextStop] = []
-    campaign, u_now, spent = fit.campaign, aim.u_now, 0.0
+    axis, stops, spent, most = _Onward(fit, target), list[NextStop](), 0.0, math.inf if minutes is None else minutes
+    u_now = axis.u_now
     with Job({"choosing stops": 1.0}, progress) as job:
         while len(stops) < count:
-            best: tuple[NextStop, AxisCampaign] | None = None
-            for k, (command, direction) in enumerate(product(grid.tolist(), ("forward", "backward"))):
-                job.at((len(stops) + k / (2 * len(grid))) / count)
-                via = _run_up_start(campaign, command, SIDES[direction])
-                needed = (1 + (via is not None)) * move_s / 60.0
-                if (via is None or low <= via <= high) and (minutes is None or spent + needed <= minutes):
-                    after = _with_stop(campaign, fit.rows, AxisStop(via, command, direction), move_s)
-                    u = aim.u(after)
-                    stop = NextStop(command, direction, via, u, u_now - u, (u_now - u) / needed)
-                    if best is None or stop.gain_per_minute > best[0].gain_per_minute:
-                        best = stop, after
-            if best is None:
+            job.at(len(stops) / count)
+            options = axis.options()
+            needed, after = options.moves * axis.move_s / 60.0, axis.u_after(options)
+            gains = np.where(spent + needed <= most, (axis.u_now - after) / needed, -math.inf)
+            k = int(np.argmax(gains)) if len(gains) else 0
+            if not len(gains) or gains[k] == -math.inf:
                 break
-            stops.append(best[0])
-            campaign, u_now, spent = best[1], best[0].u, spent + (1 + (best[0].via is not None)) * move_s / 60.0
-    return AxisPlan(target, aim.u_now, tuple(stops), spent)
+            via, u = None if math.isnan(options.via[k]) else float(options.via[k]), float(after[k])
+            direction = DIRECTIONS[int(options.side[k])]
+            gain = float(axis.u_now - u), float(gains[k])
+            stops.append(NextStop(float(options.command[k]), direction, via, u, *gain))
+            spent += float(needed[k])
+            axis.read(options, k, u)
+    return AxisPlan(target, u_now, tuple(stops), spent)

@@ -29,11 +29,11 @@ from tvsbayes.model.headlines import Derived
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import Knowledge, fit_places, fitted_errors, information_of, prior_knowledge
 from tvsbayes.planning.gear_places import NO_PLACES, expected_scales
-from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
+from tvsbayes.statistics.optimal_design import covariance_of
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
 from tvsbayes.twin.simulated_campaign import simulate
