@@ -16,7 +16,6 @@ from tvsbayes.coordinates.cloud import LawChecked
 from tvsbayes.coordinates.cloud_files import CloudFile
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
-from tvsbayes.files.documents import StatedValue
 from tvsbayes.importing.sightings import STEP_DEG
 from tvsbayes.report.axis_document import (
     axis_document,
@@ -206,7 +205,7 @@ def test_rows_say_whether_data_or_prior_set_a_value():
 
 def test_a_stated_length_is_printed_with_its_unit_and_u():
     """As temperature and humidity of the set-up are."""
-    stated = {"board_certificate": "PTB 123", "pitch_mm": StatedValue(30.0, 0.02)}
+    stated = {"board_certificate": "PTB 123", "pitch_mm": {"value": 30.0, "u": 0.02}}
     e = SimpleNamespace(fit=small_record(), campaign=SimpleNamespace(header={"traceability": stated}))
     rows = {row[1]: row[2] for row in method_section(e).tables[0].rows if row[0] == "traceability"}
     assert rows == {"board_certificate": "PTB 123", "pitch": "30 mm, u = 0.02 mm"}

@@ -12,7 +12,6 @@ from support.axes import runs
 from support.dcc_structure import structure_problems
 from support.refusals import refusal
 
-from tvsbayes.files.documents import StatedValue
 from tvsbayes.metrology.conformity import Tolerance
 from tvsbayes.metrology.dcc import Embedded, Parties
 from tvsbayes.report.axis_document import axis_document, criteria_of, curve_commands
@@ -29,7 +28,7 @@ REPORT = Embedded("A1", b"<html></html>")
 HEADER = {
     "created": datetime.datetime(2026, 11, 20, 13, 0),
     "serial": "KGT-16",
-    "environment": {"temperature_degC": StatedValue(20.3, 0.3)},
+    "environment": {"temperature_degC": {"value": 20.3, "u": 0.3}},
     "traceability": {"reference_calibrated": datetime.date(2026, 2, 3)},
 }
 KNOWN = Reference(u_per_unit=2e-6, certificate="K 17", valid_until=datetime.date(2027, 2, 28))

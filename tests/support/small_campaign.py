@@ -7,7 +7,6 @@ import datetime
 import numpy as np
 from support.written_rows import move_row, spot_row
 
-from tvsbayes.files.documents import StatedValue
 from tvsbayes.instrument.campaign import Campaign, Spot
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import Prior
@@ -81,7 +80,7 @@ def small_campaign() -> Campaign:
         "synthetic": False,
         "seed": 7,
         "notes": "two lines,\nsecond line # no comment",
-        "environment": {"temperature_degC": StatedValue(21.0, 0.5)},
+        "environment": {"temperature_degC": {"value": 21.0, "u": 0.5}},
         "traceability": {"board_certificate": "B-17", "stereo_calibrated": datetime.date(2026, 1, 3)},
     }
     return Campaign(moves, tuple(spots), small_stereo(), RigTable(priors, "azimuth"), header)

@@ -13,6 +13,12 @@ from tvsbayes.instrument.conditions import check_power
 from tvsbayes.instrument.mechanisms import WORDS
 
 CAMPAIGN_FORMAT = "tvsbayes-campaign/1"
+
+
+def _quantity(keys: Keys, key: str, low: float, high: float, u_max: float) -> dict[str, float]:
+    return keys.quantity(key, low, high, u_max)._asdict()
+
+
 TIMES: dict[str, Kind] = dict.fromkeys(("created", "powered_on"), Keys.date)
 ORIGIN: dict[str, Kind] = {"synthetic": Keys.flag, "seed": (Keys.integer, 0, 2**63 - 1)}
 PEOPLE: dict[str, Kind] = {
@@ -20,13 +26,13 @@ PEOPLE: dict[str, Kind] = {
     "notes": (Keys.text, 4000),
 }
 ENVIRONMENT: dict[str, Kind] = {
-    "temperature_degC": (Keys.quantity, -100.0, 200.0, 100.0),
-    "humidity_percent": (Keys.quantity, 0.0, 100.0, 100.0),
+    "temperature_degC": (_quantity, -100.0, 200.0, 100.0),
+    "humidity_percent": (_quantity, 0.0, 100.0, 100.0),
 }
 """Keys of the headers of every instrument, with `[environment]`."""
 _TRACEABILITY: dict[str, Kind] = {
     "board_certificate": Keys.text,
-    "pitch_mm": (Keys.quantity, 1e-3, 1e4, 1e3),
+    "pitch_mm": (_quantity, 1e-3, 1e4, 1e3),
     "stereo_calibrated": Keys.date,
 }
 _URDF: dict[str, Kind] = {

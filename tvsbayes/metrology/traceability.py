@@ -74,7 +74,7 @@ def header_table(campaign: Measured, name: str) -> dict[str, object]:
 def stated_value(campaign: Measured, name: str, key: str) -> StatedValue | None:
     """Return a quantity of such a table."""
     entry = header_table(campaign, name).get(key)
-    return entry if isinstance(entry, StatedValue) else None
+    return StatedValue(**entry) if isinstance(entry, dict) else None
 
 
 UNITS = {"degC": "degC", "percent": "%", "mm": "mm"}
