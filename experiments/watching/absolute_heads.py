@@ -180,7 +180,7 @@ def one_head(task: tuple[str, str, int]) -> dict[str, object]:
         try:
             printed, taken = ran(cwd, *PROGRAM, "fit", "night", "--quick", "--json")
         except subprocess.CalledProcessError as error:
-            return row | {"answer": "none", "problem": error.stderr[-300:]}
+            return row | {"answer": "none", "problem": (error.stdout + error.stderr)[-300:]}
         row |= {"imports": taken / imports, "import_s": imports}
         fitted = json.loads(printed)
         zero = fitted["parameters"]["elevation_zero_deg"]["sd"]
