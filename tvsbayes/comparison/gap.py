@@ -74,9 +74,10 @@ def explain_gap(fit: JointFit, posterior: Posterior | None = None, draws: int = 
     from tvsbayes.posterior.draws import derived_of
     from tvsbayes.posterior.predictive import by_way, looks, turned_by
 
-    selection, measured = select_experiments(fit.campaign), classic_of(fit.campaign)
+    selection = select_experiments(fit.campaign)
     result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
-    if not len(selection.experiments) or measured is None:
+    # Sightings of a head have no experiments, and no points that classic could take.
+    if not len(selection.experiments) or (measured := classic_of(fit.campaign)) is None:
         return result
     chosen = _chosen_draws(fit, posterior, draws)
     z, errors_rad, rows = chosen.z, chosen.place_errors_rad, experiment_rows(fit.campaign, selection)
