@@ -24,8 +24,7 @@ def followed() -> Independence:
     """Two tabulated coordinates, the second of which follows the first; both are Gumbel's, all shares are the real."""
     alone = tabulated(np.array([0.5, 0.0]), np.array([1.0, 0.8]), np.arange(2))
     at = (NODES - of_a_leader(LEADER_NODES)[:, None]) / 0.8
-    tables = Tables.normalised(-at - np.exp(-at)).log_density
-    followers = Followers(np.array([0]), np.array([1]), tables[None])
+    followers = Followers(np.array([0]), np.array([1]), Tables.normalised((-at - np.exp(-at))[None]))
     return replace(alone, coupled=np.zeros(0, int), followers=followers)
 
 

@@ -9,10 +9,10 @@ from support.small_posterior import SIGMAS
 
 from tvsbayes.errors import NotConverged
 from tvsbayes.inference.density import Points
+from tvsbayes.inference.ensemble import moves
 from tvsbayes.inference.importance import weighted_run
 from tvsbayes.inference.students import StudentMixture
 from tvsbayes.inference.summaries import reweighted
-from tvsbayes.inference.walkers import moves
 
 
 class Toy:

@@ -13,8 +13,8 @@ from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
 from tvsbayes.inference.chain import GROUPS
+from tvsbayes.inference.ensemble import GroupEvolution, moves
 from tvsbayes.inference.proposal import Independence
-from tvsbayes.inference.walkers import GroupEvolution, moves
 from tvsbayes.posterior.target import WALKERS, walkers_for
 
 RESOLVED = 0.05

@@ -11,7 +11,7 @@ from support.small_posterior import SEED, mapped_already, small_fit
 
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import AMPLITUDE_NAMES
-from tvsbayes.posterior.arviz_tree import COORDS, RESAMPLED, VARIABLES, _dataset, _variables, data_tree
+from tvsbayes.posterior.arviz_tree import COORDS, RESAMPLED, VARIABLES, data_tree, dataset
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.results.tiers import IMPORTANCE
 
@@ -30,7 +30,7 @@ def draws():
 def test_amplitudes_of_stated_periods_have_a_dimension_of_their_own(draws, count):
     """One period or all: the labels are those of the contract names."""
     varying = AMPLITUDE_NAMES[-count:]
-    variable = _dataset(_variables(draws, set(varying), SHAPE, TWO_MIRROR))["harmonic_amplitude_deg"]
+    variable = dataset(draws, set(varying), SHAPE, TWO_MIRROR)["harmonic_amplitude_deg"]
     dim = variable.dims[-1]
     assert variable.sizes == {"chain": 2, "draw": 3, dim: count}
     assert [f"harmonic_amplitude_deg.{label}" for label in variable[dim].values] == list(varying)
@@ -40,10 +40,9 @@ def test_amplitudes_of_stated_periods_have_a_dimension_of_their_own(draws, count
 
 def test_every_variable_of_several_names_has_a_dimension_with_as_many_labels(draws):
     """All parameters at once, whatever a rig may leave open."""
-    for name, variable in VARIABLES.items():
-        labels = 1 if variable.dim is None else len(COORDS[variable.dim])
-        assert labels == len(variable.names), name
-    whole = _dataset(_variables(draws, {n for spec in VARIABLES.values() for n in spec.names}, SHAPE, TWO_MIRROR))
+    for name, (names, dim) in VARIABLES.items():
+        assert len(names) == (1 if dim is None else len(COORDS[dim])), name
+    whole = dataset(draws, {n for names, _ in VARIABLES.values() for n in names}, SHAPE, TWO_MIRROR)
     assert set(whole.data_vars) == set(VARIABLES)
 
 

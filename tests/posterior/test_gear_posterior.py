@@ -13,8 +13,8 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.posterior.draws import headline_names
-from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
+from tvsbayes.posterior.target import importance_run
 from tvsbayes.twin.simulated_campaign import simulate
 
 TRUE = {

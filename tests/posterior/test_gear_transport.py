@@ -86,7 +86,11 @@ def fitted(dozen) -> SimpleNamespace:
 @pytest.fixture(scope="module")
 def path(fitted) -> Transport:
     chart = transport(fitted)
-    assert chart.noise > 10 and chart.narrow and chart.linear.places.shape[1] == len(chart.on_tilt) > 0
+    assert (
+        chart.noise > 10
+        and chart.narrow
+        and chart.linear.places.shape[1] == fitted.arrays.gears.without_padding().columns > 0
+    )
     return chart
 
 
@@ -151,22 +155,24 @@ def check_dense(fitted: SimpleNamespace, path: Transport, least: float) -> None:
 
 def test_the_map_has_mean_and_covariance_of_the_dense_campaign_at_any_scales(fitted, path):
     """Scales of pixels, stops, gears, play and the time constant of a creep together."""
-    assert path.pixels.sum() == 1 and np.isin(LOOK_SCATTER_NAMES, np.array(TWO_MIRROR.names)[path.free]).sum() == 0
+    assert path.linear.pixels.sum() == 1 and np.isin(LOOK_SCATTER_NAMES, path.names).sum() == 0
     check_dense(fitted, path, 0.01)
 
 
 def test_a_creep_moves_the_map_with_its_time_constant(fitted, path):
     """Of the time constant alone."""
-    one, other = (path.conditional(w[None]).own[0] for w in (2.0 * path.creep_noise, 0.0 * path.creep_noise))
+    one, other = (
+        path.conditional(w[None]).own[0] for w in (2.0 * path.linear.creep.scaled, 0.0 * path.linear.creep.scaled)
+    )
     precision, at_mode = one @ one.T, other @ other.T
-    assert path.creep_noise.sum() == 1 and np.abs(precision - at_mode).max() > 0.01 * np.abs(at_mode).max()
+    assert path.linear.creep.scaled.sum() == 1 and np.abs(precision - at_mode).max() > 0.01 * np.abs(at_mode).max()
 
 
 def test_looks_that_scatter_more_or_less_than_at_the_mode(scattered):
     """Where every look has a stop of its own the scatter adds to its error: the map is exact."""
     path = transport(scattered)
-    names = np.array(TWO_MIRROR.names)[path.free[: path.noise]]
-    assert set(LOOK_SCATTER_NAMES) <= set(names) and path.pixels.sum() == 0
+    names = path.names[: path.noise]
+    assert set(LOOK_SCATTER_NAMES) <= set(names) and path.linear.pixels.sum() == 0
     check_dense(scattered, path, 0.01)
     # Of scatter alone.
     for axis, name in zip(AXES, LOOK_SCATTER_NAMES, strict=True):
@@ -184,9 +190,10 @@ def test_a_drift_takes_from_the_map_what_it_takes_from_the_dense_campaign(dozen,
     fitted = fit_of(dozen, dozen.campaign, VALUES | dict.fromkeys(LOOK_SCATTER_NAMES, 0.0) | drift, held, redraw=False)
     path = transport(fitted)
     dense, _ = dense_density(fitted, path, fitted.z)
-    without = path.physical.copy()
+    without = np.array(fitted.mode.physical)
     without[TWO_MIRROR.columns("drift_deg_per_root_hour")] = 0.0
-    paths = (path, replace(path, physical=without))
+    still = transport(SimpleNamespace(**{**vars(fitted), "mode": SimpleNamespace(physical=without)}))
+    paths = (path, replace(path, linear=replace(path.linear, place_root=still.linear.place_root)))
     factors = [each.conditional(np.zeros((1, path.noise))).own[0] for each in paths]
     drifting, still = ((factor @ factor.T)[::-1, ::-1] for factor in factors)
     assert np.abs(drifting - dense).max() < share * np.abs(still - dense).max()
@@ -198,15 +205,15 @@ def test_products_of_a_creep_are_those_of_the_covariance_of_all_others(dozen):
     path = transport(fit_of(dozen, dozen.campaign, VALUES | SCATTER | CREEP, held, redraw=False))
     linear, noise = path.linear, 1.5 * np.random.default_rng(15).standard_normal((3, path.noise))
     inner = linear.looks.inner(np.exp(noise[:, :2]))
-    later = linear.creep.later(noise @ path.creep_noise)
+    later = linear.creep.later(noise)
     spanned = (linear.looks.shares(inner) @ linear.looks.basis).reshape(inner.shape)
-    load, products = linear.looks.load, linear.at(inner, later)
+    load, (gram, by_states, _) = linear.looks.load, linear.products(inner, later)
     for one, k in enumerate(spanned):
         moved = load @ (later[one][:, None, None] * linear.creep.rows)
         columns = (linear.columns.reshape(*load.shape[:2], -1) + moved).reshape(len(linear.columns), -1)
         weight = np.eye(4) - load @ k @ np.swapaxes(load, 1, 2)
         weighted = (weight @ columns.reshape(*load.shape[:2], -1)).reshape(columns.shape)
-        for product, rows in ((products.gram[one], columns), (products.by_states[one], linear.states.load)):
+        for product, rows in ((gram[one], columns), (by_states[one], linear.states.load)):
             bound = ROUNDING * len(columns) * np.abs(rows).T @ np.abs(weighted)
             assert (np.abs(product - rows.T @ weighted) <= bound).all()
 

@@ -21,7 +21,7 @@ from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.inference import importance
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.importance import Acceptance, Pool, Weighing, k_max, uncertain
+from tvsbayes.inference.importance import Acceptance, Pool, k_max, uncertain
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.inference.tables import Tables
 from tvsbayes.instrument.campaign import read_campaign
@@ -29,9 +29,8 @@ from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import BLOCKS, Prior
 from tvsbayes.pipeline import unusable
 from tvsbayes.posterior.draws import Posterior, headline_names
-from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.posterior.target import Target
+from tvsbayes.posterior.target import Target, importance_run
 from tvsbayes.results.convergence import MonteCarloError
 from tvsbayes.statistics.weighted_draws import smoothed_weights, weighted_summary
 
@@ -64,19 +63,24 @@ class Skewed:
         return first_proposal(self, 5, np.arange(5) == 0, np.arange(5) >= 3)
 
 
+def in_rounds(pool: Pool, generator: np.random.RandomState, rounds: int) -> Pool:
+    """After the first three of which the proposal is fitted to all."""
+    for number in range(rounds):
+        pool = pool.extended(generator)
+        pool = replace(pool, next_proposal=pool.proposal) if number < 3 else pool
+    return pool
+
+
 def skewed_pool(rounds: int = 5) -> Pool:
     target, generator = Skewed(), np.random.RandomState(SEED)
-    pool = Pool.empty(target.first_proposal())
-    for number in range(rounds):
-        pool = pool.extended(target, generator, fitted=number < 3)
-    return pool
+    return in_rounds(Pool(target, SEED, target.first_proposal(), 0.0), generator, rounds)
 
 
 def test_weights_are_the_target_over_the_mixture_of_all_proposals():
     """By hand, for two proposals of other numbers of draws; by each draw's own proposal alone they are others."""
     one, other = normal(0.0, 1.0, 2), normal(0.8, 1.5, 2)
     w = np.random.default_rng(1).standard_normal((6, 2))
-    pool = Pool(Points(w, np.arange(6.0), {}), (one, other), (2, 4), other)
+    pool = Pool(Skewed(), SEED, other, 0.0, Points(w, np.arange(6.0), {}), (one, other), (2, 4))
     densities = np.exp([q.log_density(w) for q in (one, other)])
     expected = np.exp(np.arange(6.0)) / (densities[0] * 2 / 6 + densities[1] * 4 / 6)
     np.testing.assert_allclose(np.exp(pool.log_weights), expected, rtol=1e-12)
@@ -126,10 +130,7 @@ def test_the_evidence_of_a_normal_posterior_is_laplaces(normal_fit):
     """L + ln |C| / 2 + constants: the normal integral over the coordinates against their normal priors."""
     fitted, path = normal_fit
     target, generator = Target(fitted, path), np.random.RandomState(SEED)
-    pool = Pool.empty(target.first_proposal())
-    for number in range(4):
-        pool = pool.extended(target, generator, fitted=number < 3)
-    judged = Weighing(target, pool).importance
+    judged = in_rounds(Pool(target, SEED, target.first_proposal(), 0.0), generator, 4).importance
     free = np.flatnonzero(fitted.free)
     log_volume = 0.5 * np.linalg.slogdet(fitted.covariance[np.ix_(free, free)])[1]
     expected = fitted.log_density + log_volume + spot_constants(fitted.campaign).sum()
@@ -153,7 +154,7 @@ def fitted(monkeypatch) -> JointFit:
 @pytest.fixture
 def proposed(monkeypatch) -> None:
     """The first proposal is that of the shared run: it is not looked for again."""
-    monkeypatch.setattr(Target, "first_proposal", lambda target: small_run().pool.proposals[0])
+    monkeypatch.setattr(Target, "first_proposal", lambda target: small_run().proposals[0])
 
 
 def test_a_campaign_is_sampled_in_few_rounds_and_accepted(fitted, posterior):
@@ -217,14 +218,15 @@ def too_narrow(fitted, monkeypatch):
 
 @pytest.fixture
 def begun(monkeypatch) -> list[Independence]:
-    """The proposals that pools begin with."""
-    proposals = []
+    """The proposals that pools are begun with anew."""
+    proposals, refitted = [], Pool.refitted.fget
 
-    def empty(proposal, invalid=0):
-        proposals.append(proposal)
-        return Pool(None, (), (), proposal, invalid)
+    def recorded(pool):
+        fresh = refitted(pool)
+        proposals.append(fresh.next_proposal)
+        return fresh
 
-    monkeypatch.setattr(Pool, "empty", empty)
+    monkeypatch.setattr(Pool, "refitted", property(recorded))
     return proposals
 
 
@@ -236,8 +238,8 @@ def test_a_proposal_that_is_too_narrow_is_fitted_again(too_narrow, posterior, be
     judged, other = again.convergence, posterior.convergence
     assert judged.answer == "accepted" and judged.missing == ()
     # After the narrowed one come refitted proposals.
-    assert len(begun) > 1 and run.pool.proposals == (begun[-1],)
-    assert run.pool.counts == (judged.importance.draws,), "draws of the narrow proposal are in the answer"
+    assert begun and run.proposals == (begun[-1],)
+    assert run.counts == (judged.importance.draws,), "draws of the narrow proposal are in the answer"
     # Fitted to draws of a bad proposal it is worth less than a good one, but no tenth of it.
     assert judged.importance.effective_share > 0.1 * other.importance.effective_share
     name = other.importance.least_ess.quantity
@@ -251,7 +253,7 @@ def test_a_heavy_tail_is_answered_by_another_proposal(fitted, begun, monkeypatch
     monkeypatch.setattr(importance, "K_MAX", -1.0)
     monkeypatch.setattr(importance, "ROUND", 256)
     again = importance_run(fitted, SEED, rounds_max=6 + 12)
-    assert again.pool.proposals == (begun[-1],) and again.pool.counts == (12 * 256,)
+    assert again.proposals == (begun[-1],) and again.counts == (12 * 256,)
     assert again.sample.convergence.answer != "accepted"
 
 

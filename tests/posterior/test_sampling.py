@@ -14,9 +14,8 @@ from support.waits import check_forward, doings
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.inference.diagnosis import diagnose
 from tvsbayes.posterior.chain import stored_chain
-from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import DRAWING, sample, walking
-from tvsbayes.posterior.target import Target
+from tvsbayes.posterior.target import Target, importance_run
 from tvsbayes.results.tiers import CHAIN
 
 LONG, SHORT, BLOCK = 96, 12, 6

@@ -27,14 +27,9 @@ from support.two_parameters import (
 
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.model.compiled import BATCH
+from tvsbayes.posterior.linear_campaign import FAR_ABOVE, positive_factor
 from tvsbayes.posterior.target import Target
-from tvsbayes.posterior.transport import (
-    BLOCK_ROWS,
-    FAR_ABOVE,
-    Transport,
-    by_width,
-    positive_factor,
-)
+from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width
 
 FLOOR = 1e-9
 """Of a centred map, in y: Gauss and Newton take differences of residuals of 1e4 units of noise."""
@@ -108,7 +103,7 @@ def test_w_keeps_the_curvature_far_from_the_mode():
         values, vectors = np.linalg.eigh(factor @ factor.T)
         assert values[0] < 0.3
         aside, curvature = 0.25 * vectors[:, 0], []
-        centre = conditional.solved(conditional.shift)[0][::-1]
+        centre = conditional.located(np.zeros((1, path.dimension - count)))[0]
         y = np.concatenate([np.repeat(w, 3, axis=0), centre + np.outer([-1, 0, 1], aside)], axis=1)
         with jax.enable_x64(True):
             inside = plain.to_w(plain.from_whitened(y))

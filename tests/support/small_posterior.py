@@ -12,11 +12,11 @@ from scipy import stats
 from support.varying_gears import perfect_rig
 
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.inference.importance import ImportanceRun
+from tvsbayes.inference.importance import Pool
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
-from tvsbayes.posterior.importance import importance_run
+from tvsbayes.posterior.target import importance_run
 from tvsbayes.posterior.transport import Transport, transport
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -55,11 +55,11 @@ def small_fit() -> tuple[JointFit, Transport]:
 
 def mapped_already(patch: pytest.MonkeyPatch) -> None:
     """The map of that fit takes seconds and no random number: it is not made again."""
-    patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: small_fit()[1])
+    patch.setattr("tvsbayes.posterior.target.transport", lambda fit: small_fit()[1])
 
 
 @cache
-def small_run() -> ImportanceRun:
+def small_run() -> Pool:
     """Importance sampling of that fit."""
     with pytest.MonkeyPatch.context() as patch:
         mapped_already(patch)

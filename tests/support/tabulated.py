@@ -20,4 +20,4 @@ def tabulated(mean: np.ndarray, sd: np.ndarray, places: np.ndarray) -> Independe
 def no_followers() -> Followers:
     """Every coordinate has a density of its own."""
     nothing = np.zeros(0, int)
-    return Followers(nothing, nothing, np.zeros((0, len(LEADER_NODES), len(NODES))))
+    return Followers(nothing, nothing, Tables(np.zeros((0, len(LEADER_NODES), len(NODES)))))

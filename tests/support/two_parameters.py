@@ -11,7 +11,7 @@ from support.partial_arrays import no_gears, partial_arrays
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
-from tvsbayes.instrument.parameters import PERIODS_MAX
+from tvsbayes.model.gear_processes import BlockRoot
 from tvsbayes.posterior.linear_campaign import LinearCampaign
 from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.stop_states import StopStates
@@ -37,16 +37,10 @@ def linear_campaign(along: np.ndarray, prior: np.ndarray, noise: int) -> LinearC
     nothing = np.zeros(0)
     looks = LookNoise.of(np.zeros((1, ROWS, 2)), np.ones(1), np.zeros(2), np.ones(2))
     of_states = np.zeros((0, noise)), nothing
-    return LinearCampaign(np.zeros(ROWS), column, no_states(), *of_states, np.zeros((ROWS, 0)), prior, looks)
-
-
-class Scaled(Transport):
-    """A map whose noise coordinate, where it has one, scales the datum as one of all pixels does."""
-
-    @property
-    def pixels(self) -> np.ndarray:
-        """1 at that coordinate."""
-        return np.ones(self.noise)
+    of_places = np.zeros((ROWS, 0)), lambda log_scale: BlockRoot((np.zeros((len(log_scale), 0, 0)),))
+    # The noise coordinate, where there is one, scales the datum as one of all pixels does.
+    scales = np.ones(noise), np.zeros((2, noise))
+    return LinearCampaign(np.zeros(ROWS), column, no_states(), *of_states, *of_places, prior, looks, *scales)
 
 
 def route() -> Transport:
@@ -54,10 +48,9 @@ def route() -> Transport:
 
     The first scales the noise of the one datum of the second, which has no prior.
     """
-    return Scaled(
+    return Transport(
         mechanism=TWO_MIRROR,
         mode=np.zeros(len(TWO_MIRROR.names)),
-        physical=np.zeros(len(TWO_MIRROR.names)),
         free=np.array([BACKLASH, RATIO]),
         root=np.eye(2),
         noise=1,
@@ -67,11 +60,6 @@ def route() -> Transport:
         linear=linear_campaign(np.ones(1), np.zeros((1, 1)), 1),
         residuals=lambda z: np.zeros((len(z), ROWS)),
         bend=np.zeros((1, 0, 0)),
-        angle_rad=np.zeros(0),
-        on_tilt=np.zeros(0, bool),
-        of_play=np.zeros(0, bool),
-        drift_axis=np.zeros((0, 2)),
-        period_deg=np.zeros((2, PERIODS_MAX)),
     )
 
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from tvsbayes.inference.importance import Sample
 from tvsbayes.results.convergence import Convergence, Reweighted
 from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import RUNS
@@ -43,17 +42,10 @@ class Chain:
     goal: int
 
 
-class ChainRun(Protocol):
-    """A run of a chain, made with the arguments of `ensemble.Run`."""
-
-    def until_converged(self, seconds: float) -> Sample: ...  # noqa: D102
-
-
-def run_of(tier: Tier) -> Callable[..., ChainRun]:
-    """Load the class that runs a chain of a tier."""
+def run_of(tier: Tier) -> Callable[..., Any]:
+    """Load the class that runs a chain of a tier, made as `ensemble.Run` is."""
     module, _, name = RUNS[tier].partition(":")
-    run: Callable[..., ChainRun] = getattr(importlib.import_module(f"tvsbayes.inference.{module}"), name)
-    return run
+    return getattr(importlib.import_module(f"tvsbayes.inference.{module}"), name)
 
 
 class Judged(Protocol):

@@ -5,6 +5,7 @@ Coordinates w (n, d) hold many points at once; arrays are NumPy's.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -46,6 +47,9 @@ class Points:
             np.concatenate([points.log_target for points in each]),
             {name: np.concatenate([points.parts[name] for points in each]) for name in each[0].parts},
         )
+
+
+NO_POINTS = Points(np.zeros((0, 0)), np.zeros(0), {})
 
 
 class Density(Protocol):
@@ -94,25 +98,36 @@ class Density(Protocol):
         ...
 
 
-class Proposal(Protocol):
-    """A proposal density, which can be fitted to its draws."""
+class Proposal(ABC):
+    """A proposal density, which can be fitted to its draws; drawing from it is a `Step` of a chain."""
 
+    @abstractmethod
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
         """Draw independent points, shape (count, d)."""
-        ...
 
+    @abstractmethod
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Compute the log density, shape (n,)."""
-        ...
 
+    @abstractmethod
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Proposal:
-        """Return a proposal fitted to weighted draws of the target."""
-        ...
+        """Return a proposal fitted to weighted draws of the target.
+
+        Args:
+            w: draws, shape (n, d).
+            log_target: their log densities, shape (n,).
+            log_weights: log (target / their proposal), shape (n,).
+        """
 
     @property
+    @abstractmethod
     def steps(self) -> tuple[tuple[Step, float], ...]:
         """Return Metropolis-Hastings steps of a chain with their shares, which sum to at most 1."""
-        ...
+
+    def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Propose independent points, as a `Step`."""
+        proposed = self.draw(len(w), generator)
+        return proposed, self.log_density(w) - self.log_density(proposed)
 
 
 class Step(Protocol):

@@ -1,4 +1,7 @@
-"""The run of a chain: extended by steps of its walkers until it has converged."""
+"""The run of a chain: emcee's ensemble with moves of its own, extended until it has converged.
+
+The walkers form groups that never use one another, so that R-hat compares independent chains.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar
 
+import emcee
 import numpy as np
 
-from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.chain import GROUPS, Chain
 from tvsbayes.inference.density import Density, Proposal
 from tvsbayes.inference.diagnosis import ESS_LIMIT, TAU_LIMIT, diagnose, steps_wanted
-from tvsbayes.inference.importance import ImportanceRun, Sample
-from tvsbayes.inference.walkers import Walkers
+from tvsbayes.inference.importance import Pool, Sample
 from tvsbayes.progress import Advance, OpenEnded
 from tvsbayes.results.convergence import Convergence
 from tvsbayes.results.records import Tier
@@ -48,6 +51,40 @@ def next_look(chain: Chain, convergence: Convergence) -> int:
     return int(np.ceil(len(chain.w) * growth))
 
 
+class GroupEvolution(emcee.moves.DEMove):
+    """Differential evolution (ter Braak, Statistics and Computing 16 (2006) 239) within groups of neighbours.
+
+    Both halves of the ensemble, the walkers of even and of odd number, hold the same share of every group: a walker's
+    partners are those of its group in the other half.
+    """
+
+    def __init__(self):
+        # With fewer walkers than twice the dimension, differential evolution explores a subspace only; all other moves
+        # leave it.
+        super().__init__(randomize_split=False, live_dangerously=True)
+
+    def get_proposal(
+        self, s: np.ndarray, c: list[np.ndarray], random: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Propose new positions for the half s, given the other, as `emcee.moves.RedBlueMove` requires."""
+        others = np.split(np.concatenate(c), GROUPS)
+        moved = [
+            super(GroupEvolution, self).get_proposal(half, [other], random)[0]
+            for half, other in zip(np.split(s, GROUPS), others, strict=True)
+        ]
+        return np.concatenate(moved), np.zeros(len(s))
+
+
+def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
+    """Return the proposal's steps and, for the remaining share, differential evolution, which needs no proposal.
+
+    Never emcee 3.1.6's snooker or full-covariance Gaussian: both are biased.
+    """
+    steps = [(emcee.moves.MHMove(step), share) for step, share in proposal.steps]
+    rest = 1 - sum(share for _, share in steps)
+    return [*steps, (GroupEvolution(), rest)] if rest > 0 else steps
+
+
 class Run[D: Density]:
     """One call of a sampler: steps in blocks, tests of convergence on a schedule that depends on the chain alone.
 
@@ -58,7 +95,7 @@ class Run[D: Density]:
 
     def __init__(
         self,
-        start: ImportanceRun[D],
+        start: Pool[D],
         chain: Chain | None,
         keep: Callable[[Chain], None] | None,
         advance: Advance,
@@ -67,27 +104,44 @@ class Run[D: Density]:
         self.start, self.keep, self.advance, self.began = start, keep, advance, began
         density = start.density
         positions = start.starts(density.walkers)
-        walkers, dimension = positions.shape
         if chain is None:
-            state = np.random.RandomState(start.seed).get_state()
-            empty = np.zeros((0, walkers, dimension))
-            chain = Chain(empty, np.zeros((0, walkers)), np.zeros(walkers), state, 0, 0.0, FIRST_CHECK)
+            walkers, state = len(positions), np.random.RandomState(start.seed).get_state()
+            chain = Chain(
+                np.zeros((0, *positions.shape)), np.zeros((0, walkers)), np.zeros(walkers), state, 0, 0.0, FIRST_CHECK
+            )
         self.before, self.goal, self.saved_at, self.ended = chain, chain.goal, began, False
         self.invalid = density.invalid
-        self.walkers = Walkers(density, self.proposal, positions, chain)
+        self.sampler = emcee.EnsembleSampler(*positions.shape, density, moves=moves(self.proposal), vectorize=True)
+        # emcee's wrapper prints the walkers and a traceback for every exception, Ctrl-C among them.
+        self.sampler.log_prob_fn = density
+        ended = (chain.w[-1], chain.log_density[-1]) if len(chain.w) else (positions,)
+        self.state = emcee.State(*ended, random_state=chain.random_state)
 
     @property
     def proposal(self) -> Proposal:
         """Return the proposal whose steps the walkers take."""
         return self.start.proposal
 
+    def walk(self, steps: int) -> None:
+        """Continue from the last whole step, with the generator's state there."""
+        state = self.sampler.get_last_sample() if self.sampler.iteration else self.state
+        for _ in self.sampler.sample(state, iterations=steps, skip_initial_state_check=True):
+            pass
+
     def chain(self) -> Chain:
         """Return all steps so far, earlier runs included."""
-        chain = replace(self.walkers.chain, goal=self.goal)
-        if len(chain.w) == len(self.before.w):
-            return chain
-        seconds = self.before.seconds + time.monotonic() - self.began
-        return replace(chain, invalid=self.before.invalid + self.start.density.invalid - self.invalid, seconds=seconds)
+        before, backend = self.before, self.sampler.backend
+        if backend.iteration == 0:
+            return replace(before, goal=self.goal)
+        return Chain(
+            w=np.concatenate([before.w, backend.get_chain()]),
+            log_density=np.concatenate([before.log_density, backend.get_log_prob()]),
+            accepted=before.accepted + backend.accepted,
+            random_state=backend.random_state,
+            invalid=before.invalid + self.start.density.invalid - self.invalid,
+            seconds=before.seconds + time.monotonic() - self.began,
+            goal=self.goal,
+        )
 
     def save(self) -> None:
         """Write the checkpoint, if one is kept."""
@@ -126,7 +180,7 @@ class Run[D: Density]:
         try:
             while True:
                 steps = min(BLOCK, self.goal - done)
-                self.walkers.advance(steps)
+                self.walk(steps)
                 done += steps
                 elapsed = time.monotonic() - self.began
                 over = elapsed > seconds

@@ -14,11 +14,12 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from tvsbayes.errors import NotConverged
-from tvsbayes.inference.density import Density, Points, Proposal, columns_of
+from tvsbayes.inference.density import NO_POINTS, Density, Points, Proposal, columns_of
 from tvsbayes.inference.summaries import monte_carlo_errors
 from tvsbayes.progress import Advance, OpenEnded, unshown
 from tvsbayes.results.convergence import (
@@ -63,85 +64,6 @@ HEAVIEST_MAX, ROUGH_HEAVIEST_MAX = 0.05, 0.2
 
 
 @dataclass(frozen=True)
-class Pool:
-    """Weighted draws and the proposals that they were drawn from.
-
-    Attributes:
-        points: draws, round by round; None before the first.
-        proposals: proposals of the draws; counts: draws of each, in order.
-        next_proposal: fitted to all of them.
-        invalid: draws whose density has no value.
-    """
-
-    points: Points | None
-    proposals: tuple[Proposal, ...]
-    counts: tuple[int, ...]
-    next_proposal: Proposal
-    invalid: int = 0
-
-    @classmethod
-    def empty(cls, proposal: Proposal, invalid: int = 0) -> Pool:
-        """Return a pool before its first round."""
-        return cls(None, (), (), proposal, invalid)
-
-    @property
-    def drawn(self) -> Points:
-        """Return the draws; there must be some."""
-        assert self.points is not None
-        return self.points
-
-    @property
-    def log_weights(self) -> np.ndarray:
-        """Compute log (target / mixture of the proposals), shape (n,)."""
-        each = np.stack([proposal.log_density(self.drawn.w) for proposal in self.proposals])
-        share = np.log(np.array(self.counts) / len(self.drawn))
-        return self.drawn.log_target - np.logaddexp.reduce(each + share[:, None], axis=0)
-
-    @property
-    def refitted(self) -> Proposal:
-        """Fit the next proposal to all draws."""
-        return self.next_proposal.fitted(self.drawn.w, self.drawn.log_target, self.log_weights)
-
-    def extended(self, density: Density, generator: np.random.RandomState, fitted: bool) -> Pool:
-        """Add another round; fit the proposal to all draws if `fitted`."""
-        proposal, before = self.next_proposal, density.invalid
-        # A separate stream, since drawing the quantities integrated out must not change the draws of w; its seed is
-        # the state of the generator, which no other round of this or of another seed has.
-        _, key, place, *_ = generator.get_state()
-        integrated_out = random_stream(int(place), Stream.POOLED_ROUNDS, *key.tolist())
-        w = proposal.draw(ROUND, generator)
-        valued = density.valued(w, integrated_out)
-        proposals, counts = self.proposals, self.counts
-        if proposals and proposals[-1] is proposal:
-            counts = (*counts[:-1], counts[-1] + ROUND)
-        else:
-            proposals, counts = (*proposals, proposal), (*counts, ROUND)
-        points = valued if self.points is None else Points.joined([self.points, valued])
-        pool = Pool(points, proposals, counts, proposal, self.invalid + density.invalid - before)
-        if not np.isfinite(points.log_target).sum() > 8 * w.shape[1]:
-            raise FloatingPointError("the posterior density is not finite around the mode")
-        if fitted:
-            pool = replace(pool, next_proposal=pool.refitted)
-        return pool
-
-
-def piloted(density: Density, generator: np.random.RandomState, rounds_max: int) -> Pool:
-    """Return an empty pool with the proposal fitted in pilot rounds.
-
-    The proposal of a round is fitted to all rounds before it. Rounds continue until their effective sample size is
-    `PILOT_EFFECTIVE`, at most `rounds_max`: a density far from the first proposal needs many.
-    """
-    pilot = Pool.empty(density.first_proposal())
-    for number in range(1, rounds_max + 1):
-        pilot = pilot.extended(density, generator, fitted=True)
-        if PILOT_ROUNDS <= number < rounds_max:
-            smooth = Weighing(density, pilot).smoothed
-            if smooth.pareto_k < K_MAX and effective_draws(smooth.weights) >= PILOT_EFFECTIVE:
-                break
-    return Pool.empty(pilot.next_proposal, pilot.invalid)
-
-
-@dataclass(frozen=True)
 class Sample:
     """A sampled posterior.
 
@@ -167,109 +89,6 @@ class Sample:
     def equal(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Resample coordinates (count, d) with equal weights, in random order."""
         return self.points.w[generator.permutation(systematic(self.weights.ravel(), count, generator.random()))]
-
-
-@dataclass(frozen=True)
-class Weighing:
-    """A pool with the weights of its draws, and whether these meet the limits for the headlines.
-
-    Attributes:
-        density: density of the posterior.
-        pool: the draws.
-    """
-
-    density: Density
-    pool: Pool
-
-    @cached_property
-    def log_weights(self) -> np.ndarray:
-        """Compute log weights of all draws, shape (n,)."""
-        return self.pool.log_weights
-
-    @cached_property
-    def finite(self) -> np.ndarray:
-        """Mark draws whose density has a value, shape (n,); only these have weights."""
-        return np.isfinite(self.log_weights)
-
-    @cached_property
-    def smoothed(self) -> SmoothedWeights:
-        """Compute smoothed weights and their tail index."""
-        return smoothed_weights(self.log_weights[self.finite])
-
-    @cached_property
-    def points(self) -> Points:
-        """Return the draws that have weights."""
-        return self.pool.drawn.taken(self.finite)
-
-    @cached_property
-    def columns(self) -> dict[str, np.ndarray]:
-        """Return draws of every quantity that varies."""
-        return columns_of(self.density, self.points)
-
-    def summary(self, names: Sequence[str]) -> WeightedSummary:
-        """Summarise the columns of these names."""
-        return weighted_summary(np.stack([self.columns[name] for name in names], axis=1), self.smoothed.weights)
-
-    @cached_property
-    def headlines(self) -> tuple[str, ...]:
-        """Return the headlines by which the draws are judged; all quantities where no headline varies."""
-        return tuple(name for name in self.density.headlines if name in self.columns) or tuple(self.columns)
-
-    @cached_property
-    def monte_carlo_error(self) -> dict[str, MonteCarloError]:
-        """Compute the Monte Carlo error of every headline."""
-        return monte_carlo_errors(self.headlines, self.summary(self.headlines))
-
-    @property
-    def log_evidence(self) -> float:
-        """Compute the log of the integral of likelihood times prior, by the mean weight and the density's constants."""
-        highest = np.max(self.log_weights)
-        return float(highest + np.log(np.mean(np.exp(self.log_weights - highest))) + self.density.log_constant)
-
-    @cached_property
-    def importance(self) -> Importance:
-        """Judge the weights by the headlines."""
-        summary = self.summary(self.headlines)
-        raw = np.exp(self.log_weights - np.max(self.log_weights))
-        kish, count = effective_draws(raw), len(self.log_weights)
-        deviations = {n: self.columns[n] - mean for n, mean in zip(self.headlines, summary.mean, strict=True)}
-        heaviest = float(np.max(self.smoothed.weights))
-        acceptance = Acceptance(self.smoothed.pareto_k, heaviest, count, self.monte_carlo_error)
-        return Importance(
-            accepted=not acceptance.missing,
-            missing=acceptance.missing,
-            rounds=count // ROUND,
-            draws=count,
-            effective_share=kish / count,
-            least_ess=extreme(dict(zip(self.headlines, summary.ess_least.tolist(), strict=True)), min),
-            pareto_k=acceptance.pareto_k,
-            worst_pareto_k=extreme({name: pareto_k(raw[self.finite] * x**2) for name, x in deviations.items()}, max),
-            heaviest_share=heaviest,
-            log_evidence=self.log_evidence,
-            log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
-            invalid_evaluations=self.pool.invalid,
-            answer=acceptance.answer,
-        )
-
-    @property
-    def rounds_wanted(self) -> float:
-        """Estimate from the draws how many rounds of the same proposal an accepted answer needs."""
-        importance = self.importance
-        factor = max(e.rounds_factor for e in self.monte_carlo_error.values())
-        return importance.rounds * max(factor, importance.heaviest_share / HEAVIEST_MAX)
-
-    def sample(self, seconds: float) -> Sample:
-        """Return all draws as a sample on which `seconds` were spent."""
-        every = self.summary(list(self.columns))
-        convergence = Reweighted(
-            self.importance,
-            dict(zip(self.columns, every.ess_mean.tolist(), strict=True)),
-            dict(zip(self.columns, every.ess_interval95.min(axis=0).tolist(), strict=True)),
-            self.monte_carlo_error,
-        )
-        return Sample(
-            self.points, self.density.quantities(self.points), self.smoothed.weights[None], convergence, seconds
-        )
 
 
 def k_max(draws: int) -> float:
@@ -314,82 +133,235 @@ class Acceptance:
         return "rough" if self.pareto_k < ROUGH_K_MAX and self.heaviest <= ROUGH_HEAVIEST_MAX and known else "laplace"
 
 
+def worst(errors: Mapping[str, MonteCarloError]) -> str:
+    """Return the headline of the largest Monte Carlo error, by the draws that it needs."""
+    return max(errors, key=lambda name: errors[name].rounds_factor)
+
+
 def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
     """Name in a sentence the headline of the largest Monte Carlo error; none where all errors are within limits."""
     bad = {name: e for name, e in errors.items() if not e.within(MEAN_ERROR_MAX, END_ERROR_MAX)}
     if not bad:
         return ()
-    name = max(bad, key=lambda each: bad[each].rounds_factor)
+    name = worst(bad)
     mean, ends = bad[name].mean, max(bad[name].interval95)
     wanted = f"wanted at most {MEAN_ERROR_MAX:g} and {END_ERROR_MAX:g}"
     return (f"Monte Carlo error of {name}: {mean:.2f} sd of its mean, {ends:.2f} sd of its interval's ends, {wanted}",)
 
 
 @dataclass(frozen=True)
-class ImportanceRun[D: Density]:
-    """Result of importance sampling, from which a chain may start: density, pool of draws, sample."""
+class Pool[D: Density]:
+    """Rounds of weighted draws of a density, from which a chain may start.
+
+    Attributes:
+        density: density of the posterior.
+        seed: seed of all random numbers.
+        next_proposal: proposal of the next round.
+        drawn: draws, round by round.
+        proposals: proposals of the draws; counts: draws of each, in order.
+        began: moment at which the work on them began, by `time.monotonic`.
+        invalid: draws whose density has no value.
+    """
 
     density: D
-    pool: Pool
-    sample: Sample
     seed: int
+    next_proposal: Proposal
+    began: float
+    drawn: Points = NO_POINTS
+    proposals: tuple[Proposal, ...] = ()
+    counts: tuple[int, ...] = ()
+    invalid: int = 0
+
+    @property
+    def refitted(self) -> Self:
+        """Return a pool before its first round, with the proposal fitted to the draws of this one."""
+        return replace(self, next_proposal=self.proposal, drawn=NO_POINTS, proposals=(), counts=())
+
+    def extended(self, generator: np.random.RandomState) -> Self:
+        """Add another round."""
+        proposal, before = self.next_proposal, self.density.invalid
+        # A separate stream, since drawing the quantities integrated out must not change the draws of w; its seed is
+        # the state of the generator, which no other round of this or of another seed has.
+        _, key, place, *_ = generator.get_state()
+        integrated_out = random_stream(int(place), Stream.POOLED_ROUNDS, *key.tolist())
+        drawn = Points.joined([self.drawn, self.density.valued(proposal.draw(ROUND, generator), integrated_out)])
+        if not np.isfinite(drawn.log_target).sum() > 8 * drawn.w.shape[1]:
+            raise FloatingPointError("the posterior density is not finite around the mode")
+        proposals, counts = self.proposals, self.counts
+        if proposals and proposals[-1] is proposal:
+            proposals, counts, last = proposals[:-1], counts[:-1], counts[-1]
+        else:
+            last = 0
+        return replace(
+            self,
+            drawn=drawn,
+            proposals=(*proposals, proposal),
+            counts=(*counts, last + ROUND),
+            invalid=self.invalid + self.density.invalid - before,
+        )
+
+    @property
+    def rounds(self) -> int:
+        """Return the number of rounds."""
+        return sum(self.counts) // ROUND
+
+    @cached_property
+    def log_weights(self) -> np.ndarray:
+        """Compute log (target / mixture of the proposals) of all draws, shape (n,)."""
+        each = np.stack([proposal.log_density(self.drawn.w) for proposal in self.proposals])
+        share = np.log(np.array(self.counts) / len(self.drawn))
+        return self.drawn.log_target - np.logaddexp.reduce(each + share[:, None], axis=0)
 
     @cached_property
     def proposal(self) -> Proposal:
         """Fit the proposal to all draws; a chain is valid for any proposal."""
-        return self.pool.refitted
+        return self.next_proposal.fitted(self.drawn.w, self.drawn.log_target, self.log_weights)
+
+    @cached_property
+    def finite(self) -> np.ndarray:
+        """Mark draws whose density has a value, shape (n,); only these have weights."""
+        return np.isfinite(self.log_weights)
+
+    @cached_property
+    def smoothed(self) -> SmoothedWeights:
+        """Compute smoothed weights and their tail index."""
+        return smoothed_weights(self.log_weights[self.finite])
+
+    @cached_property
+    def points(self) -> Points:
+        """Return the draws that have weights."""
+        return self.drawn.taken(self.finite)
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return draws of every quantity that varies."""
+        return columns_of(self.density, self.points)
+
+    @cached_property
+    def headlines(self) -> tuple[str, ...]:
+        """Return the headlines by which the draws are judged; all quantities where no headline varies."""
+        return tuple(name for name in self.density.headlines if name in self.columns) or tuple(self.columns)
+
+    @cached_property
+    def summary(self) -> WeightedSummary:
+        """Summarise the headlines."""
+        return self._summary(self.headlines)
+
+    def _summary(self, names: Sequence[str]) -> WeightedSummary:
+        return weighted_summary(np.stack([self.columns[name] for name in names], axis=1), self.smoothed.weights)
+
+    @cached_property
+    def errors(self) -> dict[str, MonteCarloError]:
+        """Compute the Monte Carlo error of every headline."""
+        return monte_carlo_errors(self.headlines, self.summary)
+
+    @property
+    def log_evidence(self) -> float:
+        """Compute the log of the integral of likelihood times prior, by the mean weight and the density's constants."""
+        highest = np.max(self.log_weights)
+        return float(highest + np.log(np.mean(np.exp(self.log_weights - highest))) + self.density.log_constant)
+
+    @cached_property
+    def importance(self) -> Importance:
+        """Judge the weights by the headlines."""
+        raw, headlines = np.exp(self.log_weights - np.max(self.log_weights)), self.headlines
+        kish, count, heaviest = effective_draws(raw), len(raw), float(np.max(self.smoothed.weights))
+        acceptance = Acceptance(self.smoothed.pareto_k, heaviest, count, self.errors)
+        off = {name: self.columns[name] - mean for name, mean in zip(headlines, self.summary.mean, strict=True)}
+        return Importance(
+            accepted=not acceptance.missing,
+            missing=acceptance.missing,
+            rounds=self.rounds,
+            draws=count,
+            effective_share=kish / count,
+            least_ess=extreme(dict(zip(headlines, self.summary.ess_least.tolist(), strict=True)), min),
+            pareto_k=acceptance.pareto_k,
+            worst_pareto_k=extreme({name: pareto_k(raw[self.finite] * x**2) for name, x in off.items()}, max),
+            heaviest_share=heaviest,
+            log_evidence=self.log_evidence,
+            log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
+            invalid_evaluations=self.invalid,
+            answer=acceptance.answer,
+        )
+
+    @property
+    def rounds_wanted(self) -> float:
+        """Estimate from the draws how many rounds of the same proposal an accepted answer needs."""
+        factor = self.errors[worst(self.errors)].rounds_factor
+        return self.rounds * max(factor, self.importance.heaviest_share / HEAVIEST_MAX)
+
+    @cached_property
+    def sample(self) -> Sample:
+        """Return the draws that have weights as a sample, with the effective draws of every quantity."""
+        every = self._summary(list(self.columns))
+        ess = (every.ess_mean, every.ess_interval95.min(axis=0))
+        bulk, tail = (dict(zip(self.columns, each.tolist(), strict=True)) for each in ess)
+        convergence = Reweighted(self.importance, bulk, tail, self.errors)
+        weights, quantities = self.smoothed.weights[None], self.density.quantities(self.points)
+        return Sample(self.points, quantities, weights, convergence, time.monotonic() - self.began)
 
     def starts(self, count: int) -> np.ndarray:
-        """Draw starts w by weight without replacement, shape (count, d)."""
-        log_weights = self.pool.log_weights
+        """Draw starts w of a chain by weight without replacement, shape (count, d)."""
         generator = np.random.RandomState(self.seed)
         # Gumbel's trick: the largest perturbed weights are a weighted sample without replacement.
-        keys = np.where(np.isfinite(log_weights), log_weights, -np.inf) + generator.gumbel(size=len(log_weights))
-        return self.pool.drawn.w[np.argsort(-keys)[:count]]
+        keys = np.where(self.finite, self.log_weights, -np.inf) + generator.gumbel(size=len(self.log_weights))
+        return self.drawn.w[np.argsort(-keys)[:count]]
+
+
+def piloted[D: Density](pool: Pool[D], generator: np.random.RandomState, rounds_max: int) -> Pool[D]:
+    """Fit the proposal of an empty pool in pilot rounds.
+
+    The proposal of a round is fitted to all rounds before it. Rounds continue until their effective sample size is
+    `PILOT_EFFECTIVE`, at most `rounds_max`: a density far from the first proposal needs many.
+    """
+    for number in range(1, rounds_max + 1):
+        pool = pool.extended(generator)
+        pool = replace(pool, next_proposal=pool.proposal)
+        if PILOT_ROUNDS <= number < rounds_max:
+            smooth = pool.smoothed
+            if smooth.pareto_k < K_MAX and effective_draws(smooth.weights) >= PILOT_EFFECTIVE:
+                break
+    return replace(pool, drawn=NO_POINTS, proposals=(), counts=())
 
 
 def weighted_run[D: Density](
     density: D,
     seed: int,
     advance: Advance = unshown,
-    rounds_max: int | None = None,
+    rounds_max: int = ROUNDS_MAX,
     rounds_least: int | None = None,
     pilots_max: int = 0,
-) -> ImportanceRun[D]:
+    began: float | None = None,
+) -> Pool[D]:
     """Draw rounds until the answer is accepted; where that would take too long, from a newly fitted proposal.
 
     Args:
         density: density about a mode.
         seed: seed of the draws.
         advance: called with the share that is done.
-        rounds_max: rounds of all proposals together, by default `ROUNDS_MAX`.
+        rounds_max: rounds of all proposals together.
         rounds_least: rounds of the proposal that gives the answer, by default `ROUNDS_LEAST`.
         pilots_max: pilot rounds at most, as in `piloted`.
+        began: moment at which work began, by default now.
 
     Raises:
         NotConverged: the density is not finite around the mode.
     """
-    began = time.monotonic()
-    generator = np.random.RandomState(seed)
-    drawn = OpenEnded()
+    began, generator, drawn = began or time.monotonic(), np.random.RandomState(seed), OpenEnded()
     try:
-        pool = piloted(density, generator, pilots_max)
-        wanted = ROUNDS_LEAST if rounds_least is None else rounds_least
-        begun, total, rounds, patience = wanted, 0, 0, PATIENCE * wanted
+        pool = piloted(Pool(density, seed, density.first_proposal(), began), generator, pilots_max)
+        begun = wanted = ROUNDS_LEAST if rounds_least is None else rounds_least
+        left, patience = rounds_max, PATIENCE * wanted
         while True:
-            while rounds < wanted:
-                rounds, total = rounds + 1, total + 1
-                pool = pool.extended(density, generator, fitted=False)
-                advance(drawn.share(total, total + wanted - rounds))
-            weighed = Weighing(density, pool)
-            left = (ROUNDS_MAX if rounds_max is None else rounds_max) - total
-            if weighed.importance.accepted or left <= 0:
-                return ImportanceRun(density, pool, weighed.sample(time.monotonic() - began), seed)
-            needed, heavy = weighed.rounds_wanted, not weighed.importance.pareto_k < K_MAX
+            while pool.rounds < wanted:
+                pool, left = pool.extended(generator), left - 1
+                advance(drawn.share(rounds_max - left, rounds_max - left + wanted - pool.rounds))
+            if pool.importance.accepted or left <= 0:
+                return pool
+            rounds, needed, heavy = pool.rounds, pool.rounds_wanted, not pool.importance.pareto_k < K_MAX
             if (needed > patience or (heavy and rounds >= 2 * begun)) and left >= 2 * rounds:
                 # The next proposal is fitted to these draws and may use twice as many.
-                pool = Pool.empty(pool.refitted, pool.invalid)
-                begun, rounds, wanted, patience = rounds, 0, rounds, 2 * patience
+                pool, begun, wanted, patience = pool.refitted, rounds, rounds, 2 * patience
             elif heavy and rounds < 2 * begun <= rounds + left:
                 # More draws hardly change the tail index, but a proposal fitted to them may.
                 wanted = 2 * begun

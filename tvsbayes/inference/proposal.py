@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from tvsbayes.inference.density import Step
+from tvsbayes.inference.density import Proposal, Step
 from tvsbayes.inference.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 
 HEAVY_DOF = 5.0
@@ -66,28 +66,19 @@ def log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.n
     return constant - 0.5 * (dof + dimension) * np.log1p(distance2 / dof)
 
 
-@dataclass(frozen=True)
-class Regression:
-    """Regression of a log ratio of densities on coordinates (d), their squares and significant products.
+def regression(x: np.ndarray, log_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Regress a log ratio of densities on coordinates and their squares, and significant products.
 
-    Attributes:
-        slope, square: coefficients, shape (d,).
-        cross: coefficients of products, symmetric, zero where not taken, shape (d, d).
-    """
-
-    slope: np.ndarray
-    square: np.ndarray
-    cross: np.ndarray
-
-
-def regression(x: np.ndarray, log_ratio: np.ndarray) -> Regression:
-    """Regress a log ratio of densities on coordinates, taking products by forward selection on the residuals.
-
-    All d (d - 1) / 2 products would add more scatter than they explain.
+    Products are taken by forward selection on the residuals: all d (d - 1) / 2 would add more scatter than they
+    explain.
 
     Args:
         x: coordinates in units of their sds, shape (n, d).
         log_ratio: shape (n,).
+
+    Returns:
+        Coefficients of the coordinates and of their squares, shape (d,) each, and of products, symmetric, zero where
+        not taken, shape (d, d).
     """
     count, dimension = x.shape
     design = np.column_stack([np.ones(count), x, x**2])
@@ -110,15 +101,14 @@ def regression(x: np.ndarray, log_ratio: np.ndarray) -> Regression:
     _, slope, square, product = np.split(solution, [1, 1 + dimension, 1 + 2 * dimension])
     cross = np.zeros((dimension, dimension))
     cross[tuple(pairs.T)] = product
-    return Regression(slope, square, cross + cross.T)
+    return slope, square, cross + cross.T
 
 
 @dataclass(frozen=True)
-class Independence:
+class Independence(Proposal):
     """An independence proposal: coordinates normal or tabulated, mixed with heavier-tailed parts.
 
-    Parts of the mixture: every coordinate by itself; the coupled ones from a multivariate t; all from another t. It is
-    a step of a chain too (`density.Step`).
+    Parts of the mixture: every coordinate by itself; the coupled ones from a multivariate t; all from another t.
 
     Attributes:
         mean, sd: moments of every coordinate, shape (d,).
@@ -254,11 +244,6 @@ class Independence:
         v[:, self.places] = self.followers.drawn(led, share, chances, alone | stays)
         return v
 
-    def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """See `density.Step`."""
-        proposed = self.draw(len(w), generator)
-        return proposed, self.log_density(w) - self.log_density(proposed)
-
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:
         """Return the moves of a chain with their shares."""
@@ -276,39 +261,30 @@ class Independence:
         return self.to_w(after), np.where(new, self._each(before) - self._each(after), 0.0).sum(axis=1)
 
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Independence:
-        """Fit the proposal to weighted draws of the target; return it unchanged where too few have weight.
+        """Fit the proposal as `Proposal.fitted` says; return it unchanged where too few draws have weight.
 
         Where the target differs from the proposal in means and covariance only, the log of their ratio is linear in v
         and the products of its coordinates. The coefficients give both and change the tables. A regression on the draws
         with weight scatters far less than weighted moments.
-
-        Args:
-            w: draws, shape (n, d).
-            log_target: their log densities, shape (n,).
-            log_weights: log (target / their proposal), shape (n,).
         """
         matters = np.isfinite(log_weights) & (log_weights > np.max(log_weights) - MATTERS)
         if matters.sum() <= 8 * len(self.mean):
             return self
         v = self.to_v(w[matters])
         near = np.clip((v - self.mean) / self.sd, -REACH, REACH)
-        surface = regression(near, log_target[matters] - self._each(v).sum(axis=1))
-        variance = 1 / np.clip(1 - 2 * surface.square, 0.6, 1.6)
-        mean = self.mean + self.sd * np.clip(surface.slope * variance, -1.0, 1.0)
+        slope, square, cross = regression(near, log_target[matters] - self._each(v).sum(axis=1))
+        variance = 1 / np.clip(1 - 2 * square, 0.6, 1.6)
+        mean = self.mean + self.sd * np.clip(slope * variance, -1.0, 1.0)
         sd = INFLATION * np.sqrt(np.clip(self.sd**2 * variance, *VARIANCE_RANGE))
         at = np.clip((NODES - self.mean[self.places, None]) / self.sd[self.places, None], -REACH, REACH)
         tilt, bend = (
-            np.clip(x[self.places, None], -limit, limit)
-            for x, limit in zip((surface.slope, surface.square), TILT_LIMITS, strict=True)
+            np.clip(x[self.places, None], -limit, limit) for x, limit in zip((slope, square), TILT_LIMITS, strict=True)
         )
         change = tilt * at + bend * at**2
-        every = [
-            Tables.normalised(rows + change[row]).log_density
-            for rows, row in zip(self.followers.log_density, self.followers.follower, strict=True)
-        ]
-        followers = replace(self.followers, log_density=np.reshape(every, self.followers.log_density.shape))
+        of_followers = self.followers.tables.log_density + change[self.followers.follower][:, None]
+        followers = replace(self.followers, tables=Tables.normalised(of_followers))
         straight = self.moved(mean, sd, Tables.normalised(self.tables.log_density + change), followers)
-        return straight.turned(surface.cross * np.sqrt(np.outer(variance, variance)))
+        return straight.turned(cross * np.sqrt(np.outer(variance, variance)))
 
 
 def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimension: int) -> list[tuple[int, int]]:
@@ -352,14 +328,13 @@ def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimen
     pairs: list[tuple[int, int]] = []
     reached: set[int] = set()
     for root in sorted(edges, key=lambda row: -len(edges[row])):
-        waiting = [] if root in reached else [root]
+        queue = [] if root in reached else [root]
         reached.add(root)
-        while waiting:
-            leader = waiting.pop(0)
-            for follower in (row for row in edges[leader] if row not in reached):
-                reached.add(follower)
-                pairs.append((leader, follower))
-                waiting.append(follower)
+        for leader in queue:
+            new = [row for row in edges[leader] if row not in reached]
+            reached.update(new)
+            queue.extend(new)
+            pairs.extend((leader, row) for row in new)
     return pairs
 
 
@@ -428,9 +403,8 @@ def first_proposal(
         lines[follower] = special.logsumexp(rows[k], axis=0)
     leaders = np.setdiff1d(np.arange(len(places)), [follower for _, follower in pairs])
     lines[leaders] = alone[leaders] + gains[leaders]
-    conditional = np.reshape([Tables.normalised(each).log_density for each in rows], rows.shape)
     leader_rows, follower_rows = np.reshape(np.array(pairs, dtype=int), (-1, 2)).T
-    followers = Followers(leader_rows, follower_rows, conditional)
+    followers = Followers(leader_rows, follower_rows, Tables.normalised(rows))
     tables = Tables.normalised(lines)
     mean, sd = np.zeros(dimension), np.full(dimension, INFLATION)
     together, zero = np.flatnonzero(coupled), np.zeros(dimension)

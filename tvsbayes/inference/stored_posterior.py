@@ -6,22 +6,18 @@ Needs no model, no fit and no JAX. `fit.json` states what the draws are, `draws.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.display import Shown, View
+from tvsbayes.display import View
 from tvsbayes.errors import NotConverged
 from tvsbayes.files.documents import Keys
-from tvsbayes.inference.summaries import Propagated, carried, reweighted
+from tvsbayes.inference.summaries import NamedDraws
 from tvsbayes.results.records import AnswerKind
 from tvsbayes.results.store import AGAIN, FitFiles, damaged_draws
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 FORMAT, OLDER = re.compile(r"tvsbayes-(?:[a-z]+-)?fit/1"), re.compile(r"tvsbayes-(?:[a-z]+-)?fit/[0-9]+")
 """Formats of `fit.json` whose draws can be read, of any instrument; formats of any version."""
@@ -31,13 +27,11 @@ COLUMNS = (("names", "physical"), ("names", "draws"), ("derived_names", "derived
 
 
 @dataclass(frozen=True, repr=False)
-class StoredPosterior(Shown):
-    """Draws of a posterior from `results/`.
+class StoredPosterior(NamedDraws):
+    """Draws of a posterior from `results/`; for an axis in the unit of its readings.
 
     Attributes:
-        by_name: draws of every quantity, each of shape (n,), in the unit of its name; for an axis in the unit of its
-            readings.
-        weights: weights of the draws, sum 1, shape (n,). Repeats of a draw are merged, with the sum of their weights.
+        by_name, weights: as of `NamedDraws`, shape (n,). Repeats of a draw are merged, with the sum of their weights.
         answer: "accepted"; with `anyway` also "rough", or "laplace" for the approximation at the mode.
     """
 
@@ -47,31 +41,7 @@ class StoredPosterior(Shown):
 
     def shown(self) -> View:
         """Show means, sds and 95 % intervals."""
-        propagated = self.propagate(lambda p: np.stack(list(p.values()), axis=1))
-        return propagated.by_quantity(f"Posterior of {len(self.weights)} stored draws, {self.answer}", self.by_name)
-
-    def to_dataframe(self) -> pd.DataFrame:
-        """Return all draws by name, one row each, with their `weight` (sum 1)."""
-        import pandas as pd
-
-        return pd.DataFrame({**self.by_name, "weight": self.weights})
-
-    def propagate(self, function: Callable[[Mapping[str, np.ndarray]], np.ndarray]) -> Propagated:
-        """Propagate the posterior into a quantity of your own, as `Posterior.propagate` does.
-
-        Args:
-            function: called once with all draws, a mapping from name to an array (n,); returns one value per draw, an
-                array (n,) or (n, ...).
-
-        Returns:
-            Mean, sd, interval and their Monte Carlo errors, which take the stored draws as independent; `draws` and
-            `weights` with a first axis of one.
-
-        Raises:
-            ValueError: the function returned another number of rows, or values that are not finite.
-        """
-        values = carried(function, self.by_name, len(self.weights))
-        return reweighted(values[None], self.weights[None])
+        return self.view_of(f"Posterior of {len(self.weights)} stored draws, {self.answer}", tuple(self.by_name))
 
 
 def posterior_in(files: FitFiles, *, anyway: bool = False) -> StoredPosterior:

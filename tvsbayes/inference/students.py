@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.inference.density import Step
+from tvsbayes.inference.density import Proposal, Step
 from tvsbayes.inference.proposal import log_t
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
@@ -26,7 +26,7 @@ STRIDE = 2.38
 
 
 @dataclass(frozen=True)
-class StudentMixture:
+class StudentMixture(Proposal):
     """A mixture of Student distributions.
 
     Attributes:
@@ -65,11 +65,6 @@ class StudentMixture:
             volume = np.sum(np.log(np.diag(root)))
             parts.append(np.log(share) - volume + log_t(square, w.shape[1], DEGREES))
         return np.logaddexp.reduce(parts, axis=0)
-
-    def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """See `density.Step`."""
-        proposed = self.draw(len(w), generator)
-        return proposed, self.log_density(w) - self.log_density(proposed)
 
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:

@@ -1,18 +1,22 @@
-"""Quantities under a sampled posterior: mean, sd, interval and their Monte Carlo errors.
+"""Draws by name, propagated into quantities: mean, sd, interval and their Monte Carlo errors.
 
 Draws are ordered (chain, draw, ...); a chain is a walker. Weighted draws are independent, all in one chain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tvsbayes.display import Cell, Shown, View
 from tvsbayes.results.convergence import MonteCarloError
 from tvsbayes.statistics.weighted_draws import TAILS, Moments, weighted_summary
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, repr=False)
@@ -40,30 +44,60 @@ class Propagated(Moments, Shown):
         rows: list[tuple[Cell, ...]] = [(str(k), *row) for k, row in enumerate(columns)]
         return View("Propagated quantity", ("element", "mean", "sd", "2.5 %", "97.5 %", "Monte Carlo error"), rows)
 
-    def by_quantity(self, title: str, names: Iterable[str]) -> View:
-        """Show mean, sd and interval of the quantities of these names, each of shape (names,)."""
-        columns = (each.tolist() for each in (self.mean, self.sd, *self.interval95))
+
+class NamedDraws(Shown):
+    """Draws of a posterior by name, with weights.
+
+    Attributes:
+        by_name: draws of every quantity, chains joined, each of shape (n,), in the unit of its name.
+        weights: weights of the draws, sum 1, shape (n,) or (chain, draw).
+    """
+
+    by_name: Mapping[str, np.ndarray]
+    weights: np.ndarray
+
+    def view_of(self, title: str, names: Sequence[str]) -> View:
+        """Show means, sds and 95 % intervals of the quantities of these names."""
+        found = self.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
+        columns = (each.tolist() for each in (found.mean, found.sd, *found.interval95))
         return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), list(zip(names, *columns, strict=True)))
 
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return all draws by name, one row each, with their `weight` (sum 1)."""
+        import pandas as pd
 
-def carried(
-    function: Callable[[Mapping[str, np.ndarray]], np.ndarray], by_name: Mapping[str, np.ndarray], count: int
-) -> np.ndarray:
-    """Evaluate a function of all draws by name; values (count, ...), one for each draw.
+        return pd.DataFrame({**self.by_name, "weight": self.weights.ravel()})
 
-    Raises:
-        ValueError: the number of rows is wrong, or values are not finite.
-    """
-    values = np.asarray(function(by_name), dtype=float)
-    if values.ndim == 0 or len(values) != count:
-        raise ValueError(
-            f"the function returned shape {values.shape}; its first axis must be the {count} draws it was given: "
-            "compute with whole arrays, not with their means"
-        )
-    if not np.all(np.isfinite(values)):
-        share = np.mean(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
-        raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
-    return values
+    def summarised(self, values: np.ndarray) -> Propagated:
+        """Compute mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
+        return reweighted(values, np.atleast_2d(self.weights))
+
+    def propagate(self, function: Callable[[Mapping[str, np.ndarray]], np.ndarray]) -> Propagated:
+        """Propagate the posterior into a quantity of your own.
+
+        Args:
+            function: called once with all draws, a mapping from name to an array (n,) in the unit of the name; returns
+                one value per draw, an array (n,) or (n, ...). For example the turn by 200 steps to the left after a
+                reversal, deg: `lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"]`. The names are those
+                of `fit.json` and of `list(posterior.by_name)`.
+
+        Returns:
+            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with weighted or correlated draws), each
+            of the shape (...) of one value. Draws read from files are taken as independent.
+
+        Raises:
+            ValueError: the function returned a wrong number of rows, or values that are not finite.
+        """
+        values, count = np.asarray(function(self.by_name), dtype=float), self.weights.size
+        if values.ndim == 0 or len(values) != count:
+            raise ValueError(
+                f"the function returned shape {values.shape}; its first axis must be the {count} draws it was given: "
+                "compute with whole arrays, not with their means"
+            )
+        if not np.all(np.isfinite(values)):
+            share = np.mean(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+            raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
+        return self.summarised(values.reshape(*np.atleast_2d(self.weights).shape, *values.shape[1:]))
 
 
 def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:
@@ -78,8 +112,8 @@ def propagated(values: np.ndarray) -> Propagated:
     # Imported here: loading takes as long as a fit with stored traces, and only chains need it.
     from arviz_stats.base import array_stats
 
-    flat = values.reshape(*values.shape[:2], -1)
-    weights = np.full(values.shape[:2], 1 / (values.shape[0] * values.shape[1]))
+    shape, flat = values.shape[:2], values.reshape(*values.shape[:2], -1)
+    count = shape[0] * shape[1]
     # A quantity that is equal in all draws has no effective number of draws and no Monte Carlo error.
     moving = np.ptp(flat, axis=(0, 1)) > 0
 
@@ -89,17 +123,16 @@ def propagated(values: np.ndarray) -> Propagated:
             result[moving] = statistic(flat[..., moving], chain_axis=0, draw_axis=1, **options)
         return result.reshape(values.shape[2:])
 
-    errors = [each(array_stats.mcse, 0.0, method="quantile", prob=prob) for prob in TAILS]
     return Propagated(
         mean=values.mean(axis=(0, 1)),
         sd=values.std(axis=(0, 1)),
         interval95=np.quantile(values, TAILS, axis=(0, 1)),
         mcse_mean=each(array_stats.mcse, 0.0, method="mean"),
         mcse_sd=each(array_stats.mcse, 0.0, method="sd"),
-        mcse_interval95=np.stack(errors),
-        ess=each(array_stats.ess, float(values.shape[0] * values.shape[1]), method="bulk"),
+        mcse_interval95=np.stack([each(array_stats.mcse, 0.0, method="quantile", prob=prob) for prob in TAILS]),
+        ess=each(array_stats.ess, float(count), method="bulk"),
         draws=values,
-        weights=weights,
+        weights=np.full(shape, 1 / count),
     )
 
 

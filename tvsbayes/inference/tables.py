@@ -53,7 +53,7 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Tables:
-    """Densities of h coordinates, piecewise linear in the log between `NODES`, shape (h, nodes), zero outside."""
+    """Densities of single coordinates, zero outside `NODES`; the log, (..., nodes), is piecewise linear between."""
 
     log_density: np.ndarray
 
@@ -61,19 +61,19 @@ class Tables:
     def normalised(cls, log_density: np.ndarray) -> Tables:
         """Normalise log densities given up to a constant each, -inf or NaN where undefined."""
         finite = np.where(np.isfinite(log_density), log_density, -np.inf)
-        finite = np.maximum(finite - finite.max(axis=1, keepdims=True), FLOOR)
-        return cls(finite - np.log(cls(finite).masses.sum(axis=1, keepdims=True)))
+        finite = np.maximum(finite - finite.max(axis=-1, keepdims=True), FLOOR)
+        return cls(finite - np.log(cls(finite).masses.sum(axis=-1, keepdims=True)))
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """Compute the probability between neighbouring nodes, shape (h, nodes - 1)."""
-        low, rise = self.log_density[:, :-1], np.diff(self.log_density)
+        """Compute the probability between neighbouring nodes, shape (..., nodes - 1)."""
+        low, rise = self.log_density[..., :-1], np.diff(self.log_density)
         steep = np.abs(rise) > 1e-9
         return STEP * np.exp(low) * np.where(steep, np.expm1(rise) / np.where(steep, rise, 1.0), 1.0)
 
     @cached_property
     def moments(self) -> WithSd[np.ndarray]:
-        """Compute means and sds, shape (h,) each, by the trapezoid rule with ten points per step."""
+        """Compute means and sds of h coordinates, shape (h,) each, by the trapezoid rule with ten points per step."""
         x = np.linspace(NODES[0], NODES[-1], 10 * (len(NODES) - 1) + 1)
         lines = np.array([np.interp(x, NODES, each) for each in self.log_density])
         density = np.exp(lines.reshape(len(self.log_density), len(x)))
@@ -83,8 +83,9 @@ class Tables:
 
     @cached_property
     def reached(self) -> np.ndarray:
-        """Compute the probability below each node but the last, shape (h, nodes - 1)."""
-        return np.concatenate([np.zeros((len(self.masses), 1)), np.cumsum(self.masses, axis=1)[:, :-1]], axis=1)
+        """Compute the probability below each node but the last, shape (..., nodes - 1)."""
+        below = np.cumsum(self.masses, axis=-1)[..., :-1]
+        return np.concatenate([np.zeros((*below.shape[:-1], 1)), below], axis=-1)
 
     def at(self, w: np.ndarray) -> np.ndarray:
         """Compute log densities of w (n, h)."""
@@ -132,33 +133,25 @@ class Followers:
 
     Attributes:
         leader, follower: rows among the tabulated coordinates, leaders before their followers, shape (f,) each.
-        log_density: log density of the follower at `NODES`, by the leader's node, shape (f, leader nodes, nodes).
+        tables: densities of the follower by the leader's node, shape (f, leader nodes, nodes).
     """
 
     leader: np.ndarray
     follower: np.ndarray
-    log_density: np.ndarray
+    tables: Tables
 
-    def share(self, leaders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the node below leaders (n,) and the share of the node above."""
+    def _share(self, leaders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the node below leaders (n, ...) and the share of the node above."""
         at = np.clip((leaders - LEADER_NODES[0]) / (LEADER_NODES[1] - LEADER_NODES[0]), 0, len(LEADER_NODES) - 1)
         node = np.minimum(at.astype(int), len(LEADER_NODES) - 2)
         return node, at - node
 
-    @cached_property
-    def tables(self) -> list[Tables]:
-        """Return the tables of each follower, a row for every node of its leader."""
-        return [Tables(rows) for rows in self.log_density]
-
     def at(self, w: np.ndarray) -> np.ndarray:
         """Compute log densities of the followers, shape (n, f), at tabulated coordinates w (n, h)."""
-        log_density = np.empty((len(w), len(self.leader)))
-        for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
-            node, above = self.share(w[:, leader])
-            low, high = (_line_at(w[:, follower], self.log_density[k][node + step]) for step in (0, 1))
-            with np.errstate(divide="ignore"):
-                log_density[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
-        return log_density
+        (node, above), each = self._share(w[:, self.leader]), np.arange(len(self.leader))
+        low, high = (_line_at(w[:, self.follower], self.tables.log_density[each, node + k]) for k in (0, 1))
+        with np.errstate(divide="ignore"):
+            return np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
 
     def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Draw followers again, except those kept; tabulated coordinates (n, h).
@@ -169,11 +162,10 @@ class Followers:
             chance: uniform numbers for the mixtures, shape (n, f).
             kept: shape (n, h), boolean.
         """
-        result = w.copy()
+        result, tables = w.copy(), self.tables
         for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
-            node, above = self.share(result[:, leader])
-            chosen = node + (chance[:, k] < above)
-            table = self.tables[k]
-            new = _point_below(share[:, follower], table.log_density[chosen], table.reached[chosen])
+            node, above = self._share(result[:, leader])
+            chosen = k, node + (chance[:, k] < above)
+            new = _point_below(share[:, follower], tables.log_density[chosen], tables.reached[chosen])
             result[:, follower] = np.where(kept[:, follower], w[:, follower], new)
         return result

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -49,20 +47,16 @@ COORDS: dict[str, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True)
-class Variable:
-    """A variable of posterior.nc: the names of its quantities, and their dimension beyond (chain, draw), if any."""
-
-    names: tuple[str, ...]
-    dim: str | None = None
+type Variable = tuple[tuple[str, ...], str | None]
+"""The names of a variable's quantities, and their dimension beyond (chain, draw), if any."""
 
 
 def _of_block(block: str, names: tuple[str, ...]) -> Variable:
     """Build the variable of a block, with the dimension of its labels; a single quantity has none."""
     if len(names) == 1:
-        return Variable(names)
+        return names, None
     labels = tuple(name.removeprefix(f"{block}.") for name in names)
-    return Variable(names, next(dim for dim, of_dim in COORDS.items() if of_dim == labels))
+    return names, next(dim for dim, of_dim in COORDS.items() if of_dim == labels)
 
 
 _RIG_BLOCKS = sorted({parameter.block: None for parameter in TWO_MIRROR.declared}, key=lambda b: len(BLOCKS[b]) > 1)
@@ -71,49 +65,32 @@ VARIABLES: dict[str, Variable] = {
     **{block: _of_block(block, names) for block, names in _DERIVED.items() if names},
     "mean_degrees_per_step": _of_block("degrees_per_step", BLOCKS["degrees_per_step"]),
     **{b.replace(".", "_"): _of_block(b, BLOCKS[b]) for b in _RIG_BLOCKS if b != "degrees_per_step"},
-    "stereo": Variable(STEREO_PARAMETER_NAMES, "stereo_parameter"),
+    "stereo": (STEREO_PARAMETER_NAMES, "stereo_parameter"),
 }
 """Variables of posterior.nc. `degrees_per_step` by direction; the mean ratio of an axis is `mean_degrees_per_step`."""
 
 
-def variables_of(mechanism: Mechanism) -> dict[str, Variable]:
-    """Return the variables of posterior.nc for a mechanism; each term of a head's geometry is one."""
+def dataset(draws: Derived, varying: set[str], shape: tuple[int, int], mechanism: Mechanism) -> xr.Dataset:
+    """Build the variables of posterior.nc of what varies; each term of a head's geometry is one.
+
+    Of a dimension of which some entries are fixed the others have a dimension of the variable's own.
+    """
+    columns, variables = Draws(draws, mechanism), {}
     own = {*mechanism.names, *derived_names(mechanism)}
-    shared = {name: spec for name, spec in VARIABLES.items() if spec.names[0] in own}
-    terms = [name for name in mechanism.names if mechanism.parameters[name] in TERMS]
-    return shared | {name.replace(".", "_"): Variable((name,)) for name in terms}
-
-
-def _variables(
-    draws: Derived, varying: set[str], shape: tuple[int, int], mechanism: Mechanism
-) -> dict[str, xr.DataArray]:
-    """Return all variables that vary, with named dimensions; fixed entries of a dimension are left out."""
-    columns = Draws(draws, mechanism)
-    result = {}
-    for variable, spec in variables_of(mechanism).items():
-        chosen = np.array([name in varying for name in spec.names])
-        if not chosen.any():
+    shared = {name: spec for name, spec in VARIABLES.items() if spec[0][0] in own}
+    of_terms = (name for name in mechanism.names if mechanism.parameters[name] in TERMS)
+    terms = {name.replace(".", "_"): ((name,), None) for name in of_terms}
+    for variable, (names, dim) in (shared | terms).items():
+        chosen = [name for name in names if name in varying]
+        if not chosen:
             continue
-        values = np.stack([columns[name] for name in np.array(spec.names)[chosen]], axis=-1)
+        values = np.stack([columns[name] for name in chosen], axis=-1).reshape(*shape, -1)
         coords: dict[str, object] = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
-        if spec.dim is None:
-            values = values.reshape(shape)
-        else:
-            values = values.reshape(*shape, -1)
-            coords[spec.dim] = [label for label, yes in zip(COORDS[spec.dim], chosen, strict=True) if yes]
-        result[variable] = xr.DataArray(values, coords, tuple(coords))
-    return result
-
-
-def _dataset(variables: Mapping[str, xr.DataArray]) -> xr.Dataset:
-    """Join variables; a dimension with fewer entries in some variable gets a name of its own."""
-    full = {}
-    for name, array in variables.items():
-        for dim in array.dims[2:]:
-            if array.sizes[dim] < len(COORDS[str(dim)]):
-                array = array.rename({dim: f"{name}_{dim}"})
-        full[name] = array
-    return xr.Dataset(full)
+        if dim is not None:
+            labels = [label for name, label in zip(names, COORDS[dim], strict=True) if name in varying]
+            coords[dim if len(labels) == len(names) else f"{variable}_{dim}"] = labels
+        variables[variable] = xr.DataArray(values[..., 0] if dim is None else values, coords, tuple(coords))
+    return xr.Dataset(variables)
 
 
 def data_tree(posterior: Posterior) -> xr.DataTree:
@@ -129,10 +106,10 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         Weighted draws are resampled to one chain of equal weight; `sample_stats` has the number (`source`) and the
         weight of the draw that each was, the attributes of the tree the effective draws by quantity.
     """
-    weighted = posterior if posterior.tier == IMPORTANCE else None
-    source = None if weighted is None else weighted.equal_places(RESAMPLED)
-    if weighted is not None and source is not None:
-        posterior = weighted.taken(source[None])
+    weighted, source = posterior, None
+    if weighted.tier == IMPORTANCE:
+        source = weighted.equal_places(RESAMPLED)[None]
+        posterior = weighted.taken(source)
     fit = posterior.fit
     shape = posterior.z.shape[:2]
     mechanism = fit.space.mechanism
@@ -144,25 +121,24 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     spots = ordered_spots(fit.campaign)
     coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
     stats = {"lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw"))}
-    lengths: dict[str, int] = {}
-    effective: dict[str, str] = {}
-    if weighted is not None and source is not None:
-        stats["source"] = xr.DataArray(source[None], coords, ("chain", "draw"))
-        stats["log_weight"] = xr.DataArray(np.log(weighted.weights.ravel()[source])[None], coords, ("chain", "draw"))
-        effective = {"ess_mean": json.dumps(weighted.convergence.ess_bulk)}
-        effective["ess_interval_ends"] = json.dumps(weighted.convergence.ess_tail)
-    if isinstance(posterior.convergence, Convergence):
-        convergence = posterior.convergence
+    attributes: dict[str, object] = {}
+    if source is not None:
+        stats["source"] = xr.DataArray(source, coords, ("chain", "draw"))
+        stats["log_weight"] = xr.DataArray(np.log(weighted.weights.ravel()[source]), coords, ("chain", "draw"))
+        attributes["ess_mean"] = json.dumps(weighted.convergence.ess_bulk)
+        attributes["ess_interval_ends"] = json.dumps(weighted.convergence.ess_tail)
+    convergence = posterior.convergence
+    if isinstance(convergence, Convergence):
         stats["acceptance_rate"] = xr.DataArray(convergence.acceptance, {"chain": coords["chain"]}, ("chain",))
-        lengths = {"steps": convergence.steps, "discarded": convergence.discarded, "thin": convergence.thin}
+        attributes |= {"steps": convergence.steps, "discarded": convergence.discarded, "thin": convergence.thin}
     places = {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)}
     pixels = pixels_of(spots) if fit.campaign.has_images else np.zeros((len(spots), len(PIXEL_LABELS)))
     # Sightings have angles about the direction sighted, rad, in the columns of `sightings.SIGHTED`.
     observed = xr.DataArray(pixels, places, tuple(places), name="pixels")
     tree = xr.DataTree.from_dict(
         {
-            "posterior": _dataset(_variables(posterior.draws, varying, shape, mechanism)),
-            "prior": _dataset(_variables(prior_draws, varying, prior_draws.physical.shape[:2], mechanism)),
+            "posterior": dataset(posterior.draws, varying, shape, mechanism),
+            "prior": dataset(prior_draws, varying, prior_draws.physical.shape[:2], mechanism),
             "posterior_predictive": predictive_pixels(posterior).to_dataset(name="pixels"),
             "log_likelihood": move_log_likelihood(posterior).to_dataset(name="pixels"),
             "observed_data": observed.to_dataset(),
@@ -171,13 +147,12 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     )
     tree.attrs = {
         "format": POSTERIOR_FORMAT,
-        "sampling_library": posterior.tier if lengths else "tvsbayes",
+        "sampling_library": "tvsbayes" if source is not None else posterior.tier,
         "tier": posterior.tier,
         "sampling_time": posterior.seconds,
         "seed": posterior.seed,
         "converged": int(posterior.converged),
-        **lengths,
-        **effective,
+        **attributes,
         "versions": json.dumps({name: version_of(name) for name in ("tvsbayes", CHAIN, "arviz", "jax", "numpy")}),
         "inputs": json.dumps(input_hashes(fit.campaign)),
         "fingerprint": fingerprint(fit),

@@ -6,17 +6,16 @@ those of a chain equal weights; chains are walkers of the ensemble.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from tvsbayes.display import Shown, View
+from tvsbayes.display import View
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
-from tvsbayes.inference.summaries import Propagated, carried, propagated, reweighted
+from tvsbayes.inference.summaries import NamedDraws, Propagated, propagated
 from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS
 from tvsbayes.instrument.mechanisms import Mechanism
 from tvsbayes.instrument.parameters import HEADLINES
@@ -28,9 +27,6 @@ from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic, weighted_mean
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 DERIVED_BATCH = 2049
 """Batch size, that of the fit for its headlines, so that the compilation is shared."""
@@ -72,7 +68,7 @@ def headline_names(fit: JointFit) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, repr=False)
-class Posterior(Shown):
+class Posterior(NamedDraws):
     """A sampled posterior; check `converged` before using it.
 
     Attributes:
@@ -103,14 +99,7 @@ class Posterior(Shown):
         """Show means, sds and 95 % intervals of the headlines."""
         state = "converged" if self.converged else "NOT CONVERGED"
         title = f"Posterior by {self.tier}, {self.weights.size} draws, {state}"
-        names = headline_names(self.fit)
-        return self.propagate(lambda p: np.stack([p[name] for name in names], axis=1)).by_quantity(title, names)
-
-    def to_dataframe(self) -> pd.DataFrame:
-        """Return all draws by name, one row each, with their `weight` (sum 1)."""
-        import pandas as pd
-
-        return pd.DataFrame({**self.by_name, "weight": self.weights.ravel()})
+        return self.view_of(title, headline_names(self.fit))
 
     @property
     def converged(self) -> bool:
@@ -123,7 +112,7 @@ class Posterior(Shown):
         return self.convergence.tier
 
     @property
-    def by_name(self) -> Draws:
+    def by_name(self) -> Draws:  # type: ignore[override]
         """Return all draws by public name, chains joined; their weights are `weights.ravel()`."""
         return Draws(self.draws, self.fit.space.mechanism)
 
@@ -179,27 +168,7 @@ class Posterior(Shown):
 
     def summarised(self, values: np.ndarray) -> Propagated:
         """Compute mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
-        return reweighted(values, self.weights) if self.tier == IMPORTANCE else propagated(values)
-
-    def propagate(self, function: Callable[[Mapping[str, np.ndarray]], np.ndarray]) -> Propagated:
-        """Propagate the posterior into a quantity of your own.
-
-        Args:
-            function: called once with all draws, a mapping from name to an array (n,) in the unit of the name; returns
-                one value per draw, an array (n,) or (n, ...). For example the turn by 200 steps to the left after a
-                reversal, deg: `lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"]`. The names are those
-                of `fit.json` and of `list(posterior.by_name)`.
-
-        Returns:
-            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with weighted or correlated draws), each
-            of the shape (...) of one value.
-
-        Raises:
-            ValueError: the function returned a wrong number of rows, or values that are not finite.
-        """
-        chains, draws = self.z.shape[:2]
-        values = carried(function, self.by_name, chains * draws)
-        return self.summarised(values.reshape(chains, draws, *values.shape[1:]))
+        return super().summarised(values) if self.tier == IMPORTANCE else propagated(values)
 
     def local_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
         """Compute gear ratio times mirror slope (left, right, up, down) at any pose (formulation 3.2)."""

@@ -15,13 +15,13 @@ import jax
 import numpy as np
 
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.importance import K_MAX, ROUND, Acceptance, ImportanceRun, Pool, Weighing
+from tvsbayes.inference.importance import K_MAX, ROUND, Acceptance, Pool, worst
 from tvsbayes.inference.summaries import monte_carlo_errors
 from tvsbayes.instrument.homing import prior_chance
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import Mapped, transport_beside
-from tvsbayes.results.convergence import END_ERROR_MAX, MEAN_ERROR_MAX, MonteCarloError, Reweighted
+from tvsbayes.results.convergence import END_ERROR_MAX, MEAN_ERROR_MAX, MonteCarloError
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import TAILS, WeightedSummary, weighted_summary
 
@@ -41,74 +41,58 @@ MARGIN = 1.1
 
 
 @dataclass(frozen=True)
-class WayDraws:
+class Way:
     """Weighted draws under one homing hypothesis.
 
     Attributes:
-        target: its density.
-        pool: its draws.
-        seed: seed of all random numbers; `part`: number of the way, and of fits of its proposal, which draw others.
+        pool: the draws.
+        part: number of the way, and of fits of its proposal, which draw other random numbers.
         shared: whether these are the first draws of the most probable way, weighed anew.
     """
 
-    target: Target
-    pool: Pool
-    seed: int
+    pool: Pool[Target]
     part: tuple[int, int] = (0, 0)
     shared: bool = False
-
-    @cached_property
-    def weighed(self) -> Weighing:
-        """Return the draws with their weights."""
-        return Weighing(self.target, self.pool)
-
-    @property
-    def rounds(self) -> int:
-        """Return the number of rounds."""
-        return sum(self.pool.counts) // ROUND
 
     @property
     def reliable(self) -> bool:
         """Whether the tail of the weights determines means."""
-        return self.weighed.smoothed.pareto_k < K_MAX
+        return self.pool.smoothed.pareto_k < K_MAX
 
     @property
     def log_evidence(self) -> float:
         """Compute the log evidence with the prior probability of the way."""
-        return self.weighed.log_evidence + float(np.log(prior_chance(self.target.fit.sides)))
+        return self.pool.log_evidence + float(np.log(prior_chance(self.pool.density.fit.sides)))
 
-    @property
-    def refitted(self) -> WayDraws:
-        """Draw as many rounds from a proposal fitted to these draws, which are left out."""
-        part = self.part[0], self.part[1] + 1
-        empty = replace(self, pool=Pool.empty(self.pool.refitted, self.pool.invalid), part=part)
-        return empty.extended(self.rounds, self.pool)
-
-    def extended(self, rounds: int, first: Pool) -> WayDraws:
+    def extended(self, rounds: int, first: Pool[Target]) -> Way:
         """Extend to so many rounds; shared draws by those of `first`, which has as many."""
-        pool, generator = self.pool, np.random.RandomState([self.seed, *self.part, sum(self.pool.counts)])
-        while sum(pool.counts) < rounds * ROUND:
-            if self.shared:
-                pool = _weighed_anew(self.target, pool, first, self.seed, self.part[0])
-            else:
-                pool = pool.extended(self.target, generator, fitted=False)
+        pool, generator = self.pool, np.random.RandomState([self.pool.seed, *self.part, sum(self.pool.counts)])
+        while pool.rounds < rounds:
+            pool = _weighed_anew(pool, first, self.part[0]) if self.shared else pool.extended(generator)
         return replace(self, pool=pool)
 
+    def refitted(self) -> Way:
+        """Draw as many rounds from a proposal fitted to these draws, which are left out."""
+        empty = Way(self.pool.refitted, (self.part[0], self.part[1] + 1))
+        return empty.extended(self.pool.rounds, self.pool)
 
-def _weighed_anew(target: Target, pool: Pool, first: Pool, seed: int, way: int) -> Pool:
+    def alone(self, first: Pool[Target]) -> Way:
+        """Draw by a map of its own, from the proposal fitted for the most probable way."""
+        target = Target(self.pool.density.fit, transport_beside(self.pool.density.fit, first.density.path))
+        # Numbers of its own: the same ones in the proposal of the first way would tie the draws of both.
+        empty = Pool(target, first.seed, first.proposals[-1], first.began)
+        return Way(empty, (self.part[0], 0)).extended(ALONE_ROUNDS, first)
+
+
+def _weighed_anew(pool: Pool[Target], first: Pool[Target], way: int) -> Pool[Target]:
     """Extend a pool by the next round of `first`, under another homing hypothesis, of this number."""
-    begin, before = sum(pool.counts), target.invalid
-    subset = first.drawn.taken(slice(begin, begin + ROUND))
-    mapped = Mapped(subset.parts["z"], subset.parts["log_jacobian"])
-    normal = target.place_normals(ROUND, random_stream(seed, Stream.OTHER_HOMING, begin // ROUND, way))
-    added = target.at(subset.w, mapped, normal)
-    return replace(
-        pool,
-        points=added if pool.points is None else Points.joined([pool.points, added]),
-        proposals=first.proposals,
-        counts=(begin + ROUND,),
-        invalid=pool.invalid + target.invalid - before,
-    )
+    begin, target = sum(pool.counts), pool.density
+    before, round_ = target.invalid, first.drawn.taken(slice(begin, begin + ROUND))
+    mapped = Mapped(round_.parts["z"], round_.parts["log_jacobian"])
+    normal = target.place_normals(ROUND, random_stream(first.seed, Stream.OTHER_HOMING, begin // ROUND, way))
+    drawn = Points.joined([pool.drawn, target.at(round_.w, mapped, normal)])
+    invalid = pool.invalid + target.invalid - before
+    return replace(pool, drawn=drawn, proposals=first.proposals, counts=(begin + ROUND,), invalid=invalid)
 
 
 @dataclass(frozen=True)
@@ -120,7 +104,7 @@ class Mixture:
         left: rounds that may still be drawn.
     """
 
-    ways: tuple[WayDraws, ...]
+    ways: tuple[Way, ...]
     left: int
 
     @cached_property
@@ -130,63 +114,56 @@ class Mixture:
         chance = np.exp(log_evidence - log_evidence.max())
         return chance / chance.sum()
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the headlines by which the draws are judged."""
-        return self.ways[0].weighed.headlines
-
-    def _columns(self, way: WayDraws) -> np.ndarray:
-        return np.stack([way.weighed.columns[name] for name in self.names], axis=1)
-
     @cached_property
     def _weights(self) -> tuple[np.ndarray, ...]:
         """Compute the weights of the draws of each way in the mixture, shapes (n,)."""
-        return tuple(p * way.weighed.smoothed.weights for p, way in zip(self.probabilities, self.ways, strict=True))
+        return tuple(p * way.pool.smoothed.weights for p, way in zip(self.probabilities, self.ways, strict=True))
+
+    @property
+    def headlines(self) -> tuple[str, ...]:
+        """Return the headlines by which the draws are judged."""
+        return self.ways[0].pool.headlines
 
     @cached_property
     def summary(self) -> WeightedSummary:
         """Summarise the headlines; the weights of a shared draw are added."""
-        first = self.ways[0]
-        weights, values = [self._weights[0].copy()], [self._columns(first)]
+        first, pools = self.ways[0].pool, [self.ways[0].pool]
+        weights = [self._weights[0].copy()]
         for way, own in zip(self.ways[1:], self._weights[1:], strict=True):
-            if way.shared and np.array_equal(way.weighed.finite, first.weighed.finite[: len(way.weighed.finite)]):
+            if way.shared and np.array_equal(way.pool.finite, first.finite[: len(way.pool.finite)]):
                 weights[0][: len(own)] += own
             else:
                 weights.append(own)
-                values.append(self._columns(way))
-        return weighted_summary(np.concatenate(values), np.concatenate(weights))
+                pools.append(way.pool)
+        columns = [np.concatenate([pool.columns[name] for pool in pools]) for name in self.headlines]
+        return weighted_summary(np.stack(columns, axis=1), np.concatenate(weights))
 
     @cached_property
     def errors(self) -> dict[str, MonteCarloError]:
         """Compute the Monte Carlo error of every headline."""
-        return monte_carlo_errors(self.names, self.summary)
+        return monte_carlo_errors(self.headlines, self.summary)
 
     @cached_property
     def acceptance(self) -> Acceptance:
         """Judge the draws, by the largest tail index of a way that counts and the largest weight of a draw."""
         counts = zip(self.probabilities, self.ways, strict=True)
-        pareto_k = max(way.weighed.smoothed.pareto_k for p, way in counts if p >= WORTH_RELIABLE_WEIGHTS)
+        pareto_k = max(way.pool.smoothed.pareto_k for p, way in counts if p >= WORTH_RELIABLE_WEIGHTS)
         heaviest = float(max(weights.max() for weights in self._weights))
         return Acceptance(pareto_k, heaviest, sum(map(len, self._weights)), self.errors)
 
     @property
-    def worst(self) -> str:
-        """Return the headline with the largest error."""
-        return max(self.errors, key=lambda name: self.errors[name].rounds_factor)
-
-    @property
     def shares_of_error(self) -> np.ndarray:
         """Compute the share of each way in the squared error of the worst headline, shape (ways,)."""
-        name = self.worst
-        error, column = self.errors[name], self.names.index(name)
-        worst = int(np.argmax([error.mean / MEAN_ERROR_MAX, *(each / END_ERROR_MAX for each in error.interval95)]))
+        name = worst(self.errors)
+        error, column = self.errors[name], self.headlines.index(name)
+        which = int(np.argmax([error.mean / MEAN_ERROR_MAX, *(each / END_ERROR_MAX for each in error.interval95)]))
         squares = []
         for way, weights in zip(self.ways, self._weights, strict=True):
-            values = way.weighed.columns[name]
-            if worst == 0:
+            values = way.pool.columns[name]
+            if which == 0:
                 influence = values - self.summary.mean[column]
             else:
-                influence = (values <= self.summary.interval95[worst - 1][column]) - TAILS[worst - 1]
+                influence = (values <= self.summary.interval95[which - 1][column]) - TAILS[which - 1]
             squares.append(float(np.sum((weights * influence) ** 2)))
         return np.array(squares) / np.sum(squares)
 
@@ -196,85 +173,75 @@ class Mixture:
 
     def _with_reliable_weights(self) -> Mixture | None:
         """Draw otherwise under the first way whose weights are unreliable."""
-        first = self.ways[0]
+        first = self.ways[0].pool
         for place, way in enumerate(self.ways[1:], 1):
+            rounds = way.pool.rounds
             if way.reliable:
                 continue
-            if way.shared and way.rounds < first.rounds:
-                return self._with(place, way.extended(first.rounds, first.pool))
+            if way.shared and rounds < first.rounds:
+                return self._with(place, way.extended(first.rounds, first))
             if way.shared and self.left >= ALONE_ROUNDS:
-                return self._with(place, self._alone(way, place), ALONE_ROUNDS)
-            if not way.shared and self.probabilities[place] >= WORTH_RELIABLE_WEIGHTS and self.left >= way.rounds:
-                return self._with(place, way.refitted, way.rounds)
+                return self._with(place, way.alone(first), ALONE_ROUNDS)
+            if not way.shared and self.probabilities[place] >= WORTH_RELIABLE_WEIGHTS and self.left >= rounds:
+                return self._with(place, way.refitted(), rounds)
         return None
 
     def _with_smaller_error(self) -> Mixture | None:
         """Draw more under the way that lowers the largest error most for its cost."""
-        first = self.ways[0]
-        factor, shares = self.errors[self.worst].rounds_factor, self.shares_of_error
-        cost = np.array([SHARED_COST if way.shared and way.rounds < first.rounds else 1.0 for way in self.ways])
-        for place in np.argsort(-shares / cost).tolist():
+        first = self.ways[0].pool
+        factor, shares = self.errors[worst(self.errors)].rounds_factor, self.shares_of_error
+        cheap = np.array([way.shared and way.pool.rounds < first.rounds for way in self.ways])
+        for place in np.argsort(-shares / np.where(cheap, SHARED_COST, 1.0)).tolist():
             if shares[place] < WORTH_DRAWING:
                 continue
-            way = self.ways[place]
+            way, rounds = self.ways[place], self.ways[place].pool.rounds
             # Of the squared error, 1 - 1 / factor must go, which this way's share may not hold.
             kept = max(1 - (1 - 1 / factor) / shares[place], 0.5) if factor > 1 else 0.5
-            rounds = max(way.rounds + 1, int(np.ceil(min(MARGIN / kept, 2.0) * way.rounds)))
-            if way.shared and way.rounds < first.rounds:
-                return self._with(place, way.extended(min(rounds, first.rounds), first.pool))
+            wanted = max(rounds + 1, int(np.ceil(min(MARGIN / kept, 2.0) * rounds)))
+            if cheap[place]:
+                return self._with(place, way.extended(min(wanted, first.rounds), first))
             if self.left > 0:
                 # A way that shares all draws of the first has more when that has.
-                drawn = 0 if way.shared else place
-                further = min(rounds - way.rounds, self.left)
-                return self._with(drawn, self.ways[drawn].extended(way.rounds + further, first.pool), further)
+                drawn, further = 0 if way.shared else place, min(wanted - rounds, self.left)
+                return self._with(drawn, self.ways[drawn].extended(rounds + further, first), further)
         return None
 
-    def _with(self, place: int, way: WayDraws, drawn: int = 0) -> Mixture:
+    def _with(self, place: int, way: Way, drawn: int = 0) -> Mixture:
         """Put other draws of a way, of which so many rounds were drawn."""
         return Mixture((*self.ways[:place], way, *self.ways[place + 1 :]), self.left - drawn)
 
-    def _alone(self, way: WayDraws, place: int) -> WayDraws:
-        """Draw from another homing hypothesis, by its own map and the proposal fitted for the most probable one."""
-        first = self.ways[0]
-        target = Target(way.target.fit, transport_beside(way.target.fit, first.target.path))
-        # Numbers of its own: the same ones in the proposal of the first way would tie the draws of both.
-        empty = WayDraws(target, Pool.empty(first.pool.proposals[-1]), way.seed, (place, 0))
-        return empty.extended(ALONE_ROUNDS, first.pool)
-
-    def posterior(self, seconds: float) -> Posterior:
-        """Build the posterior of all ways, on whose draws `seconds` were spent."""
-        parts = [way.target.posterior(way.weighed.sample(0.0), self.ways[0].seed) for way in self.ways]
-        diagnosis = parts[0].convergence
-        assert isinstance(diagnosis, Reweighted)
+    def posterior(self) -> Posterior:
+        """Build the posterior of all ways."""
+        first, verdict = self.ways[0].pool, self.acceptance
         importance = replace(
-            diagnosis.importance,
-            accepted=not self.acceptance.missing,
-            missing=self.acceptance.missing,
-            pareto_k=self.acceptance.pareto_k,
-            heaviest_share=self.acceptance.heaviest,
-            answer=self.acceptance.answer,
+            first.importance,
+            accepted=not verdict.missing,
+            missing=verdict.missing,
+            pareto_k=verdict.pareto_k,
+            heaviest_share=verdict.heaviest,
+            answer=verdict.answer,
         )
-        convergence = replace(diagnosis, importance=importance, monte_carlo_error=self.errors)
-        return replace(mixed(parts, self.probabilities), convergence=convergence, seconds=seconds)
+        parts = [way.pool.density.posterior(way.pool.sample, first.seed) for way in self.ways]
+        convergence = replace(parts[0].convergence, importance=importance, monte_carlo_error=self.errors)
+        whole, seconds = mixed(parts, self.probabilities), time.monotonic() - first.began
+        return replace(whole, convergence=convergence, seconds=seconds)
 
 
-def homing_mixture(run: ImportanceRun[Target]) -> Posterior:
+def homing_mixture(first: Pool[Target]) -> Posterior:
     """Compute the posterior over all homing hypotheses of a fit, from the draws of the most probable one."""
-    began = time.monotonic()
+    target, proposal = first.density, first.next_proposal
     shared = [
-        WayDraws(
-            Target(way.fit, run.density.path), Pool.empty(run.pool.next_proposal), run.seed, (place, 0), shared=True
-        )
-        for place, way in enumerate(run.density.fit.mixture[1:], 1)
+        Way(Pool(Target(way.fit, target.path), first.seed, proposal, first.began), (place, 0), shared=True)
+        for place, way in enumerate(target.fit.mixture[1:], 1)
         if way.fit
     ]
     if not shared:
-        return run.density.posterior(run.sample, run.seed)
-    ways = (WayDraws(run.density, run.pool, run.seed), *(way.extended(1, run.pool) for way in shared))
-    mixture = Mixture(ways, FURTHER_ROUNDS_MAX if run.sample.convergence.importance.accepted else 0)
+        return target.posterior(first.sample, first.seed)
+    ways = (Way(first), *(way.extended(1, first) for way in shared))
+    mixture = Mixture(ways, FURTHER_ROUNDS_MAX if first.importance.accepted else 0)
     while (better := mixture.improved()) is not None:
         mixture = better
-    return mixture.posterior(run.sample.seconds + time.monotonic() - began)
+    return mixture.posterior()
 
 
 def mixed(parts: Sequence[Posterior], probabilities: np.ndarray) -> Posterior:

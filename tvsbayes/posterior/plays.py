@@ -40,6 +40,10 @@ class HalfNormal:
         """Convert steps of z to linear steps, the inverse of `bent`."""
         return (half_normal(np.minimum(self.mode + bent, FARTHEST_SD)) - half_normal(self.mode)) / self._slope
 
+    def log_bend(self, z: np.ndarray) -> np.ndarray:
+        """Compute ln |d(bent)/d(straight)| at z."""
+        return np.log(self._slope / half_normal_slope(z))
+
     @property
     def precision(self) -> float:
         """Return the prior precision of a linear step."""

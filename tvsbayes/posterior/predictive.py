@@ -265,29 +265,29 @@ def looks_again(
     looks and pixel noise are drawn again; ranges are as observed.
     """
     count, mechanism = len(ordered_spots(fit.campaign)), fit.space.mechanism
-    arrays = jax.tree.map(lambda of_spot: np.asarray(of_spot)[:count], fit.arrays.spots)
-    sd_rad = np.radians(physical[:, mechanism.stop_columns])
-    variance = np.sum(arrays.redraw_mix[None] * sd_rad[:, None] ** 2, axis=3)
-    fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
-    rows = np.arange(count)[:, None]
-    error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
-    home_rad = np.radians(physical[:, None, mechanism.columns("home_sd_deg")])
-    home = np.sqrt(arrays.homed) * home_rad * generator.standard_normal((len(z), count, 2))
-    segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(count), 0))
-    # Row at which the zero of each axis was set last, for all draws.
-    zero = np.maximum.accumulate(np.where(arrays.new_zero, rows, 0), axis=0)[None]
-    drift_rad = np.radians(physical[:, mechanism.columns("drift_deg_per_root_hour")])
-    walked = drift_rad[:, None] * np.sqrt(arrays.hours) * generator.standard_normal(home.shape)
+    spots = jax.tree.map(lambda of_spot: np.asarray(of_spot)[:count], fit.arrays.spots)
+    shape, rows = (len(z), count, 2), np.arange(count)[:, None]
+
+    def held(values: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+        """Take values (draws, spots, 2) of the spot at which they were drawn last, (spots, 2) or (spots, 1)."""
+        return np.take_along_axis(values, np.maximum.accumulate(np.where(drawn, rows, 0), axis=0)[None], axis=1)
+
+    variance = np.sum(spots.redraw_mix[None] * np.radians(physical[:, mechanism.stop_columns])[:, None] ** 2, axis=3)
+    error = held(np.sqrt(variance) * generator.standard_normal(shape), spots.redraw)
+    home_rad, drift_rad, scatter_rad = (
+        np.radians(physical[:, None, mechanism.columns(block)])
+        for block in ("home_sd_deg", "drift_deg_per_root_hour", "look_scatter_deg")
+    )
+    home = np.sqrt(spots.homed) * home_rad * generator.standard_normal(shape)
+    walked = drift_rad * np.sqrt(spots.hours) * generator.standard_normal(shape)
     total = np.cumsum(walked, axis=1)
-    # The zero drifts as a random walk from its homing on.
-    error = error + np.take_along_axis(home - (total - walked), zero, axis=1) + total
+    # The zero of an axis is set by a homing, and drifts as a random walk from there on.
+    error = error + held(home - (total - walked), spots.new_zero) + total
     error = error + turned_by(fit.arrays, place_errors_rad)
     # The position in the play is Gaussian after an unknown approach, as in the filter.
-    place = generator.standard_normal(home.shape)[:, segment]
+    place = held(generator.standard_normal(shape), spots.new_segment[:, None])
     error = error + fit.linearised.play_sd_rad * place
     pixel_scale = physical[:, mechanism.index["pixel_scale"]].reshape(-1, 1, 1)
-    root = np.linalg.inv(arrays.whitening)
-    noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal((len(z), count, 4)))
-    scatter_rad = np.radians(physical[:, None, mechanism.columns("look_scatter_deg")])
-    error = error + scatter_rad * generator.standard_normal(error.shape)
+    noise = np.einsum("sij,nsj->nsi", np.linalg.inv(spots.whitening), generator.standard_normal((len(z), count, 4)))
+    error = error + scatter_rad * generator.standard_normal(shape)
     return looks(fit, z, error) + pixel_scale * noise

@@ -19,7 +19,7 @@ from tvsbayes.inference.chain import better, run_of
 from tvsbayes.posterior.chain import stored_chain, write_chain
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.homing_mixture import homing_mixture
-from tvsbayes.posterior.importance import importance_run
+from tvsbayes.posterior.target import importance_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence, Reweighted
 from tvsbayes.results.records import Tier

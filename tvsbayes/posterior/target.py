@@ -5,6 +5,7 @@ Coordinates w of `posterior.transport`; log densities are exact and include the 
 
 from __future__ import annotations
 
+import time
 from functools import cached_property
 
 import jax
@@ -14,12 +15,15 @@ from tvsbayes.estimators.campaign_arrays import spot_constants
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.importance import Sample
+from tvsbayes.inference.importance import ROUNDS_MAX, Pool, Sample, weighted_run
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
-from tvsbayes.posterior.transport import Mapped, Transport
+from tvsbayes.posterior.transport import Mapped, Transport, transport
+from tvsbayes.progress import Advance, unshown
 
+MAPPED_SHARE = 0.25
+"""Share of the time of importance sampling for the map, for the progress display."""
 WALKERS = 64
 """Least number of walkers in an ensemble: a whole `BATCH` in each half."""
 
@@ -117,3 +121,13 @@ class Target:
         assert isinstance(sample.quantities, Draws)
         draws = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), sample.quantities.derived)
         return Posterior(self.fit, z, density, draws, sample.weights, sample.convergence, seed, sample.seconds)
+
+
+def importance_run(fit: JointFit, seed: int, advance: Advance = unshown, rounds_max: int = ROUNDS_MAX) -> Pool[Target]:
+    """Run `weighted_run` for a converged fit, by its map."""
+    began, path = time.monotonic(), transport(fit)
+    advance(MAPPED_SHARE)
+    rest = 1 - MAPPED_SHARE
+    return weighted_run(
+        Target(fit, path), seed, lambda share: advance(MAPPED_SHARE + rest * share), rounds_max, began=began
+    )

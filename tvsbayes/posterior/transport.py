@@ -11,8 +11,9 @@ from the model's residuals centre the narrow ones. NumPy outside the compiled fu
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -26,7 +27,7 @@ from tvsbayes.instrument.parameters import BLOCKS, KINDS, NOISE_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import BlockRoot, column_blocks
-from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal, half_normal_slope
+from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal
 from tvsbayes.posterior.linear_campaign import Conditional, Creep, LinearCampaign
 from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.plays import Cut, HalfNormal
@@ -46,14 +47,10 @@ WALK_INFORMATION = 1.0
 of the term. If an informed term is left out, other coordinates of the map absorb it, such as a creep."""
 LEAST_SCALE = 1e-6
 """Least ratio of a noise scale to that at the mode: smaller ones have no effect."""
-FAR_ABOVE = 1e200
-"""Last diagonal element that makes a matrix positive definite for any last row; its root is not used."""
 FAR_SD, FAR_PIXELS = 4.0, 4.0
 """Limits of the map for the scatter of looks: sds of its prior, and pixel variance at the mode over that of a draw."""
 BLOCK_ROWS = 64
 """Points mapped together: their matrices fit into the processor's cache."""
-CENTRINGS = 1
-"""Gauss-Newton steps of the narrow coordinates at every draw: a second one does not improve the weights."""
 BEND_STEP = 2.0
 """Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode. A move as long as
 the play makes a kink in the residuals, whose second difference grows as the step gets shorter."""
@@ -66,46 +63,11 @@ at 3.7 sd of a stop sd), and the tilt of the frames with the mirrors' offset. Ea
 t of its own."""
 
 
-def positive_factor(bordered: np.ndarray) -> np.ndarray:
-    """Compute Cholesky factors of precisions with an additional last row, of their lower triangles, shape (n, k, k).
-
-    Far out, the functions that span the noise of looks may leave a precision indefinite, or the stops without a factor
-    (NaN). Its diagonal is raised, or it is replaced by 1: any positive definite matrix makes a map, and the weights are
-    those of the density itself.
-    """
-    try:
-        return np.linalg.cholesky(bordered)
-    except np.linalg.LinAlgError:
-        finite = np.isfinite(bordered).all(axis=(1, 2))[:, None, None]
-        raised, diagonal = np.where(finite, bordered, np.eye(bordered.shape[1])), np.arange(bordered.shape[1] - 1)
-        least = np.linalg.eigvalsh(raised[:, :-1, :-1])[:, 0]
-        raised[:, diagonal, diagonal] += np.where(least > 0, 0.0, 1.0 - least)[:, None]
-        return np.linalg.cholesky(raised)
-
-
-@dataclass(frozen=True)
-class Mapped:
+class Mapped(NamedTuple):
     """Points z (n, p) and ln |dy/dw| there (n,)."""
 
     z: np.ndarray
     log_jacobian: np.ndarray
-
-    @classmethod
-    def joined(cls, parts: Sequence[Mapped]) -> Mapped:
-        """Concatenate parts."""
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
-
-
-@dataclass(frozen=True)
-class Centred:
-    """Narrow coordinates y given the others: y = centre + turn^-1 (linear y - mean).
-
-    The linear y is that of the linearised campaign. Shapes (n, k), (n, k) and (n, k, k).
-    """
-
-    mean: np.ndarray
-    centre: np.ndarray
-    turn: np.ndarray
 
 
 def by_width(covariance: np.ndarray) -> np.ndarray:
@@ -131,8 +93,8 @@ class Transport:
 
     Attributes:
         mechanism: the instrument.
+        mechanism: the instrument.
         mode: z at w = 0, shape (p,).
-        physical: values of the parameters there, in the units of their names, shape (p,).
         free: sampled columns of z, (d,): noise scales, then all others, the widest conditional sd first.
         root: lower-triangular factor of their covariance in that order, separately for noise coordinates and others,
             whose mean at other scales follows from the residuals, shape (d, d).
@@ -145,15 +107,11 @@ class Transport:
         residuals: residuals of the model, for centring.
         bend: change of the slopes of the narrow coordinates with all others, `turn` = 1 + bend' y, shape (g, narrow,
             narrow).
-        angle_rad, on_tilt, of_play: arguments of `gear_processes.column_blocks` for the first of the e errors, which
-            are followed by the terms of the drifts.
-        drift_axis: 1 at the axis (pan, tilt) whose drift is the sd of each of those terms, shape (terms, 2).
-        period_deg: periods of the gears' errors, shape (2, 3).
     """
 
     mechanism: Mechanism
+    mechanism: Mechanism
     mode: np.ndarray
-    physical: np.ndarray
     free: np.ndarray
     root: np.ndarray
     noise: int
@@ -163,21 +121,21 @@ class Transport:
     linear: LinearCampaign
     residuals: Residuals
     bend: np.ndarray
-    angle_rad: np.ndarray
-    on_tilt: np.ndarray
-    of_play: np.ndarray
-    drift_axis: np.ndarray
-    period_deg: np.ndarray
 
     @property
     def dimension(self) -> int:
         """Return the number of sampled coordinates."""
         return len(self.free)
 
+    @cached_property
+    def names(self) -> np.ndarray:
+        """Return the names of the sampled coordinates, shape (d,)."""
+        return np.array(self.mechanism.names)[self.free]
+
     @property
     def heavy(self) -> np.ndarray:
         """Mark the coordinates of `HEAVY_NAMES`, shape (d,)."""
-        return np.isin(np.array(self.mechanism.names)[self.free], (*HEAVY_NAMES, self.mechanism.optics_names[0]))
+        return np.isin(self.names, (*HEAVY_NAMES, self.mechanism.optics_names[0]))
 
     @property
     def coupled(self) -> np.ndarray:
@@ -185,37 +143,24 @@ class Transport:
 
         They are wide: where several of them are far out together, the proposal fits the target badly.
         """
-        return np.isin(np.array(self.mechanism.names)[self.free], self.mechanism.optics_names)
+        return np.isin(self.names, self.mechanism.optics_names)
 
-    def noise_of(self, *columns: int) -> np.ndarray:
-        """Mark with 1 the noise coordinate that is each of some columns (k,) of z, shape (k, q)."""
-        return (np.array(columns)[:, None] == self.free[: self.noise]).astype(float)
-
-    @cached_property
-    def pixels(self) -> np.ndarray:
-        """Mark with 1 the noise coordinate that scales all pixels, shape (q,)."""
-        return self.noise_of(self.mechanism.index["pixel_scale"])[0]
+    @property
+    def wide(self) -> int:
+        """Return the number of coordinates that are neither noise nor centred."""
+        return self.dimension - self.noise - self.narrow
 
     @cached_property
-    def creep_noise(self) -> np.ndarray:
-        """Mark with 1 the noise coordinate that is the time constant of a creep, shape (q,)."""
-        return self.noise_of(self.mechanism.index["creep_minutes"])[0]
-
-    @cached_property
-    def plays(self) -> tuple[int, ...]:
-        """Return the positions in y, without noise coordinates, of backlashes that are not narrow."""
-        wide = np.array(self.mechanism.names)[self.free[self.noise : self.dimension - self.narrow]]
-        return tuple(np.flatnonzero(np.isin(wide, BLOCKS["backlash_deg"])))
-
-    def _play_at_mode(self, place: int) -> HalfNormal:
-        return HalfNormal(float(self.mode[self.free[self.noise + place]]))
+    def plays(self) -> dict[int, HalfNormal]:
+        """Return the backlashes that are not narrow, by their positions in y without noise coordinates."""
+        of_play = np.isin(self.names[self.noise :][: self.wide], BLOCKS["backlash_deg"])
+        return {k: HalfNormal(float(self.mode[self.free[self.noise + k]])) for k in np.flatnonzero(of_play).tolist()}
 
     def from_whitened(self, y: np.ndarray) -> np.ndarray:
         """Map y (n, d) to z (n, p): linear, except for a backlash, whose degrees are linear and never negative."""
         step = y @ self.root.T
-        for place in self.plays:
-            column = self.noise + place
-            step[:, column] = self._play_at_mode(place).bent(step[:, column])
+        for place, play in self.plays.items():
+            step[:, self.noise + place] = play.bent(step[:, self.noise + place])
         z = np.repeat(self.mode[None], len(y), axis=0)
         z[:, self.free] += step
         return z
@@ -223,23 +168,9 @@ class Transport:
     def to_whitened(self, z: np.ndarray) -> np.ndarray:
         """Map z (n, p) to y (n, d)."""
         step = (z - self.mode)[:, self.free]
-        for place in self.plays:
-            column = self.noise + place
-            step[:, column] = self._play_at_mode(place).straight(step[:, column])
+        for place, play in self.plays.items():
+            step[:, self.noise + place] = play.straight(step[:, self.noise + place])
         return np.linalg.solve(self.root, step.T).T
-
-    def _log_bend(self, z: np.ndarray) -> np.ndarray:
-        """Compute ln |dz/dy| at z (n, p), relative to the mode, shape (n,)."""
-        columns = self.free[self.noise + np.array(self.plays, dtype=int)]
-        return np.log(half_normal_slope(self.mode[columns]) / half_normal_slope(z[:, columns])).sum(axis=1)
-
-    def _bounds(self, place: int, given: Conditional, y: np.ndarray) -> np.ndarray:
-        """Compute the bound at zero backlash, in its coordinate w less the mean's shift, given the wider y (n, g)."""
-        row = self.root[self.noise + place, self.noise :]
-        least = (self._play_at_mode(place).least - y[:, :place] @ row[:place]) / row[place]
-        factor = given.own[:, ::-1, ::-1][:, :, place]
-        others = np.einsum("nj,nj->n", y[:, :place], factor[:, :place])
-        return others + least * factor[:, place] - given.shift[:, ::-1][:, place]
 
     def _log_scale(self, noise: np.ndarray) -> np.ndarray:
         """Compute ln of the noise scales over those at the mode, at noise coordinates (n, q)."""
@@ -249,55 +180,13 @@ class Transport:
         ratio = half_normal(z) / half_normal(np.where(self.half, at, 0.0))
         return np.where(self.half, np.log(np.maximum(ratio, LEAST_SCALE)), step)
 
-    def _place_roots(self, log_scale: np.ndarray) -> BlockRoot:
-        """Compute factors of the covariance of errors at places, then of drift terms, at ln of noise scales (n, q)."""
-        mechanism, values = self.mechanism, np.zeros((len(log_scale), len(self.physical)))
-        scales, drifts = mechanism.columns(*GEAR_SCALES), mechanism.columns("drift_deg_per_root_hour")
-        values[:, scales] = self.physical[scales] * np.exp(log_scale @ self.noise_of(*scales).T)
-        gears = scales_at(values, self.period_deg, mechanism)
-        errors = column_blocks(gears, self.angle_rad, self.on_tilt, self.of_play)
-        drift = np.radians(self.physical[drifts]) * np.exp(log_scale @ self.noise_of(*drifts).T)
-        terms = (drift @ self.drift_axis.T)[..., None] * np.eye(len(self.drift_axis))
-        return BlockRoot((*errors.blocks, terms))
-
-    def _conditional(self, noise: np.ndarray, score_at_mode: np.ndarray) -> Conditional:
-        """Compute the distribution of y given noise coordinates (n, q), by the linearised campaign and the prior.
-
-        The precision of errors at places and y has the slope as an additional last row. The parts of y in its factor
-        are the required factor and forward solution, the errors integrated out (Schur complement).
-        """
-        linear, log_scale = self.linear, self._log_scale(noise)
-        weight = np.exp(-2 * log_scale @ self.pixels)
-        places, count = linear.places.shape[1], linear.columns.shape[1]
-        later = None if linear.creep is None else linear.creep.later(log_scale @ self.creep_noise)
-        scatter = self.noise_of(*self.mechanism.columns("look_scatter_deg"))
-        inner = linear.looks.inner(weight[:, None] * np.exp(2 * log_scale @ scatter.T))
-        products = linear.at(inner, later)
-        variance = linear.constant + np.exp(2 * log_scale) @ linear.by_noise.T
-        elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance), products.of_states)
-        white = elimination.whitened(products.by_states)
-        whole = weight[:, None, None] * (products.gram - np.swapaxes(white, 1, 2) @ white)
-        root = self._place_roots(log_scale)
-        # Errors at places are in units of their prior sds, since their covariance may be nearly singular.
-        whole[:, places:, :places] = np.swapaxes(root.transposed_times(whole[:, :places, places:]), 1, 2)
-        whole[:, :places, :places] = root.congruent(whole[:, :places, :places])
-        diagonal = np.arange(places)
-        whole[:, diagonal, diagonal] += 1.0
-        whole[:, places:-1, places:-1] += linear.prior[::-1, ::-1]
-        whole[:, -1, places:-1] -= score_at_mode
-        whole[:, -1, -1] = FAR_ABOVE
-        factor = positive_factor(whole)
-        last = count - 1
-        leading, shift = factor[:, :last, :last], factor[:, last, places:last]
-        return Conditional(weight, inner, elimination, white, root, leading, shift, later)
-
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
         """Compute the constant part of the score at the mode: that of the likelihood not through the residuals."""
-        given = self._conditional(np.zeros((1, self.noise)), np.zeros(len(self.linear.prior)))
+        given = self.linear.conditional(self._log_scale(np.zeros((1, self.noise))), np.zeros(len(self.linear.prior)))
         score = np.zeros(len(self.linear.prior))
-        for place in self.plays:
-            score += self._play_at_mode(place).score * self.root[self.noise + place, self.noise :]
+        for place, play in self.plays.items():
+            score += play.score * self.root[self.noise + place, self.noise :]
         return given.own[0] @ given.shift[0] - score[::-1]
 
     def conditional(self, noise: np.ndarray) -> Conditional:
@@ -305,62 +194,70 @@ class Transport:
 
         That of a backlash is truncated at zero, so its mean differs.
         """
-        return self._conditional(noise, self._score_at_mode)
+        return self.linear.conditional(self._log_scale(noise), self._score_at_mode)
 
-    def _centred(self, noise: np.ndarray, wide: np.ndarray, given: Conditional) -> Centred:
-        """Centre the narrow coordinates given noise coordinates (n, q) and y of the wide ones (n, g - k)."""
-        mean, linear = given.means(wide[:, ::-1])[:, ::-1], self.linear
-        centre, still = mean, self.free[: self.noise][self.creep_noise == 0]
-        for _ in range(CENTRINGS):
-            y = np.concatenate([noise, wide, centre], axis=1)
-            y_own, z = y[:, self.noise :], self.from_whitened(y)
-            z[:, still] = self.mode[still]
-            beyond = self.residuals(z) - linear.residual + y_own @ linear.along.T
-            if linear.creep is not None and given.later is not None:
-                places, rows = linear.places.shape[1], linear.creep.rows
-                beyond += linear.creep.more(given.later, y_own[:, ::-1] @ rows[:, places:-1].T - rows[:, -1])
-            step = given.centring(linear, np.nan_to_num(beyond), self.narrow)[:, ::-1]
-            turn = np.eye(self.narrow) + np.tensordot(y_own, self.bend, 1)
-            centre = centre + np.linalg.solve(turn, (mean + step - centre)[..., None])[..., 0]
-        return Centred(mean, centre, turn)
+    def _cut(self, place: int, given: Conditional, y: np.ndarray) -> Cut:
+        """Truncate a backlash at zero in its standard normal coordinate, given the wider ones of y (n, g)."""
+        row = self.root[self.noise + place, self.noise :]
+        least = (self.plays[place].least - y[:, :place] @ row[:place]) / row[place]
+        return Cut(given.standard(np.column_stack([y[:, :place], least]))[:, -1])
+
+    @cached_property
+    def _still(self) -> np.ndarray:
+        """Return the columns of noise scales that move no spot: all but the time constant of a creep."""
+        return self.free[: self.noise][~np.isin(self.names[: self.noise], BLOCKS["creep_minutes"])]
+
+    def _centred(self, noise: np.ndarray, wide: np.ndarray, given: Conditional) -> tuple[np.ndarray, ...]:
+        """Centre the narrow coordinates given noise coordinates (n, q) and y of the wide ones (n, g - k).
+
+        Returns:
+            Their linear mean (n, k), a Gauss-Newton step from it (n, k), and `turn` (n, k, k): in the map they are
+            mean + turn^-1 (linear y - mean + step). A second step does not improve the weights.
+        """
+        mean = given.means(wide)
+        y = np.concatenate([wide, mean], axis=1)
+        z = self.from_whitened(np.concatenate([noise, y], axis=1))
+        z[:, self._still] = self.mode[self._still]
+        step = given.centring(given.misfit(self.residuals(z), y), self.narrow)
+        return mean, step, np.eye(self.narrow) + np.tensordot(y, self.bend, 1)
 
     def mapped(self, w: np.ndarray) -> Mapped:
         """Map w (n, d) to z with the Jacobian; noise coordinates are the same in w and y."""
-        return Mapped.joined([self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))])
+        blocks = [self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))]
+        return Mapped(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
     def _mapped(self, w: np.ndarray) -> Mapped:
-        noise, y, w = w[:, : self.noise], w.copy(), w.copy()
-        rest = w[:, self.noise :]
+        noise, rest = w[:, : self.noise], w[:, self.noise :].copy()
         given = self.conditional(noise)
-        y[:, self.noise :] = given.solved(rest[:, ::-1] + given.shift)[:, ::-1]
+        y = given.located(rest)
         log_jacobian = -np.log(np.diagonal(given.own, axis1=1, axis2=2)).sum(axis=1)
         for place in self.plays:
-            cut = Cut(self._bounds(place, given, y[:, self.noise :]))
-            within = cut.within(rest[:, place])
-            log_jacobian += cut.log_slope(rest[:, place], within)
-            rest[:, place] = within
-            y[:, self.noise :] = given.solved(rest[:, ::-1] + given.shift)[:, ::-1]
+            cut, free = self._cut(place, given, y), rest[:, place].copy()
+            rest[:, place] = cut.within(free)
+            log_jacobian += cut.log_slope(free, rest[:, place])
+            y = given.located(rest)
         if self.narrow:
-            narrow = self.dimension - self.narrow
-            about = self._centred(noise, y[:, self.noise : narrow], given)
-            y[:, narrow:] = about.centre + np.linalg.solve(about.turn, (y[:, narrow:] - about.mean)[..., None])[..., 0]
+            mean, step, turn = self._centred(noise, y[:, : self.wide], given)
+            away = y[:, self.wide :] - mean + step
+            y = np.concatenate([y[:, : self.wide], mean + np.linalg.solve(turn, away[..., None])[..., 0]], axis=1)
             # A draw without density has no turn: NaN says so.
             with np.errstate(invalid="ignore"):
-                log_jacobian -= np.linalg.slogdet(about.turn)[1]
-        z = self.from_whitened(y)
-        return Mapped(z, log_jacobian + self._log_bend(z))
+                log_jacobian -= np.linalg.slogdet(turn)[1]
+        z = self.from_whitened(np.concatenate([noise, y], axis=1))
+        for place, play in self.plays.items():
+            log_jacobian += play.log_bend(z[:, self.free[self.noise + place]])
+        return Mapped(z, log_jacobian)
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
         """Map z (n, p) to w (n, d), the inverse of `mapped` on the sampled columns."""
-        y = self.to_whitened(z)
-        noise, narrow = y[:, : self.noise], self.dimension - self.narrow
+        noise, y = np.split(self.to_whitened(z), [self.noise], axis=1)
         given = self.conditional(noise)
         if self.narrow:
-            about = self._centred(noise, y[:, self.noise : narrow], given)
-            y[:, narrow:] = about.mean + np.einsum("nij,nj->ni", about.turn, y[:, narrow:] - about.centre)
-        rest = (np.einsum("nij,ni->nj", given.own, y[:, self.noise :][:, ::-1]) - given.shift)[:, ::-1].copy()
+            mean, step, turn = self._centred(noise, y[:, : self.wide], given)
+            y[:, self.wide :] = mean + np.einsum("nij,nj->ni", turn, y[:, self.wide :] - mean) - step
+        rest = given.standard(y).copy()
         for place in self.plays:
-            rest[:, place] = Cut(self._bounds(place, given, y[:, self.noise :])).without(rest[:, place])
+            rest[:, place] = self._cut(place, given, y).without(rest[:, place])
         return np.concatenate([noise, rest], axis=1)
 
 
@@ -385,7 +282,7 @@ def curvatures(path: Transport) -> np.ndarray:
     moved = np.empty((count, count, count))
     for one in range(count):
         mixed = 0.5 * (curvature(steps[one:] + steps[one]) - bend[one:] - bend[one])
-        moved[one, one:] = given.centring(path.linear, -mixed, count)[:, ::-1]
+        moved[one, one:] = given.centring(-mixed, count)
         moved[one:, one] = moved[one, one:]
     return moved
 
@@ -411,24 +308,15 @@ def centred_count(moved: np.ndarray) -> int:
     return int(np.argmin(left))
 
 
-@dataclass(frozen=True)
-class Walks:
-    """Drifts of the zeros as terms of unit prior variance.
-
-    Attributes:
-        columns: d(predicted)/d(term) of a drift of 1 rad h^(-1/2), shape (4 n, terms).
-        axis: as `drift_axis` in `Transport`.
-    """
-
-    columns: np.ndarray
-    axis: np.ndarray
-
-
-def walks(fit: JointFit, stops: StopStates) -> Walks:
-    """Build the terms of estimated drifts, separately after every homing.
+def walks(fit: JointFit, stops: StopStates) -> tuple[np.ndarray, np.ndarray]:
+    """Build estimated drifts of the zeros as terms of unit prior variance, separately after every homing.
 
     A random walk is the sum of its steps from look to look. After rotation to the eigenvectors of the spots'
     information, with stop errors eliminated, few terms are needed.
+
+    Returns:
+        d(predicted)/d(term) of a drift of 1 rad h^(-1/2), shape (4 n, terms); 1 at the axis (pan, tilt) whose drift is
+        the sd of each term, shape (terms, 2).
     """
     slope = np.asarray(fit.linearised.slope)
     spots = jax.tree.map(lambda x: np.asarray(x)[: len(slope)], fit.arrays.spots)
@@ -453,10 +341,10 @@ def walks(fit: JointFit, stops: StopStates) -> Walks:
             information, turn = np.linalg.eigh(flat.T @ flat - by_stops.T @ by_stops)
             columns.append(flat @ turn[:, scale[axis] ** 2 * information > WALK_INFORMATION])
             axes.append(np.tile(np.arange(2) == axis, (columns[-1].shape[1], 1)))
-    return Walks(np.concatenate(columns, axis=1), np.concatenate(axes))
+    return np.concatenate(columns, axis=1), np.concatenate(axes)
 
 
-def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Creep | None:
+def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise, noise: np.ndarray) -> Creep | None:
     """Build the creep of the zeros where its time constant is estimated, else None.
 
     Args:
@@ -464,16 +352,40 @@ def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Cre
         by_y: d(z)/dy of the total creep of each zero, shape (2, g).
         errors: number of columns of errors at places and drifts, before those of y.
         looks: noise of all looks.
+        noise: columns of z of the noise scales, shape (q,).
     """
-    minutes, creeps = fit.space.mechanism.index["creep_minutes"], fit.space.mechanism.columns("creep_deg")
-    if not fit.free[minutes]:
+    column, creeps = fit.space.mechanism.index["creep_minutes"], fit.space.mechanism.columns("creep_deg")
+    if not fit.free[column]:
         return None
     physical, moves = np.asarray(fit.mode.physical), np.asarray(fit.arrays.spots.move_index)[: len(looks.load)]
     unit_rad = np.radians(np.asarray(fit.space.u)[creeps])
-    at_mode = -np.radians(physical[creeps])
-    rows = np.column_stack([np.zeros((2, errors)), unit_rad[:, None] * by_y[:, ::-1], at_mode])
-    rows /= looks.unit_rad[:, None]
-    return Creep(np.asarray(fit.arrays.moves.warm_minutes)[moves], float(physical[minutes]), looks, rows)
+    rows = [np.zeros((2, errors)), unit_rad[:, None] * by_y[:, ::-1], -np.radians(physical[creeps])]
+    warm, minutes = np.asarray(fit.arrays.moves.warm_minutes)[moves], float(physical[column])
+    return Creep(warm, minutes, at_columns([column], noise)[0], looks, np.column_stack(rows) / looks.unit_rad[:, None])
+
+
+def at_columns(columns: Sequence[int] | np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Mark with 1 the noise coordinate that is each of some columns (k,) of z, shape (k, q)."""
+    return (np.asarray(columns)[:, None] == noise).astype(float)
+
+
+def place_roots(fit: JointFit, noise: np.ndarray, drift_axis: np.ndarray) -> Callable[[np.ndarray], BlockRoot]:
+    """Build `LinearCampaign.place_root` of errors at places, then of the terms of the drifts (`walks`)."""
+    physical, gears = np.asarray(fit.mode.physical), fit.arrays.gears.without_padding()
+    on_tilt, period_deg = np.asarray(gears.on_tilt), np.asarray(fit.space.harmonic_period_deg)
+    angle_rad = np.asarray(gears.places.steps)[gears.place] * np.radians(physical[RATIO_COLUMNS])[on_tilt.astype(int)]
+    mechanism = fit.space.mechanism
+    scales, drifts = mechanism.columns(*GEAR_SCALES), mechanism.columns("drift_deg_per_root_hour")
+    of_scales, of_drifts = at_columns(scales, noise), at_columns(drifts, noise)
+
+    def root(log_scale: np.ndarray) -> BlockRoot:
+        values = np.zeros((len(log_scale), len(physical)))
+        values[:, scales] = physical[scales] * np.exp(log_scale @ of_scales.T)
+        errors = column_blocks(scales_at(values, period_deg, mechanism), angle_rad, on_tilt, gears.of_play)
+        drift = np.radians(physical[drifts]) * np.exp(log_scale @ of_drifts.T)
+        return BlockRoot((*errors.blocks, (drift @ drift_axis.T)[..., None] * np.eye(len(drift_axis))))
+
+    return root
 
 
 def look_noise(fit: JointFit) -> LookNoise:
@@ -488,25 +400,22 @@ def look_noise(fit: JointFit) -> LookNoise:
 
 def transport(fit: JointFit) -> Transport:
     """Build the map at the mode of a converged fit."""
-    by_noise = np.isin(fit.names, SCALE_NAMES)
-    others = np.flatnonzero(fit.free & ~by_noise)
-    covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
+    others = np.flatnonzero(fit.free & ~np.isin(fit.names, SCALE_NAMES))
+    covariance = _covariance(fit, others)
     order = by_width(covariance)
-    straight = uncentred(fit, others[order], np.linalg.cholesky(covariance[np.ix_(order, order)]))
+    straight = uncentred(fit, others[order], covariance[np.ix_(order, order)])
     moved = curvatures(straight)
-    plain = np.setdiff1d(np.arange(len(others)), straight.plays)
+    plain = np.setdiff1d(np.arange(len(others)), list(straight.plays))
     narrow = centred_count(moved[np.ix_(plain, plain, plain)])
     # A play is never centred, as it is linear in degrees.
     last = plain[len(plain) - narrow :]
     turned = np.concatenate([np.setdiff1d(np.arange(len(others)), last), last])
     order = order[turned]
-    path = uncentred(fit, others[order], np.linalg.cholesky(covariance[np.ix_(order, order)]))
-    beside_noise, wide = slice(path.noise, None), len(others) - narrow
-    before = np.linalg.solve(
-        straight.root[beside_noise, beside_noise], path.root[beside_noise, beside_noise][np.argsort(turned)]
-    )
-    after = np.linalg.inv(before)[wide:]
-    bend = np.einsum("abc,ai,bp,kc->ikp", moved, before, before[:, wide:], after, optimize=True)
+    path = uncentred(fit, others[order], covariance[np.ix_(order, order)])
+    old, new = (each.root[each.noise :, each.noise :] for each in (straight, path))
+    before = np.linalg.solve(old, new[np.argsort(turned)])
+    after, wide = np.linalg.inv(before), len(others) - narrow
+    bend = np.einsum("abc,ai,bp,kc->ikp", moved, before, before[:, wide:], after[wide:], optimize=True)
     return replace(path, narrow=narrow, bend=bend)
 
 
@@ -516,36 +425,36 @@ def transport_beside(fit: JointFit, path: Transport) -> Transport:
     A proposal fitted in w there is valid here, and no second differences are needed.
     """
     others = path.free[path.noise :]
-    covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
-    return replace(uncentred(fit, others, np.linalg.cholesky(covariance)), narrow=path.narrow, bend=path.bend)
+    return replace(uncentred(fit, others, _covariance(fit, others)), narrow=path.narrow, bend=path.bend)
 
 
-def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
+def _covariance(fit: JointFit, others: np.ndarray) -> np.ndarray:
+    """Compute the Laplace covariance of some coordinates of z at the mode's scales."""
+    return np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
+
+
+def uncentred(fit: JointFit, others: np.ndarray, covariance: np.ndarray) -> Transport:
     """Build the map at the mode of a converged fit, with no coordinate centred.
 
     Args:
         fit: converged.
         others: sampled coordinates of z except noise scales, in the order of y, shape (g,).
-        wide: lower triangular factor of their covariance, shape (g, g).
+        covariance: of these, shape (g, g).
     """
+    wide = np.linalg.cholesky(covariance)
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
-    mechanism, physical = fit.space.mechanism, np.asarray(fit.mode.physical)
-    names = np.array(fit.names)
-    free = np.flatnonzero(fit.free)
-    scales = np.isin(names[free], SCALE_NAMES)
+    mechanism, names, free = fit.space.mechanism, np.array(fit.names), np.flatnonzero(fit.free)
+    noise = free[np.isin(names[free], SCALE_NAMES)]
     # The scatter of looks comes first: given it, the other scales are nearly independent.
-    noise = free[scales]
     noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
     stops, looks = stop_states(fit, linear), look_noise(fit)
-    drifts = walks(fit, stops)
+    drifts, drift_axis = walks(fit, stops)
     by_noise = np.append(mechanism.stop_columns, mechanism.columns("home_sd_deg"))[:, None] == noise
-    gears = fit.arrays.gears.without_padding()
-    columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, gears.columns)
-    half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
-    ratio = np.radians(physical[RATIO_COLUMNS])
+    errors = fit.arrays.gears.without_padding().columns
+    columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, errors)
     creeps = others == mechanism.columns("creep_deg")[:, None]
-    spots = len(linear.residual)
+    half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
 
     def misfit(z: np.ndarray) -> np.ndarray:
         return in_batches(lambda at: residuals(at, fit.space, fit.arrays), z).reshape(len(z), -1)
@@ -556,7 +465,6 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     return Transport(
         mechanism=mechanism,
         mode=fit.z,
-        physical=physical,
         free=np.concatenate([noise, others]),
         root=linalg.block_diag(of_noise, wide),
         noise=len(noise),
@@ -565,21 +473,19 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
         half=half,
         linear=LinearCampaign(
             residual=linear.residual.ravel(),
-            along=(linear.jacobian[..., others] @ wide).reshape(4 * spots, -1),
+            along=(linear.jacobian[..., others] @ wide).reshape(linear.residual.size, len(others)),
             states=stops,
             by_noise=stops.variance @ by_noise,
             # Stops and homings whose sd is not estimated keep their variance.
             constant=stops.constant + stops.variance @ ~by_noise.any(axis=1),
-            places=np.column_stack([columns, drifts.columns]),
+            places=np.column_stack([columns, drifts]),
+            place_root=place_roots(fit, noise, drift_axis),
             prior=(wide.T * precision) @ wide,
             looks=looks,
-            creep=creep(fit, creeps @ wide, gears.columns + len(drifts.axis), looks),
+            pixels=at_columns(mechanism.columns("pixel_scale"), noise)[0],
+            scatter=at_columns(mechanism.columns("look_scatter_deg"), noise),
+            creep=creep(fit, creeps @ wide, errors + drifts.shape[1], looks, noise),
         ),
         residuals=misfit,
         bend=np.zeros((len(others), 0, 0)),
-        angle_rad=np.asarray(gears.places.steps)[gears.place] * ratio[np.asarray(gears.on_tilt).astype(int)],
-        on_tilt=np.asarray(gears.on_tilt),
-        of_play=gears.of_play,
-        drift_axis=drifts.axis,
-        period_deg=np.asarray(fit.space.harmonic_period_deg),
     )
