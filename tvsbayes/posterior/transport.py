@@ -93,7 +93,6 @@ class Transport:
 
     Attributes:
         mechanism: the instrument.
-        mechanism: the instrument.
         mode: z at w = 0, shape (p,).
         free: sampled columns of z, (d,): noise scales, then all others, the widest conditional sd first.
         root: lower-triangular factor of their covariance in that order, separately for noise coordinates and others,
@@ -109,7 +108,6 @@ class Transport:
             narrow).
     """
 
-    mechanism: Mechanism
     mechanism: Mechanism
     mode: np.ndarray
     free: np.ndarray
