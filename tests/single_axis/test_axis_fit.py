@@ -64,7 +64,7 @@ def test_a_chain_runs_where_weighted_draws_are_not_accepted(monkeypatch, refused
 def test_the_seed_is_that_of_the_line_which_is_integrated_out():
     model = model_of(drawn(3, runs(1)).campaign)
     density = AxisDensity(model, find_mode(model))
-    one, again, other = (weighted_run(density, seed).pool.drawn.parts["linear"] for seed in (1, 1, 2))
+    one, again, other = (weighted_run(density, seed).drawn.parts["linear"] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
     # Independent normal numbers; those of one stream correlate by 0.4 and 0.7 in the first and third column.
     count = min(len(one), len(other))
