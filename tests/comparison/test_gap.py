@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -15,9 +16,13 @@ from tvsbayes.comparison.gap import BACKLASH, CHANCE, PROJECTION, STEREO_SCALE, 
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import Alternative, JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
+from tvsbayes.instrument.plan import PlanBuilder
+from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.posterior import predictive
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.comparison_record import Gap
+from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth, read_truth
 
 TWIN = Path(__file__).resolve().parents[2] / "data" / "twins" / "paper_twin"
@@ -134,3 +139,13 @@ def test_terms_and_chance_are_about_what_the_classic_saw(mixed_fit):
         chance = {t.name: t for t in gap.terms}[CHANCE]
         spread = np.hypot(chance.sd, measured.directions[direction].u_type_a_deg_per_step)
         assert abs(chance.value) < 4 * spread
+
+
+def test_a_head_with_sightings_has_no_gap():
+    """It has no four-point experiments, and no cameras to see any."""
+    table, plan = RigTable(mechanism=SIGHTING_HEAD), PlanBuilder()
+    plan.home(0, 0)
+    plan.move(100, 100)
+    plan.look()
+    campaign = simulate(Rig(table, None, table.priors, {}, {}, {}, {}), plan.steps, 7).campaign
+    assert explain_gap(SimpleNamespace(campaign=campaign)) == dict.fromkeys(DIRECTIONS)

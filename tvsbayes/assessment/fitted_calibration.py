@@ -15,11 +15,10 @@ from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, cause
 from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
 from tvsbayes.assessment.summary import equal_laplace_draws, seen_range
 from tvsbayes.calibration.drawn_looks import noise_of_a_look
-from tvsbayes.calibration.frames import EXTRINSICS_NAMES
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration, input_names
-from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, shifts_at, states_of
+from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, poses_of, shifts_at, states_of
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
@@ -72,7 +71,7 @@ def calibration_of_draws(
             column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
     named_inputs = input_names(campaign.rig.mechanism)
     inputs = np.stack([column[name] for name in named_inputs], axis=1)
-    zeros, extrinsics = (columns_of(names, physical, wanted) for wanted in (ZERO_NAMES, EXTRINSICS_NAMES))
+    zeros, extrinsics = columns_of(names, physical, ZERO_NAMES), poses_of(names, physical)
     states = states_of(campaign) if len(zeros) else {}
     if states:
         shifts = shifts_at(zeros, states)

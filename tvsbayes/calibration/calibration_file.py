@@ -21,7 +21,7 @@ from tvsbayes.calibration.frames import EXTRINSICS_NAMES, NO_POSE
 from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration, input_names
-from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, shifts_at
+from tvsbayes.calibration.states import ZERO_NAMES, columns_of, poses_at, poses_of, shifts_at
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
@@ -256,7 +256,7 @@ def calibration_of_arrays(file: Mapping[str, np.ndarray], path: Path = DRAWS) ->
         states = _states(tables.get("states", {}))
         # They are among the draws of `fit.json`, row by row with the inputs.
         known, physical = (file["names"].tolist(), file["physical"]) if "names" in file else ([], NO_POSE)
-        zeros, extrinsics = (columns_of(known, physical, wanted) for wanted in (ZERO_NAMES, EXTRINSICS_NAMES))
+        zeros, extrinsics = columns_of(known, physical, ZERO_NAMES), poses_of(known, physical)
         if states:
             extrinsics = poses_at(extrinsics, names, shifts_at(zeros, states)[:, 0])
         return _shaped(

@@ -9,6 +9,7 @@ from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
+from tvsbayes.calibration.frames import EXTRINSICS_NAMES
 from tvsbayes.gears.states import HOUR_MINUTES, HOUR_S, crept, travelled
 from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.campaign import Campaign, Look, ordered_spots
@@ -58,6 +59,13 @@ def shifts_at(zeros: np.ndarray, states: Mapping[Axis, State]) -> np.ndarray:
     column = dict(zip(ZERO_NAMES, zeros.T, strict=True))
     shifts = [total_shift(column, axis, states[axis])[:, 0] for axis in AXES if states]
     return np.stack(shifts, axis=1) if shifts else np.zeros((len(zeros), len(AXES)))
+
+
+def poses_of(names: Sequence[str], physical: np.ndarray) -> np.ndarray:
+    """Select the extrinsics (n, 6) of draws (n, names); zeros of a head with sightings, whose frame is P."""
+    poses = columns_of(names, physical, EXTRINSICS_NAMES)
+    is_head = mechanism_of(names).zeros[0] not in RECEIVER_NAMES
+    return np.zeros((len(physical), len(EXTRINSICS_NAMES))) if is_head and not len(poses) else poses
 
 
 def poses_at(extrinsics: np.ndarray, names: Container[str], turned_deg: np.ndarray) -> np.ndarray:

@@ -259,7 +259,7 @@ def verify_looks(
     remedy = "aim at more points; `tvsbayes plan CAMPAIGN --verify` names them"
     used = usable_looks(looks, "fresh looks can be used; verify takes at least", remedy)
     aimed = AimedLooks.of(calibration, looks, used)
-    nominal = aimed.nominal_steps({name: prior.value for name, prior in fit.campaign.rig.priors.items()})
+    nominal = aimed.nominal_steps(fit.campaign.rig.values)
     watched = WatchedLooks(fit, looks)
     angles, shifts = SeenAngles.of(fit, watched, aimed.sides, seed), shifts_deg(watched, calibration)
     error = angles.value + shifts
@@ -363,7 +363,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     sides = np.ones_like(steps)
     sides[1::2, k] = -1.0
     aimed = AimedLooks(calibration, steps, sides)
-    nominal = aimed.nominal_steps({name: prior.value for name, prior in campaign.rig.priors.items()})
+    nominal = aimed.nominal_steps(campaign.rig.values)
     off = [aimed.off_deg(nominal, *factors)[:, k] for factors in ((0.0, 0.0), (1.0, 0.0))]
     if not np.any(off[0]):
         what = f"the nominal counters of {AXES[k]} are those of the calibration: there is no correction to verify"

@@ -294,8 +294,8 @@ def _reading_findings(ok: Sequence[Spot]) -> list[Finding]:
 def _metres(campaign: Campaign) -> list[str]:
     """Find lengths stated in metres where the name says mm."""
     lengths = campaign.rig.mechanism.parameters.keys() & {"mirror_offset_mm"}
-    stated = {name: campaign.rig.priors[name].value for name in lengths}
-    origin = [campaign.rig.priors[name].value for name in names_of("extrinsics.translation_mm")]
+    stated = {name: campaign.rig.values[name] for name in lengths}
+    origin = [campaign.rig.values[name] for name in names_of("extrinsics.translation_mm")]
     stated["extrinsics.translation_mm"] = max(origin, key=abs)
     traceability = campaign.header.get("traceability")
     if isinstance(traceability, dict) and isinstance(traceability.get("pitch_mm"), dict):

@@ -73,6 +73,11 @@ class RigTable:
         require_periods(self.priors, self.harmonic_period_deg)
 
     @property
+    def values(self) -> dict[str, float]:
+        """The stated values by name, and the constants of the instrument."""
+        return {**self.mechanism.constants, **{name: prior.value for name, prior in self.priors.items()}}
+
+    @property
     def first_period_deg(self) -> dict[str, float]:
         """The first stated period of each axis that states one: that of its `harmonic_deg`."""
         return {axis: periods[0] for axis, periods in self.harmonic_period_deg.items()}

@@ -189,7 +189,7 @@ def setup_section(e: Evidence) -> Section:
     position = [summary.parameters[name].value for name in names] if known else None
     views = [
         FigureView(
-            figures.setup(campaign, position, campaign.rig.priors["baseline_mm"].value),
+            figures.setup(campaign, position, campaign.rig.values["baseline_mm"]),
             "Positions of cameras, positioner and spots from above and from the side; the coordinates are in spots.csv "
             "and in the table of results",
             "The rig as estimated, frame S: left camera at the origin, X depth, Y left, Z up.",
