@@ -106,9 +106,19 @@ def turned():
     return campaign(moves, values, u=0.002)
 
 
+@pytest.fixture(scope="module")
+def homed(fitted):
+    """The same axis, homed since its last reading."""
+    moves, last = fitted.campaign.moves, fitted.campaign.moves[-1]
+    again = AxisMove(last.move + 1, last.segment + 1, last.time_s + 600.0, last.command)
+    return fit_axis(replace(fitted.campaign, moves=(*moves, again)), tier="importance")
+
+
+@pytest.mark.parametrize("axis", ["fitted", "homed"])
 @pytest.mark.parametrize("target", TARGETS)
-def test_stops_are_worth_what_the_model_with_their_readings_says(fitted, target):
-    """Of all readings and those before, on the line: a line over the commands read, the drift, the path."""
+def test_stops_are_worth_what_the_model_with_their_readings_says(request, axis, target):
+    """Of all readings and those before, on the line: a line over the commands read, the drift, the path, a new zero."""
+    fitted = request.getfixturevalue(axis)
     campaign, rows = fitted.campaign, fitted.rows
     gap_s = np.median([b.time_s - a.time_s for a, b in pairwise(campaign.moves) if b.time_s > a.time_s])
     moves, readings = list(campaign.moves), list(campaign.readings)

@@ -165,6 +165,12 @@ class _Onward:
         self.u_now, self._scales = math.sqrt(self._between + self._given), self.model.coordinates.values(self.w)
         self._drift, self._drift_variance = self.model.drift(self.w)
         self._read, self._read_s, self._time_s = fit.rows.command, fit.rows.time_s[-1], moves[-1].time_s
+        self._zero, segment = fit.rows.zero[-1], moves[-1].segment
+        if segment != moves[fit.rows.move[-1]].segment and not fit.campaign.absolute:
+            # Homed since the last reading: no row has this zero, a homing draws it.
+            self._zero, self._read_s = np.nan, next(m.time_s for m in moves if m.segment == segment)
+            self._drift = np.zeros_like(self._drift)
+            self._drift_variance = self._scales["home_sd"] ** 2
         self._at, self._path = moves[-1].command, travelled(fit.rows.legs.command, fit.rows.legs.segment)[-1]
 
     def _functionals(self, w: np.ndarray, read: np.ndarray) -> np.ndarray:
@@ -207,7 +213,7 @@ class _Onward:
         columns = np.zeros((len(self.w), len(command), model.columns))
         play = PlayPlaces(command[None], path[None], out, out, np.zeros_like(out))
         model.fill(columns, command, play, model.in_time(self._scales["creep_minutes"], warm_s, kelvin), waves)
-        columns[..., model.layout["homed"]] = model.homed == rows.zero[-1]
+        columns[..., model.layout["homed"]] = model.homed == self._zero
         u = np.full(len(command), np.median([r.u for r in campaign.readings if r.status == "ok"]))
         errors = reference_errors(campaign, value, time_s, u * campaign.reference.common)
         for column, cause in enumerate(rows.reference_causes, start=model.layout["reference"].start):
