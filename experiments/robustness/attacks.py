@@ -11,6 +11,7 @@ come commands that are killed or do not end, and inputs that could hurt.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import random
@@ -19,6 +20,7 @@ import resource
 import shutil
 import signal
 import socket
+import stat
 import subprocess
 import tempfile
 import time
@@ -41,6 +43,24 @@ LATE = ATTACKED // 4
 """Looks after which the memory of a run is read."""
 LONGEST_S = 1200.0
 """For a run to come to its end; reached only where it hangs."""
+
+
+def listing(place: Path) -> dict[str, str]:
+    """Kind, target or hash of everything below."""
+    state = {}
+    for folder, folders, files in os.walk(place):
+        for path in (Path(folder) / name for name in (*folders, *files)):
+            mode = path.lstat().st_mode
+            if stat.S_ISLNK(mode):
+                state[str(path)] = f"link to {path.readlink()}"
+            elif not stat.S_ISREG(mode):
+                state[str(path)] = str(stat.S_IFMT(mode))
+            elif path.stat().st_size > 5e7:
+                # Sparse giants of the folder itself are identified by their size.
+                state[str(path)] = str(path.stat().st_size)
+            else:
+                state[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return state
 
 
 def looks(folder: Path) -> dict[int, object]:
@@ -232,8 +252,6 @@ DAMAGES = (*REWRITTEN, *INSTEAD, "spots.csv edited", "spots.csv deleted")
 
 def damaged(place: Path, what: str) -> str:
     """A row: exit codes of `check` and `acquire --resume`, and what is kept."""
-    from experiments.robustness.hostile import listing
-
     folder = shutil.copytree(place / "killed", place / "damaged" / what.replace(" ", "_"))
     acknowledged, log, spots = looks(folder).keys(), folder / "log.jsonl", folder / "spots.csv"
     if what in REWRITTEN:
