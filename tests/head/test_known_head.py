@@ -152,8 +152,7 @@ def test_fresh_looks_show_whether_the_calibration_is_applied(ask, known_head, tm
     folder, truth = known_head
     assert ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")[0] == 0
     steps = read_plan(tmp_path / "plan.csv", SIGHTING_HEAD)
-    priors = read_campaign(folder).rig.priors
-    nominal, calibration = {name: prior.value for name, prior in priors.items()}, load_calibration(folder)
+    nominal, calibration = read_campaign(folder).rig.values, load_calibration(folder)
 
     def sent(pan, tilt):
         # The direction that the calibration gives these counters, at its state.

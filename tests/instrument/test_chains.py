@@ -122,7 +122,7 @@ def test_headlines_are_continuous_around_the_circle_and_through_the_zenith(azimu
         p, spots = run.truth.parameters, run.campaign.spots
         at = seen_places(run.campaign.moves, [spot.move for spot in spots], table)
         with jax.enable_x64(True):
-            model = model_of(jnp.array([*(p[n] for n in HEAD.rig_names), *np.zeros(24)]), mechanism=HEAD)
+            model = model_of(jnp.array([*(p[n] for n in EVERY_TERM.rig_names), *np.zeros(24)]), mechanism=EVERY_TERM)
             places = Places(*map(jnp.asarray, (at.steps, at.on_tilt, np.ones(len(at.steps), bool))))
             pose_rad = np.radians(run.truth.reference_pose_deg)
             line = SeenLine(pose_rad, places, line_share(at, np.ones(len(spots), bool)))

@@ -131,10 +131,12 @@ def fill_values(x: np.ndarray, y: np.ndarray) -> list[float]:
     _, first = np.unique(farthest, return_index=True)
     for fill in np.sort(farthest[np.sort(first)[:FILLS_TRIED]]):
         at = y == fill
-        rest = ~at
+        rest = ~at & plain
         if 4 * at.sum() > len(y) or rest.sum() < FILLED_MIN or not np.ptp(x[rest]) or not np.ptp(y[rest]):
             continue
         slope, off = line_through(x[rest], y[rest])
+        if not np.isfinite(off).all():
+            continue
         away = np.abs(fill - y[rest].mean() - slope * (x[at] - x[rest].mean()))
         far = away > max(FILL_SHARE * np.ptp(y[rest]), FILL_SDS * float(np.std(off)))
         usual = abs(fill) >= FILL_HUGE or fill in (0, -1) or (abs(fill) >= 99 and {*str(abs(int(fill)))} == {"9"})

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from tvsbayes.display import View
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged
 from tvsbayes.files.documents import Keys
 from tvsbayes.inference.summaries import NamedDraws
@@ -27,7 +27,7 @@ COLUMNS = (("names", "physical"), ("names", "draws"), ("derived_names", "derived
 
 
 @dataclass(frozen=True, repr=False)
-class StoredPosterior(NamedDraws):
+class StoredPosterior(NamedDraws, Shown):
     """Draws of a posterior from `results/`; for an axis in the unit of its readings.
 
     Attributes:

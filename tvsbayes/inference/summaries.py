@@ -45,7 +45,7 @@ class Propagated(Moments, Shown):
         return View("Propagated quantity", ("element", "mean", "sd", "2.5 %", "97.5 %", "Monte Carlo error"), rows)
 
 
-class NamedDraws(Shown):
+class NamedDraws:
     """Draws of a posterior by name, with weights.
 
     Attributes:

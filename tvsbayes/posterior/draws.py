@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
-from tvsbayes.display import View
+from tvsbayes.display import Shown, View
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.inference.summaries import NamedDraws, Propagated, propagated
@@ -68,7 +68,7 @@ def headline_names(fit: JointFit) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, repr=False)
-class Posterior(NamedDraws):
+class Posterior(NamedDraws, Shown):
     """A sampled posterior; check `converged` before using it.
 
     Attributes:

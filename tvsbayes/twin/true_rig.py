@@ -17,7 +17,7 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
 from tvsbayes.instrument.axes import AXES, SENSES, SIDES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.mechanisms import Mechanism, mechanism_of
+from tvsbayes.instrument.mechanisms import MECHANISMS, Mechanism
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
@@ -135,7 +135,9 @@ class Truth(WithStereo):
         # Older files without errors of gears, scatter of looks and shifts of zeros have none of them.
         perfect = {name: REGISTRY[name].prior.value for name in (*GEAR_ERROR_NAMES, *LATE_NAMES)}
         parameters = {name: float(value) for name, value in document["parameters"].items()}
-        parameters = {**perfect, **_constants(mechanism_of(parameters)), **parameters}
+        kinds = (kind for kind in MECHANISMS.values() if kind.tilt_zero in parameters)
+        constants = {name: value for kind in kinds for name, value in _constants(kind).items()}
+        parameters = {**perfect, **constants, **parameters}
         side, tables = document.get("homing_side"), document.get("gear_error")
         return cls(
             parameters=parameters,
