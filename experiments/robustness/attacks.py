@@ -123,37 +123,34 @@ def http(port: int, path: str, body: bytes | None = None, method: str = "", **he
     return "\r\n".join([*lines, *(f"{k}: {v}" for k, v in fields.items() if v), "", ""]).encode() + (body or b"")
 
 
-def requests(port: int, key: str, watcher: str) -> list[tuple[bytes, Sequence[int]]]:
+def requests(port: int, token: str) -> list[tuple[bytes, Sequence[int]]]:
     """What is sent, and the answers that refuse it."""
-    mine, big = {"X_Tvsbayes_Key": key}, b"0" * 10_000_000
+    mine, big = {"X_Tvsbayes_Token": token}, b"0" * 10_000_000
     chunked = {**mine, "Transfer_Encoding": "chunked", "Content_Length": ""}
     hosts = ("evil", f"evil:{port}", f"0.0.0.0:{port}", f"[::1]:{port}", f"127.0.0.1.evil:{port}", "127.0.0.1")
     paths = ("/../live", "/%2e%2e/live", "/..%2flive", "/%c0%ae%c0%ae/live", "//live", "/live/", "/live%00")
     paths += ("/log.jsonl", "/frames/000001_left.png", "/live.html%00.js", "http://evil/x", "/\\..\\live")
-    tokens = (b"", b'{"token": "no"}', b'{"token": null}', b'["token"]', b'{"token": "\\ud800"}')
     bodies = (b"", b"no", b"[]", b"7", b'{"what": "fire"}', b'{"what": {"what": "stop"}}')
     raw = f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: close\r\n".encode()
     return [
-        *((http(port, "/live", X_Tvsbayes_Key=k), (403,)) for k in ("", "wrong", " ", "\u00fc")),
-        *((http(port, "/key", body), (403,)) for body in (*tokens, b'{"token": ' + b"[" * 4000)),
+        *((http(port, "/live", X_Tvsbayes_Token=k), (403,)) for k in ("", "wrong", " ", "\u00fc")),
         *((http(port, "/live", **mine, Origin=o), (403,)) for o in ("http://evil", "null", "http://127.0.0.1:1")),
         (http(port, "/live", **mine, Sec_Fetch_Site="cross-site"), (403,)),
         *((http(port, "/live", **mine, Host=host), (403,)) for host in hosts),
-        (raw + f"Host: 127.0.0.1:{port}\r\nX-Tvsbayes-Key: {key}\r\n\r\n".encode(), (400,)),
+        (raw + f"Host: 127.0.0.1:{port}\r\nX-Tvsbayes-Token: {token}\r\n\r\n".encode(), (400,)),
         (http(port, "/live", **mine, Host=""), (400, 403)),
         *((http(port, path, **mine), (400, 403, 404)) for path in paths),
         (http(port, "/live", method="OPTIONS", Origin="http://evil"), (403,)),
         (http(port, "/live", Origin="http://evil", Upgrade="websocket"), (403,)),
-        *((http(port, "/ask", body, **mine), (400,)) for body in bodies),
-        (http(port, "/ask", b'{"what": "stop"}'), (403,)),
-        (http(port, "/ask", b'{"what": "stop"}', X_Tvsbayes_Key=watcher), (403,)),
-        (http(port, "/ask", b"5", **chunked | {"Content_Length": "1"}), (400,)),
-        (http(port, "/ask", b"{}", **mine, Content_Length="1000000000"), (400,)),
-        (http(port, "/ask", big, **mine), (0, 400)),
-        (http(port, "/ask", b"989680\r\n" + big, **chunked), (0, 400)),
+        *((http(port, "/live", body, **mine), (405,)) for body in bodies),
+        (http(port, "/live", b'{"what": "stop"}'), (403,)),
+        (http(port, "/live", b"5", **chunked | {"Content_Length": "1"}), (400,)),
+        (http(port, "/live", b"{}", **mine, Content_Length="1000000000"), (0, 400)),
+        (http(port, "/live", big, **mine), (0, 400)),
+        (http(port, "/live", b"989680\r\n" + big, **chunked), (0, 400)),
         (http(port, "/live", **mine, X_Long="x" * 200_000), (0, 400, 431)),
         (raw + b"x: y\r\n" * 10_000 + b"\r\n", (0, 400, 403, 431)),
-        (http(port, "/ask", b"\x1f\x8b0", **mine, Content_Encoding="gzip"), (400,)),
+        (http(port, "/live", b"\x1f\x8b0", **mine, Content_Encoding="gzip"), (400, 405)),
         (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(500), (0, 400)),
     ]
 
@@ -165,13 +162,12 @@ def attacked(place: Path) -> list[str]:
     peak_alone, codes = alone.memory_mb("VmHWM"), [alone.child.wait(LONGEST_S)]
     run = Run(ATTACKED, place / "attacked", "--live", "--no-browser")
     link = run.until(lambda: re.search(r"http://127\.0\.0\.1:(\d+)/#(\S+)", run.log.read_text()))
-    port, token = int(link[1]), json.dumps({"token": link[2]}).encode()
-    key, watcher = (json.loads(sent(port, http(port, "/key", token))[1])["key"] for _ in range(2))
+    port, token = int(link[1]), link[2]
     waits: list[float] = []
 
     def still_answers() -> None:
         began = time.monotonic()
-        assert sent(port, http(port, "/live", X_Tvsbayes_Key=key))[0] == 200
+        assert sent(port, http(port, "/live", X_Tvsbayes_Token=token))[0] == 200
         waits.append(1000 * (time.monotonic() - began))
 
     run.looked(5)
@@ -183,7 +179,7 @@ def attacked(place: Path) -> list[str]:
         one.close()
     with ThreadPoolExecutor(50) as pool:
         taken = Counter(pool.map(lambda _: sent(port, http(port, "/live.js"))[0], range(DOWNLOADS)))
-    wrong, listed = [], requests(port, key, watcher)
+    wrong, listed = [], requests(port, token)
     for request, allowed in listed:
         status, _ = sent(port, request)
         wrong += [] if status in allowed else [f"; {status} for {request[:80]!r}"]
@@ -194,10 +190,10 @@ def attacked(place: Path) -> list[str]:
     codes.append(run.child.wait(LONGEST_S))
     one, other = ((place / name / "spots.csv").read_bytes() for name in ("alone", "attacked"))
     return [
-        f"{IDLE} idle connections without the key: {descriptors} of {FILES_MAX} descriptors in use",
+        f"{IDLE} idle connections without the token: {descriptors} of {FILES_MAX} descriptors in use",
         f"{DOWNLOADS} parallel downloads: {taken[200]} answered, {taken[0]} closed",
         f"{len(listed)} requests that must be refused: {len(listed) - len(wrong)} were{''.join(wrong)}",
-        f"a request with the key after each: answered, after {max(waits):.0f} ms at most",
+        f"a request with the token after each: answered, after {max(waits):.0f} ms at most",
         f"memory {before:.0f} MB before, {after:.0f} after; most {peak:.0f}, of an unattacked run {peak_alone:.0f}",
         f"exit codes {codes}, {len(looks(run.out))} looks, spots.csv {'as unattacked' if one == other else 'DIFFERS'}",
     ]
