@@ -25,7 +25,8 @@ def fit_with(correlation: float, shift: str, *, free: bool = True) -> SimpleName
     left, right = DIRECTIONS.index("left"), DIRECTIONS.index("right")
     mean = 0.5 * (ratios[:, left] + ratios[:, right])
     ratios[:, left], ratios[:, right] = mean + 1e-4 * apart, mean - 1e-4 * apart
-    draws = Derived(physical, np.zeros((DRAWS, len(MODELLED))), np.zeros((DRAWS, 2, 2)), np.zeros((DRAWS, 0)))
+    none = np.zeros((DRAWS, len(MODELLED))), np.zeros((DRAWS, 2, 2)), np.zeros((DRAWS, 0))
+    draws = Derived(physical, *none, TWO_MIRROR.key)
     draws.modelled[:, [MODELLED[f"effective_deg_per_step.{direction}"] for direction in DIRECTIONS]] = ratios
     return SimpleNamespace(draws=draws, names=TWO_MIRROR.names, free=np.full(len(TWO_MIRROR.names), free))
 

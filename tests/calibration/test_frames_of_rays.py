@@ -10,8 +10,10 @@ from support.bent_rig import AXES, BENT, ROUNDING, ROUNDING_MM, TWIN_SIDE, calib
 
 from tvsbayes.calibration.drawn_looks import drawn
 from tvsbayes.calibration.frames import EXTRINSICS_NAMES, P_INPUTS
+from tvsbayes.calibration.states import poses_of
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import sides_of
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD, TWO_MIRROR
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.twin.physics import Sheet, light_on_sheet
 
@@ -88,3 +90,11 @@ def test_frames_that_there_are_not(placed, bent):
     with pytest.raises(InputError, match="where the cameras stand") as refused:
         bent.ray(*STEPS, frame="camera")
     assert "results/" in refused.value.remedy
+
+
+def test_a_head_with_sightings_stands_in_its_own_frame():
+    """A scanner's draws without extrinsics have no pose instead."""
+    for kind, poses in ((SIGHTING_HEAD, np.zeros((3, 6))), (TWO_MIRROR, np.zeros((0, 6)))):
+        names = [name for name in kind.names if not name.startswith("extrinsics")]
+        np.testing.assert_array_equal(poses_of(names, np.ones((3, len(names)))), poses)
+    np.testing.assert_array_equal(poses_of(TWO_MIRROR.names, np.ones((3, len(TWO_MIRROR.names)))), np.ones((3, 6)))

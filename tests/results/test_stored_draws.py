@@ -16,8 +16,10 @@ from support.small_results import small_draws, small_mode, small_record, small_s
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.pipeline import load_calibration
-from tvsbayes.results.stored_draws import write_results
+from tvsbayes.results.stored_draws import StoredMode, write_results
 
 
 def test_results_are_two_files_with_their_provenance(tmp_path):
@@ -38,6 +40,20 @@ def test_results_are_two_files_with_their_provenance(tmp_path):
     assert names == ["backlash_deg.pan", "not estimated", "pixel_scale"]
     expected = np.cov(physical[:, [0, 2]], rowvar=False)
     np.testing.assert_allclose(document["covariance"]["matrix"], expected, rtol=1e-12)
+
+
+def test_a_head_that_also_stored_what_it_lacks_keeps_its_own():
+    """0.3.0 wrote the scanner's cameras, as coordinates that nothing moves, into the draws of a head with sightings."""
+    own, rig = SIGHTING_HEAD.names, len(SIGHTING_HEAD.rig_names)
+    names = (*own[:3], "baseline_mm", *own[3:], *STEREO_PARAMETER_NAMES)
+    numbers = np.arange(len(names), dtype=float)
+    prior = np.tile(numbers[: rig + 1], (2, 1))
+    stored = StoredMode(names, numbers, np.diag(numbers), 1.0, prior, np.ones(4), np.ones(4))
+    kept = stored.of(own, SIGHTING_HEAD.rig_names)
+    np.testing.assert_array_equal(kept.z, np.delete(numbers[: rig + 1], 3))
+    np.testing.assert_array_equal(np.diag(kept.covariance), kept.z)
+    np.testing.assert_array_equal(kept.prior, [kept.z, kept.z])
+    assert kept.names == own and stored.of((*own, "new"), SIGHTING_HEAD.rig_names) is None
 
 
 def test_results_with_a_calibration_are_read_back(tmp_path):

@@ -13,7 +13,7 @@ from tvsbayes.model.headlines import MODELLED, Derived
 
 def drawn_quantities(*shape: int, physical: np.ndarray | None = None, **blocks: np.ndarray) -> Derived:
     """Draws of a shape: parameters, and quantities by block (..., entries); what is not named is 0."""
-    point = Derived(*(jnp.zeros(n) for n in (len(TWO_MIRROR.names), len(MODELLED), (2, 2), 0)))
+    point = Derived(*(jnp.zeros(n) for n in (len(TWO_MIRROR.names), len(MODELLED), (2, 2), 0)), TWO_MIRROR.key)
     drawn = jax.tree.map(lambda x: np.zeros((*shape, *x.shape)), point)
     if physical is not None:
         drawn.physical[...] = physical

@@ -94,7 +94,7 @@ def causes_of(
     parts = information.noises | {cause: np.diag(own.astype(float)) for cause, own in priors.items()}
     mechanism, at = fit.space.mechanism, physical_at(fit.z, fit.space)
     own_names, slopes = input_names(mechanism), np.asarray(at.slope)
-    slope = named_at(fit.z, fit.space, own_names).slope
+    slope = named_at(at, mechanism, own_names).slope
     moved = np.asarray(at.value) + 1j * COMPLEX_STEP * np.eye(len(slopes))
     for (axis, state), zero in zip((states or {}).items(), mechanism.zeros, strict=bool(states)):
         shift = total_shift({name: moved[:, mechanism.index[name]] for name in ZERO_NAMES}, axis, state)[:, 0]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PyTree
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.looks import Looks, Numbers, aperture_reading, in_frame_s, seen, spot_angles
 from tvsbayes.instrument.mechanisms import Mechanism
-from tvsbayes.instrument.parameters import CAMERAS, NOISE_NAMES
+from tvsbayes.instrument.parameters import NOISE_NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.model.geometry import materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace, Point
@@ -36,15 +36,9 @@ def _groups(mechanism: Mechanism) -> tuple[np.ndarray, ...]:
     Returns:
         Coordinates of gears, optics, frames, cameras and receiver, and of scales of noise, which act in none.
     """
-    zero, *optics = (parameter.name for parameter in mechanism.path)
-    columns = mechanism.index
-
-    def owned(*names: str) -> np.ndarray:
-        return np.array([columns[name] for name in names if name in columns], dtype=int)
-
-    gears, frames, receiver = (mechanism.columns(*blocks) for blocks in (GEARS, FRAMES, RECEIVER))
-    cameras = owned("focal_scale", *(parameter.name for parameter in CAMERAS))
-    return np.append(gears, columns[zero]), owned(*optics), frames, cameras, receiver, owned(*NOISE_NAMES)
+    gears, cameras = (*GEARS, mechanism.tilt_zero), ("focal_scale", *STEREO_PARAMETER_NAMES)
+    parts = gears, mechanism.optics_names, FRAMES, cameras, RECEIVER, NOISE_NAMES
+    return tuple(mechanism.columns(*names) for names in parts)
 
 
 def look_jacobian(at: Point, space: ParameterSpace, looks: Looks, arrays: CampaignArrays) -> Numbers:

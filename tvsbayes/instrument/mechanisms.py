@@ -94,11 +94,11 @@ class Mechanism:
         """Names of coordinates with a prior in `[rig]`, which come first."""
         return tuple(name for name, of in self.parameters.items() if of.place != "stereo")
 
-    def columns(self, *blocks: str) -> np.ndarray:
-        """Coordinates of the parameters of blocks that the instrument has, in the order of the arguments."""
+    def columns(self, *names_or_blocks: str) -> np.ndarray:
+        """Coordinates of parameters or whole blocks, those that the instrument has, in the order of the arguments."""
         import numpy as np
 
-        names = (name for block in blocks for name in BLOCKS[block])
+        names = (name for each in names_or_blocks for name in BLOCKS.get(each, (each,)))
         return np.array([self.index[name] for name in names if name in self.index], dtype=int)
 
     @cached_property

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR
+from tvsbayes.instrument.mechanisms import MECHANISMS
 from tvsbayes.instrument.parameters import BLOCKS, QUANTITIES, REGISTRY, TARGETS
 from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.model.compiled import compiled
@@ -145,7 +145,7 @@ class Derived(eqx.Module):
     modelled: Float[Array | np.ndarray, "*draws modelled"]
     jacobian: Float[Array | np.ndarray, "*draws 2 2"]
     place_errors_rad: Float[Array | np.ndarray, "*draws errors"]
-    key: str = eqx.field(static=True, default=TWO_MIRROR.key)
+    key: str = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return a parameter or one of `DERIVED`, with the leading axes of the fields."""

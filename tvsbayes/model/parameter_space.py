@@ -306,10 +306,9 @@ def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
     return Physical(np.asarray(point.values), slope)
 
 
-def named_at(z: np.ndarray, space: ParameterSpace, names: Sequence[str]) -> Physical:
-    """Compute `physical_at` of named parameters (k,), slopes (k, p); constants of the instrument do not vary."""
-    at, mechanism = physical_at(z, space), space.mechanism
-    value, slope = np.zeros(len(names)), np.zeros((len(names), len(z)))
+def named_at(at: Physical, mechanism: Mechanism, names: Sequence[str]) -> Physical:
+    """Select named parameters (k,), slopes (k, p); constants of the instrument do not vary."""
+    value, slope = np.zeros(len(names)), np.zeros((len(names), len(at.value)))
     for row, name in enumerate(names):
         if (column := mechanism.index.get(name)) is None:
             value[row] = mechanism.constants[name]

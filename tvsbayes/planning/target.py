@@ -19,7 +19,7 @@ from tvsbayes.instrument.axes import APPROACH_SIGN, DIRECTIONS
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, TARGET_ROWS, TARGETS
 from tvsbayes.instrument.protocols import RUN_UP_STEPS
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.parameter_space import ParameterSpace, named_at
+from tvsbayes.model.parameter_space import ParameterSpace, named_at, physical_at
 from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces
 from tvsbayes.results.records import Record
 from tvsbayes.statistics.intervals import NORMAL_95
@@ -181,9 +181,9 @@ def sensitivity(
     rows = list(target.indices)
     if target.point_mm is None:
         return Sensitivity(np.asarray(gears.headlines(z, space, pose_rad).gradient)[rows])
-    names = input_names(space.mechanism)
-    inputs = named_at(z, space, names)
-    stop_sd = noise_of_a_look(dict(zip(OF_A_LOOK, named_at(z, space, OF_A_LOOK).value, strict=True)))
+    names, at = input_names(space.mechanism), physical_at(z, space)
+    inputs, noise = (named_at(at, space.mechanism, wanted) for wanted in (names, OF_A_LOOK))
+    stop_sd = noise_of_a_look(dict(zip(OF_A_LOOK, noise.value, strict=True)))
     azimuth = table.aperture_convention == "azimuth"
     calibration = Calibration(
         mean=inputs.value,
